@@ -1,0 +1,1 @@
+"""Retrieval: arrays in, decisions out."""

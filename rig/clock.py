@@ -1,0 +1,40 @@
+"""The one clock of a bench: the only module that asks the operating system for the time."""
+
+import time
+from datetime import UTC, datetime
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Time as a bench sees it; injected into everything that waits or stamps."""
+
+    def now_ns(self) -> int:
+        """Return monotonic time in nanoseconds; only differences have a meaning."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Let ``seconds`` pass; zero and negative values return at once."""
+        ...
+
+    def utc(self) -> datetime:
+        """Return the civil time, for records that people read."""
+        ...
+
+
+class SystemClock:
+    """The computer's own monotonic clock."""
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()  # noqa: TID251 - this is the clock that everyone else is given
+
+    def sleep(self, seconds: float) -> None:
+        if seconds > 0:
+            time.sleep(seconds)  # noqa: TID251
+
+    def utc(self) -> datetime:
+        return datetime.now(UTC)  # noqa: TID251
+
+
+def seconds_between(start_ns: int, end_ns: int) -> float:
+    """Return ``end_ns - start_ns`` in seconds."""
+    return (end_ns - start_ns) * 1e-9

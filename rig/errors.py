@@ -1,0 +1,159 @@
+"""The registry of errors: one class a kind, with a code, what happened, the evidence, and the next step.
+
+The hundreds of a code are the exit code of the command line (design: 3 configuration, 4 device, 5 motion or safety,
+6 quality, 7 catalog, 8 unknown object, 9 busy).
+"""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+Evidence = Mapping[str, Any]
+
+
+class RigError(Exception):
+    """Base of every error that the rig raises on purpose.
+
+    Parameters
+    ----------
+    what
+        What happened, in a sentence.
+    next_step
+        What the person at the bench does now.
+    evidence
+        The numbers it was judged by, units in the keys.
+    """
+
+    code: ClassVar[int] = 100
+    title: ClassVar[str] = "internal error"
+
+    def __init__(self, what: str, *, next_step: str, evidence: Evidence | None = None) -> None:
+        super().__init__(what)
+        self.what = what
+        self.next_step = next_step
+        self.evidence: dict[str, Any] = dict(evidence or {})
+
+    @property
+    def exit_code(self) -> int:
+        return self.code // 100
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the error for `--json` output."""
+        return {
+            "error": self.title,
+            "code": self.code,
+            "what": self.what,
+            "evidence": self.evidence,
+            "next_step": self.next_step,
+        }
+
+
+class UsageError(RigError):
+    """A command or call was asked for something that cannot be."""
+
+    code = 200
+    title = "usage"
+
+
+class ConfigError(RigError):
+    """The configuration cannot be used; the evidence lists every mistake at once."""
+
+    code = 300
+    title = "configuration"
+
+
+class DeviceNotFound(RigError):
+    """A device does not answer where the configuration says it is."""
+
+    code = 400
+    title = "device not found"
+
+
+class DeviceMismatch(RigError):
+    """Another device answers than the one expected."""
+
+    code = 401
+    title = "wrong device"
+
+
+class DeviceSilent(RigError):
+    """A device stopped answering, after all retries."""
+
+    code = 402
+    title = "device silent"
+
+
+class DeviceRefused(RigError):
+    """A device answered with an error status."""
+
+    code = 403
+    title = "device refused"
+
+
+class DeviceFault(RigError):
+    """A device reports that it is broken, overheated, overloaded or out of supply."""
+
+    code = 404
+    title = "device fault"
+
+
+class LimitExceeded(RigError):
+    """A motion would leave the table's limits (its cable)."""
+
+    code = 500
+    title = "limit"
+
+
+class MotionTimeout(RigError):
+    """The table did not arrive and settle within the computed time."""
+
+    code = 501
+    title = "motion timeout"
+
+
+class RotationDisagreement(RigError):
+    """Encoder and gyro differ by more than their uncertainty: slip, backlash or a loose platter."""
+
+    code = 502
+    title = "rotation disagreement"
+
+
+class NotReady(RigError):
+    """A motion was asked for in a state that forbids it."""
+
+    code = 503
+    title = "not ready"
+
+
+class ViewRejected(RigError):
+    """No acceptable view within the allowed retakes."""
+
+    code = 600
+    title = "view rejected"
+
+
+class CatalogError(RigError):
+    """The catalog cannot do what was asked."""
+
+    code = 700
+    title = "catalog"
+
+
+class ObjectExists(CatalogError):
+    """An object of that name is enrolled already."""
+
+    code = 701
+    title = "object exists"
+
+
+class ObjectNotFound(CatalogError):
+    """No object of that name is in the catalog."""
+
+    code = 702
+    title = "object not found"
+
+
+class CatalogBusy(RigError):
+    """Another process holds the catalog or the bench."""
+
+    code = 900
+    title = "busy"

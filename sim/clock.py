@@ -1,0 +1,73 @@
+"""Virtual time: integer nanoseconds that pass only when somebody waits for them."""
+
+import heapq
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from itertools import count
+
+EPOCH = datetime(2020, 1, 1, tzinfo=UTC)
+"""Civil time at virtual time 0 where none is given: fixed, so that a run is reproducible to the byte."""
+
+
+class Timer:
+    """A callback that waits for its virtual time; `cancel` takes it back."""
+
+    def __init__(self, at_ns: int, callback: Callable[[], None]) -> None:
+        self.at_ns = at_ns
+        self._callback: Callable[[], None] | None = callback
+
+    @property
+    def pending(self) -> bool:
+        return self._callback is not None
+
+    def cancel(self) -> None:
+        self._callback = None
+
+    def fire(self) -> None:
+        callback, self._callback = self._callback, None
+        if callback is not None:
+            callback()
+
+
+class VirtualClock:
+    """A `rig.clock.Clock` whose time is moved by its sleepers.
+
+    Emulators schedule what they do by themselves (a byte arrives, a watchdog expires) with `call_at`; whoever sleeps
+    runs these callbacks on the way, each at its own time, equal times in the order of their scheduling.
+    """
+
+    def __init__(self, start_utc: datetime = EPOCH) -> None:
+        self._now_ns = 0
+        self._start_utc = start_utc
+        self._timers: list[tuple[int, int, Timer]] = []
+        self._order = count()
+
+    def now_ns(self) -> int:
+        return self._now_ns
+
+    def utc(self) -> datetime:
+        return self._start_utc + timedelta(microseconds=self._now_ns // 1000)
+
+    def sleep(self, seconds: float) -> None:
+        if seconds > 0:
+            self.advance_to(self._now_ns + round(seconds * 1e9))
+
+    def call_at(self, at_ns: int, callback: Callable[[], None]) -> Timer:
+        """Schedule ``callback`` for ``at_ns``; a time that has passed means as soon as time moves on."""
+        timer = Timer(max(at_ns, self._now_ns), callback)
+        heapq.heappush(self._timers, (timer.at_ns, next(self._order), timer))
+        return timer
+
+    def next_event_ns(self) -> int | None:
+        """Return the time of the next pending callback, or None."""
+        while self._timers and not self._timers[0][2].pending:
+            heapq.heappop(self._timers)
+        return self._timers[0][0] if self._timers else None
+
+    def advance_to(self, at_ns: int) -> None:
+        """Let time pass until ``at_ns``, running what falls due up to and including it."""
+        while (due_ns := self.next_event_ns()) is not None and due_ns <= at_ns:
+            timer = heapq.heappop(self._timers)[2]
+            self._now_ns = max(self._now_ns, due_ns)
+            timer.fire()
+        self._now_ns = max(self._now_ns, at_ns)

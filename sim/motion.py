@@ -1,0 +1,192 @@
+"""Trajectories of the servo's shaft and what the platter makes of them, in closed form.
+
+Everything is evaluated for arrays of times, past ones included, so that the gyro's FIFO and a frame's exposure see the
+angle of their own moment and nothing is integrated in steps.
+"""
+
+from dataclasses import dataclass
+from math import copysign, sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Motion with piecewise constant acceleration.
+
+    Attributes
+    ----------
+    start_s : float64 (k,)
+        Times at which the pieces begin, rising; the last piece holds for ever.
+    position_deg, velocity_dps, acceleration_dps2 : float64 (k,)
+        State at the beginning of each piece, and its acceleration.
+    """
+
+    start_s: Floats
+    position_deg: Floats
+    velocity_dps: Floats
+    acceleration_dps2: Floats
+
+    @property
+    def end_s(self) -> float:
+        """Time at which the last change of acceleration happens."""
+        return float(self.start_s[-1])
+
+    def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
+        """Return position and velocity at ``time_s``; before the first piece, its beginning."""
+        t = np.asarray(time_s, dtype=np.float64)
+        i = np.maximum(np.searchsorted(self.start_s, t, side="right") - 1, 0)
+        tau = np.maximum(t - self.start_s[i], 0.0)
+        v, a = self.velocity_dps[i], self.acceleration_dps2[i]
+        return self.position_deg[i] + v * tau + 0.5 * a * tau**2, v + a * tau
+
+    def acceleration_at(self, time_s: ArrayLike) -> Floats:
+        """Return the acceleration at ``time_s``."""
+        i = np.maximum(np.searchsorted(self.start_s, np.asarray(time_s, dtype=np.float64), side="right") - 1, 0)
+        return np.asarray(self.acceleration_dps2[i], dtype=np.float64)
+
+
+def _from_pieces(start_s: float, position: float, velocity: float, pieces: list[tuple[float, float]]) -> Trajectory:
+    """Chain (duration, acceleration) pieces; a piece that stops or reverses is cut at its standstill, so each is monotone."""
+    rows: list[tuple[float, float, float, float]] = []
+    t, x, v = start_s, position, velocity
+    for duration, a in pieces:
+        if duration <= 0:
+            continue
+        turn = -v / a if a and v else 0.0
+        for d in (turn, duration - turn) if 0 < turn < duration else (duration,):
+            rows.append((t, x, v, a))
+            t, x, v = t + d, x + v * d + 0.5 * a * d * d, v + a * d
+    rows.append((t, x, v, 0.0))
+    columns = np.array(rows, dtype=np.float64).T
+    return Trajectory(*(np.ascontiguousarray(c) for c in columns))
+
+
+def rest(start_s: float, position_deg: float) -> Trajectory:
+    """Return a standstill."""
+    return _from_pieces(start_s, position_deg, 0.0, [])
+
+
+def to_position(
+    start_s: float, position_deg: float, velocity_dps: float, goal_deg: float, v_max: float, a_max: float
+) -> Trajectory:
+    """Return the trapezoid (or triangle) profile from a moving start to a standstill at ``goal_deg``.
+
+    ``v_max`` in °/s and ``a_max`` in °/s², both positive. A start that is too fast to stop in time overshoots and returns.
+    """
+    v0 = velocity_dps
+    stop_at = position_deg + copysign(v0 * v0 / (2 * a_max), v0) if v0 else position_deg
+    direction = copysign(1.0, goal_deg - stop_at)
+    u0 = v0 * direction  # speed towards the goal
+    braking: list[tuple[float, float]] = []
+    if u0 > v_max:
+        braking = [((u0 - v_max) / a_max, -direction * a_max)]
+    x1 = position_deg + sum(v0 * d + 0.5 * a * d * d for d, a in braking)
+    u1 = min(u0, v_max)
+    distance = max((goal_deg - x1) * direction, 0.0)
+    u_peak = min(v_max, sqrt(max(distance * a_max + 0.5 * u1 * u1, 0.0)))
+    ramps = (2 * u_peak**2 - u1 * u1) / (2 * a_max)
+    cruise = max(distance - ramps, 0.0) / u_peak if u_peak > 0 else 0.0
+    pieces = [
+        *braking,
+        ((u_peak - u1) / a_max, direction * a_max),
+        (cruise, 0.0),
+        (u_peak / a_max, -direction * a_max),
+    ]
+    path = _from_pieces(start_s, position_deg, v0, pieces)
+    path.position_deg[-1], path.velocity_dps[-1] = goal_deg, 0.0  # the last knot carries no rounding
+    return path
+
+
+def to_velocity(start_s: float, position_deg: float, velocity_dps: float, goal_dps: float, a_max: float) -> Trajectory:
+    """Return a ramp from ``velocity_dps`` to ``goal_dps``, held for ever."""
+    change = goal_dps - velocity_dps
+    path = _from_pieces(
+        start_s, position_deg, velocity_dps, [(abs(change) / a_max, copysign(a_max, change))] if change else []
+    )
+    path.velocity_dps[-1] = goal_dps
+    return path
+
+
+class Platter:
+    """The platter on the shaft: free play (a play operator) and a damped structural vibration.
+
+    The play operator keeps the platter within ±play/2 of the shaft and otherwise leaves it where friction holds it.
+    The vibration is x'' + 2ζω x' + ω² x = −a(t), solved exactly for each piece of constant shaft acceleration a.
+    """
+
+    def __init__(self, play_deg: float, structure_hz: float, damping: float) -> None:
+        self._half_play = play_deg / 2
+        self._omega = 2 * np.pi * structure_hz
+        self._zeta = damping
+        self._path = rest(0.0, 0.0)
+        self._platter = np.zeros(1)
+        self._shake = np.zeros((1, 2))  # deflection and its rate at each knot
+
+    @property
+    def shaft(self) -> Trajectory:
+        return self._path
+
+    def follow(self, path: Trajectory, previous: "Platter | None") -> None:
+        """Take ``path`` as the shaft's motion, going on from where ``previous`` leaves the platter at its start."""
+        t0 = path.start_s[0]
+        if previous is None:
+            platter, shake = float(path.position_deg[0]), (0.0, 0.0)
+        else:
+            platter = float(previous._rigid(np.array([t0]))[0][0])
+            shake = tuple(float(s[0]) for s in previous._vibration(np.array([t0])))  # type: ignore[assignment]
+        self._path = path
+        self._platter = np.empty(len(path.start_s))
+        self._shake = np.empty((len(path.start_s), 2))
+        for k, x in enumerate(path.position_deg):
+            platter = min(max(platter, x - self._half_play), x + self._half_play)
+            self._platter[k] = platter
+            if k:
+                shake = self._swing(shake, float(path.acceleration_dps2[k - 1]), path.start_s[k] - path.start_s[k - 1])
+            self._shake[k] = shake
+
+    def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
+        """Return the platter's angle and rate (°, °/s) at times within this path."""
+        t = np.asarray(time_s, dtype=np.float64)
+        angle, rate = self._rigid(t)
+        deflection, deflection_rate = self._vibration(t)
+        return angle + deflection, rate + deflection_rate
+
+    def _knot(self, t: Floats) -> NDArray[np.intp]:
+        return np.maximum(np.searchsorted(self._path.start_s, t, side="right") - 1, 0)
+
+    def _rigid(self, t: Floats) -> tuple[Floats, Floats]:
+        x, v = self._path.at(t)
+        held = self._platter[self._knot(t)]
+        angle = np.clip(held, x - self._half_play, x + self._half_play)
+        engaged = ((v > 0) & (angle <= x - self._half_play)) | ((v < 0) & (angle >= x + self._half_play))
+        return angle, np.where(engaged, v, 0.0)
+
+    def _vibration(self, t: Floats) -> tuple[Floats, Floats]:
+        if self._omega == 0:
+            return np.zeros_like(t), np.zeros_like(t)
+        k = self._knot(t)
+        tau = np.maximum(t - self._path.start_s[k], 0.0)
+        return self._response(self._shake[k, 0], self._shake[k, 1], self._path.acceleration_dps2[k], tau)
+
+    def _swing(self, state: tuple[float, float], acceleration: float, tau: float) -> tuple[float, float]:
+        if self._omega == 0:
+            return 0.0, 0.0
+        x, v = self._response(*(np.float64(s) for s in (*state, acceleration, tau)))
+        return float(x), float(v)
+
+    def _response(
+        self, x0: Floats | np.float64, v0: Floats | np.float64, a: Floats | np.float64, tau: Floats | np.float64
+    ) -> tuple[Floats, Floats]:
+        w, z = self._omega, self._zeta
+        wd = w * sqrt(1 - z * z)
+        offset = -a / (w * w)
+        c = x0 - offset
+        d = (v0 + z * w * c) / wd
+        decay, cos, sin = np.exp(-z * w * tau), np.cos(wd * tau), np.sin(wd * tau)
+        x = offset + decay * (c * cos + d * sin)
+        v = decay * ((d * wd - z * w * c) * cos - (c * wd + z * w * d) * sin)
+        return np.asarray(x), np.asarray(v)

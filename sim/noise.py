@@ -1,0 +1,71 @@
+"""Everything that is imperfect about the simulated bench, in one place."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Self
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """Errors of the simulated bench; defaults follow the datasheets of the parts.
+
+    Values that differ from part to part (bias, scale, tilt) are drawn once per world from a normal distribution with the
+    given standard deviation; the others act on every reading.
+    """
+
+    # Servo and table: XL430-W250 e-manual, measured play of its gears.
+    backlash_deg: float = 0.25
+    """Free play between shaft and platter, full width."""
+    encoder_noise_deg: float = 0.02
+    """Standard deviation of one encoder reading before its quantisation to 0.088°."""
+    structure_hz: float = 11.0
+    """Natural frequency of platter and object on the shaft: they ring after each change of acceleration."""
+    structure_damping: float = 0.15
+    """Damping ratio of that ringing."""
+    voltage_noise_v: float = 0.05
+    """Standard deviation of the supply voltage."""
+
+    # Gyro and accelerometer: MPU-6000/6050 product specification rev 3.4, sections 6.1 and 6.2.
+    gyro_noise_dps_rthz: float = 0.005
+    """Rate noise density."""
+    gyro_bias_dps: float = 5.0
+    """Standard deviation of the zero-rate output from part to part (specified within ±20 °/s)."""
+    gyro_bias_walk_dps_rts: float = 0.0003
+    """Random walk of the bias, per square root of a second."""
+    gyro_scale_error: float = 0.01
+    """Standard deviation of the relative scale error (specified within ±3 %)."""
+    accel_noise_g_rthz: float = 0.0004
+    """Acceleration noise density."""
+    accel_bias_g: float = 0.03
+    """Standard deviation of the zero-g output (specified within ±0.05 and ±0.08 g)."""
+    imu_tilt_deg: float = 1.0
+    """Standard deviation of the mounting tilt about each horizontal axis."""
+
+    # Camera: a 1/3" USB sensor at gain 1 (EMVA 1288 terms).
+    full_well_e: float = 10000.0
+    """Electrons of a saturated pixel: sets the shot noise; 0 switches it off."""
+    read_noise_e: float = 12.0
+    """Standard deviation of the dark noise in electrons."""
+    vignetting: float = 0.12
+    """Relative loss of light in the image's corners."""
+    light_flicker: float = 0.004
+    """Standard deviation of the relative brightness from frame to frame."""
+
+    # The hand that places the objects.
+    placement_mm: float = 1.0
+    """Standard deviation of an object's distance from the axis, along each axis of the platter."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{field.name} = {value!r}: give a finite number that is not negative")
+
+    @classmethod
+    def none(cls) -> Self:
+        """Return the perfect bench: no noise, no play, no error (ringing is damped out at once)."""
+        zeros = dict.fromkeys((f.name for f in fields(cls)), 0.0)
+        return cls(**zeros)
+
+    def with_values(self, **values: float) -> Self:
+        """Return a copy with some values changed."""
+        return replace(self, **values)

@@ -1,0 +1,150 @@
+"""The one world behind the simulated servo, IMU and camera: what is really there, and when it changed.
+
+The emulators have two sides: the bus, on which unchanged drivers talk to them, and this world, which tests set.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim.clock import VirtualClock
+from sim.motion import Floats, Platter, Trajectory, rest
+from sim.noise import NoiseModel
+
+HISTORY_S = 12.0
+"""How far back the past is kept: longer than the IMU's FIFO and the camera's buffers reach."""
+
+
+class Thing(Protocol):
+    """Something that can stand on the platter; `sim.camera` knows how to draw the kinds there are."""
+
+    @property
+    def name(self) -> str: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What the camera would see, but for the table's angle.
+
+    ``yaw_deg`` is how far the thing was turned, counter-clockwise, against the platter when it was put there;
+    ``offset_mm`` where its axis stands in the platter's frame; ``light`` relative to the nominal light, as B, G, R.
+    """
+
+    thing: Thing | None = None
+    yaw_deg: float = 0.0
+    offset_mm: tuple[float, float] = (0.0, 0.0)
+    light: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+class World:
+    """True state of the simulated bench on its virtual clock.
+
+    Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. With ``noise`` and ``seed`` the whole
+    run is determined: each emulator draws from its own stream (`rng`), so one more reading of one device does not change
+    what another one sees.
+    """
+
+    def __init__(self, *, noise: NoiseModel | None = None, seed: int = 0, clock: VirtualClock | None = None) -> None:
+        self.clock = clock or VirtualClock()
+        self.noise = noise or NoiseModel()
+        self.seed = seed
+        self._scenes: list[tuple[int, Scene]] = [(0, Scene())]
+        first = self._platter()
+        first.follow(rest(0.0, 0.0), None)
+        self._motions: list[tuple[int, Platter, float]] = [(0, first, 0.0)]
+
+    def rng(self, name: str) -> np.random.Generator:
+        """Return a fresh generator for the stream ``name`` of this world's seed."""
+        return np.random.default_rng([self.seed, crc32(name.encode())])
+
+    # -- the table ------------------------------------------------------------------------------------------------
+
+    def drive(self, shaft: Trajectory) -> None:
+        """Let the servo's shaft follow ``shaft`` from now on."""
+        now_ns = self.clock.now_ns()
+        _, previous, slip = self._motions[-1]
+        platter = self._platter()
+        platter.follow(shaft, previous)
+        self._motions.append((now_ns, platter, slip))
+        self._forget(self._motions, now_ns)
+
+    def slip(self, angle_deg: float) -> None:
+        """Turn the platter by ``angle_deg`` against the shaft, at once: a loose platter, a bumped table."""
+        now_ns = self.clock.now_ns()
+        _, platter, slipped = self._motions[-1]
+        self._motions.append((now_ns, platter, slipped + angle_deg))
+
+    def shaft(self, time_ns: int | None = None) -> tuple[float, float]:
+        """Return angle (°) and speed (°/s) of the servo's shaft."""
+        t = self.clock.now_ns() if time_ns is None else time_ns
+        x, v = self._motions[self._index(t)][1].shaft.at(t * 1e-9)
+        return float(x), float(v)
+
+    def table_deg(self, time_ns: int | None = None) -> float:
+        """Return the true angle of the platter, now or at a time not longer ago than `HISTORY_S`."""
+        return float(self.table_motion([self.clock.now_ns() if time_ns is None else time_ns])[0][0])
+
+    def table_motion(self, times_ns: ArrayLike) -> tuple[Floats, Floats]:
+        """Return the platter's true angle (°) and rate (°/s) at each of the given times, int64 (n,)."""
+        t: NDArray[np.int64] = np.atleast_1d(np.asarray(times_ns, dtype=np.int64))
+        starts = np.array([start for start, _, _ in self._motions])
+        which = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
+        angle, rate = np.empty(t.shape), np.empty(t.shape)
+        for i in np.unique(which):
+            here = which == i
+            _, platter, slipped = self._motions[i]
+            angle[here], rate[here] = platter.at(t[here] * 1e-9)
+            angle[here] += slipped
+        return angle, rate
+
+    # -- what stands on it ----------------------------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Scene:
+        return self._scenes[-1][1]
+
+    def scene_at(self, time_ns: int) -> Scene:
+        return next((scene for start, scene in reversed(self._scenes) if start <= time_ns), self._scenes[0][1])
+
+    def change(self, **values: Any) -> None:
+        """Change fields of the `Scene` from now on."""
+        now_ns = self.clock.now_ns()
+        self._scenes.append((now_ns, replace(self.scene, **values)))
+        self._forget(self._scenes, now_ns)
+
+    def put(self, thing: Thing | None, yaw_deg: float = 0.0, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Put ``thing`` (or nothing) on the platter, turned by ``yaw_deg`` against the room at this moment."""
+        self.change(thing=thing, yaw_deg=yaw_deg - self.table_deg(), offset_mm=offset_mm)
+
+    @contextmanager
+    def changed(self, **values: Any) -> Iterator[None]:
+        """Change fields of the scene for the length of a `with` block."""
+        before = self.scene
+        self.change(**values)
+        try:
+            yield
+        finally:
+            self.change(**{name: getattr(before, name) for name in values})
+
+    # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _platter(self) -> Platter:
+        return Platter(self.noise.backlash_deg, self.noise.structure_hz, self.noise.structure_damping)
+
+    def _index(self, time_ns: int) -> int:
+        for i in range(len(self._motions) - 1, 0, -1):
+            if self._motions[i][0] <= time_ns:
+                return i
+        return 0
+
+    @staticmethod
+    def _forget(history: list[Any], now_ns: int) -> None:
+        """Drop what ended before the history's horizon; the entry in force there stays."""
+        horizon = now_ns - round(HISTORY_S * 1e9)
+        while len(history) > 1 and history[1][0] <= horizon:
+            del history[0]
