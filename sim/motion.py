@@ -50,7 +50,7 @@ class Trajectory:
 
 
 def _from_pieces(start_s: float, position: float, velocity: float, pieces: list[tuple[float, float]]) -> Trajectory:
-    """Chain (duration, acceleration) pieces; a piece that stops or reverses is cut at its standstill, so each is monotone."""
+    """Chain (duration, acceleration) pieces; one that reverses is cut at its standstill, so that each is monotone."""
     rows: list[tuple[float, float, float, float]] = []
     t, x, v = start_s, position, velocity
     for duration, a in pieces:
@@ -75,7 +75,8 @@ def to_position(
 ) -> Trajectory:
     """Return the trapezoid (or triangle) profile from a moving start to a standstill at ``goal_deg``.
 
-    ``v_max`` in °/s and ``a_max`` in °/s², both positive. A start that is too fast to stop in time overshoots and returns.
+    ``v_max`` in °/s and ``a_max`` in °/s², both positive. A start that is too fast to stop in time overshoots and
+    returns.
     """
     v0 = velocity_dps
     stop_at = position_deg + copysign(v0 * v0 / (2 * a_max), v0) if v0 else position_deg

@@ -8,8 +8,8 @@ from typing import Self
 class NoiseModel:
     """Errors of the simulated bench; defaults follow the datasheets of the parts.
 
-    Values that differ from part to part (bias, scale, tilt) are drawn once per world from a normal distribution with the
-    given standard deviation; the others act on every reading.
+    Values that differ from part to part (bias, scale, tilt) are drawn once per world from a normal distribution with
+    the given standard deviation; the others act on every reading.
     """
 
     # Servo and table: XL430-W250 e-manual, measured play of its gears.

@@ -44,9 +44,9 @@ class Scene:
 class World:
     """True state of the simulated bench on its virtual clock.
 
-    Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. With ``noise`` and ``seed`` the whole
-    run is determined: each emulator draws from its own stream (`rng`), so one more reading of one device does not change
-    what another one sees.
+    Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. With ``noise`` and ``seed`` the
+    whole run is determined: each emulator draws from its own stream (`rng`), so one more reading of one device does not
+    change what another one sees.
     """
 
     def __init__(self, *, noise: NoiseModel | None = None, seed: int = 0, clock: VirtualClock | None = None) -> None:

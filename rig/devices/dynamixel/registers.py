@@ -1,4 +1,4 @@
-"""Control tables of Dynamixel models, read from the `.model` files that the SDK ships: registers by name, values signed."""
+"""Control tables of Dynamixel models, from the `.model` files that the SDK ships: registers by name, values signed."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,0 +1,146 @@
+"""What a bench is, and how one is opened by name.
+
+Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, or anybody else's.
+"""
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from importlib.metadata import entry_points
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+from pydantic import BaseModel
+
+from rig.clock import Clock
+from rig.config import RigConfig, validate
+from rig.devices.camera import Camera
+from rig.devices.imu import Imu
+from rig.devices.servo import Servo
+from rig.errors import ConfigError, RigError
+
+GROUP = "rig.benches"
+
+
+class Operator(Protocol):
+    """Whoever puts objects on the table."""
+
+    def place(self, name: str | None) -> None:
+        """Have the object ``name`` on the table (None: the one to be identified), and the hands away, on return."""
+        ...
+
+
+class ObjectStandsThere:
+    """The operator of a bench where the object is on the table before the command is given."""
+
+    def place(self, name: str | None) -> None:
+        """Do nothing: ``name`` stands there already."""
+
+
+@dataclass(slots=True)
+class Bench(AbstractContextManager["Bench"]):
+    """The open devices of one bench, on one clock.
+
+    ``conditions`` says under which noise model or calibration the bench works, ``findings`` what opening it revealed
+    that a person should know; both are kept with every enrollment.
+    """
+
+    name: str
+    config: RigConfig
+    clock: Clock
+    servo: Servo
+    imu: Imu
+    camera: Camera
+    operator: Operator = field(default_factory=ObjectStandsThere)
+    conditions: Mapping[str, Any] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except (RigError, OSError):
+            if error is None:  # otherwise the first error is the one that people must see
+                raise
+
+    def close(self) -> None:
+        """Torque off, then let go of the devices; a device that fails here does not keep the others open."""
+        failures: list[Exception] = []
+        for step in (self.servo.torque_off, self.servo.close, self.imu.close, self.camera.close):
+            try:
+                step()
+            except (RigError, OSError) as failure:
+                failures.append(failure)
+        if failures:
+            raise failures[0]
+
+    def devices(self) -> dict[str, Any]:
+        """Return the identities of the devices, for the record."""
+        return {
+            "servo": _plain(self.servo.identity),
+            "imu": _plain(self.imu.identity),
+            "camera": _plain(self.camera.identity),
+        }
+
+
+class BenchKind(Protocol):
+    """A plug-in: its options, checked with the rest of the configuration, and how it is opened."""
+
+    @property
+    def options(self) -> type[BaseModel]:
+        """Model of the section ``[bench.<name>]``."""
+        ...
+
+    def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
+        """Open the devices; what was opened is closed again when a later one fails."""
+        ...
+
+
+def bench_names() -> list[str]:
+    """Return the names of the installed kinds of benches."""
+    return sorted(point.name for point in entry_points(group=GROUP))
+
+
+def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Bench:
+    """Open a bench by name; use it in a ``with`` block.
+
+    Parameters
+    ----------
+    name
+        A kind of bench (`bench_names`); None takes ``config.default_bench``.
+    config
+        The configuration; None takes the defaults.
+    seed
+        Seed of a simulated bench; real ones ignore it.
+
+    Raises
+    ------
+    ConfigError
+        There is no such bench, or its options have mistakes.
+    DeviceNotFound, DeviceMismatch, DeviceSilent
+        A device is not there, is another one, or does not answer.
+    """
+    config = config or RigConfig()
+    name = name or config.default_bench
+    points = {point.name: point for point in entry_points(group=GROUP)}
+    unknown = sorted(set(config.bench) - set(points))
+    if name not in points or unknown:
+        wrong = name if name not in points else unknown[0]
+        near = get_close_matches(wrong, points, n=1)
+        raise ConfigError(
+            f"There is no bench {wrong!r}.",
+            next_step=f"Did you mean {near[0]}?" if near else "Choose one of the benches listed.",
+            evidence={"benches": sorted(points)},
+        )
+    kind: BenchKind = points[name].load()
+    options = validate(kind.options, config.bench.get(name, {}), where="the configuration", prefix=f"bench.{name}")
+    return kind.open(config, options, seed)
+
+
+def _plain(identity: Any) -> dict[str, Any]:
+    return {name: getattr(identity, name) for name in identity.__dataclass_fields__}

@@ -1,0 +1,268 @@
+"""The configuration `rig.toml`: every key with its unit, range and default; every mistake reported at once."""
+
+import difflib
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+import platformdirs
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rig.errors import ConfigError
+
+M = TypeVar("M", bound=BaseModel)
+
+APP = "hbr-rig"
+FILE_NAME = "rig.toml"
+
+
+class Section(BaseModel):
+    """Base of every section: unknown keys are errors, values are fixed once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Degrees = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class ServoConfig(Section):
+    """Where the servo is and what it should be."""
+
+    port: str = Field("/dev/ttyUSB0", description="serial port of the U2D2 or another adapter")
+    baud: int = Field(57600, ge=9600, le=4_500_000, description="bits per second; the servo's factory setting is 57600")
+    id: int = Field(1, ge=0, le=252, description="id on the bus")
+    model: str = Field("xl430_w250", description="model as in the SDK's control tables")
+    retries: int = Field(
+        3, ge=0, le=20, description="repetitions of a spoiled transaction before the servo counts as silent"
+    )
+    write_settings: bool = Field(False, description="write EEPROM settings that differ from what the rig needs")
+
+
+class TableConfig(Section):
+    """How the table moves and when it counts as settled."""
+
+    direction: Literal[1, -1] = Field(
+        1, description="+1: rising servo position turns counter-clockwise seen from above"
+    )
+    zero_deg: Degrees = Field(180.0, description="servo angle at table angle 0")
+    limits_deg: tuple[Degrees, Degrees] = Field(
+        (-400.0, 400.0), description="cable budget: lowest and highest table angle"
+    )
+    velocity_dps: float = Field(90.0, gt=0, le=200, description="cruise speed; the gyro's range must hold it")
+    acceleration_dps2: float = Field(240.0, gt=0, le=5000, description="ramp")
+    approach_deg: float = Field(
+        3.0,
+        ge=0,
+        le=30,
+        description="every stop is approached upwards from at least this far below: takes up the gears' play",
+    )
+    tolerance_deg: float = Field(0.6, gt=0, le=5, description="largest distance from the goal that counts as arrived")
+    backlash_deg: float = Field(
+        0.5, ge=0, le=10, description="largest play between encoder and platter that is no fault"
+    )
+    quiet_dps: float = Field(0.35, gt=0, le=10, description="largest rate that the gyro may see at rest")
+    quiet_s: float = Field(0.12, ge=0.02, le=5, description="how long encoder and gyro must be quiet")
+    poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
+    watchdog_s: float = Field(0.5, ge=0.1, le=2.5, description="the servo stops by itself after this much silence")
+
+    @model_validator(mode="after")
+    def _limits_in_order(self) -> Self:
+        low, high = self.limits_deg
+        if not (low <= 0 <= high and high - low >= 360):
+            raise ValueError("limits_deg must span at least one turn and hold 0, e.g. [-400, 400]")
+        return self
+
+
+class ImuConfig(Section):
+    """Where the IMU is and how it is mounted."""
+
+    bus: int | str = Field(1, description="I2C bus number, or the path of its device")
+    address: int = Field(0x68, ge=0x08, le=0x77, description="I2C address; 0x69 with AD0 high")
+    axis: Literal["x", "y", "z"] = Field("z", description="the sensor's axis along the table's")
+    sign: Literal[1, -1] = Field(1, description="+1 where a counter-clockwise turn reads positive")
+    range_dps: Literal[250, 500, 1000, 2000] = Field(250, description="full scale of the gyro")
+    rate_hz: float = Field(200.0, ge=4, le=1000, description="samples per second")
+    scale: float = Field(1.0, ge=0.8, le=1.25, description="true rate per rate read, from calibration")
+    scale_uncertainty: float = Field(
+        0.012, ge=0, le=0.1, description="standard uncertainty of the scale; 0.012 uncalibrated"
+    )
+
+
+class CameraConfig(Section):
+    """Which camera, and the settings that are locked."""
+
+    source: int | str = Field(0, description="index or path for OpenCV")
+    width: int = Field(640, ge=80, le=8000, description="pixels")
+    height: int = Field(480, ge=80, le=8000, description="pixels")
+    fps: float = Field(30.0, gt=0, le=500, description="frames per second")
+    exposure_us: float | None = Field(8000.0, gt=0, le=1e6, description="locked exposure; none leaves the camera's")
+    gain: float | None = Field(None, ge=0, description="locked gain in the camera's own unit; none leaves the camera's")
+    white_balance_k: float | None = Field(5000.0, ge=1000, le=20000, description="locked white balance")
+
+
+class ViewConfig(Section):
+    """When a view is good enough."""
+
+    roi: tuple[int, int, int, int] | None = Field(
+        (80, 0, 480, 480), description="x, y, width, height of the part that is described"
+    )
+    min_sharpness: NotNegative = Field(3.0, description="smallest variance of the Laplacian of the grey image's region")
+    max_dark: Fraction = Field(0.95, description="largest share of pixels below level 8")
+    max_saturated: Fraction = Field(0.25, description="largest share of pixels at level 255")
+    min_mean: float = Field(4.0, ge=0, le=255, description="smallest mean level")
+    retakes: int = Field(3, ge=0, le=20, description="further frames taken before a view is given up")
+
+
+class CatalogConfig(Section):
+    """Where enrolled objects live."""
+
+    path: Path | None = Field(None, description="folder; none: the user's data folder, one catalog a bench")
+
+
+class EnrollConfig(Section):
+    """How an object is enrolled."""
+
+    views: int = Field(72, ge=4, le=720, description="views in a turn")
+
+
+class IdentifyConfig(Section):
+    """How an object is found."""
+
+    max_views: int = Field(8, ge=1, le=72, description="give the best answer after this many views")
+    min_views: int = Field(2, ge=1, le=72, description="never decide before")
+    first_step_deg: float = Field(
+        90.0, ge=-180, le=180, description="rotation between the first two views, + to the left"
+    )
+    omega: float = Field(0.5, ge=0, le=100, description="weight of the orientation term")
+    list_length: int = Field(10, ge=1, le=1000, description="views on a retrieval list")
+    extension: Literal["visual", "orient", "orient_all"] = Field(
+        "orient_all", description="how missing views are filled in"
+    )
+    margin: float = Field(0.08, ge=0, le=1, description="stop when the best score leads by this much a view")
+    min_score: float = Field(0.75, ge=0, le=1, description="below this score a view the object is unknown")
+
+    @model_validator(mode="after")
+    def _views_in_order(self) -> Self:
+        if self.min_views > self.max_views:
+            raise ValueError(f"min_views ({self.min_views}) is above max_views ({self.max_views})")
+        return self
+
+
+class RigConfig(Section):
+    """Everything in `rig.toml`."""
+
+    default_bench: str = Field("hardware", description="bench that is opened where --bench does not say")
+    servo: ServoConfig = ServoConfig()
+    table: TableConfig = TableConfig()
+    imu: ImuConfig = ImuConfig()
+    camera: CameraConfig = CameraConfig()
+    view: ViewConfig = ViewConfig()
+    catalog: CatalogConfig = CatalogConfig()
+    enroll: EnrollConfig = EnrollConfig()
+    identify: IdentifyConfig = IdentifyConfig()
+    bench: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="options of the benches, by name: [bench.sim]"
+    )
+
+    def catalog_path(self, bench_name: str) -> Path:
+        """Return the catalog's folder: simulated views never mix with real ones unless the configuration says so."""
+        return self.catalog.path or Path(platformdirs.user_data_dir(APP)) / bench_name
+
+
+def default_path() -> Path | None:
+    """Return the configuration in force without `--config`: ./rig.toml, else the user's; None where neither exists."""
+    for path in (Path(FILE_NAME), Path(platformdirs.user_config_dir(APP)) / FILE_NAME):
+        if path.is_file():
+            return path
+    return None
+
+
+def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> RigConfig:
+    """Read a configuration file and apply ``overrides`` (``"section.key=value"``, values in TOML's notation).
+
+    Raises
+    ------
+    ConfigError
+        The file is missing, is no TOML, or holds mistakes: all of them at once, each with its key.
+    """
+    values: dict[str, Any] = {}
+    source = path or default_path()
+    if source is not None:
+        try:
+            values = tomllib.loads(source.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(
+                f"Cannot read the configuration {source}.",
+                next_step="Give an existing file with --config, or leave the option out for the defaults.",
+                evidence={"reason": error.strerror or str(error)},
+            ) from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigError(
+                f"{source} is not a TOML file.", next_step="Mend the line named.", evidence={"reason": str(error)}
+            ) from error
+        # Paths in a file are relative to that file, not to where the command happens to be run.
+        catalog = values.get("catalog")
+        if isinstance(catalog, dict) and isinstance(catalog.get("path"), str):
+            catalog["path"] = os.path.normpath(source.resolve().parent / Path(catalog["path"]).expanduser())
+    for override in overrides:
+        _apply(values, override)
+    return validate(RigConfig, values, where=str(source) if source else "the command line")
+
+
+def validate(model: type[M], values: Mapping[str, Any], *, where: str, prefix: str = "") -> M:
+    """Return ``values`` as ``model``; every mistake at once in one `ConfigError`."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        mistakes = [_mistake(model, prefix, e) for e in error.errors(include_url=False)]
+    raise ConfigError(
+        f"{len(mistakes)} mistake{'s' if len(mistakes) > 1 else ''} in {where}.",
+        next_step="Mend the keys listed.",
+        evidence={"mistakes": mistakes},
+    )
+
+
+def _mistake(model: type[BaseModel], prefix: str, error: Any) -> str:
+    key = ".".join([*([prefix] if prefix else []), *(str(part) for part in error["loc"])])
+    if error["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(str(error["loc"][-1]), _siblings(model, error["loc"][:-1]), n=1)
+        return f"{key}: unknown key" + (f"; did you mean {near[0]}?" if near else "")
+    message = error["msg"].removeprefix("Value error, ")
+    found = "" if isinstance(error["input"], dict) else f" (found {error['input']!r})"
+    return f"{key}: {message}{found}" if key else f"{message}{found}"
+
+
+def _siblings(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
+    for part in path:
+        field = model.model_fields.get(str(part))
+        inner = field.annotation if field else None
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            return []
+        model = inner
+    return list(model.model_fields)
+
+
+def _apply(values: dict[str, Any], override: str) -> None:
+    key, sign, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not sign or not all(parts):
+        raise ConfigError(
+            f"Cannot read the setting {override!r}.",
+            next_step="Write SECTION.KEY=VALUE, e.g. --set identify.max_views=4.",
+        )
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()  # a bare word is a string
+    here = values
+    for part in parts[:-1]:
+        inner = here.setdefault(part, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{part} in {override!r} is not a section.", next_step="Write SECTION.KEY=VALUE.")
+        here = inner
+    here[parts[-1]] = value

@@ -1,0 +1,96 @@
+"""The SDK's port on the bench's clock, around any object that reads and writes bytes as pyserial's does."""
+
+import errno
+from typing import Protocol
+
+import serial
+from dynamixel_sdk import PortHandler
+
+from rig.clock import Clock
+from rig.errors import DeviceNotFound
+
+READ_SLICE_S = 0.002
+"""How long one read of the wire blocks: bounds how late a timeout is noticed, and keeps the CPU idle meanwhile."""
+
+BABBLE_GRACE_MS = 50.0
+"""How far past its timeout a packet may drag on while bytes keep coming; the SDK itself would go on for ever."""
+
+
+class Wire(Protocol):
+    """The part of `serial.Serial` that the port uses."""
+
+    baudrate: int
+
+    @property
+    def in_waiting(self) -> int: ...
+    def read(self, size: int = 1) -> bytes: ...
+    def write(self, data: bytes, /) -> int | None: ...
+    def reset_input_buffer(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class LineBabble(Exception):
+    """Bytes keep coming, but no packet: another master, a wrong baud rate, an open line."""
+
+
+def open_serial(path: str, baud: int) -> Wire:
+    """Open a serial port for this process alone.
+
+    Raises
+    ------
+    DeviceNotFound
+        With the likely reason: no such port, no permission, another program holds it.
+    """
+    try:
+        wire: Wire = serial.Serial(path, baud, timeout=READ_SLICE_S, write_timeout=1.0, exclusive=True)
+    except (serial.SerialException, OSError, ValueError) as error:
+        reason = getattr(error, "errno", None)
+        if reason == errno.EACCES:
+            step = "Add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again."
+        elif reason in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
+            step = "Close the other program that uses this port (e.g. Dynamixel Wizard, another rig)."
+        else:
+            step = "Check the USB cable and servo.port; `python -m serial.tools.list_ports` lists the ports."
+        raise DeviceNotFound(
+            f"Cannot open the servo's port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
+        ) from error
+    return wire
+
+
+class ClockedPort(PortHandler):  # type: ignore[misc]
+    """A `PortHandler` for an open wire whose timeouts run on an injected clock.
+
+    Other than the SDK's own it neither spins while it waits nor waits for ever while the line babbles.
+    """
+
+    def __init__(self, wire: Wire, clock: Clock, name: str = "") -> None:
+        super().__init__(name)
+        self.ser = wire
+        self.baudrate = wire.baudrate
+        self.is_open = True
+        self.tx_time_per_byte = 10_000.0 / self.baudrate
+        self._clock = clock
+
+    def getCurrentTime(self) -> float:  # noqa: N802 - the SDK's name
+        """Return the time in milliseconds, as the SDK wants it."""
+        return self._clock.now_ns() * 1e-6
+
+    def writePort(self, packet: list[int]) -> int:  # noqa: N802
+        return self.ser.write(bytes(packet)) or 0
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        data: bytes = self.ser.read(length)
+        if data and self.getTimeSinceStart() > self.packet_timeout + BABBLE_GRACE_MS:
+            raise LineBabble
+        return data
+
+    def drain(self, quiet_s: float = 0.005, limit_s: float = 0.25) -> None:
+        """Throw away what arrives until the line has been quiet for ``quiet_s``.
+
+        A reply that comes after its timeout would otherwise be taken for the answer to the next request: Protocol 2.0
+        has no sequence numbers.
+        """
+        start_ns = last_ns = self._clock.now_ns()
+        while (now_ns := self._clock.now_ns()) - last_ns < quiet_s * 1e9 and now_ns - start_ns < limit_s * 1e9:
+            if self.ser.read(256):
+                last_ns = self._clock.now_ns()
