@@ -1,1 +1,25 @@
 """Retrieval: arrays in, decisions out."""
+
+from hbr.active import Decision, Side, next_view
+from hbr.cedd import cedd, describe
+from hbr.hough import Extension, Ranking, retrieve
+from hbr.index import ViewIndex
+from hbr.packing import pack, unpack
+from hbr.tanimoto import tanimoto
+from hbr.views import Views
+
+__all__ = [
+    "Decision",
+    "Extension",
+    "Ranking",
+    "Side",
+    "ViewIndex",
+    "Views",
+    "cedd",
+    "describe",
+    "next_view",
+    "pack",
+    "retrieve",
+    "tanimoto",
+    "unpack",
+]

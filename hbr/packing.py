@@ -1,0 +1,61 @@
+"""CEDD levels in 54 bytes: 144 levels of 3 bits, bin 0 first, most significant bit first."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.cedd import BINS, LevelArray
+
+BITS: Final = 3
+PACKED_BYTES: Final = BINS * BITS // 8
+
+
+def pack(levels: LevelArray) -> bytes:
+    """Pack one descriptor into 54 bytes.
+
+    Parameters
+    ----------
+    levels : integer array (144,)
+        Levels 0..7.
+
+    Returns
+    -------
+    bytes
+        54 bytes; several descriptors packed and joined are a table of 54-byte rows.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The levels are not integers, not of shape (144,), or outside 0..7.
+    """
+    levels = np.asarray(levels)
+    if not np.issubdtype(levels.dtype, np.integer):
+        raise TypeError(f"the levels are of {levels.dtype}; pass the integer levels that cedd or describe returns")
+    if levels.shape != (BINS,):
+        raise ValueError(f"the levels have shape {levels.shape}, not ({BINS},); pack one descriptor at a time")
+    if levels.min() < 0 or levels.max() > 7:
+        raise ValueError(
+            f"the levels span {levels.min()}..{levels.max()}, not 0..7; pass a descriptor, not a histogram"
+        )
+    bits = np.unpackbits(levels.astype(np.uint8)[:, None], axis=1)[:, -BITS:]
+    return np.packbits(bits).tobytes()
+
+
+def unpack(packed: bytes) -> LevelArray:
+    """Restore one descriptor from its 54 bytes, the inverse of `pack`.
+
+    Returns
+    -------
+    uint8 array (144,)
+        Levels 0..7.
+
+    Raises
+    ------
+    ValueError
+        There are not exactly 54 bytes.
+    """
+    if len(packed) != PACKED_BYTES:
+        raise ValueError(f"{len(packed)} bytes; a packed descriptor has {PACKED_BYTES}, check how it was stored")
+    bits: NDArray[np.uint8] = np.unpackbits(np.frombuffer(packed, np.uint8)).reshape(BINS, BITS)
+    return np.packbits(bits, axis=1)[:, 0] >> np.uint8(8 - BITS)
