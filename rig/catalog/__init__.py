@@ -1,0 +1,30 @@
+"""The catalog of enrolled objects: an SQLite file, and the images as plain files beside it."""
+
+from rig.catalog.catalog import Catalog, ModelSet
+from rig.catalog.enrollment import Enrollment
+from rig.catalog.records import (
+    EnrollmentStatus,
+    EnrollmentSummary,
+    ObjectDetails,
+    ObjectSummary,
+    Provenance,
+    Sitting,
+    StoredView,
+    ViewRecord,
+    clean_name,
+)
+
+__all__ = [
+    "Catalog",
+    "Enrollment",
+    "EnrollmentStatus",
+    "EnrollmentSummary",
+    "ModelSet",
+    "ObjectDetails",
+    "ObjectSummary",
+    "Provenance",
+    "Sitting",
+    "StoredView",
+    "ViewRecord",
+    "clean_name",
+]

@@ -1,0 +1,180 @@
+"""The writing side of an enrollment."""
+
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, and_, select, update
+
+import hbr
+from rig.catalog import images
+from rig.catalog.database import Database, insert_row
+from rig.catalog.records import EnrollmentStatus, Sitting, StoredView, ViewRecord
+from rig.catalog.schema import DESCRIPTOR_KIND, DESCRIPTOR_VERSION, enrollments, views
+from rig.clock import Clock
+from rig.errors import CatalogError, UsageError
+
+
+class Enrollment:
+    """An enrollment in progress, as `Catalog.begin` or `Catalog.resume` returns it.
+
+    Leaving it, by an exception or a power cut, loses nothing: it stays in progress and can be resumed.
+
+    Attributes
+    ----------
+    id, object_id, object_name
+        The enrollment and its object.
+    sitting
+        What its views are taken with now.
+    planned_azimuth_deg
+        Azimuth planned for view 0, 1, ....
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        clock: Clock,
+        *,
+        id: int,
+        object_id: int,
+        object_name: str,
+        sitting: Sitting,
+        planned_azimuth_deg: tuple[float, ...],
+    ) -> None:
+        self._database = database
+        self._clock = clock
+        self.id = id
+        self.object_id = object_id
+        self.object_name = object_name
+        self.sitting = sitting
+        self.planned_azimuth_deg = planned_azimuth_deg
+
+    @property
+    def folder(self) -> Path:
+        """Where its images are, relative to the catalog."""
+        return images.folder(self.object_id, self.object_name, self.id)
+
+    def missing(self) -> tuple[int, ...]:
+        """Return the indices of the planned views that are not stored yet, ascending."""
+        with self._database.read() as connection:
+            return self._missing(connection)
+
+    def add(self, record: ViewRecord, image_bgr: NDArray[np.uint8]) -> StoredView:
+        """Store a view and its image, uint8 (H, W, 3) BGR; both are durable when this returns.
+
+        The image is whole under its name before its row is committed: a crash in between leaves an image without a
+        row, which is harmless, and never a row without its image.
+
+        Raises
+        ------
+        UsageError
+            The view is not in the plan, or the image is none.
+        TypeError, ValueError
+            The descriptor is none (`hbr.pack`).
+        CatalogError
+            The view is stored already, the enrollment is no longer in progress, or the disk is full or fails.
+        CatalogBusy
+            Another process is writing for longer than the timeout.
+        """
+        index = int(record.index)
+        if index >= len(self.planned_azimuth_deg):
+            raise UsageError(
+                f"view {index} is not one of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r}",
+                next_step="begin a new enrollment with the larger plan",
+            )
+        packed = hbr.pack(record.descriptor)
+        png = images.encode(image_bgr)
+        image = self.folder / f"{index:03d}.png"
+        sha256 = images.digest(png)
+        age_ns = self._clock.now_ns() - record.captured_ns
+        captured_utc = self._clock.utc() - timedelta(microseconds=age_ns // 1000)
+        # The image is written under the write lock: two processes at one enrollment cannot change each other's images.
+        with self._database.write() as connection:
+            self._check_in_progress(connection)
+            if index not in self._missing(connection):
+                raise CatalogError(
+                    f"view {index} of {self.object_name!r} is stored already",
+                    next_step="go on with the missing views; check that no other process enrolls this object",
+                )
+            images.write(self._database.root / image, png)
+            view_id = insert_row(
+                connection,
+                views,
+                enrollment_id=self.id,
+                view_index=index,
+                sitting_id=self.sitting.id,
+                commanded_deg=float(record.commanded_deg),
+                encoder_deg=float(record.encoder_deg),
+                imu_deg=None if record.imu_deg is None else float(record.imu_deg),
+                imu_sigma_deg=None if record.imu_sigma_deg is None else float(record.imu_sigma_deg),
+                azimuth_deg=float(record.azimuth_deg),
+                descriptor_kind=DESCRIPTOR_KIND,
+                descriptor_version=DESCRIPTOR_VERSION,
+                descriptor=packed,
+                captured_utc=captured_utc,
+                captured_ns=int(record.captured_ns),
+                image=image.as_posix(),
+                image_sha256=sha256,
+                image_bytes=len(png),
+                evidence=record.evidence,
+            )
+        return StoredView(
+            id=view_id,
+            object_name=self.object_name,
+            enrollment_id=self.id,
+            sitting=self.sitting,
+            record=record,
+            captured_utc=captured_utc,
+            image=image.as_posix(),
+            image_sha256=sha256,
+            image_bytes=len(png),
+        )
+
+    def finish(self) -> None:
+        """Make this the enrollment that the object is retrieved through; the one before it is superseded.
+
+        Raises
+        ------
+        CatalogError
+            Planned views are missing, or the enrollment is no longer in progress.
+        """
+        with self._database.write() as connection:
+            self._check_in_progress(connection)
+            if missing := self._missing(connection):
+                raise CatalogError(
+                    f"{len(missing)} of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r} "
+                    "are missing",
+                    next_step="resume the enrollment (--resume), or abandon it",
+                    evidence={"missing_views": list(missing)},
+                )
+            connection.execute(
+                update(enrollments)
+                .where(
+                    and_(enrollments.c.object_id == self.object_id, enrollments.c.status == EnrollmentStatus.COMPLETE)
+                )
+                .values(status=EnrollmentStatus.SUPERSEDED)
+            )
+            self._close(connection, EnrollmentStatus.COMPLETE)
+
+    def abandon(self) -> None:
+        """Give the enrollment up; its images stay, and the complete enrollment before it stays in use."""
+        with self._database.write() as connection:
+            self._check_in_progress(connection)
+            self._close(connection, EnrollmentStatus.ABANDONED)
+
+    def _close(self, connection: Connection, status: EnrollmentStatus) -> None:
+        connection.execute(
+            update(enrollments).where(enrollments.c.id == self.id).values(status=status, finished_utc=self._clock.utc())
+        )
+
+    def _missing(self, connection: Connection) -> tuple[int, ...]:
+        present = set(connection.scalars(select(views.c.view_index).where(views.c.enrollment_id == self.id)))
+        return tuple(index for index in range(len(self.planned_azimuth_deg)) if index not in present)
+
+    def _check_in_progress(self, connection: Connection) -> None:
+        status = connection.scalar(select(enrollments.c.status).where(enrollments.c.id == self.id))
+        if status != EnrollmentStatus.IN_PROGRESS:
+            raise CatalogError(
+                f"the enrollment of {self.object_name!r} is {status}, not in progress", next_step="begin a new one"
+            )
