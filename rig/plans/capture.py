@@ -1,0 +1,51 @@
+"""The step that both plans share: take one accepted view at the table's present rest."""
+
+from collections.abc import Generator
+
+from rig.errors import ViewRejected
+from rig.plans.events import Event, Moved, Rejected
+from rig.turntable import Move, Turntable
+from rig.view import Attempt, Viewer
+
+
+def moved(index: int, move: Move) -> Moved:
+    """Return the event that tells of a finished move."""
+    gyro = move.gyro
+    return Moved(
+        index=index,
+        commanded_deg=move.commanded_deg,
+        encoder_deg=move.encoder_deg,
+        rotation_encoder_deg=move.rotation_encoder_deg,
+        rotation_imu_deg=gyro.angle_deg if gyro.valid else None,
+        imu_sigma_deg=gyro.sigma_deg if gyro.valid else None,
+        bound_deg=move.agreement.bound_deg if move.agreement else None,
+        agrees=move.agrees,
+        seconds=move.seconds,
+    )
+
+
+def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Generator[Event, None, Attempt]:
+    """Yield the rejected frames and return the accepted one.
+
+    Raises
+    ------
+    ViewRejected
+        No frame was acceptable; the evidence is that of the last.
+    """
+    attempts = viewer.attempts(settled_ns, table.check_still)
+    for attempt in attempts:
+        if attempt.accepted:
+            return attempt
+        yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
+    evidence = attempt.evidence
+    raise ViewRejected(
+        f"View {index} was not acceptable: {'; '.join(attempt.reasons)}.",
+        next_step="Look at light, focus and what stands before the camera; view.retakes and the limits are in [view].",
+        evidence={
+            "sharpness": round(evidence.sharpness, 1),
+            "mean_level": round(evidence.mean_level, 1),
+            "dark_share": round(evidence.dark_share, 3),
+            "saturated_share": round(evidence.saturated_share, 3),
+            "peak_rate_dps": round(evidence.stillness.peak_rate_dps, 3),
+        },
+    )

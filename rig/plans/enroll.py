@@ -1,0 +1,117 @@
+"""The plan that enrolls an object: one turn, a checked view at every step, each durable before the table turns on."""
+
+from collections.abc import Generator
+
+from hbr.angles import wrap360
+from rig.bench import Bench
+from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.clock import seconds_between
+from rig.errors import CatalogError, RotationDisagreement
+from rig.plans.capture import capture, moved
+from rig.plans.events import Accepted, Enrolled, Event, Started, plain
+from rig.turntable import Move, Turntable
+from rig.view import Viewer
+
+
+def enroll(
+    bench: Bench,
+    catalog: Catalog,
+    name: str,
+    *,
+    views: int | None = None,
+    label: str | None = None,
+    note: str | None = None,
+    resume: bool = False,
+    replace: bool = False,
+) -> Generator[Event, None, Enrolled]:
+    """Enroll the object ``name`` with views at even steps; yields events and returns the last of them.
+
+    The table turns upwards from 0, so that its play is taken up; view k has the azimuth −k·360/views. An interrupted
+    enrollment keeps its views: ``resume`` takes the missing ones. Closing the generator takes the torque off.
+
+    Raises
+    ------
+    ObjectExists, CatalogError, CatalogBusy
+        See `Catalog.begin` and `Catalog.resume`.
+    RotationDisagreement
+        Encoder and gyro differ by more than their uncertainty: no view is stored at an angle in doubt.
+    ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
+        See `rig.view` and `rig.turntable`; views stored so far stay.
+    """
+    views = views or bench.config.enroll.views
+    provenance = Provenance(
+        bench=bench.name,
+        devices=bench.devices(),
+        conditions={**bench.conditions, "view": bench.config.view.model_dump(mode="json")},
+    )
+    if resume:
+        enrollment = catalog.resume(name, provenance=provenance)
+        views = len(enrollment.planned_azimuth_deg)
+    else:
+        planned_deg = [float(wrap360(-k * 360.0 / views)) for k in range(views)]
+        enrollment = catalog.begin(
+            name, planned_azimuth_deg=planned_deg, provenance=provenance, label=label, note=note, replace=replace
+        )
+    missing = enrollment.missing()
+    if not missing:
+        raise CatalogError(f"No view of {name!r} is missing.", next_step="Nothing is to be done.")
+    yield Started("enroll", enrollment.object_name, len(missing), dict(provenance.conditions))
+    bench.operator.place(enrollment.object_name)
+    started_ns = bench.clock.now_ns()
+    viewer = Viewer(bench.camera, bench.config.view)
+    retakes = 0
+    imu = _ImuAngle()
+    with Turntable(bench) as table:
+        for index in missing:
+            move = table.goto(index * 360.0 / views)
+            yield moved(index, move)
+            if not move.agrees:
+                raise _disagreement(move)
+            imu.add(move)
+            shot = yield from capture(index, viewer, table, move.settled_ns)
+            retakes += shot.number - 1
+            record = ViewRecord(
+                index=index,
+                commanded_deg=move.commanded_deg,
+                encoder_deg=move.encoder_deg,
+                azimuth_deg=float(wrap360(-move.encoder_deg)),
+                descriptor=viewer.describe(shot.image_bgr),
+                captured_ns=shot.evidence.exposed_ns,
+                imu_deg=imu.angle_deg,
+                imu_sigma_deg=imu.sigma_deg,
+                evidence=plain(shot.evidence),
+            )
+            enrollment.add(record, shot.image_bgr)
+            yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr)
+    enrollment.finish()
+    done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
+    yield done
+    return done
+
+
+class _ImuAngle:
+    """The table's angle by the gyro alone, from where the encoder first was."""
+
+    def __init__(self) -> None:
+        self.angle_deg: float | None = None
+        self.sigma_deg: float | None = None
+
+    def add(self, move: Move) -> None:
+        if self.angle_deg is None or self.sigma_deg is None:
+            self.angle_deg, self.sigma_deg = move.encoder_deg, 0.0
+        elif move.gyro.valid:
+            self.angle_deg += move.gyro.angle_deg
+            self.sigma_deg += move.gyro.sigma_deg  # not in squares: bias and scale errors are common to all moves
+
+
+def _disagreement(move: Move) -> RotationDisagreement:
+    assert move.agreement is not None  # a move without one agrees
+    return RotationDisagreement(
+        f"The servo turned {move.rotation_encoder_deg:.2f}°, the platter {move.gyro.angle_deg:.2f}°.",
+        next_step="Tighten the platter, look for slip or a knocked table, then go on with --resume.",
+        evidence={
+            "difference_deg": round(move.agreement.difference_deg, 3),
+            "bound_deg": round(move.agreement.bound_deg, 3),
+            "table_deg": round(move.encoder_deg, 2),
+        },
+    )

@@ -1,0 +1,145 @@
+"""What a plan tells while it runs: small frozen events, the one stream that people, files and tests see."""
+
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.view import ViewEvidence
+
+_OUTSIDE = {"json": False}
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """A plan begins: ``plan`` is "enroll" or "identify", ``views`` how many views it takes at most."""
+
+    plan: str
+    name: str | None
+    views: int
+    conditions: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """The table turned and is at rest.
+
+    Angles of the table in degrees, unwrapped. ``agrees`` says whether encoder and gyro measured the same rotation
+    within ``bound_deg``; when they do not, the platter's gyro is believed.
+    """
+
+    index: int
+    commanded_deg: float
+    encoder_deg: float
+    rotation_encoder_deg: float
+    rotation_imu_deg: float | None
+    imu_sigma_deg: float | None
+    bound_deg: float | None
+    agrees: bool
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A frame was not taken, and why."""
+
+    index: int
+    attempt: int
+    reasons: tuple[str, ...]
+    evidence: ViewEvidence
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A view was taken (and, when enrolling, is durable)."""
+
+    index: int
+    azimuth_deg: float
+    evidence: ViewEvidence
+    image_bgr: NDArray[np.uint8] = field(metadata=_OUTSIDE, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """An object with its Hough score per view and its pose: the azimuth at which the camera sees it now."""
+
+    name: str
+    score: float
+    pose_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ranked:
+    """What is thought after a view; ``margin`` is the lead of the first candidate in score per view."""
+
+    index: int
+    candidates: tuple[Candidate, ...]
+    margin: float
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """Where to look next (Eq. 6-7): the side on which the ``rivals`` look less alike.
+
+    ``rotation_deg`` is the camera's around the object, positive to the left; the table turns the other way, to
+    ``target_deg``. ``s_left`` and ``s_right`` are None for the first move, which is fixed.
+    """
+
+    index: int
+    side: str
+    rotation_deg: float
+    target_deg: float
+    s_left: float | None
+    s_right: float | None
+    rivals: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Enrolled:
+    """An object is complete in the catalog."""
+
+    name: str
+    views: int
+    retakes: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """The answer: an object's name, or None for "unknown".
+
+    ``score`` and ``margin`` are per view; ``pose_deg`` the azimuth the camera sees last, in the catalog's frame,
+    ``yaw_deg`` how far the object stands turned counter-clockwise against its enrollment; ``reason`` why the search
+    ended.
+    """
+
+    name: str | None
+    candidates: tuple[Candidate, ...]
+    score: float
+    margin: float
+    pose_deg: float
+    yaw_deg: float
+    views: int
+    travelled_deg: float
+    seconds: float
+    reason: str
+
+
+Event = Started | Moved | Rejected | Accepted | Ranked | Decided | Enrolled | Identified
+
+
+def event_dict(event: Event) -> dict[str, Any]:
+    """Return an event as plain data for JSON, its kind under ``"event"``; pictures are left out."""
+    return {"event": type(event).__name__.lower(), **plain(event)}
+
+
+def plain(value: Any) -> Any:
+    """Return dataclasses as dicts and tuples as lists, all the way down; fields marked ``json=False`` are left out."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value) if f.metadata.get("json", True)}
+    if isinstance(value, tuple | list):
+        return [plain(v) for v in value]
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    return value

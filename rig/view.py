@@ -1,0 +1,131 @@
+"""A view is a frame with the evidence that it may be trusted; this module takes frames and judges them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import hbr
+from rig.config import ViewConfig
+from rig.devices.camera import Camera, CameraLocks, Frame
+
+DARK_LEVEL = 8
+"""Grey levels below this carry no detail in an 8-bit frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stillness:
+    """What encoder and gyro saw between settling and the end of the exposure."""
+
+    peak_rate_dps: float
+    encoder_change_deg: float
+    still: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ViewEvidence:
+    """The numbers a frame was judged by.
+
+    ``settled_ns`` and ``exposed_ns`` are times on the bench's clock; ``sharpness`` is the variance of the Laplacian of
+    the grey region, in squared levels; the shares are of the region's pixels.
+    """
+
+    settled_ns: int
+    exposed_ns: int
+    sharpness: float
+    mean_level: float
+    dark_share: float
+    saturated_share: float
+    repeated: bool
+    locks: CameraLocks
+    locks_hold: bool
+    stillness: Stillness
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One frame, the ``number``-th for this view from 1 on, and why it was not taken (nothing: it was accepted)."""
+
+    number: int
+    image_bgr: NDArray[np.uint8]
+    evidence: ViewEvidence
+    reasons: tuple[str, ...]
+
+    @property
+    def accepted(self) -> bool:
+        return not self.reasons
+
+
+class Viewer:
+    """Takes views with one camera, whose locks must stay as they were when the viewer was made."""
+
+    def __init__(self, camera: Camera, config: ViewConfig) -> None:
+        self._camera = camera
+        self._config = config
+        self._locks = camera.read_locks()
+        self._last: NDArray[np.uint8] | None = None
+
+    def attempts(self, settled_ns: int, check_still: Callable[[], Stillness]) -> Iterator[Attempt]:
+        """Capture until a frame is accepted or the retakes are used up; the last attempt tells which.
+
+        Parameters
+        ----------
+        settled_ns
+            When the table came to rest: no older exposure counts.
+        check_still
+            Looks at encoder and gyro again, after the exposure.
+        """
+        after_ns = settled_ns
+        for number in range(1, 2 + self._config.retakes):
+            frame = self._camera.capture(after_ns)
+            attempt = self._judge(number, frame, settled_ns, check_still())
+            self._last = frame.image_bgr
+            yield attempt
+            if attempt.accepted:
+                return
+            after_ns = frame.exposed_ns + 1
+
+    def describe(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the CEDD levels, uint8 (144,), of the frame's region of interest."""
+        return hbr.describe(self._region(image_bgr))
+
+    def _region(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if self._config.roi is None:
+            return image_bgr
+        x, y, width, height = self._config.roi
+        return image_bgr[y : y + height, x : x + width]
+
+    def _judge(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:
+        config = self._config
+        grey = cv2.cvtColor(self._region(frame.image_bgr), cv2.COLOR_BGR2GRAY)
+        locks = self._camera.read_locks()
+        evidence = ViewEvidence(
+            settled_ns=settled_ns,
+            exposed_ns=frame.exposed_ns,
+            sharpness=float(cv2.Laplacian(grey, cv2.CV_16S).var()),
+            mean_level=float(grey.mean()),
+            dark_share=float(np.count_nonzero(grey < DARK_LEVEL) / grey.size),
+            saturated_share=float(np.count_nonzero(grey == 255) / grey.size),
+            repeated=self._last is not None and np.array_equal(frame.image_bgr, self._last),
+            locks=locks,
+            locks_hold=locks == self._locks,
+            stillness=stillness,
+        )
+        reasons = []
+        if frame.exposed_ns < settled_ns:
+            reasons.append("exposed before the table was at rest")
+        if not stillness.still:
+            reasons.append(f"the table moved during the exposure ({stillness.peak_rate_dps:.2f} °/s)")
+        if evidence.repeated:
+            reasons.append("the camera repeated its last frame")
+        if not evidence.locks_hold:
+            reasons.append("exposure or white balance is not as locked")
+        if evidence.mean_level < config.min_mean or evidence.dark_share > config.max_dark:
+            reasons.append(f"too dark (mean level {evidence.mean_level:.1f}, {evidence.dark_share:.0%} black)")
+        if evidence.saturated_share > config.max_saturated:
+            reasons.append(f"overexposed ({evidence.saturated_share:.0%} saturated)")
+        if evidence.sharpness < config.min_sharpness:
+            reasons.append(f"blurred (sharpness {evidence.sharpness:.1f} < {config.min_sharpness:g})")
+        return Attempt(number, frame.image_bgr, evidence, tuple(reasons))
