@@ -1,0 +1,320 @@
+"""The MPU-6050 on an I2C bus of the computer, through smbus2.
+
+Registers: RM-MPU-6000A rev 4.2; noise and scales: PS-MPU-6000A rev 3.4. The gyro's samples are taken by the sensor's
+own clock and wait in its FIFO, so that a late reader loses no rotation.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from smbus2 import SMBus, i2c_msg
+
+from rig.clock import Clock
+from rig.devices.imu import ImuIdentity, ImuSamples
+from rig.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+
+_SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
+_USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W, _WHO_AM_I = 0x6A, 0x6B, 0x72, 0x74, 0x75
+
+_EXPECTED_ID = 0x68
+_DEVICE_RESET, _ASLEEP, _CLOCK_PLL_GYRO_X = 0x80, 0x40, 0x01
+_FIFO_ENABLE, _FIFO_RESET, _FIFO_GYRO_XYZ = 0x40, 0x04, 0x70
+_RESET_S, _START_S = 0.1, 0.05
+"""After DEVICE_RESET (register 107), and the gyro's start-up of 30 ms (PS 6.1) with the PLL's settling."""
+
+_FRAME, _FIFO_FULL = 6, 1018
+"""A frame of three words, and the last count at which another frame still fits into the 1024 bytes."""
+
+_ATTEMPTS, _RETRY_PAUSE_S = 3, 0.002
+_NOISE_DPS_RTHZ = 0.005
+_LSB_PER_G = 16384.0
+_LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
+_FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}
+"""DLPF_CFG by the gyro's bandwidth in Hz; all run at an internal rate of 1 kHz."""
+
+_OTHERS = {
+    0x70: "an MPU-6500 sold as an MPU-6050",
+    0x71: "an MPU-9250",
+    0x73: "an MPU-9255",
+    0x12: "an ICM-20602",
+    0x19: "an MPU-6886",
+    0x98: "an ICM-20689, or a clone",
+    0x00: "nothing that drives the bus: SDA held low, or a missing ground",
+    0xFF: "nothing that drives the bus: SDA is not connected",
+}
+
+_T = TypeVar("_T")
+
+
+@dataclass(slots=True)
+class Mpu6050Statistics:
+    """What the bus has been through since it was opened."""
+
+    transfers: int = 0
+    retries: int = 0
+    overflows: int = 0
+
+
+class Mpu6050:
+    """An MPU-6050 as a `rig.devices.imu.Imu`.
+
+    Opening it resets the sensor, wakes it, sets it and reads the settings back.
+
+    Parameters
+    ----------
+    bus
+        Number of the I2C bus, or the path of its device file.
+    address
+        0x68, or 0x69 with AD0 high.
+    clock
+        The bench's clock.
+    range_dps
+        Full scale of the gyro: 250, 500, 1000 or 2000 °/s.
+    rate_hz
+        Samples a second, 1000 divided by a whole number up to 256.
+    bandwidth_hz
+        Of the gyro's low-pass: 188, 98, 42, 20, 10 or 5 Hz; below half of ``rate_hz``, or noise folds down.
+
+    Raises
+    ------
+    ConfigError
+        When a setting is none that the sensor has.
+    DeviceNotFound
+        When the bus cannot be opened, or nobody acknowledges the address.
+    DeviceMismatch
+        When something else answers there.
+    DeviceFault
+        When the sensor does not keep its settings.
+    """
+
+    def __init__(
+        self,
+        bus: int | str,
+        *,
+        clock: Clock,
+        address: int = 0x68,
+        range_dps: int = 250,
+        rate_hz: float = 200.0,
+        bandwidth_hz: int = 42,
+    ) -> None:
+        self._clock = clock
+        self._address = address
+        self._range_dps = range_dps
+        self._bus_name = bus if isinstance(bus, str) else f"/dev/i2c-{bus}"
+        self._settings = _settings(range_dps, rate_hz, bandwidth_hz)
+        self._period_ns = 1_000_000 * (1 + self._settings[_SMPLRT_DIV][0])
+        self._newest_ns = clock.now_ns()
+        self.statistics = Mpu6050Statistics()
+        self._bus = _open(self._bus_name)
+        try:
+            self.identity = self._identify()
+            self._set_up()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def rate_hz(self) -> float:
+        return 1e9 / self._period_ns
+
+    @property
+    def range_dps(self) -> float:
+        return float(self._range_dps)
+
+    def close(self) -> None:
+        self._bus.close()
+
+    def read_samples(self) -> ImuSamples:
+        """Return what the FIFO holds.
+
+        The newest sample was taken at most one period before the count was read; each sample follows the one before
+        by a period, and the row is moved only as far as that demands, so that the sensor's clock may run a little fast
+        or slow.
+
+        Raises
+        ------
+        DeviceSilent
+            When the sensor does not answer, after retries.
+        DeviceFault
+            When it fell back to sleep or lost its settings (a brown-out).
+        """
+        before_ns = self._clock.now_ns()
+        count = self._fifo_count()
+        after_ns = self._clock.now_ns()
+        if count > _FIFO_FULL or (count % _FRAME and (count := self._fifo_count()) % _FRAME):
+            return self._start_over()  # twice a broken frame: not one that was just being written
+        samples, missing = count // _FRAME, 0
+        due = (before_ns - self._newest_ns) / self._period_ns
+        if samples < 0.9 * due - 2:  # the sensor's clock is off by 5 % at most (PS 6.6): it did not sample all the time
+            self._check_settings()
+            missing = round(due) - samples
+        data = self._pop(count) if count else b""
+        if data is None:
+            return self._start_over()
+        if samples:
+            predicted_ns = self._newest_ns + (samples + missing) * self._period_ns
+            self._newest_ns = min(max(predicted_ns, before_ns - self._period_ns), after_ns)
+        gyro = np.frombuffer(data, ">i2").reshape(-1, 3) / _LSB_PER_DPS[self._range_dps]
+        return ImuSamples(self._newest_ns + self._period_ns * np.arange(1 - samples, 1), gyro, missing)
+
+    def read_gravity_g(self) -> NDArray[np.float64]:
+        """Return one accelerometer reading (3,), in g; raises as `read_samples` does."""
+        self._check_settings()
+        return np.frombuffer(self._read(_ACCEL_XOUT_H, 6), ">i2") / _LSB_PER_G
+
+    def temperature_c(self) -> float:
+        """Return the temperature of the sensor's die (register 65); raises as `read_samples` does."""
+        self._check_settings()
+        return int.from_bytes(self._read(_TEMP_OUT_H, 2), "big", signed=True) / 340 + 36.53
+
+    # -- setting up -----------------------------------------------------------------------------------------------
+
+    def _identify(self) -> ImuIdentity:
+        try:
+            got = self._read(_WHO_AM_I, 1)[0]
+        except DeviceSilent as silent:
+            raise DeviceNotFound(
+                f"nobody answers at I2C address {self._address:#04x} of {self._bus_name}",
+                next_step="Check the sensor's supply, SDA, SCL and ground, and the AD0 pin (low 0x68, high 0x69); "
+                f"`i2cdetect -y {self._bus_name.removeprefix('/dev/i2c-')}` shows who is there (UU: a kernel driver "
+                "holds the address).",
+                evidence=silent.evidence,
+            ) from silent
+        if got != _EXPECTED_ID:
+            likely = _OTHERS.get(got, "another chip; address 0x68 is also that of the clocks DS1307 and DS3231")
+            raise DeviceMismatch(
+                f"WHO_AM_I at I2C address {self._address:#04x} of {self._bus_name} is {got:#04x}, "
+                f"expected {_EXPECTED_ID:#04x} (MPU-6050): probably {likely}",
+                next_step="Check the wiring, or give the address of the MPU-6050; another chip needs its own driver.",
+                evidence={"got": got, "expected": _EXPECTED_ID},
+            )
+        return ImuIdentity("MPU-6050", self._address, got, _NOISE_DPS_RTHZ)
+
+    def _set_up(self) -> None:
+        self._write(_PWR_MGMT_1, _DEVICE_RESET)
+        self._clock.sleep(_RESET_S)
+        self._write(_PWR_MGMT_1, _CLOCK_PLL_GYRO_X)
+        self._clock.sleep(_START_S)
+        for register, values in self._settings.items():
+            self._write(register, *values)
+        self._empty_fifo()
+        self._check_settings()
+
+    def _check_settings(self) -> None:
+        """Raise DeviceFault unless the sensor is awake with the settings it was given."""
+        got = {register: self._read(register, len(values)) for register, values in self._settings.items()}
+        if got == self._settings:
+            return
+        asleep = got[_USER_CTRL][1] & _ASLEEP
+        raise DeviceFault(
+            "the MPU-6050 fell asleep: its supply was interrupted"
+            if asleep
+            else "the MPU-6050 does not keep its settings: another program changed them, or the bus corrupts bytes",
+            next_step="Check its supply and cable, then open the bench again."
+            if asleep
+            else "Close other programs that use the I2C bus, shorten its cable, then open the bench again.",
+            evidence={f"register_{r:#04x}": {"got": got[r].hex(), "expected": self._settings[r].hex()} for r in got},
+        )
+
+    def _start_over(self) -> ImuSamples:
+        """Give up what the FIFO holds: it is full, or its frames are broken."""
+        self.statistics.overflows += 1
+        lost = max(round((self._clock.now_ns() - self._newest_ns) / self._period_ns), 1)
+        self._empty_fifo()
+        return ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), lost)
+
+    def _empty_fifo(self) -> None:
+        self._write(_USER_CTRL, _FIFO_RESET)  # works only while FIFO_EN is 0 (register 106)
+        self._write(_USER_CTRL, _FIFO_ENABLE)
+        self._newest_ns = self._clock.now_ns()
+
+    # -- the bus --------------------------------------------------------------------------------------------------
+
+    def _fifo_count(self) -> int:
+        return int.from_bytes(self._read(_FIFO_COUNTH, 2), "big")
+
+    def _pop(self, count: int) -> bytes | None:
+        """Read ``count`` bytes of the FIFO; None when a broken transfer took some of them along."""
+        repeated = False
+
+        def pop() -> bytes | None:
+            nonlocal repeated
+            if repeated and self._fifo_count() < count:
+                return None
+            repeated = True
+            answer = i2c_msg.read(self._address, count)
+            self._bus.i2c_rdwr(i2c_msg.write(self._address, [_FIFO_R_W]), answer)
+            return bytes(answer)
+
+        return self._transfer(pop)
+
+    def _read(self, register: int, count: int) -> bytes:
+        return self._transfer(lambda: bytes(self._bus.read_i2c_block_data(self._address, register, count)))
+
+    def _write(self, register: int, *values: int) -> None:
+        self._transfer(lambda: self._bus.write_i2c_block_data(self._address, register, list(values)))
+
+    def _transfer(self, transfer: Callable[[], _T]) -> _T:
+        """Return what ``transfer`` does, and try again when the bus fails."""
+        for attempt in range(_ATTEMPTS):
+            if attempt:
+                self.statistics.retries += 1
+                self._clock.sleep(_RETRY_PAUSE_S)
+            self.statistics.transfers += 1
+            try:
+                return transfer()
+            except OSError as error:
+                failure = error
+        raise DeviceSilent(
+            f"the sensor at I2C address {self._address:#04x} of {self._bus_name} stopped answering: {failure.strerror}",
+            next_step="Check its plug and supply, then open the bench again.",
+            evidence={"errno": failure.errno, "attempts": _ATTEMPTS, "retries_so_far": self.statistics.retries},
+        ) from failure
+
+
+def _settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:
+    """Return the values to write, and to find again, by their first register."""
+    mistakes: dict[str, Any] = {}
+    divider = round(1000 / rate_hz) if rate_hz > 0 else 0
+    if not (1 <= divider <= 256 and abs(1000 / divider - rate_hz) < 1e-6 * rate_hz):
+        mistakes["rate_hz"] = f"{rate_hz:g}: give 1000 divided by a whole number up to 256"
+    if range_dps not in _LSB_PER_DPS:
+        mistakes["range_dps"] = f"{range_dps}: give one of {', '.join(map(str, _LSB_PER_DPS))}"
+    if bandwidth_hz not in _FILTERS:
+        mistakes["bandwidth_hz"] = f"{bandwidth_hz}: give one of {', '.join(map(str, _FILTERS))}"
+    if mistakes:
+        raise ConfigError(
+            "the MPU-6050 has no such setting: " + "; ".join(f"{name} = {text}" for name, text in mistakes.items()),
+            next_step="Correct these values of the IMU in the configuration.",
+            evidence=mistakes,
+        )
+    full_scale = list(_LSB_PER_DPS).index(range_dps) << 3
+    return {
+        _SMPLRT_DIV: bytes([divider - 1, _FILTERS[bandwidth_hz], full_scale, 0]),  # and CONFIG, GYRO_, ACCEL_CONFIG
+        _FIFO_EN: bytes([_FIFO_GYRO_XYZ]),
+        _USER_CTRL: bytes([_FIFO_ENABLE, _CLOCK_PLL_GYRO_X]),  # and PWR_MGMT_1
+    }
+
+
+def _open(path: str) -> SMBus:
+    bus = SMBus()
+    try:
+        bus.open(path)
+    except OSError as error:
+        bus.close()
+        match error:
+            case FileNotFoundError():
+                next_step = "Enable I2C (on a Raspberry Pi: `raspi-config`); `i2cdetect -l` lists the buses there are."
+            case PermissionError():
+                next_step = "Join the group i2c (`sudo usermod -aG i2c $USER`), then log in again."
+            case _:
+                next_step = "Give the device file of an I2C bus; `i2cdetect -l` lists them."
+        raise DeviceNotFound(
+            f"the I2C bus {path} cannot be opened: {error.strerror}",
+            next_step=next_step,
+            evidence={"errno": error.errno},
+        ) from error
+    return bus

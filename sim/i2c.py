@@ -1,0 +1,282 @@
+"""A simulated I2C bus underneath the unmodified smbus2.
+
+smbus2 opens a path and speaks `ioctl` to it; the seam is the name ``smbus2.smbus2.ioctl``. While a simulated bus is
+open, calls on its file go to the bus and all others to the kernel, so that a real bus works beside it.
+
+Transactions follow the kernel's user interface (Documentation/i2c/{dev-interface,smbus-protocol,fault-codes}.rst). Not
+simulated: ten-bit addresses, packet error checking, clock stretching, several masters.
+"""
+
+import ctypes
+import os
+import tempfile
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from errno import EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import smbus2.smbus2 as smbus
+
+from sim.clock import VirtualClock
+
+BIT_NS = 2_500
+"""One bit at 400 kHz (fast mode); a byte takes nine, with its acknowledge."""
+TIMEOUT_S = 1.0
+"""How long the kernel waits for a bus that does not move (the default of ``i2c_adapter.timeout``)."""
+
+_MAX_MESSAGES = 42
+_MAX_MESSAGE_LENGTH = 8192
+
+
+class I2cDevice(Protocol):
+    """A device on the bus as its pins see the traffic."""
+
+    def start(self, reading: bool) -> None:
+        """Take notice of a (repeated) start with this device's address."""
+        ...
+
+    def write(self, data: bytes) -> int:
+        """Take the bytes that the master sends and return how many were acknowledged."""
+        ...
+
+    def read(self, count: int) -> bytes:
+        """Return the next ``count`` bytes that the master clocks out."""
+        ...
+
+    def stop(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """What crossed the wire between a start and the next start or stop; ``time_ns`` is its end."""
+
+    time_ns: int
+    address: int
+    reading: bool
+    data: bytes
+
+
+class SimI2cBus:
+    """A bus with a path that ``smbus2.SMBus(path)`` opens.
+
+    Bus side: `path`. World side: `attach`, `detach` (a pulled cable), `nack`, `cut_read`, `stuck`, and `wire`, the last
+    messages that were acknowledged.
+    """
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock = clock
+        self._devices: dict[int, I2cDevice] = {}
+        self._addressed: dict[int, int] = {}
+        self._nacks = 0
+        self._cut: int | None = None
+        self.stuck = False
+        self.wire: deque[Message] = deque(maxlen=1000)
+        handle, self.path = tempfile.mkstemp(prefix="sim-i2c-")
+        self._key = _file_key(handle)
+        os.close(handle)
+        _install(self._key, self)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take the bus away; a second call does nothing."""
+        _remove(self._key)
+        Path(self.path).unlink(missing_ok=True)
+
+    # -- world side -----------------------------------------------------------------------------------------------
+
+    def attach(self, address: int, device: I2cDevice) -> None:
+        if not 0x08 <= address <= 0x77:
+            raise ValueError(f"address {address:#04x} is reserved: use 0x08 to 0x77")
+        if address in self._devices:
+            raise ValueError(f"address {address:#04x} is taken: detach what is there first")
+        self._devices[address] = device
+
+    def detach(self, address: int) -> I2cDevice:
+        """Unplug the device at ``address`` and return it."""
+        return self._devices.pop(address)
+
+    def nack(self, count: int = 1) -> None:
+        """Let nobody acknowledge the next ``count`` addresses."""
+        self._nacks = count
+
+    def cut_read(self, after_bytes: int) -> None:
+        """Break the next read of more than ``after_bytes`` bytes off after so many."""
+        self._cut = after_bytes
+
+    # -- bus side: what the kernel does ---------------------------------------------------------------------------
+
+    def ioctl(self, fd: int, request: int, argument: Any) -> int:
+        """Serve one ``ioctl`` of ``/dev/i2c-N``; raises OSError with the kernel's number."""
+        match request:
+            case smbus.I2C_FUNCS:
+                emulated = smbus.I2cFunc.SMBUS_EMUL | smbus.I2cFunc.SMBUS_READ_BLOCK_DATA
+                more = smbus.I2cFunc.I2C | smbus.I2cFunc.SMBUS_BLOCK_PROC_CALL
+                argument.value = (emulated | more) & ~smbus.I2cFunc.SMBUS_PEC
+            case smbus.I2C_SLAVE | smbus.I2C_SLAVE_FORCE:
+                if not 0 <= argument <= 0x7F:
+                    raise _os_error(EINVAL)
+                self._addressed[fd] = argument
+            case smbus.I2C_PEC:
+                if argument:
+                    raise _os_error(EOPNOTSUPP)
+            case smbus.I2C_SMBUS:
+                self._transaction(lambda: self._smbus(self._addressed.get(fd, 0), argument))
+            case smbus.I2C_RDWR:
+                messages = [argument.msgs[i] for i in range(argument.nmsgs)]
+                if not 0 < len(messages) <= _MAX_MESSAGES or any(m.len > _MAX_MESSAGE_LENGTH for m in messages):
+                    raise _os_error(EINVAL)
+                self._transaction(lambda: self._combined(messages))
+            case _:
+                raise _os_error(ENOTTY)
+        return 0
+
+    def _transaction(self, messages: Callable[[], None]) -> None:
+        if self.stuck:
+            self._clock.sleep(TIMEOUT_S)
+            raise _os_error(ETIMEDOUT)
+        try:
+            messages()
+        finally:
+            for device in list(self._devices.values()):
+                device.stop()
+
+    def _combined(self, messages: list[Any]) -> None:
+        for m in messages:
+            if m.flags & smbus.I2C_M_RD:
+                ctypes.memmove(m.buf, self._read(m.addr, m.len), m.len)
+            else:
+                self._write(m.addr, ctypes.string_at(m.buf, m.len))
+
+    def _smbus(self, address: int, message: Any) -> None:
+        reading = message.read_write == smbus.I2C_SMBUS_READ
+        command, data = bytes([message.command]), message.data.contents
+        match message.size:
+            case smbus.I2C_SMBUS_QUICK:
+                self._start(address, reading)
+            case smbus.I2C_SMBUS_BYTE if reading:
+                data.byte = self._read(address, 1)[0]
+            case smbus.I2C_SMBUS_BYTE:
+                self._write(address, command)
+            case smbus.I2C_SMBUS_BYTE_DATA if reading:
+                data.byte = self._write_read(address, command, 1)[0]
+            case smbus.I2C_SMBUS_BYTE_DATA:
+                self._write(address, command + bytes([data.byte]))
+            case smbus.I2C_SMBUS_WORD_DATA if reading:
+                data.word = int.from_bytes(self._write_read(address, command, 2), "little")
+            case smbus.I2C_SMBUS_WORD_DATA:
+                self._write(address, command + data.word.to_bytes(2, "little"))
+            case smbus.I2C_SMBUS_PROC_CALL:
+                sent = command + data.word.to_bytes(2, "little")
+                data.word = int.from_bytes(self._write_read(address, sent, 2), "little")
+            case smbus.I2C_SMBUS_BLOCK_DATA if reading:
+                self._read_counted(address, command, data.block)
+            case smbus.I2C_SMBUS_BLOCK_DATA:
+                self._write(address, command + bytes(data.block[: _length(data) + 1]))
+            case smbus.I2C_SMBUS_BLOCK_PROC_CALL:
+                self._read_counted(address, command + bytes(data.block[: _length(data) + 1]), data.block)
+            case smbus.I2C_SMBUS_I2C_BLOCK_DATA if reading:
+                count = _length(data)
+                data.block[1 : count + 1] = list(self._write_read(address, command, count))
+            case smbus.I2C_SMBUS_I2C_BLOCK_DATA:
+                self._write(address, command + bytes(data.block[1 : _length(data) + 1]))
+            case _:
+                raise _os_error(EOPNOTSUPP)
+
+    def _write_read(self, address: int, sent: bytes, count: int) -> bytes:
+        self._write(address, sent)
+        return self._read(address, count)
+
+    def _read_counted(self, address: int, sent: bytes, block: Any) -> None:
+        """Read a block whose first byte is its length (``I2C_M_RECV_LEN``)."""
+        self._write(address, sent)
+        count = self._read(address, 1)[0]
+        if not 1 <= count <= smbus.I2C_SMBUS_BLOCK_MAX:
+            raise _os_error(EPROTO)
+        block[: count + 1] = [count, *self._clock_out(self._devices[address], address, count)]
+
+    # -- the wire -------------------------------------------------------------------------------------------------
+
+    def _start(self, address: int, reading: bool) -> I2cDevice:
+        self._pass(1)
+        device = self._devices.get(address)
+        if device is None or self._nacks:
+            self._nacks = max(self._nacks - 1, 0)
+            raise _os_error(ENXIO)
+        device.start(reading)
+        return device
+
+    def _write(self, address: int, data: bytes) -> None:
+        device = self._start(address, reading=False)
+        self._pass(len(data))
+        acknowledged = device.write(data)
+        self.wire.append(Message(self._clock.now_ns(), address, False, data[:acknowledged]))
+        if acknowledged < len(data):
+            raise _os_error(EREMOTEIO)
+
+    def _read(self, address: int, count: int) -> bytes:
+        return self._clock_out(self._start(address, reading=True), address, count)
+
+    def _clock_out(self, device: I2cDevice, address: int, count: int) -> bytes:
+        cut, moved = self._cut, count
+        if cut is not None and count > cut:
+            self._cut, moved = None, cut
+        data = device.read(moved)
+        self._pass(moved)
+        if moved < count:
+            raise _os_error(EIO)
+        self.wire.append(Message(self._clock.now_ns(), address, True, data))
+        return data
+
+    def _pass(self, byte_count: int) -> None:
+        self._clock.advance_to(self._clock.now_ns() + 9 * BIT_NS * byte_count)
+
+
+def _length(data: Any) -> int:
+    count = int(data.block[0])
+    if not 1 <= count <= smbus.I2C_SMBUS_BLOCK_MAX:
+        raise _os_error(EINVAL)
+    return count
+
+
+def _os_error(number: int) -> OSError:
+    return OSError(number, os.strerror(number))
+
+
+# -- the seam -----------------------------------------------------------------------------------------------------
+
+_FileKey = tuple[int, int]
+_seam: Any = smbus
+_open_buses: dict[_FileKey, SimI2cBus] = {}
+_kernel_ioctl: Any = None
+
+
+def _file_key(fd: int) -> _FileKey:
+    status = os.fstat(fd)
+    return status.st_dev, status.st_ino
+
+
+def _routed_ioctl(fd: int, request: int, argument: Any = 0, *rest: Any) -> Any:
+    bus = _open_buses.get(_file_key(fd))
+    return bus.ioctl(fd, request, argument) if bus else _kernel_ioctl(fd, request, argument, *rest)
+
+
+def _install(key: _FileKey, bus: SimI2cBus) -> None:
+    global _kernel_ioctl
+    if not _open_buses:
+        _kernel_ioctl, _seam.ioctl = _seam.ioctl, _routed_ioctl
+    _open_buses[key] = bus
+
+
+def _remove(key: _FileKey) -> None:
+    if _open_buses.pop(key, None) and not _open_buses:
+        _seam.ioctl = _kernel_ioctl

@@ -1,0 +1,182 @@
+"""A register-true MPU-6050 for the simulated I2C bus.
+
+Behaviour follows the register map RM-MPU-6000A rev 4.2 and the product specification PS-MPU-6000A rev 3.4. Register
+names and numbers are written down here once more, not shared with the driver, so that an error in one does not hide in
+the other.
+
+Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, the interrupt
+pin, the motion processor, and start-up times. The low-pass is of first order, and the accelerometer follows the gyro's
+rate and bandwidth.
+"""
+
+import numpy as np
+
+from sim.imu.inertial import InertialModel
+from sim.motion import Floats
+from sim.world import World
+
+SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, FIFO_EN = 0x19, 0x1A, 0x1B, 0x1C, 0x23
+INT_STATUS, ACCEL_XOUT_H, TEMP_OUT_H, GYRO_XOUT_H, GYRO_ZOUT_L = 0x3A, 0x3B, 0x41, 0x43, 0x48
+SIGNAL_PATH_RESET, USER_CTRL, PWR_MGMT_1 = 0x68, 0x6A, 0x6B
+FIFO_COUNTH, FIFO_COUNTL, FIFO_R_W, WHO_AM_I = 0x72, 0x73, 0x74, 0x75
+
+DATA_RDY, FIFO_OFLOW = 0x01, 0x10
+DEVICE_RESET, SLEEP = 0x80, 0x40
+FIFO_ENABLED, FIFO_RESET, SIG_COND_RESET = 0x40, 0x04, 0x01
+
+FIFO_SIZE = 1024
+LSB_PER_DPS = (131.0, 65.5, 32.8, 16.4)
+LSB_PER_G = (16384.0, 8192.0, 4096.0, 2048.0)
+BANDWIDTH_HZ = (256.0, 188.0, 98.0, 42.0, 20.0, 10.0, 5.0, 256.0)
+"""Of the gyro, by DLPF_CFG; 7 is reserved and taken as 0."""
+
+_WRITABLE = {  # the bits that keep what is written; all others of the map read as 0
+    **dict.fromkeys((0x0D, 0x0E, 0x0F, 0x10, SMPLRT_DIV, 0x1F, FIFO_EN, 0x6C), 0xFF),
+    **dict.fromkeys((GYRO_CONFIG, ACCEL_CONFIG), 0xF8),
+    CONFIG: 0x3F,
+    0x37: 0xFE,  # INT_PIN_CFG
+    0x38: 0x19,  # INT_ENABLE
+    0x69: 0x30,  # MOT_DETECT_CTRL
+    USER_CTRL: 0x70,
+    PWR_MGMT_1: 0x6F,
+}
+_SAMPLING = {SMPLRT_DIV, CONFIG, PWR_MGMT_1}
+
+# FIFO_EN's bits in the order of the words in the data registers (accel x, y, z, temperature, gyro x, y, z), which is
+# also the order in which a sample enters the FIFO.
+_FIFO_BITS = (0x08, 0x08, 0x08, 0x80, 0x40, 0x20, 0x10)
+
+
+class SimMpu6050:
+    """The sensor on the platter; an `sim.i2c.I2cDevice`.
+
+    World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `who_am_i` (a clone answers
+    otherwise) and `power_cycle`.
+    """
+
+    def __init__(self, world: World, *, ad0: bool = False, who_am_i: int = 0x68) -> None:
+        self.address = 0x69 if ad0 else 0x68
+        self.inertial = InertialModel(world, f"imu-{self.address:02x}")
+        self.temperature_c = 25.0
+        self.who_am_i = who_am_i
+        self._clock = world.clock
+        self.power_cycle()
+
+    def power_cycle(self) -> None:
+        """Lose everything: what a brown-out or DEVICE_RESET leaves behind."""
+        self._registers = bytearray(0x80)
+        self._registers[PWR_MGMT_1] = SLEEP
+        self._fifo = bytearray()
+        self._last_popped = 0
+        self._pointer = 0
+        self._pointed = True
+        self._begin_sampling()
+
+    # -- bus side -------------------------------------------------------------------------------------------------
+
+    def start(self, reading: bool) -> None:
+        self._pointed = reading  # a write begins with the register's number, a read goes on from where the pointer is
+
+    def write(self, data: bytes) -> int:
+        acknowledged = len(data)
+        if data and not self._pointed:
+            self._pointer, self._pointed = data[0] & 0x7F, True
+            data = data[1:]
+        for byte in data:
+            self._set(self._pointer, byte)
+            self._advance()
+        return acknowledged
+
+    def read(self, count: int) -> bytes:
+        self._take_samples()  # once a burst: its bytes belong to one sample
+        answer = bytearray()
+        while len(answer) < count:
+            if self._pointer == FIFO_R_W:
+                answer += self._pop(count - len(answer))
+            else:
+                answer.append(self._get(self._pointer))
+                self._advance()
+        return bytes(answer)
+
+    def stop(self) -> None: ...
+
+    def _advance(self) -> None:
+        if self._pointer != FIFO_R_W:
+            self._pointer = (self._pointer + 1) & 0x7F
+
+    def _get(self, register: int) -> int:
+        if register == WHO_AM_I:
+            return self.who_am_i
+        if register == FIFO_COUNTH:  # reading it latches both bytes
+            self._registers[FIFO_COUNTH : FIFO_COUNTL + 1] = len(self._fifo).to_bytes(2, "big")
+        value = self._registers[register]
+        if register == INT_STATUS:
+            self._registers[INT_STATUS] = 0
+        return value
+
+    def _set(self, register: int, value: int) -> None:
+        if register == PWR_MGMT_1 and value & DEVICE_RESET:
+            self.power_cycle()
+            return
+        self._take_samples()  # under the settings that were in force
+        changed = (self._registers[register] ^ value) & _WRITABLE.get(register, 0)
+        self._registers[register] ^= changed
+        if register == USER_CTRL:
+            if value & FIFO_RESET and not value & FIFO_ENABLED:
+                self._fifo.clear()
+            if value & SIG_COND_RESET:
+                self._clear_data()
+        elif register == SIGNAL_PATH_RESET and value & 0x07:
+            self.inertial.restart()
+        elif register in _SAMPLING and changed:
+            self._begin_sampling()
+
+    def _pop(self, count: int) -> bytes:
+        taken = bytes(self._fifo[:count])
+        del self._fifo[:count]
+        self._last_popped = taken[-1] if taken else self._last_popped
+        return taken.ljust(count, bytes([self._last_popped]))  # an empty FIFO repeats its last byte
+
+    # -- sampling -------------------------------------------------------------------------------------------------
+
+    def _begin_sampling(self) -> None:
+        self._epoch_ns = self._clock.now_ns()
+        self._taken = 0
+        self.inertial.restart()
+
+    def _clear_data(self) -> None:
+        self._registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = bytes(GYRO_ZOUT_L + 1 - ACCEL_XOUT_H)
+
+    def _take_samples(self) -> None:
+        """Catch up with the samples that fell due since somebody last looked."""
+        registers = self._registers
+        if registers[PWR_MGMT_1] & SLEEP:
+            return
+        filter_setting, decimation = registers[CONFIG] & 0x07, 1 + registers[SMPLRT_DIV]
+        internal_hz = 8000 if filter_setting in (0, 7) else 1000
+        period_ns = 1_000_000_000 // internal_hz * decimation
+        due = (self._clock.now_ns() - self._epoch_ns) // period_ns
+        if due == self._taken:
+            return
+        first = max(self._taken, due - FIFO_SIZE)  # nobody can ask for older ones
+        times_ns = self._epoch_ns + period_ns * np.arange(first + 1, due + 1)
+        self._taken = due
+        gyro, accel = self.inertial.sample(times_ns, internal_hz, BANDWIDTH_HZ[filter_setting], decimation)
+        words = self._quantised(gyro, accel)
+        registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = words[-1].tobytes()
+        registers[INT_STATUS] |= DATA_RDY
+        chosen = [i for i, bit in enumerate(_FIFO_BITS) if registers[FIFO_EN] & bit]
+        if chosen and registers[USER_CTRL] & FIFO_ENABLED:
+            self._fifo += words[:, chosen].tobytes()
+            if len(self._fifo) > FIFO_SIZE:
+                del self._fifo[:-FIFO_SIZE]
+                registers[INT_STATUS] |= FIFO_OFLOW
+
+    def _quantised(self, gyro: Floats, accel: Floats) -> np.ndarray[tuple[int, int], np.dtype[np.int16]]:
+        """Return the samples (n, 7) as the big-endian words of the data registers, saturated."""
+        values = np.empty((len(gyro), 7))
+        values[:, :3] = accel * LSB_PER_G[self._registers[ACCEL_CONFIG] >> 3 & 3]
+        values[:, 3] = (self.temperature_c - 36.53) * 340
+        values[:, 4:] = gyro * LSB_PER_DPS[self._registers[GYRO_CONFIG] >> 3 & 3]
+        words: np.ndarray[tuple[int, int], np.dtype[np.int16]] = np.clip(np.rint(values), -32768, 32767).astype(">i2")
+        return words
