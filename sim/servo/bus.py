@@ -1,0 +1,231 @@
+"""The half-duplex line between host and servos, byte by byte in time."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Protocol
+
+from sim.clock import VirtualClock
+from sim.servo.protocol2 import (
+    BROADCAST_ID,
+    Instruction,
+    InstructionPacket,
+    PacketParser,
+    Status,
+    fast_status_parts,
+    status_packet,
+)
+from sim.servo.requests import CHAINED_READS, FAST_READS, chained_reads
+
+BITS_PER_BYTE = 10
+"""A start bit, 8 data bits, a stop bit."""
+ABANDON_S = 0.05
+"""Silence after which a device gives up a packet that has begun; the e-manual gives no number."""
+PING_SLOT_S = 0.003
+PING_STATUS_BYTES = 14
+"""Broadcast Ping: each id has a slot of one status packet and 3 ms, which is what the SDK's timeout reckons with."""
+COLLISION_SHIFT_BITS = 3
+"""How much later the second of two devices with one id starts: no two of them answer at the same instant."""
+
+
+class Source(Enum):
+    HOST = "host"
+    DEVICE = "device"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Bytes that go over the line without a gap; ``start_ns`` is when the first start bit begins."""
+
+    source: Source
+    start_ns: int
+    baudrate: int
+    data: bytes
+
+    def arrival_ns(self, count: int) -> int:
+        """Return when the first ``count`` bytes have arrived."""
+        return self.start_ns + count * BITS_PER_BYTE * 1_000_000_000 // self.baudrate
+
+    @property
+    def end_ns(self) -> int:
+        return self.arrival_ns(len(self.data))
+
+
+class Device(Protocol):
+    """What the bus asks of a servo."""
+
+    @property
+    def bus_id(self) -> int: ...
+    @property
+    def baudrate(self) -> int: ...
+    @property
+    def powered(self) -> bool: ...
+    @property
+    def return_delay_ns(self) -> int: ...
+    def execute(self, packet: InstructionPacket) -> Status | None: ...
+
+
+class ServoBus:
+    """Servos on one line, and the host's adapter.
+
+    An instruction reaches the devices when its last byte has arrived; an answer begins after the device's Return Delay Time,
+    in a chained read after the answer before it (where a device of the chain is silent, those behind it stay silent too).
+    A device set to another baud rate than the host's understands nothing. Two devices with one id spoil each other's answers.
+
+    Attributes
+    ----------
+    taps
+        Called with each frame that is sent, both ways, as the host sees it.
+    tampers
+        Called with each frame of a device on its way to the host, one after the other; a tamper returns the frame that goes on
+        in its place (other bytes, another time), or None to lose it.
+    """
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock = clock
+        self.taps: list[Callable[[Frame], None]] = []
+        self.tampers: list[Callable[[Frame], Frame | None]] = []
+        self._devices: list[Device] = []
+        self._deliver: Callable[[Frame], None] | None = None
+        self._parser = PacketParser()
+        self._heard = Frame(Source.HOST, 0, 1, b"")
+
+    def attach(self, device: Device) -> None:
+        """Plug a servo into the line."""
+        self._devices.append(device)
+
+    def detach(self, device: Device) -> None:
+        """Pull a servo's cable out of the line; ValueError if it is not there."""
+        self._devices.remove(device)
+
+    def connect(self, deliver: Callable[[Frame], None]) -> bool:
+        """Give the line's one host its receiver; return False where there is a host already."""
+        if self._deliver is not None:
+            return False
+        self._deliver = deliver
+        return True
+
+    def disconnect(self) -> None:
+        self._deliver = None
+
+    def send(self, data: bytes, baudrate: int) -> int:
+        """Put the host's bytes on the line, after those still going out; return when the last one has arrived."""
+        frame = Frame(Source.HOST, max(self.clock.now_ns(), self._sent_until_ns), baudrate, data)
+        self._sent_until_ns = frame.end_ns
+        for tap in self.taps:
+            tap(frame)
+        self.clock.call_at(frame.end_ns, lambda: self._hear(frame))
+        return frame.end_ns
+
+    _sent_until_ns = 0
+
+    def _hear(self, frame: Frame) -> None:
+        if frame.baudrate != self._heard.baudrate or frame.start_ns - self._heard.end_ns > ABANDON_S * 1e9:
+            self._parser.reset()
+        self._heard = frame
+        for packet in self._parser.feed(frame.data):
+            self._dispatch(packet, frame.baudrate)
+
+    def _dispatch(self, packet: InstructionPacket, baudrate: int) -> None:
+        devices = [device for device in self._devices if device.powered and device.baudrate == baudrate]
+        # Who is who before the instruction: it may change an id, a baud rate or a delay, which hold from the next one on.
+        called = [(device.bus_id, device.return_delay_ns, device) for device in devices]
+        answers = [
+            (bus_id, delay_ns, status)
+            for bus_id, delay_ns, device in called
+            if (status := device.execute(packet)) is not None
+        ]
+        now_ns = self.clock.now_ns()
+        if packet.instruction in CHAINED_READS:
+            frames = self._chain(packet, answers, baudrate)
+        elif packet.instruction == Instruction.PING and packet.bus_id == BROADCAST_ID:
+            slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
+            frames = [
+                self._frame(now_ns + bus_id * slot_ns + delay_ns, baudrate, status_packet(bus_id, status))
+                for bus_id, delay_ns, status in answers
+            ]
+        else:
+            frames = [
+                self._frame(now_ns + delay_ns, baudrate, status_packet(bus_id, status))
+                for bus_id, delay_ns, status in answers
+            ]
+        for frame in superpose(frames):
+            self._reply(frame)
+
+    def _chain(
+        self, packet: InstructionPacket, answers: Sequence[tuple[int, int, Status]], baudrate: int
+    ) -> list[Frame]:
+        """Return the answers to a chained read, each waiting for the one before."""
+        requests = chained_reads(packet)
+        chain: list[list[tuple[int, int, Status]]] = []
+        for bus_id in requests:
+            link = [answer for answer in answers if answer[0] == bus_id]
+            if not link:
+                break
+            chain.append(link)
+        fast = packet.instruction in FAST_READS
+        parts = (
+            fast_status_parts([size for _, size in requests.values()], [(link[0][0], link[0][2]) for link in chain])
+            if fast
+            else []
+        )
+        frames: list[Frame] = []
+        free_ns = self.clock.now_ns()
+        for k, link in enumerate(chain):
+            for bus_id, delay_ns, status in link:
+                data = parts[k] if fast else status_packet(bus_id, status)
+                start_ns = free_ns if fast and k else free_ns + delay_ns  # a fast read's parts make up one packet
+                frames.append(self._frame(start_ns, baudrate, data))
+            free_ns = max(frame.end_ns for frame in frames)
+        return frames
+
+    @staticmethod
+    def _frame(start_ns: int, baudrate: int, data: bytes) -> Frame:
+        return Frame(Source.DEVICE, start_ns, baudrate, data)
+
+    def _reply(self, frame: Frame) -> None:
+        for tamper in self.tampers:
+            changed = tamper(frame)
+            if changed is None:
+                return
+            frame = changed
+        for tap in self.taps:
+            tap(frame)
+        if self._deliver is not None:
+            self._deliver(frame)
+
+
+def superpose(frames: list[Frame]) -> list[Frame]:
+    """Return what the line carries when ``frames`` are sent: those that overlap in time spoil each other."""
+    line: list[Frame] = []
+    for frame in sorted(frames, key=lambda f: f.start_ns):
+        if line and frame.start_ns < line[-1].end_ns:
+            line[-1] = _collide(line[-1], frame)
+        else:
+            line.append(frame)
+    return line
+
+
+def _collide(first: Frame, second: Frame) -> Frame:
+    """Return what a receiver makes of two senders: a line with a pull-up is low where one of them drives it low."""
+    shift = COLLISION_SHIFT_BITS + (second.start_ns - first.start_ns) * first.baudrate // 1_000_000_000
+    ones, others = _levels(first.data), _levels(second.data)
+    length = max(len(ones), shift + len(others)) + BITS_PER_BYTE
+    line = [1] * length
+    line[: len(ones)] = ones
+    for i, level in enumerate(others):
+        line[shift + i] &= level
+    data = bytearray()
+    i = 0
+    while i + BITS_PER_BYTE <= length:
+        if line[i]:
+            i += 1
+            continue
+        data.append(sum(level << bit for bit, level in enumerate(line[i + 1 : i + 9])))
+        i += BITS_PER_BYTE
+    return replace(first, data=bytes(data))
+
+
+def _levels(data: bytes) -> list[int]:
+    """Return the line's levels, one a bit time, for ``data`` as a UART sends it."""
+    return [level for byte in data for level in (0, *(byte >> bit & 1 for bit in range(8)), 1)]

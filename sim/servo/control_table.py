@@ -1,0 +1,183 @@
+"""The memory of one servo: an image of bytes, the registers in it, what survives a reboot, and who may write what."""
+
+from collections.abc import Iterator
+
+from rig.devices.dynamixel.registers import ControlTable, Register, control_table, model_numbers
+from sim.servo.models import ServoModel
+from sim.servo.protocol2 import StatusError
+
+RAM_START = 64
+"""Addresses below it are EEPROM: kept without power, locked while torque is on."""
+
+_READ_ONLY = frozenset(
+    {
+        "Model Number",
+        "Model Information",
+        "Firmware Version",
+        "Registered Instruction",
+        "Hardware Error Status",
+        "Realtime Tick",
+        "Moving",
+        "Moving Status",
+        "Present PWM",
+        "Present Load",
+        "Present Current",
+        "Present Velocity",
+        "Present Position",
+        "Velocity Trajectory",
+        "Position Trajectory",
+        "Present Input Voltage",
+        "Present Temperature",
+    }
+)
+
+
+class Refusal(Exception):
+    """The device answers with an error instead of doing what was asked."""
+
+    def __init__(self, error: StatusError) -> None:
+        super().__init__(error.name)
+        self.error = error
+
+
+class Memory:
+    """Control table image of one servo; values by register name, as signed as the register is.
+
+    Indirect Data is resolved through its Indirect Address: reading or writing it reads or writes the byte that it stands for.
+    """
+
+    def __init__(self, model: ServoModel, firmware: int) -> None:
+        table = control_table(model.name, firmware)
+        self._model = model
+        self._registers = {register.name: register for register in _plain(table)}
+        self._indirect: dict[int, Register] = {}
+        for first, data, count in _indirect_blocks(table):
+            for i in range(count):
+                pointer = Register(f"Indirect Address at {first + 2 * i}", first + 2 * i, 2, signed=False)
+                self._registers[pointer.name] = pointer
+                self._indirect[data + i] = pointer
+                name = f"Indirect Data at {data + i}"
+                self._registers[name] = Register(name, data + i, 1, signed=False)
+        self._at = {register.address: register for register in self._registers.values()}
+        self._size = max(register.address + register.size for register in self._registers.values())
+        self._image = bytearray(self._size)
+        identity = {"Firmware Version": firmware, "Model Number": _model_number(model.name)}
+        self._defaults = {**model.initial, **identity}
+        for address, pointer in self._indirect.items():
+            self._defaults[pointer.name] = address
+        self._restore(0, self._size)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._registers
+
+    def __getitem__(self, name: str) -> int:
+        register = self._registers[name]
+        return register.decode(self._image[register.address : register.address + register.size])
+
+    def __setitem__(self, name: str, value: int) -> None:
+        """Set a register from inside, without any check of access; OverflowError where the value does not fit."""
+        register = self._registers[name]
+        self._image[register.address : register.address + register.size] = register.encode(value)
+
+    def forget_ram(self) -> None:
+        """Set the RAM area to its initial values, as at power-up."""
+        self._restore(RAM_START, self._size)
+
+    def forget_all(self, keep: tuple[str, ...] = ()) -> None:
+        """Set everything to its initial value but the registers named in ``keep``."""
+        kept = {name: self[name] for name in keep}
+        self._restore(0, self._size)
+        for name, value in kept.items():
+            self[name] = value
+
+    def read(self, address: int, size: int) -> bytes:
+        """Return ``size`` bytes from ``address``; addresses between the registers read as 0, as on the device.
+
+        Raises
+        ------
+        Refusal
+            DATA_LENGTH for no bytes at all, ACCESS where the range leaves the table.
+        """
+        if size == 0:
+            raise Refusal(StatusError.DATA_LENGTH)
+        if address + size > self._size:
+            raise Refusal(StatusError.ACCESS)
+        data = bytes(self._image[address : address + size])
+        if address + size > RAM_START and not self._indirect.keys().isdisjoint(range(address, address + size)):
+            return bytes(self._image[self._resolve(a)] for a in range(address, address + size))
+        return data
+
+    def entries(self, address: int, data: bytes) -> list[tuple[Register, int]]:
+        """Return the registers that a write of ``data`` to ``address`` sets, and their values, all checked against their ranges.
+
+        Raises
+        ------
+        Refusal
+            ACCESS for a register that is read only or no register at all, DATA_LENGTH for a part of a register,
+            DATA_RANGE for a value outside its range.
+        """
+        if not data:
+            raise Refusal(StatusError.DATA_LENGTH)
+        targets = [self._resolve(address + i) for i in range(len(data))]
+        entries = []
+        i = 0
+        while i < len(data):
+            register = self._at.get(targets[i])
+            if register is None:
+                raise Refusal(StatusError.DATA_LENGTH if self._within_register(targets[i]) else StatusError.ACCESS)
+            if register.name in _READ_ONLY:
+                raise Refusal(StatusError.ACCESS)
+            if targets[i : i + register.size] != list(range(register.address, register.address + register.size)):
+                raise Refusal(StatusError.DATA_LENGTH)
+            value = register.decode(data[i : i + register.size])
+            if not self._takes(register, value):
+                raise Refusal(StatusError.DATA_RANGE)
+            entries.append((register, value))
+            i += register.size
+        return entries
+
+    def _takes(self, register: Register, value: int) -> bool:
+        if register.name.startswith("Indirect Address"):
+            return RAM_START <= value < self._size
+        allowed = self._model.ranges.get(register.name)
+        return allowed is None or value in allowed
+
+    def _resolve(self, address: int) -> int:
+        pointer = self._indirect.get(address)
+        return address if pointer is None else self[pointer.name]
+
+    def _within_register(self, address: int) -> bool:
+        return any(a in self._at and a + self._at[a].size > address for a in range(address - 3, address))
+
+    def _restore(self, start: int, end: int) -> None:
+        for register in self._registers.values():
+            if start <= register.address < end:
+                self[register.name] = self._defaults.get(register.name, 0)
+
+
+def _plain(table: ControlTable) -> Iterator[Register]:
+    """Yield the registers that are not part of an indirect block, under one spelling for all models."""
+    for register in table.values():
+        if not register.name.startswith("Indirect"):
+            name = register.name.replace("BUS Watchdog", "Bus Watchdog")  # MX models spell it so
+            yield Register(name, register.address, register.size, register.signed)
+
+
+def _indirect_blocks(table: ControlTable) -> Iterator[tuple[int, int, int]]:
+    """Yield (first Indirect Address, first Indirect Data, how many) of each block.
+
+    The addresses of a block end where its data begins. The table's names "Read" and "Write" are a convention of the SDK's
+    users that splits a block in two; only a "Read" beyond the first block's data is a block of its own.
+    """
+    if "Indirect Address 1" not in table:
+        return
+    first, data = table["Indirect Address 1"].address, table["Indirect Data 1"].address
+    count = (data - first) // 2
+    yield first, data, count
+    second, second_data = table["Indirect Address Read"].address, table["Indirect Data Read"].address
+    if second >= data + count:
+        yield second, second_data, (second_data - second) // 2
+
+
+def _model_number(name: str) -> int:
+    return next(number for number, model in model_numbers().items() if model == name)

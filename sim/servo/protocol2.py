@@ -1,0 +1,152 @@
+"""Dynamixel Protocol 2.0 as a slave speaks it: instruction packets in, status packets out.
+
+Source: e-manual "DYNAMIXEL Protocol 2.0" (packet format, byte stuffing) and "CRC Calculation" (CRC-16, polynomial 0x8005).
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import pairwise
+
+BROADCAST_ID = 0xFE
+MAX_ID = 0xFC
+ALERT = 0x80
+"""Bit of a status packet's error byte: Hardware Error Status is not 0."""
+
+MAX_LENGTH = 1024
+"""Largest value of a length field that is taken for one; a longer one is noise that looks like a header."""
+
+_HEADER = b"\xff\xff\xfd"
+_STUFFED = _HEADER + b"\xfd"
+_FIXED = 7  # header, reserved, id, length
+_STATUS = 0x55
+
+
+class Instruction(IntEnum):
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
+
+
+class StatusError(IntEnum):
+    NONE = 0
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    CRC = 3
+    DATA_RANGE = 4
+    DATA_LENGTH = 5
+    DATA_LIMIT = 6
+    ACCESS = 7
+
+
+@dataclass(frozen=True, slots=True)
+class InstructionPacket:
+    """What the host asks; of a packet that is not ``intact`` (its CRC is wrong) only the id is worth anything."""
+
+    bus_id: int
+    instruction: int
+    parameters: bytes
+    intact: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a device answers: the error byte and the parameters."""
+
+    error: int
+    data: bytes = b""
+
+
+def _crc_of_byte(byte: int) -> int:
+    crc = byte << 8
+    for _ in range(8):
+        crc = (crc << 1 ^ 0x8005) & 0xFFFF if crc & 0x8000 else crc << 1
+    return crc
+
+
+_CRC_TABLE = tuple(_crc_of_byte(byte) for byte in range(256))
+
+
+def crc16(data: bytes, crc: int = 0) -> int:
+    """Return the CRC-16 of ``data`` (polynomial 0x8005, initial value 0, not reflected), going on from ``crc``."""
+    for byte in data:
+        crc = (crc << 8) & 0xFFFF ^ _CRC_TABLE[crc >> 8 ^ byte]
+    return crc
+
+
+def with_crc(frame: bytes) -> bytes:
+    return frame + crc16(frame).to_bytes(2, "little")
+
+
+class PacketParser:
+    """Finds instruction packets in a stream of bytes that may come in any pieces and among any noise."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def reset(self) -> None:
+        """Forget a packet that has begun."""
+        self._buffer.clear()
+
+    def feed(self, data: bytes) -> list[InstructionPacket]:
+        """Return the packets that ``data`` completes."""
+        buffer = self._buffer
+        buffer += data
+        packets = []
+        while (start := buffer.find(_HEADER)) >= 0:
+            del buffer[:start]
+            if len(buffer) < _FIXED:
+                return packets
+            length = int.from_bytes(buffer[5:7], "little")
+            plausible = (
+                buffer[3] == 0 and (buffer[4] <= MAX_ID or buffer[4] == BROADCAST_ID) and 3 <= length <= MAX_LENGTH
+            )
+            if not plausible:
+                del buffer[: len(_HEADER)]
+                continue
+            end = _FIXED + length
+            if len(buffer) < end:
+                return packets
+            frame = bytes(buffer[:end])
+            if crc16(frame[:-2]) == int.from_bytes(frame[-2:], "little"):
+                body = frame[_FIXED:-2].replace(_STUFFED, _HEADER)
+                packets.append(InstructionPacket(frame[4], body[0], body[1:]))
+                del buffer[:end]
+            else:
+                packets.append(InstructionPacket(frame[4], frame[_FIXED], b"", intact=False))
+                del buffer[: len(_HEADER)]  # a damaged length may have swallowed the next packet: look again inside
+        del buffer[: max(len(buffer) - len(_HEADER) + 1, 0)]
+        return packets
+
+
+def status_packet(bus_id: int, status: Status) -> bytes:
+    """Return the status packet, byte-stuffed."""
+    body = bytes((_STATUS, status.error)) + status.data
+    body = body.replace(_HEADER, _STUFFED)
+    return with_crc(_HEADER + bytes((0, bus_id)) + (len(body) + 2).to_bytes(2, "little") + body)
+
+
+def fast_status_parts(sizes: list[int], answers: list[tuple[int, Status]]) -> list[bytes]:
+    """Return what each device adds to the one status packet of a Fast Sync Read or Fast Bulk Read.
+
+    The packet's length counts all devices asked (``sizes``: bytes asked of each), also those that stay silent; the CRC of
+    each part covers everything before it, so the last one is the packet's own. Nothing is byte-stuffed (e-manual, Fast Sync
+    Read).
+    """
+    length = 1 + sum(size + 4 for size in sizes)
+    frame = _HEADER + bytes((0, BROADCAST_ID)) + length.to_bytes(2, "little") + bytes((_STATUS,))
+    ends = [0]
+    for size, (bus_id, status) in zip(sizes, answers, strict=False):
+        frame = with_crc(frame + bytes((status.error, bus_id)) + status.data.ljust(size, b"\0"))
+        ends.append(len(frame))
+    return [frame[start:end] for start, end in pairwise(ends)]

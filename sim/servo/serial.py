@@ -1,0 +1,153 @@
+"""An in-memory serial port: pyserial's interface, on the virtual clock, with the simulated bus at its other end."""
+
+import errno
+from collections import deque
+from itertools import count
+
+import serial
+
+from sim.servo.bus import Frame, ServoBus
+
+_PORT_NUMBERS = count()
+
+
+class SimSerial:
+    """Looks like an open `serial.Serial`; who reads waits on the bus's clock.
+
+    Parameters
+    ----------
+    bus
+        The line behind the adapter.
+    baudrate, timeout
+        As of `serial.Serial`: ``timeout`` in seconds, 0 to return what is there, None to wait for ever.
+
+    Raises
+    ------
+    serial.SerialException
+        The bus has a host already.
+    """
+
+    def __init__(self, bus: ServoBus, baudrate: int = 57_600, timeout: float | None = None) -> None:
+        self.port = self.name = f"sim:{next(_PORT_NUMBERS)}"
+        self.baudrate = baudrate
+        self.timeout = timeout
+        self._bus = bus
+        self._received = bytearray()
+        self._coming: deque[Frame] = deque()
+        self._taken = 0  # bytes of the first coming frame that have been received
+        self._sent_until_ns = 0
+        self._unplugged = False
+        self.is_open = False
+        self.open()
+
+    def open(self) -> None:
+        if self.is_open:
+            raise serial.SerialException("Port is already open.")
+        if not self._bus.connect(self._deliver):
+            raise serial.SerialException(
+                errno.EBUSY, f"Could not exclusively lock port {self.port}: another host is on this bus"
+            )
+        self.is_open = True
+
+    def close(self) -> None:
+        if self.is_open:
+            self.is_open = False
+            self._bus.disconnect()
+            self._received.clear()
+            self._coming.clear()
+            self._taken = 0
+
+    def unplug(self) -> None:
+        """Pull the adapter out of the computer: what is on its way is lost, and every use fails from now on."""
+        self.close()
+        self._unplugged = True
+
+    @property
+    def in_waiting(self) -> int:
+        if self._unplugged:
+            raise OSError(errno.EIO, "Input/output error")
+        self._require_open()
+        self._collect()
+        return len(self._received)
+
+    def read(self, size: int = 1) -> bytes:
+        """Return up to ``size`` bytes: all of them as soon as they are there, fewer at the timeout.
+
+        Raises
+        ------
+        serial.SerialException
+            The port is closed or unplugged.
+        RuntimeError
+            Without a timeout, nothing that is scheduled can bring the missing bytes.
+        """
+        self._require_open()
+        clock = self._bus.clock
+        deadline_ns = None if self.timeout is None else clock.now_ns() + round(self.timeout * 1e9)
+        self._collect()
+        while len(self._received) < size and clock.now_ns() != deadline_ns:
+            wake_ns = [t for t in (deadline_ns, clock.next_event_ns(), self._arrival_ns(size)) if t is not None]
+            if not wake_ns:
+                raise RuntimeError("this read would never return: no byte is on its way, give the port a timeout")
+            clock.advance_to(min(wake_ns))
+            self._require_open()
+            self._collect()
+        data = bytes(self._received[:size])
+        del self._received[:size]
+        return data
+
+    def write(self, data: bytes, /) -> int:
+        self._require_open()
+        self._sent_until_ns = self._bus.send(bytes(data), self.baudrate)
+        return len(data)
+
+    def flush(self) -> None:
+        """Wait until everything written is on the line."""
+        self._require_open()
+        if self._sent_until_ns > self._bus.clock.now_ns():
+            self._bus.clock.advance_to(self._sent_until_ns)
+
+    def reset_input_buffer(self) -> None:
+        """Throw away what has arrived; what is still on the line arrives later."""
+        self._require_open()
+        self._collect()
+        self._received.clear()
+
+    def _require_open(self) -> None:
+        if self._unplugged:
+            raise serial.SerialException(errno.EIO, f"device {self.port} disconnected")
+        if not self.is_open:
+            raise serial.PortNotOpenError()
+
+    def _deliver(self, frame: Frame) -> None:
+        self._coming.append(frame)
+
+    def _collect(self) -> None:
+        """Take over the bytes that have arrived by now; what came at another baud rate than the port's is lost."""
+        now_ns = self._bus.clock.now_ns()
+        while self._coming:
+            frame = self._coming[0]
+            elapsed_ns = now_ns - frame.start_ns
+            arrived = min(max(elapsed_ns * frame.baudrate // 10_000_000_000, 0), len(frame.data))
+            if frame.arrival_ns(arrived + 1) <= now_ns and arrived < len(frame.data):
+                arrived += 1
+            if frame.baudrate == self.baudrate:
+                self._received += frame.data[self._taken : arrived]
+            self._taken = arrived
+            if arrived < len(frame.data):
+                return
+            self._coming.popleft()
+            self._taken = 0
+
+    def _arrival_ns(self, size: int) -> int | None:
+        """Return when ``size`` bytes will be there, or the last one that is on its way."""
+        missing = size - len(self._received)
+        taken = self._taken
+        arrival_ns = None
+        for frame in self._coming:
+            available = len(frame.data) - taken
+            arrival_ns = frame.arrival_ns(taken + min(missing, available))
+            missing -= available
+            if missing <= 0:
+                break
+            taken = 0
+        return arrival_ns
