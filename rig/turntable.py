@@ -71,7 +71,12 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._clock = bench.clock
         imu = bench.config.imu
         self._heading = GyroHeading(
-            bench.imu, axis=imu.axis, sign=imu.sign, scale=imu.scale, scale_uncertainty=imu.scale_uncertainty
+            bench.imu,
+            bench.clock,
+            axis=imu.axis,
+            sign=imu.sign,
+            scale=imu.scale,
+            scale_sigma=imu.scale_uncertainty,
         )
         self._profile: MotionProfile | None = None
         self._rest_deg = 0.0
@@ -83,8 +88,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         )
         self._servo.torque_on()
         try:
-            self._heading.update()
-            self._wait_for_rest(self.angle_deg(), FIRST_REST_S, SETTLE_ALLOWANCE_S + FIRST_REST_S)
+            self._wait_for_rest(self.angle_deg(), self._config.quiet_s, SETTLE_ALLOWANCE_S)
+            self._heading.rest(FIRST_REST_S)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -155,11 +160,10 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def check_still(self) -> Stillness:
         """Look again at encoder and gyro, for the evidence of a view taken since the table came to rest."""
-        self._heading.update()
         change = abs(self.angle_deg() - self._rest_deg)
         peak = self._heading.peak_dps(self._config.quiet_s)
-        quiet = self._config.quiet_dps, QUIET_COUNTS * self._servo.resolution_deg
-        return Stillness(peak, change, still=peak <= quiet[0] and change <= quiet[1])
+        still = peak <= self._config.quiet_dps and change <= QUIET_COUNTS * self._servo.resolution_deg
+        return Stillness(peak, change, still)
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
@@ -183,6 +187,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 "The table has no torque.", next_step="Use it in a with block: `with Turntable(bench) as table:`."
             )
         started_ns, start_deg = self._clock.now_ns(), self._rest_deg
+        self._heading.rest(self._config.quiet_s)  # the bias wanders: each rest measures it anew
         self._heading.begin()
         try:
             for waypoint in waypoints:
@@ -254,7 +259,9 @@ class Turntable(AbstractContextManager["Turntable"]):
         angles = [angle for _, angle in readings]
         if max(angles) - min(angles) > QUIET_COUNTS * self._servo.resolution_deg:
             return False
-        return quiet_s == 0 or self._heading.rest(quiet_s, self._config.quiet_dps)
+        if quiet_s == 0 or self._heading.bias is None:
+            return True
+        return self._heading.peak_dps(quiet_s) <= self._config.quiet_dps
 
     def _refuse_faults(self, state: ServoState) -> None:
         if state.hardware_errors:

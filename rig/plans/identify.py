@@ -62,12 +62,12 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
                 list_length=config.list_length,
                 extension=config.extension,
             )
-            ranked = _ranked(number, ranking, index)
+            ranked = _ranked(number, ranking)
             yield ranked
             reason = _finished(config, ranked, number + 1)
             if reason:
                 break
-            decided = _decide(config, number, ranking, index, orientations, table)
+            decided = _decide(config, number, ranking, table)
             yield decided
             move = table.goto(decided.target_deg)
             travelled_deg += abs(move.rotation_deg)
@@ -91,17 +91,13 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
     return answer
 
 
-def _ranked(number: int, ranking: hbr.Ranking, index: hbr.ViewIndex) -> Ranked:
+def _ranked(number: int, ranking: hbr.Ranking) -> Ranked:
     views = number + 1
-    names = index.views.object_names
-    scores = ranking.scores / views
     candidates = tuple(
-        Candidate(names[ranking.object_index[i]], float(scores[i]), float(ranking.pose_deg[i]))
-        for i in range(min(SHOWN, len(scores)))
+        Candidate(name, float(score) / views, float(pose_deg))
+        for name, score, pose_deg in zip(ranking.names[:SHOWN], ranking.scores, ranking.pose_deg, strict=False)
     )
-    # A lone candidate leads over objects that stand on no list at all.
-    margin = float(scores[0] - scores[1]) if len(scores) > 1 else float(scores[0])
-    return Ranked(number, candidates, margin)
+    return Ranked(number, candidates, ranking.margin / views)
 
 
 def _finished(config: IdentifyConfig, ranked: Ranked, views: int) -> str:
@@ -117,8 +113,6 @@ def _decide(
     config: IdentifyConfig,
     number: int,
     ranking: hbr.Ranking,
-    index: hbr.ViewIndex,
-    orientations: list[float],
     table: Turntable,
 ) -> Decided:
     if number == 0:
@@ -126,8 +120,8 @@ def _decide(
         side = "left" if rotation_deg >= 0 else "right"
         target_deg = table.within_reach(table.rest_deg - rotation_deg)
         return Decided(number, side, rotation_deg, target_deg, None, None, ())
-    decision = hbr.next_view(ranking, index, np.array(orientations))
-    names = index.views.object_names
+    decision = hbr.next_view(ranking)
+    names = ranking.views.object_names
     return Decided(
         index=number,
         side=decision.side,

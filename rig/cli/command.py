@@ -1,0 +1,148 @@
+"""What every command shares: the common options, and how errors leave the program.
+
+Nothing here imports numpy, cv2, scipy or sqlalchemy: `rig --help` must be instant.
+"""
+
+import functools
+import inspect
+import json
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.errors import RigError
+
+if TYPE_CHECKING:
+    from rig.bench import Bench
+    from rig.catalog import Catalog
+    from rig.config import RigConfig
+
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+BenchOption = Annotated[
+    str | None, typer.Option("--bench", metavar="NAME", help="Bench to work on: hardware, sim, or a plug-in's.")
+]
+ConfigOption = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="Configuration (rig.toml).")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, e.g. identify.max_views=4. Repeatable."),
+]
+SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of a simulated bench.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout; text for people goes to stderr.")]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The common options, as given before and after the subcommand."""
+
+    bench: str | None = None
+    config: Path | None = None
+    overrides: tuple[str, ...] = ()
+    seed: int | None = None
+    json: bool = False
+    _loaded: dict[str, "RigConfig"] = field(default_factory=dict, repr=False, compare=False)
+
+    def merged(
+        self, bench: str | None, config: Path | None, overrides: list[str] | None, seed: int | None, json: bool
+    ) -> "Settings":
+        """Return these settings with those that follow the subcommand, which win."""
+        return replace(
+            self,
+            bench=bench or self.bench,
+            config=config or self.config,
+            overrides=(*self.overrides, *(overrides or ())),
+            seed=self.seed if seed is None else seed,
+            json=json or self.json,
+            _loaded={},
+        )
+
+    def load(self) -> "RigConfig":
+        """Return the configuration in force."""
+        if "config" not in self._loaded:
+            from rig.config import load_config
+
+            self._loaded["config"] = load_config(self.config, self.overrides)
+        return self._loaded["config"]
+
+    @property
+    def bench_name(self) -> str:
+        return self.bench or self.load().default_bench
+
+    def open_bench(self) -> "Bench":
+        from rig.bench import open_bench
+
+        return open_bench(self.bench_name, self.load(), seed=self.seed)
+
+    def open_catalog(self, *, create: bool = False, read_only: bool = False) -> "Catalog":
+        from rig.catalog import Catalog
+        from rig.clock import SystemClock
+
+        path = self.load().catalog_path(self.bench_name)
+        return Catalog.open(path, clock=SystemClock(), create=create, read_only=read_only)
+
+    def print_json(self, value: Any) -> None:
+        """Print one line of JSON on stdout, at once."""
+        print(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str), flush=True)
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function whose first parameter is the `Settings`.
+
+    The common options are added to its own; errors of the registry are printed with their next step and become the exit
+    code; Ctrl+C and SIGTERM unwind the stack, so that everything that is open is closed (torque off), and then end it.
+    """
+    signature = inspect.signature(function, eval_str=True)
+    own = list(signature.parameters.values())[1:]
+    shared = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, default, annotation in (
+            ("bench", None, BenchOption),
+            ("config", None, ConfigOption),
+            ("overrides", None, SetOption),
+            ("seed", None, SeedOption),
+            ("json_", False, JsonOption),
+        )
+    ]
+    context = inspect.Parameter("ctx", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
+
+    @functools.wraps(function)
+    def run(ctx: typer.Context, **values: Any) -> None:
+        given = [values.pop(name) for name in ("bench", "config", "overrides", "seed", "json_")]
+        settings = (ctx.obj or Settings()).merged(*given)
+        signal.signal(signal.SIGTERM, _terminate)
+        try:
+            function(settings, **values)
+        except RigError as error:
+            show_error(error, settings)
+            raise typer.Exit(error.exit_code) from None
+        except KeyboardInterrupt:
+            print("Interrupted; the table is stopped and its torque off.", file=sys.stderr)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+
+    run.__signature__ = inspect.Signature([context, *own, *shared])  # type: ignore[attr-defined]
+    # Typer reads the annotations beside the signature; those of the wrapped function would hide the added ones.
+    run.__annotations__ = {p.name: p.annotation for p in [context, *own, *shared]}
+    return run
+
+
+def show_error(error: RigError, settings: Settings) -> None:
+    """Print what happened, the evidence, and the next step; never a traceback."""
+    if settings.json:
+        settings.print_json(error.as_dict())
+    lines = [f"Error {error.code} ({error.title}): {error.what}"]
+    for key, value in error.evidence.items():
+        if isinstance(value, list | tuple):
+            lines += [f"  {key}:", *(f"    {item}" for item in value)]
+        else:
+            lines.append(f"  {key}: {value}")
+    print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
+
+
+def _terminate(_signal: int, _frame: object) -> None:
+    raise SystemExit(EXIT_TERMINATED)

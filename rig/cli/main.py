@@ -1,0 +1,57 @@
+"""The command `rig`."""
+
+from importlib.metadata import entry_points, version
+from typing import Annotated
+
+import typer
+
+from rig.cli import catalog, enroll, identify, table
+from rig.cli.command import BenchOption, ConfigOption, JsonOption, SeedOption, SetOption, Settings
+
+GROUP = "rig.commands"
+
+app = typer.Typer(
+    name="rig",
+    help="Turntable rig: enroll objects as views at known angles, and find them again by active retrieval.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"hbr-rig {version('hbr-rig')}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    ctx: typer.Context,
+    bench: BenchOption = None,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+    seed: SeedOption = None,
+    json_: JsonOption = False,
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Take the common options before the subcommand; they may also follow it."""
+    ctx.obj = Settings().merged(bench, config, overrides, seed, json_)
+
+
+common.__doc__ = None  # the help of the program is the app's
+
+app.command("enroll")(enroll.enroll)
+app.command("identify")(identify.identify)
+app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)
+app.command("status")(table.status)
+app.add_typer(catalog.app, name="catalog")
+for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+    app.command(_point.name)(_point.load())
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
