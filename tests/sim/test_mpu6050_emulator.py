@@ -1,0 +1,369 @@
+"""The simulated MPU-6050, register by register, through the real smbus2."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from smbus2 import SMBus, i2c_msg
+
+from sim.i2c import SimI2cBus
+from sim.imu.mpu6050 import BANDWIDTH_HZ, SimMpu6050
+from sim.motion import to_velocity
+from sim.noise import NoiseModel
+from sim.world import World
+
+AT = 0x68
+DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, FIFO_EN, INT_STATUS = 0x19, 0x1A, 0x1B, 0x1C, 0x23, 0x3A
+DATA, USER_CTRL, PWR, COUNT, FIFO, WHO = 0x3B, 0x6A, 0x6B, 0x72, 0x74, 0x75
+
+
+class Chip:
+    """One sensor, its world, and a master that reads registers."""
+
+    def __init__(self, noise: NoiseModel | None = None, seed: int = 0) -> None:
+        self.world = World(noise=noise or NoiseModel.none(), seed=seed)
+        self.sensor = SimMpu6050(self.world)
+        self.bus = SimI2cBus(self.world.clock)
+        self.bus.attach(AT, self.sensor)
+        self.master = SMBus(self.bus.path)
+
+    def close(self) -> None:
+        self.master.close()
+        self.bus.close()
+
+    def __enter__(self) -> "Chip":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def get(self, register: int, count: int = 1) -> list[int]:
+        return self.master.read_i2c_block_data(AT, register, count)
+
+    def set(self, register: int, *values: int) -> None:
+        self.master.write_i2c_block_data(AT, register, list(values))
+
+    def words(self, register: int = DATA, count: int = 7) -> list[int]:
+        return np.frombuffer(bytes(self.get(register, 2 * count)), ">i2").tolist()
+
+    def count(self) -> int:
+        return int.from_bytes(bytes(self.get(COUNT, 2)), "big")
+
+    def drain(self, count: int | None = None) -> bytes:
+        answer = i2c_msg.read(AT, self.count() if count is None else count)
+        self.master.i2c_rdwr(i2c_msg.write(AT, [FIFO]), answer)
+        return bytes(answer)
+
+    def wake(self, *, divider: int = 5, dlpf: int = 3, fifo: int = 0) -> None:
+        self.set(PWR, 0x01)
+        self.set(DIV, divider - 1, dlpf)
+        self.set(FIFO_EN, fifo)
+        self.set(USER_CTRL, 0x04)
+        self.set(USER_CTRL, 0x40)
+
+    def wait(self, seconds: float) -> None:
+        self.world.clock.sleep(seconds)
+
+    def turn(self, dps: float) -> None:
+        now_s = self.world.clock.now_ns() * 1e-9
+        self.world.drive(to_velocity(now_s, 0.0, dps, dps, 1.0))
+
+
+@pytest.fixture
+def chip() -> Iterator[Chip]:
+    with Chip() as c:
+        yield c
+
+
+def test_it_sleeps_after_power_up_and_says_who_it_is(chip: Chip) -> None:
+    assert chip.get(WHO) == [0x68]
+    assert chip.get(PWR) == [0x40]
+    chip.turn(50)
+    chip.set(USER_CTRL, 0x40)
+    chip.set(FIFO_EN, 0xF8)
+    chip.wait(1)
+    assert chip.words() == [0] * 7
+    assert chip.count() == 0
+    assert chip.get(INT_STATUS) == [0]
+
+
+def test_device_reset_brings_the_reset_values_back(chip: Chip) -> None:
+    chip.wake(fifo=0x70)
+    chip.set(GYRO_CONFIG, 0x18, 0x18)
+    chip.wait(0.1)
+    chip.set(PWR, 0x80)
+    assert chip.get(PWR) == [0x40]  # the bit clears itself
+    assert chip.get(DIV, 4) == [0, 0, 0, 0]
+    assert chip.get(USER_CTRL) == chip.get(FIFO_EN) == [0]
+    assert chip.count() == 0
+
+
+def test_ad0_moves_the_address_not_the_identity() -> None:
+    sensor = SimMpu6050(World(), ad0=True)
+    assert sensor.address == 0x69
+    sensor.start(reading=False)
+    sensor.write(bytes([WHO]))
+    assert sensor.read(1) == b"\x68"
+
+
+@given(register=st.integers(0, 0x7F), value=st.integers(0, 255))
+@settings(max_examples=200)
+def test_only_the_writable_bits_of_writable_registers_change(register: int, value: int) -> None:
+    kept = {DIV: 0xFF, CONFIG: 0x3F, GYRO_CONFIG: 0xF8, ACCEL_CONFIG: 0xF8, FIFO_EN: 0xFF, USER_CTRL: 0x70, PWR: 0x6F}
+    sensor = SimMpu6050(World(noise=NoiseModel.none()))
+
+    def dump() -> bytes:
+        sensor.start(reading=False)
+        sensor.write(b"\0")
+        return sensor.read(FIFO)  # all up to FIFO_R_W, where the pointer stays
+
+    before = dump()
+    sensor.start(reading=False)
+    sensor.write(bytes([register, value]))
+    after = dump()
+    if register == PWR and value & 0x80:
+        assert after == before
+        return
+    others = [r for r in range(FIFO) if r != register and after[r] != before[r]]
+    assert others == []
+    if register in kept:
+        assert after[register] == value & kept[register]
+    elif 0x3A <= register <= 0x60 or register >= 0x72:
+        assert register >= FIFO or after[register] == before[register]
+
+
+@pytest.mark.parametrize(("setting", "lsb"), list(enumerate([131.0, 65.5, 32.8, 16.4])))
+def test_the_gyro_scales(chip: Chip, setting: int, lsb: float) -> None:
+    chip.wake()
+    chip.set(GYRO_CONFIG, setting << 3)
+    chip.turn(200.0)
+    chip.wait(0.2)
+    assert chip.words()[4:] == [0, 0, round(200.0 * lsb)]
+
+
+@pytest.mark.parametrize(("setting", "lsb"), list(enumerate([16384, 8192, 4096, 2048])))
+def test_the_accelerometer_scales(chip: Chip, setting: int, lsb: int) -> None:
+    chip.wake()
+    chip.set(ACCEL_CONFIG, setting << 3)
+    chip.wait(0.1)
+    assert chip.words()[:3] == [0, 0, lsb]
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_rate_beyond_the_range_saturates(chip: Chip, sign: int) -> None:
+    chip.wake()
+    chip.turn(sign * 300.0)
+    chip.wait(0.2)
+    assert chip.words()[6] == (32767 if sign > 0 else -32768)
+
+
+def test_temperature_follows_the_datasheets_formula(chip: Chip) -> None:
+    chip.wake()
+    chip.sensor.temperature_c = 41.5
+    chip.wait(0.1)
+    assert chip.words()[3] / 340 + 36.53 == pytest.approx(41.5, abs=1 / 340)
+
+
+@given(
+    divider=st.integers(1, 256),
+    dlpf=st.integers(0, 7),
+    fifo=st.integers(0, 31).map(lambda bits: bits << 3),
+    wait_ms=st.integers(1, 80),
+)
+@settings(max_examples=60)
+def test_the_fifo_fills_at_the_sample_rate_with_what_was_chosen(
+    divider: int, dlpf: int, fifo: int, wait_ms: int
+) -> None:
+    words = 3 * bool(fifo & 0x08) + sum(bool(fifo & bit) for bit in (0x80, 0x40, 0x20, 0x10))
+    with Chip() as chip:
+        chip.wake(divider=divider, dlpf=dlpf, fifo=fifo)
+        epoch_ns = chip.world.clock.now_ns()  # FIFO_RESET and FIFO_EN came within the first sample, or after it
+        chip.wait(wait_ms * 1e-3)
+        samples = (chip.world.clock.now_ns() - epoch_ns) / 1e9 * (8000 if dlpf in (0, 7) else 1000) / divider
+        assert chip.count() == pytest.approx(min(2 * words * samples, 1024), abs=2 * words * 4)
+
+
+def test_fifo_frames_follow_the_order_of_the_data_registers(chip: Chip) -> None:
+    chip.wake(fifo=0xF8)
+    chip.turn(100.0)
+    chip.wait(0.1)
+    frames = np.frombuffer(chip.drain(), ">i2").reshape(-1, 7)
+    assert frames[-1].tolist() == chip.words() == [0, 0, 16384, round((25 - 36.53) * 340), 0, 0, 13100]
+
+
+def test_an_overflowing_fifo_drops_the_oldest_bytes_and_says_so(chip: Chip) -> None:
+    chip.wake(divider=1, fifo=0x70)
+    chip.wait(0.15)
+    assert chip.get(INT_STATUS) == [0x01]
+    assert chip.get(INT_STATUS)[0] & 0x10 == 0
+    chip.turn(50.0)
+    chip.wait(0.05)
+    assert chip.get(INT_STATUS) == [0x11]
+    assert chip.get(INT_STATUS)[0] & 0x10 == 0  # reading cleared it
+    assert chip.count() == 1024
+    newest = np.frombuffer(chip.drain(1024)[-48:], ">i2").reshape(-1, 3)  # 1024 is no multiple of 6: aligned at the end
+    assert newest.tolist() == [[0, 0, 6550]] * 8
+
+
+def test_fifo_reset_works_only_while_the_fifo_is_off(chip: Chip) -> None:
+    chip.wake(fifo=0x70)
+    chip.wait(0.1)
+    chip.set(USER_CTRL, 0x44)
+    assert chip.count() > 100
+    chip.set(USER_CTRL, 0x04)
+    assert chip.count() == 0
+    assert chip.get(USER_CTRL) == [0]  # the bit clears itself
+    chip.wait(0.1)
+    assert chip.count() == 0  # off: nothing enters
+
+
+def test_fifo_is_read_in_place_and_an_empty_one_repeats_its_last_byte(chip: Chip) -> None:
+    chip.wake(fifo=0x08)
+    chip.wait(0.021)
+    chip.set(FIFO_EN, 0)
+    count = chip.count()
+    assert count == 24
+    data = chip.drain(count + 3)
+    assert data[:6] == b"\0\0\0\0\x40\0"
+    assert data[count:] == data[count - 1 : count] * 3
+    assert chip.count() == 0
+
+
+def test_the_count_is_latched_by_its_high_byte(chip: Chip) -> None:
+    chip.wake(fifo=0x70)
+    chip.wait(0.3)
+    high = chip.get(COUNT)[0]
+    chip.wait(0.2)
+    low = chip.get(COUNT + 1)[0]
+    assert high * 256 + low == pytest.approx(0.3 * 200 * 6, abs=12)
+    assert chip.count() == pytest.approx(0.5 * 200 * 6, abs=12)
+
+
+def test_a_burst_belongs_to_one_sample() -> None:
+    with Chip(NoiseModel(), seed=3) as chip:
+        chip.wake(divider=1, dlpf=1, fifo=0xF8)  # a sample falls due within every third burst of 14 bytes
+        for _ in range(20):
+            chip.wait(0.0013)
+            burst = chip.words()
+            frames = np.frombuffer(chip.drain(), ">i2").reshape(-1, 7).tolist()
+            assert burst in frames
+
+
+def test_data_ready_comes_once_a_sample(chip: Chip) -> None:
+    chip.wake(divider=10)
+    ready = 0
+    for _ in range(100):
+        chip.wait(0.001)
+        ready += chip.get(INT_STATUS)[0] & 1
+    assert 9 <= ready <= 12
+
+
+def test_what_was_sampled_long_ago_is_the_rate_of_its_own_moment(chip: Chip) -> None:
+    chip.wake(dlpf=1, fifo=0x10)
+    for dps in (0.0, 40.0, -80.0):
+        chip.turn(dps)
+        chip.wait(0.1)
+    rates = np.frombuffer(chip.drain(), ">i2") / 131
+    for third, dps in zip(np.array_split(rates, 3), (0.0, 40.0, -80.0), strict=True):
+        assert np.median(third) == pytest.approx(dps, abs=0.01)
+
+
+@pytest.mark.parametrize("dlpf", [2, 3, 4, 5, 6])
+def test_noise_has_the_density_and_the_bandwidth_of_the_filter(dlpf: int) -> None:
+    density = 0.05  # ten times the part's: far above the quantisation
+    noise = NoiseModel.none().with_values(gyro_noise_dps_rthz=density)
+    with Chip(noise, seed=dlpf) as chip:
+        chip.wake(divider=1, dlpf=dlpf, fifo=0x70)
+        rates = []
+        for _ in range(100):
+            chip.wait(0.1)
+            rates.append(np.frombuffer(chip.drain(chip.count() // 6 * 6), ">i2").reshape(-1, 3) / 131)
+            assert len(rates[-1]) < 170
+    rate = np.concatenate(rates)[200:]
+    # First order: the noise bandwidth is π/2 times the corner; the slow part of the spectrum is the density's.
+    expected = density * np.sqrt(np.pi / 2 * BANDWIDTH_HZ[dlpf])
+    assert rate.std() == pytest.approx(expected, rel=0.1)
+    second = rate[: len(rate) // 500 * 500].reshape(-1, 500, 3).sum(axis=1) / 1000  # half-second integrals
+    assert second.std() == pytest.approx(density / np.sqrt(2) * np.sqrt(0.5), rel=0.35)
+
+
+def test_bias_scale_and_tilt_are_drawn_with_the_models_spread() -> None:
+    noise = NoiseModel()
+    parts = [SimMpu6050(World(noise=noise, seed=s)).inertial for s in range(300)]
+    assert np.std([p.gyro_bias_dps for p in parts]) == pytest.approx(noise.gyro_bias_dps, rel=0.1)
+    assert np.std([p.gyro_gain - 1 for p in parts]) == pytest.approx(noise.gyro_scale_error, rel=0.1)
+    assert np.std([p.accel_bias_g for p in parts]) == pytest.approx(noise.accel_bias_g, rel=0.1)
+    ups = np.array([p.up for p in parts])
+    assert np.linalg.norm(ups, axis=1) == pytest.approx(1)
+    assert np.std(np.degrees(np.arcsin(ups[:, :2]))) == pytest.approx(noise.imu_tilt_deg, rel=0.1)
+
+
+def test_the_bias_walks_at_the_models_pace() -> None:
+    pace = 0.1
+    drifts = []
+    for seed in range(100):
+        world = World(noise=NoiseModel.none().with_values(gyro_bias_walk_dps_rts=pace), seed=seed)
+        sensor = SimMpu6050(world)
+        sensor.start(reading=False)
+        sensor.write(bytes([PWR, 0x01]))
+        for _ in range(4):
+            world.clock.sleep(1.0)
+            sensor.read(1)
+        drifts.append(sensor.inertial.gyro_bias_dps)
+    assert np.std(drifts) == pytest.approx(pace * 2, rel=0.15)
+
+
+def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
+    with Chip(NoiseModel.none().with_values(imu_tilt_deg=10.0), seed=5) as chip:
+        chip.wake()
+        chip.turn(-90.0)
+        chip.wait(0.3)
+        words = np.array(chip.words())
+        up = chip.sensor.inertial.up
+        assert up[2] < 0.999
+        assert words[:3] / 16384 == pytest.approx(up, abs=1e-4)
+        assert words[4:] / 131 == pytest.approx(-90 * up, abs=0.01)
+
+
+@given(looks_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))
+@settings(max_examples=40)
+def test_samples_do_not_depend_on_how_often_one_looks(looks_ms: list[int], seed: int) -> None:
+    """The same seed gives the same bytes, in whatever portions they are fetched."""
+
+    def fetch(looks: list[int]) -> bytes:
+        # Straight at the device, where time does not pass while it talks.
+        world = World(seed=seed)
+        sensor = SimMpu6050(world)
+
+        def send(*data: int) -> None:
+            sensor.start(reading=False)
+            sensor.write(bytes(data))
+
+        for message in ((PWR, 0x01), (DIV, 9, 3), (FIFO_EN, 0x78), (USER_CTRL, 0x40)):
+            send(*message)
+        world.drive(to_velocity(0.0, 0.0, 0.0, 60.0, 100.0))
+        got = b""
+        for look in looks:
+            world.clock.sleep(look * 1e-3)
+            send(COUNT)
+            count = int.from_bytes(sensor.read(2), "big")
+            got += sensor.read(count)
+        return got
+
+    whole = fetch(looks_ms)
+    total_ms = sum(looks_ms)
+    at_once = fetch([total_ms])
+    assert len(whole) == total_ms // 10 * 12
+    assert whole[-len(at_once) :] == at_once if at_once else not whole
+
+
+def test_another_seed_is_another_part() -> None:
+    biases = {SimMpu6050(World(seed=s)).inertial.gyro_bias_dps.tobytes() for s in range(5)}
+    assert len(biases) == 5
+
+
+def test_a_clone_tells_its_own_name(chip: Chip) -> None:
+    chip.sensor.who_am_i = 0x70
+    assert chip.get(WHO) == [0x70]
