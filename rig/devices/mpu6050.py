@@ -122,7 +122,7 @@ class Mpu6050:
 
     @property
     def range_dps(self) -> float:
-        return float(self._range_dps)
+        return 32767 / _LSB_PER_DPS[self._range_dps]
 
     def close(self) -> None:
         self._bus.close()
