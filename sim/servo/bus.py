@@ -1,14 +1,14 @@
 """The half-duplex line between host and servos, byte by byte in time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import takewhile
 from typing import Protocol
 
 from sim.clock import VirtualClock
 from sim.servo.protocol2 import (
     BROADCAST_ID,
-    Instruction,
     InstructionPacket,
     PacketParser,
     Status,
@@ -46,9 +46,23 @@ class Frame:
         """Return when the first ``count`` bytes have arrived."""
         return self.start_ns + count * BITS_PER_BYTE * 1_000_000_000 // self.baudrate
 
+    def arrived(self, now_ns: int) -> int:
+        """Return how many bytes have arrived by ``now_ns``: the largest count whose `arrival_ns` is not later."""
+        count = ((now_ns - self.start_ns + 1) * self.baudrate - 1) // (BITS_PER_BYTE * 1_000_000_000)
+        return min(max(count, 0), len(self.data))
+
     @property
     def end_ns(self) -> int:
         return self.arrival_ns(len(self.data))
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a device answers, under which id and after which delay."""
+
+    bus_id: int
+    delay_ns: int
+    status: Status
 
 
 class Device(Protocol):
@@ -68,17 +82,18 @@ class Device(Protocol):
 class ServoBus:
     """Servos on one line, and the host's adapter.
 
-    An instruction reaches the devices when its last byte has arrived; an answer begins after the device's Return Delay Time,
-    in a chained read after the answer before it (where a device of the chain is silent, those behind it stay silent too).
-    A device set to another baud rate than the host's understands nothing. Two devices with one id spoil each other's answers.
+    An instruction reaches the devices when its last byte has arrived; an answer begins after the device's Return Delay
+    Time, in a chained read after the answer before it (behind a silent device the rest of the chain is silent too). A
+    device set to another baud rate than the host's understands nothing. Two devices with one id spoil each other's
+    answers. What the host sends while a device answers does no harm here.
 
     Attributes
     ----------
     taps
         Called with each frame that is sent, both ways, as the host sees it.
     tampers
-        Called with each frame of a device on its way to the host, one after the other; a tamper returns the frame that goes on
-        in its place (other bytes, another time), or None to lose it.
+        Called with each frame of a device on its way to the host, one after the other; a tamper returns the frame that
+        goes on in its place (other bytes, another time), or None to lose it.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
@@ -87,6 +102,7 @@ class ServoBus:
         self.tampers: list[Callable[[Frame], Frame | None]] = []
         self._devices: list[Device] = []
         self._deliver: Callable[[Frame], None] | None = None
+        self._sent_until_ns = 0
         self._parser = PacketParser()
         self._heard = Frame(Source.HOST, 0, 1, b"")
 
@@ -117,8 +133,6 @@ class ServoBus:
         self.clock.call_at(frame.end_ns, lambda: self._hear(frame))
         return frame.end_ns
 
-    _sent_until_ns = 0
-
     def _hear(self, frame: Frame) -> None:
         if frame.baudrate != self._heard.baudrate or frame.start_ns - self._heard.end_ns > ABANDON_S * 1e9:
             self._parser.reset()
@@ -127,61 +141,47 @@ class ServoBus:
             self._dispatch(packet, frame.baudrate)
 
     def _dispatch(self, packet: InstructionPacket, baudrate: int) -> None:
-        devices = [device for device in self._devices if device.powered and device.baudrate == baudrate]
-        # Who is who before the instruction: it may change an id, a baud rate or a delay, which hold from the next one on.
-        called = [(device.bus_id, device.return_delay_ns, device) for device in devices]
+        # Ids and delays as they were before the instruction: what it changes holds from the next one on.
+        called = [(d, d.bus_id, d.return_delay_ns) for d in self._devices if d.powered and d.baudrate == baudrate]
         answers = [
-            (bus_id, delay_ns, status)
-            for bus_id, delay_ns, device in called
+            Answer(bus_id, delay_ns, status)
+            for device, bus_id, delay_ns in called
             if (status := device.execute(packet)) is not None
         ]
-        now_ns = self.clock.now_ns()
         if packet.instruction in CHAINED_READS:
             frames = self._chain(packet, answers, baudrate)
-        elif packet.instruction == Instruction.PING and packet.bus_id == BROADCAST_ID:
-            slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
-            frames = [
-                self._frame(now_ns + bus_id * slot_ns + delay_ns, baudrate, status_packet(bus_id, status))
-                for bus_id, delay_ns, status in answers
-            ]
         else:
+            slot_ns = 0
+            if packet.bus_id == BROADCAST_ID:  # only a ping is answered then
+                slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
+            now_ns = self.clock.now_ns()
             frames = [
-                self._frame(now_ns + delay_ns, baudrate, status_packet(bus_id, status))
-                for bus_id, delay_ns, status in answers
+                Frame(
+                    Source.DEVICE, now_ns + a.delay_ns + a.bus_id * slot_ns, baudrate, status_packet(a.bus_id, a.status)
+                )
+                for a in answers
             ]
         for frame in superpose(frames):
             self._reply(frame)
 
-    def _chain(
-        self, packet: InstructionPacket, answers: Sequence[tuple[int, int, Status]], baudrate: int
-    ) -> list[Frame]:
-        """Return the answers to a chained read, each waiting for the one before."""
+    def _chain(self, packet: InstructionPacket, answers: list[Answer], baudrate: int) -> list[Frame]:
+        """Return the answers to a chained read: each waits for the one before, those of a fast read are one packet."""
         requests = chained_reads(packet)
-        chain: list[list[tuple[int, int, Status]]] = []
-        for bus_id in requests:
-            link = [answer for answer in answers if answer[0] == bus_id]
-            if not link:
-                break
-            chain.append(link)
+        links = ([answer for answer in answers if answer.bus_id == bus_id] for bus_id in requests)
+        chain = list(takewhile(bool, links))
         fast = packet.instruction in FAST_READS
-        parts = (
-            fast_status_parts([size for _, size in requests.values()], [(link[0][0], link[0][2]) for link in chain])
-            if fast
-            else []
+        parts = fast_status_parts(
+            [size for _, size in requests.values()], [(link[0].bus_id, link[0].status) for link in chain]
         )
         frames: list[Frame] = []
         free_ns = self.clock.now_ns()
-        for k, link in enumerate(chain):
-            for bus_id, delay_ns, status in link:
-                data = parts[k] if fast else status_packet(bus_id, status)
-                start_ns = free_ns if fast and k else free_ns + delay_ns  # a fast read's parts make up one packet
-                frames.append(self._frame(start_ns, baudrate, data))
+        for link, part in zip(chain, parts, strict=True):
+            for answer in link:
+                start_ns = free_ns if fast and frames else free_ns + answer.delay_ns
+                data = part if fast else status_packet(answer.bus_id, answer.status)
+                frames.append(Frame(Source.DEVICE, start_ns, baudrate, data))
             free_ns = max(frame.end_ns for frame in frames)
         return frames
-
-    @staticmethod
-    def _frame(start_ns: int, baudrate: int, data: bytes) -> Frame:
-        return Frame(Source.DEVICE, start_ns, baudrate, data)
 
     def _reply(self, frame: Frame) -> None:
         for tamper in self.tampers:

@@ -43,7 +43,7 @@ class Refusal(Exception):
 class Memory:
     """Control table image of one servo; values by register name, as signed as the register is.
 
-    Indirect Data is resolved through its Indirect Address: reading or writing it reads or writes the byte that it stands for.
+    Indirect Data is resolved through its Indirect Address, to the byte that it stands for.
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
@@ -72,7 +72,7 @@ class Memory:
 
     def __getitem__(self, name: str) -> int:
         register = self._registers[name]
-        return register.decode(self._image[register.address : register.address + register.size])
+        return register.decode(bytes(self._image[register.address : register.address + register.size]))
 
     def __setitem__(self, name: str, value: int) -> None:
         """Set a register from inside, without any check of access; OverflowError where the value does not fit."""
@@ -108,7 +108,7 @@ class Memory:
         return data
 
     def entries(self, address: int, data: bytes) -> list[tuple[Register, int]]:
-        """Return the registers that a write of ``data`` to ``address`` sets, and their values, all checked against their ranges.
+        """Return the registers that a write of ``data`` to ``address`` sets, with values checked against their ranges.
 
         Raises
         ------
@@ -166,8 +166,8 @@ def _plain(table: ControlTable) -> Iterator[Register]:
 def _indirect_blocks(table: ControlTable) -> Iterator[tuple[int, int, int]]:
     """Yield (first Indirect Address, first Indirect Data, how many) of each block.
 
-    The addresses of a block end where its data begins. The table's names "Read" and "Write" are a convention of the SDK's
-    users that splits a block in two; only a "Read" beyond the first block's data is a block of its own.
+    The addresses of a block end where its data begins. The table's entries "Write" and "Read" are parts of blocks that
+    the SDK's users have agreed on; only a "Read" beyond the first block's data is a block of its own.
     """
     if "Indirect Address 1" not in table:
         return

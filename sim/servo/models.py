@@ -89,8 +89,8 @@ class ServoModel:
     no_load_dps
         Speed without load at that supply, in °/s: the fastest that the shaft turns.
     acceleration_dps2
-        Acceleration at stall torque, in °/s², with a light platter: the steepest ramp. An estimate (no-load speed within
-        about 0.1 s): the e-manual gives the torque, but the inertia is the user's.
+        Acceleration at stall torque, in °/s², with a light platter: the steepest ramp. An estimate (no-load speed
+        within about 0.1 s): the e-manual gives the torque, but the inertia is the user's.
     stall_current
         Present Current at stall, in the register's unit; None for models that report Present Load instead.
     """

@@ -1,5 +1,6 @@
 """The gear motor on the world's shaft: how it follows a commanded trajectory, what that costs, and what holds it up."""
 
+from dataclasses import dataclass
 from math import exp
 
 from sim.motion import Trajectory, rest, to_position, to_velocity
@@ -21,31 +22,46 @@ STALL_RISE_C = 90.0
 THERMAL_TIME_S = 400.0
 """Time constant of the case."""
 
-OVERLOAD_LOAD = 0.99
+OVERLOAD = 0.99
 OVERLOAD_S = 2.0
 """How long the motor may push with all it has before the servo calls it an overload; the e-manual gives no number."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotorState:
+    """The shaft, where it should be, and what that takes; positive counter-clockwise.
+
+    ``load`` is a fraction of the stall torque, ``pwm`` of the supply, both -1..1.
+    """
+
+    angle_deg: float
+    speed_dps: float
+    target_deg: float
+    target_dps: float
+    load: float
+    pwm: float
 
 
 class Motor:
     """A position- or speed-controlled shaft in the world's degrees.
 
-    The shaft follows what is commanded exactly, unless it is jammed: then it stands, the controller's error grows, and with it
-    the load. `settle` takes heat and overload forward; whoever owns the motor calls it before each change and now and then
-    while the load varies.
+    The shaft follows what is commanded exactly, unless it is jammed: then it stands, the controller's error grows, and
+    the load with it. `settle` takes heat and overload forward, with the load of that moment; whoever owns the motor
+    calls it now and then while the motor is `busy`.
     """
 
     def __init__(self, world: World, model: ServoModel) -> None:
+        self.supply_v = model.supply_v
+        self.commanded = rest(world.clock.now_ns() * 1e-9, world.shaft()[0])
         self._world = world
         self._model = model
-        self.supply_v = model.supply_v
-        self._temperature_c = AMBIENT_C + STANDBY_RISE_C
-        self._settled_s = self._now_s()
-        self._overloaded_s = 0.0
-        self._jammed = False
         self._driven = False
-        self.commanded = rest(self._now_s(), self.angle()[0])
+        self._jammed = False
+        self._temperature_c = AMBIENT_C + STANDBY_RISE_C
+        self._overloaded_s = 0.0
+        self._settled_s = self._now_s()
 
-    # -- motion ---------------------------------------------------------------------------------------------------
+    # -- state ----------------------------------------------------------------------------------------------------
 
     @property
     def fastest_dps(self) -> float:
@@ -61,53 +77,83 @@ class Motor:
         return self._jammed
 
     @property
+    def profile_ongoing(self) -> bool:
+        """Whether the commanded trajectory has not come to its end."""
+        return self._driven and self._now_s() < self.commanded.end_s
+
+    @property
     def busy(self) -> bool:
-        """Whether the load varies: a motion is in progress, or the shaft is held up while driven."""
+        """Whether the load varies: the shaft turns, or is held up while driven."""
         return self._driven and (self._jammed or self.profile_ongoing or self.commanded.velocity_dps[-1] != 0)
 
     @property
-    def profile_ongoing(self) -> bool:
-        return self._driven and self._now_s() < self.commanded.end_s
+    def overloaded(self) -> bool:
+        return self._overloaded_s >= OVERLOAD_S
 
-    def angle(self) -> tuple[float, float]:
-        """Return angle (°) and speed (°/s) of the shaft."""
-        return self._world.shaft()
+    def state(self) -> MotorState:
+        now_s = self._now_s()
+        angle, speed = self._world.shaft()
+        position, velocity = self.commanded.at(now_s)
+        target, target_dps = float(position), float(velocity)
+        load = pwm = 0.0
+        if self._driven:
+            if self._jammed:
+                load = _clamp(PWM_PER_COUNT * (target - angle) / DEG_PER_COUNT / PWM_FULL)
+            else:
+                friction = FRICTION_LOAD * ((speed > 0) - (speed < 0))
+                inertia = (1 - FRICTION_LOAD) * float(self.commanded.acceleration_at(now_s)) / self.steepest_dps2
+                load = _clamp(friction + inertia)
+            pwm = _clamp(speed / self.fastest_dps + load)
+        return MotorState(angle, speed, target, target_dps, load, pwm)
 
-    def command(self) -> tuple[float, float]:
-        """Return angle (°) and speed (°/s) that the shaft should have."""
-        position, velocity = self.commanded.at(self._now_s())
-        return float(position), float(velocity)
+    def terminal_v(self, load: float) -> float:
+        return self.supply_v - SUPPLY_DROP_V * abs(load)
+
+    def temperature_c(self, load: float) -> float:
+        """Return the temperature of the case, taking ``load`` for the time since `settle`."""
+        target = AMBIENT_C + STANDBY_RISE_C + STALL_RISE_C * load**2
+        return target + (self._temperature_c - target) * exp((self._settled_s - self._now_s()) / THERMAL_TIME_S)
+
+    def set_temperature(self, temperature_c: float) -> None:
+        self.settle()
+        self._temperature_c = temperature_c
+
+    def settle(self) -> None:
+        """Account for heat and overload since the last call."""
+        load, now_s = self.state().load, self._now_s()
+        self._temperature_c = self.temperature_c(load)
+        self._overloaded_s = self._overloaded_s + now_s - self._settled_s if abs(load) >= OVERLOAD else 0.0
+        self._settled_s = now_s
+
+    # -- what the controller commands -----------------------------------------------------------------------------
 
     def hold(self) -> None:
         """Drive the shaft, to stay where it is."""
-        self.settle()
-        self._driven = True
-        self._follow(rest(self._now_s(), self.angle()[0]))
+        self._follow(rest(self._now_s(), self._world.shaft()[0]), driven=True)
 
     def release(self) -> None:
         """Drive the shaft no longer; friction stops it."""
-        self.settle()
-        self._driven = False
-        self._follow(to_velocity(self._now_s(), *self.angle(), 0.0, self.steepest_dps2))
+        self._follow(self._stop(), driven=False)
 
     def brake(self) -> None:
         """Stop as fast as possible and hold."""
-        self.settle()
-        self._follow(to_velocity(self._now_s(), *self.angle(), 0.0, self.steepest_dps2))
+        self._follow(self._stop())
 
-    def go_to(self, angle_deg: float, velocity_dps: float, acceleration_dps2: float) -> None:
-        self.settle()
-        self._follow(to_position(self._now_s(), *self.command(), angle_deg, velocity_dps, acceleration_dps2))
+    def go_to(self, angle_deg: float, v_max: float, a_max: float) -> None:
+        state = self.state()
+        self._follow(to_position(self._now_s(), state.target_deg, state.target_dps, angle_deg, v_max, a_max))
 
-    def turn_at(self, velocity_dps: float, acceleration_dps2: float) -> None:
-        self.settle()
-        self._follow(to_velocity(self._now_s(), *self.command(), velocity_dps, acceleration_dps2))
+    def turn_at(self, speed_dps: float, a_max: float) -> None:
+        state = self.state()
+        self._follow(to_velocity(self._now_s(), state.target_deg, state.target_dps, speed_dps, a_max))
+
+    # -- what happens to the shaft --------------------------------------------------------------------------------
 
     def jam(self) -> None:
-        """Hold the shaft where it is, against whatever drives it."""
+        """Block the shaft where it is, against whatever drives it."""
         self.settle()
         self._jammed = True
-        self._world.drive(rest(self._now_s(), self.angle()[0]))
+        self._world.drive(rest(self._now_s(), self._world.shaft()[0]))
 
     def free(self) -> None:
         """Let a jammed shaft go: it makes up for the error as fast as it can."""
@@ -115,64 +161,37 @@ class Motor:
         self._jammed = False
         if not self._driven:
             return
-        angle, goal, cruise = self.angle()[0], float(self.commanded.position_deg[-1]), self.commanded.velocity_dps[-1]
+        angle, cruise = self._world.shaft()[0], float(self.commanded.velocity_dps[-1])
         if cruise:
-            self._follow(to_velocity(self._now_s(), angle, 0.0, float(cruise), self.steepest_dps2))
+            self._follow(to_velocity(self._now_s(), angle, 0.0, cruise, self.steepest_dps2))
         else:
+            goal = float(self.commanded.position_deg[-1])
             self._follow(to_position(self._now_s(), angle, 0.0, goal, self.fastest_dps, self.steepest_dps2))
 
-    def push(self, path: Trajectory) -> None:
-        """Let a hand turn the shaft along ``path``."""
-        self.settle()
-        self._follow(path)
+    def push(self, angle_deg: float, v_max: float, a_max: float) -> float:
+        """Turn the released shaft by ``angle_deg`` from outside; return how many seconds that takes.
 
-    # -- effort ---------------------------------------------------------------------------------------------------
-
-    def load(self) -> float:
-        """Return the torque as a fraction of the stall torque, -1..1, positive counter-clockwise."""
-        if not self._driven:
-            return 0.0
-        if self._jammed:
-            error_counts = (self.command()[0] - self.angle()[0]) / DEG_PER_COUNT
-            return _clamp(PWM_PER_COUNT * error_counts / PWM_FULL)
-        speed = self.angle()[1]
-        friction = FRICTION_LOAD * ((speed > 0) - (speed < 0))
-        inertia = (1 - FRICTION_LOAD) * float(self.commanded.acceleration_at(self._now_s())) / self.steepest_dps2
-        return _clamp(friction + inertia)
-
-    def pwm(self) -> float:
-        """Return the output as a fraction of the supply, -1..1: what the speed and the load take."""
-        return _clamp(self.angle()[1] / self.fastest_dps + self.load()) if self._driven else 0.0
-
-    def terminal_v(self) -> float:
-        return self.supply_v - SUPPLY_DROP_V * abs(self.load())
-
-    def temperature_c(self) -> float:
-        """Return the temperature of the case, taking the present load for the time since `settle`."""
-        target = AMBIENT_C + STANDBY_RISE_C + STALL_RISE_C * self.load() ** 2
-        decay = exp(-(self._now_s() - self._settled_s) / THERMAL_TIME_S)
-        return target + (self._temperature_c - target) * decay
-
-    def set_temperature(self, temperature_c: float) -> None:
-        self.settle()
-        self._temperature_c = temperature_c
-
-    @property
-    def overloaded(self) -> bool:
-        return self._overloaded_s >= OVERLOAD_S
-
-    def settle(self) -> None:
-        """Account for the time since the last call, with the present load."""
-        now_s = self._now_s()
-        self._temperature_c = self.temperature_c()
-        pushing = abs(self.load()) >= OVERLOAD_LOAD and self._jammed
-        self._overloaded_s = self._overloaded_s + now_s - self._settled_s if pushing else 0.0
-        self._settled_s = now_s
+        Raises
+        ------
+        ValueError
+            The shaft is driven or jammed.
+        """
+        if self._driven or self._jammed:
+            raise ValueError("nobody turns a shaft that is held: switch the servo's torque off and free it first")
+        angle, speed = self._world.shaft()
+        self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, v_max, a_max))
+        return self.commanded.end_s - self._now_s()
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
-    def _follow(self, path: Trajectory) -> None:
+    def _stop(self) -> Trajectory:
+        return to_velocity(self._now_s(), *self._world.shaft(), 0.0, self.steepest_dps2)
+
+    def _follow(self, path: Trajectory, driven: bool | None = None) -> None:
+        self.settle()
         self.commanded = path
+        if driven is not None:
+            self._driven = driven
         if not self._jammed:
             self._world.drive(path)
 

@@ -1,6 +1,6 @@
 """Dynamixel Protocol 2.0 as a slave speaks it: instruction packets in, status packets out.
 
-Source: e-manual "DYNAMIXEL Protocol 2.0" (packet format, byte stuffing) and "CRC Calculation" (CRC-16, polynomial 0x8005).
+Source: e-manual "DYNAMIXEL Protocol 2.0" (packet format, byte stuffing) and "CRC Calculation" (CRC-16 of 0x8005).
 """
 
 from dataclasses import dataclass
@@ -102,7 +102,7 @@ class PacketParser:
         """Return the packets that ``data`` completes."""
         buffer = self._buffer
         buffer += data
-        packets = []
+        packets: list[InstructionPacket] = []
         while (start := buffer.find(_HEADER)) >= 0:
             del buffer[:start]
             if len(buffer) < _FIXED:
@@ -139,9 +139,9 @@ def status_packet(bus_id: int, status: Status) -> bytes:
 def fast_status_parts(sizes: list[int], answers: list[tuple[int, Status]]) -> list[bytes]:
     """Return what each device adds to the one status packet of a Fast Sync Read or Fast Bulk Read.
 
-    The packet's length counts all devices asked (``sizes``: bytes asked of each), also those that stay silent; the CRC of
-    each part covers everything before it, so the last one is the packet's own. Nothing is byte-stuffed (e-manual, Fast Sync
-    Read).
+    The packet's length counts all devices asked (``sizes``: bytes asked of each), also those that stay silent; the CRC
+    of each part covers everything before it, so the last one is the packet's own. Nothing is byte-stuffed (e-manual,
+    Fast Sync Read).
     """
     length = 1 + sum(size + 4 for size in sizes)
     frame = _HEADER + bytes((0, BROADCAST_ID)) + length.to_bytes(2, "little") + bytes((_STATUS,))

@@ -126,10 +126,7 @@ class SimSerial:
         now_ns = self._bus.clock.now_ns()
         while self._coming:
             frame = self._coming[0]
-            elapsed_ns = now_ns - frame.start_ns
-            arrived = min(max(elapsed_ns * frame.baudrate // 10_000_000_000, 0), len(frame.data))
-            if frame.arrival_ns(arrived + 1) <= now_ns and arrived < len(frame.data):
-                arrived += 1
+            arrived = frame.arrived(now_ns)
             if frame.baudrate == self.baudrate:
                 self._received += frame.data[self._taken : arrived]
             self._taken = arrived

@@ -1,0 +1,217 @@
+"""The servo's motion control: registers in, trajectories out, and the registers that report how it goes."""
+
+from enum import IntEnum
+
+from sim.servo.control_table import Memory
+from sim.servo.models import (
+    COUNTS_PER_TURN,
+    DEG_PER_COUNT,
+    DPS2_PER_UNIT,
+    DPS_PER_UNIT,
+    EXTENDED_POSITION_MODE,
+    POSITION_MODE,
+    PWM_FULL,
+    VELOCITY_MODE,
+    ServoModel,
+)
+from sim.servo.motor import Motor
+from sim.world import World
+
+IN_POSITION_COUNTS = 4
+FOLLOWING_ERROR_COUNTS = 100
+"""The e-manual calls these two thresholds of Moving Status predefined and gives no numbers."""
+SINGLE_TURN_HOMING_COUNTS = 1024
+"""A Homing Offset beyond it is ignored in position mode."""
+TICK_MODULUS_MS = 32_768
+
+_REVERSE, _TIME_BASED = 0x01, 0x04  # bits of Drive Mode
+_GAINS = (
+    "Velocity I Gain",
+    "Velocity P Gain",
+    "Position D Gain",
+    "Position I Gain",
+    "Position P Gain",
+    "Feedforward 2nd Gain",
+    "Feedforward 1st Gain",
+)
+
+
+class Profile(IntEnum):
+    """Profile Type of Moving Status."""
+
+    STEP = 0
+    RECTANGULAR = 1
+    TRIANGULAR = 2
+    TRAPEZOIDAL = 3
+
+
+class Controller:
+    """Turns the goal registers into the motor's trajectories.
+
+    Position registers count steps of `DEG_PER_COUNT` from the encoder's zero, in the direction of Drive Mode; the turns
+    count until they are forgotten where the e-manual says so (`wrap_position`). Gains, PWM and current limits are kept
+    but do not act.
+    """
+
+    def __init__(self, world: World, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
+        self._world = world
+        self._memory = memory
+        self._motor = motor
+        self._model = model
+        self._center = center_counts
+        self._rng = world.rng(f"servo-{memory['ID']}")
+        self._turns_counts = 0
+        self._profile = Profile.STEP
+        self._started_ns = 0
+
+    # -- commands -------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin at power-up, with torque off and the initial values in RAM."""
+        self._started_ns = self._world.clock.now_ns()
+        self._profile = Profile.STEP
+        self._memory["Goal PWM"] = self._memory["PWM Limit"]
+        if "Goal Current" in self._memory:
+            self._memory["Goal Current"] = self._memory["Current Limit"]
+        self.wrap_position()
+
+    def change_mode(self) -> None:
+        """Reset what a change of the Operating Mode resets (e-manual, Operating Mode and Present Position)."""
+        for name in ("Profile Velocity", "Profile Acceleration", "Goal Velocity"):
+            self._memory[name] = 0
+        for name in _GAINS:
+            self._memory[name] = self._model.initial.get(name, 0)
+        self._memory["Goal PWM"] = self._memory["PWM Limit"]
+        if self._memory["Operating Mode"] in (POSITION_MODE, EXTENDED_POSITION_MODE):
+            self.wrap_position()
+
+    def torque_on(self) -> None:
+        """Take the shaft as it stands: a goal written while torque was off does not count."""
+        if self._memory["Operating Mode"] == POSITION_MODE:
+            self.wrap_position()
+        self._motor.hold()
+        self._memory["Goal Position"] = self._present_position()
+        self._memory["Goal Velocity"] = 0
+        self._profile = Profile.STEP
+
+    def stop(self) -> None:
+        """Stop and hold, as a tripped Bus Watchdog does; the goal stays, for the next one to replace."""
+        self._memory["Profile Velocity"] = self._memory["Profile Acceleration"] = 0
+        self._profile = Profile.STEP
+        self._motor.brake()
+
+    def pursue_position(self) -> None:
+        """Plan the profile to Goal Position (e-manual, "What is the Profile"); other modes take no notice."""
+        if self._memory["Operating Mode"] == VELOCITY_MODE:
+            return
+        goal_deg = self._degrees(self._memory["Goal Position"])
+        velocity, acceleration = self._memory["Profile Velocity"], self._memory["Profile Acceleration"]
+        v_max = min(self._motor.fastest_dps, self._memory["Velocity Limit"] * DPS_PER_UNIT)
+        a_max = self._motor.steepest_dps2
+        if velocity and self._time_based:
+            ramp_s = min(acceleration, velocity / 2) * 1e-3
+            distance = abs(goal_deg - self._motor.state().target_deg)
+            v_max = min(v_max, distance / (velocity * 1e-3 - ramp_s))
+            a_max = min(a_max, v_max / ramp_s) if ramp_s else a_max
+        elif velocity:
+            v_max = min(v_max, velocity * DPS_PER_UNIT)
+            a_max = min(a_max, acceleration * DPS2_PER_UNIT) if acceleration else a_max
+        self._motor.go_to(goal_deg, max(v_max, _STANDSTILL), max(a_max, _STANDSTILL))
+        if not velocity:
+            self._profile = Profile.STEP
+        elif not acceleration:
+            self._profile = Profile.RECTANGULAR
+        else:
+            peak = float(abs(self._motor.commanded.velocity_dps).max())
+            self._profile = Profile.TRAPEZOIDAL if peak >= v_max * (1 - 1e-9) else Profile.TRIANGULAR
+
+    def pursue_velocity(self) -> None:
+        """Ramp to Goal Velocity; other modes take no notice."""
+        if self._memory["Operating Mode"] != VELOCITY_MODE:
+            return
+        fastest = self._motor.fastest_dps
+        goal_dps = min(max(self._sign * self._memory["Goal Velocity"] * DPS_PER_UNIT, -fastest), fastest)
+        acceleration, a_max = self._memory["Profile Acceleration"], self._motor.steepest_dps2
+        if acceleration and self._time_based:
+            a_max = min(a_max, abs(goal_dps - self._motor.state().target_dps) / (acceleration * 1e-3))
+        elif acceleration:
+            a_max = min(a_max, acceleration * DPS2_PER_UNIT)
+        self._motor.turn_at(goal_dps, max(a_max, _STANDSTILL))
+        self._profile = Profile.TRAPEZOIDAL if acceleration else Profile.STEP
+
+    def wrap_position(self) -> None:
+        """Forget the turns: from here on the position counts from within one revolution."""
+        self._turns_counts = 0
+        present = self._present_position() - self._homing
+        self._turns_counts = present - present % COUNTS_PER_TURN
+        self._memory["Goal Position"] = self._present_position()
+
+    # -- reports --------------------------------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Fill in the registers that follow the world."""
+        memory, motor, state = self._memory, self._motor, self._motor.state()
+        present, target = self._present_position(), self._counts(state.target_deg)
+        velocity = self._sign * round(state.speed_dps / DPS_PER_UNIT)
+        status = self._moving_status(present, target)
+        noise_v = self._world.noise.voltage_noise_v
+        voltage = motor.terminal_v(state.load) + (noise_v * self._rng.standard_normal() if noise_v else 0.0)
+        elapsed_ms = (self._world.clock.now_ns() - self._started_ns) // 1_000_000
+        memory["Realtime Tick"] = elapsed_ms % TICK_MODULUS_MS
+        memory["Moving"] = int(bool(status & 0x02) or abs(velocity) > memory["Moving Threshold"])
+        memory["Moving Status"] = status
+        memory["Present PWM"] = self._sign * round(state.pwm * PWM_FULL)
+        if self._model.stall_current is None:
+            memory["Present Load"] = self._sign * round(state.load * 1000)
+        else:
+            memory["Present Current"] = self._sign * round(state.load * self._model.stall_current)
+        memory["Present Velocity"] = velocity
+        memory["Present Position"] = present
+        memory["Velocity Trajectory"] = self._sign * round(state.target_dps / DPS_PER_UNIT)
+        memory["Position Trajectory"] = target
+        memory["Present Input Voltage"] = max(round(voltage * 10), 0)
+        memory["Present Temperature"] = min(max(round(motor.temperature_c(state.load)), 0), 255)
+
+    def _moving_status(self, present: int, target: int) -> int:
+        if not self._memory["Torque Enable"]:
+            return 0
+        profile = self._profile << 4
+        if self._memory["Operating Mode"] == VELOCITY_MODE:
+            return profile
+        in_position = abs(self._memory["Goal Position"] - present) <= IN_POSITION_COUNTS
+        ongoing = self._profile != Profile.STEP and self._motor.profile_ongoing
+        following_error = abs(target - present) > FOLLOWING_ERROR_COUNTS
+        return profile | following_error << 3 | ongoing << 1 | in_position
+
+    # -- scales ---------------------------------------------------------------------------------------------------
+
+    @property
+    def _sign(self) -> int:
+        return -1 if self._memory["Drive Mode"] & _REVERSE else 1
+
+    @property
+    def _time_based(self) -> bool:
+        return bool(self._memory["Drive Mode"] & _TIME_BASED)
+
+    @property
+    def _homing(self) -> int:
+        offset = self._memory["Homing Offset"]
+        ignored = self._memory["Operating Mode"] == POSITION_MODE and abs(offset) > SINGLE_TURN_HOMING_COUNTS
+        return 0 if ignored else offset
+
+    def _counts(self, angle_deg: float) -> int:
+        """Return the value of a position register at a shaft angle."""
+        return self._sign * round(angle_deg / DEG_PER_COUNT + self._center) - self._turns_counts + self._homing
+
+    def _degrees(self, counts: int) -> float:
+        """Return the shaft angle of a position register's value."""
+        return (self._sign * (counts - self._homing + self._turns_counts) - self._center) * DEG_PER_COUNT
+
+    def _present_position(self) -> int:
+        noise_deg = self._world.noise.encoder_noise_deg
+        error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
+        return self._counts(self._world.shaft()[0] + error_deg)
+
+
+_STANDSTILL = 1e-9
+"""Smallest limit of a profile: one planned to where the shaft is already has no speed of its own."""
