@@ -1,0 +1,44 @@
+# Two commands matter: `make demo` and `make test`. Both set up everything in .venv, without root, and may be run again.
+
+PYTHON ?= python3
+BIN    := .venv/bin
+READY  := .venv/.ready
+# With several threads small matrix products wait for each other; one is faster here.
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: demo test lint bench lock clean help
+
+help:
+	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
+	@echo "make test   run all tests"
+	@echo "make lint   formatting, lint, types, import contracts"
+	@echo "make bench  speed, as ratios against named peers"
+	@echo "make clean  remove what the others made"
+
+demo: $(READY)
+	@$(BIN)/rig demo
+
+test: $(READY)
+	@$(BIN)/python -m pytest
+
+lint: $(READY)
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+bench: $(READY)
+	@for file in benchmarks/bench_*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
+
+# Locked versions with their hashes, for every platform and Python that the project supports.
+lock:
+	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
+	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
+
+$(READY): requirements.lock pyproject.toml
+	@sh .ci/setup "$(PYTHON)"
+	@touch $@
+
+clean:
+	rm -rf .venv .tools rig-demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
