@@ -42,16 +42,19 @@ LOW_HIGH: Final = np.stack([_membership(_LEVELS, t) for t in ((0, 0, 68, 188), (
 
 
 def _hue_tables() -> tuple[FloatArray, NDArray[np.intp]]:
-    memberships = np.stack([_membership(np.arange(360, dtype=np.float64), t) for t in _HUES])
+    hues = np.arange(360)
+    memberships = np.stack([_membership(hues.astype(np.float64), t) for t in _HUES])
     first = (memberships > 0).argmax(axis=0)
     second = np.minimum(first + 1, len(_HUES) - 1)
-    rows = np.arange(360)
-    weights = np.stack([memberships[first, rows], np.where(second > first, memberships[second, rows], 0.0)])
-    return weights, np.stack([first, second]) % 7  # class 7 is red, like class 0
+    weights = np.stack([memberships[first, hues], np.where(second > first, memberships[second, hues], 0.0)])
+    shades = 3 + 3 * (np.stack([first, second], axis=1) % 7)[:, :, None] + np.arange(3)  # class 7 is red, like class 0
+    neutrals = np.broadcast_to(np.arange(3), (hues.size, 3))
+    return weights, np.concatenate([neutrals, shades.reshape(-1, 6)], axis=1)
 
 
-#: (2, 360) each: memberships of the (at most two, neighbouring) active hue classes, and their colours 0..6.
-HUE_WEIGHT, HUE_COLOUR = _hue_tables()
+#: (2, 360): memberships of the two neighbouring hue classes that can be active at each hue.
+#: (360, 9): bins of white, grey, black and of the light, pure and dark shade of these two classes' colours.
+HUE_WEIGHT, HUE_BINS = _hue_tables()
 
 _REPRESENTATIVES: Final = (
     # class 0 (no edge); class 1 (non-directional); classes 2, 3 (horizontal, vertical); classes 4, 5 (diagonals)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr._cedd_tables import (
-    HUE_COLOUR,
+    HUE_BINS,
     HUE_WEIGHT,
     LOW_HIGH,
     REPRESENTATIVES,
@@ -34,10 +34,11 @@ LONGEST_SIDE: Final = 640
 
 _EDGE_THRESHOLD: Final = 14.0
 _CLASS_THRESHOLDS: Final = np.array([[0.68], [0.98], [0.98], [0.98], [0.98]])
-_LUMINANCE: Final = np.array([114.0, 587.0, 299.0])  # thousandths of B, G, R
+#: Of a pixel B, G, R: the three channels, and the luminance in thousandths.
+_CHANNELS: Final = np.column_stack([np.eye(3), [114.0, 587.0, 299.0]])
 _SQRT2: Final = np.sqrt(2.0)
-_NO_EDGE: Final = 0
-_HSV_OFFSET: Final = np.array([0.0, 119.0, 239.0])  # not 120 and 240: the fuzzy sets are tuned to these
+#: Non-directional, horizontal and vertical edge, of the quarters a, b, c, d.
+_FILTERS: Final = np.array([[2.0, -2.0, -2.0, 2.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
 
 
 def cedd(image_bgr: ImageArray) -> LevelArray:
@@ -62,15 +63,19 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
         The image is no uint8 array, or is not of shape (H, W, 3).
     """
     _check_image(image_bgr)
-    grid = _grid(*image_bgr.shape[:2])
+    image = np.ascontiguousarray(image_bgr)
+    grid = _grid(*image.shape[:2])
     if 0 in grid[:2]:
         return np.zeros(BINS, np.uint8)
-    quarter_sums = _quarter_sums(image_bgr, grid)
-    colours, outputs = _colour_outputs(quarter_sums, grid)
-    blocks, textures = _texture_classes(image_bgr, quarter_sums, grid)
+    quarter_sums = _quarter_sums(image, grid)
+    textures, blocks = _texture_votes(_areas(image, quarter_sums, grid))
+    bins, outputs = _colour_outputs(*_block_colours(quarter_sums, grid))
     # bincount adds in the order given: raster order in every bin, so the sums equal the reference's to the last bit
-    bins = colours[:, blocks] + 24 * textures
-    histogram = np.bincount(bins.T.ravel(), weights=outputs[:, blocks].T.ravel(), minlength=BINS)
+    histogram = np.bincount(
+        (bins.take(blocks, axis=0) + 24 * textures[:, None]).ravel(),
+        weights=outputs.take(blocks, axis=0).ravel(),
+        minlength=BINS,
+    )
     shares = histogram / histogram.cumsum()[-1]
     levels: NDArray[np.intp] = np.abs(shares[:, None] - REPRESENTATIVES).argmin(axis=1)
     return levels.astype(np.uint8)
@@ -155,99 +160,96 @@ def _grid(height: int, width: int) -> _Grid:
 
 
 def _quarter_sums(image: ImageArray, grid: _Grid) -> FloatArray:
-    """Sums of B, G, R over each quarter of each block, (3, 2 * rows, 2 * columns); whole numbers, exact."""
-    rows, columns, quarter_height, quarter_width = grid
-    covered = image[: 2 * rows * quarter_height, : 2 * columns * quarter_width]
-    if quarter_height > 1:
-        strips = covered.reshape(2 * rows, quarter_height, -1)
-        narrow = np.uint16 if quarter_height <= 257 else np.uint32  # 257 * 255 still fits 16 bits
-        covered = np.add.reduce(strips, axis=1, dtype=narrow)
-    pixels = covered.reshape(-1, 3 * quarter_width).astype(np.float64)
-    channel_of = np.tile(np.eye(3), (1, quarter_width))
-    return (channel_of @ pixels.T).reshape(3, 2 * rows, 2 * columns)
+    """Sums of B, G, R and luminance in thousandths over the quarters of the blocks, exact whole numbers.
+
+    Of shape (4, 2 * rows, 2 * columns).
+    """
+    rows, columns, height, width = grid
+    strips = image[: 2 * rows * height, : 2 * columns * width].reshape(2 * rows, height, -1)
+    if height > 1:
+        # 257 * 255 still fits 16 bits
+        strips = np.add.reduce(strips, axis=1, dtype=np.uint16 if height <= 257 else np.uint32)
+    pixels = strips.reshape(-1, 3 * width).astype(np.float64)
+    sums: FloatArray = np.ascontiguousarray((pixels @ np.tile(_CHANNELS, (width, 1))).T)
+    return sums.reshape(4, 2 * rows, 2 * columns)
 
 
 def _areas(image: ImageArray, quarter_sums: FloatArray, grid: _Grid) -> FloatArray:
-    """Luminance of each quarter, (2 * rows, 2 * columns), whole numbers 0..255 cut as the reference cuts them.
+    """Luminance of the quarters (a top left, b top right, c, d) of the blocks, (4, blocks), whole numbers 0..255.
 
-    The reference sums ``0.114 B + 0.587 G + 0.299 R`` pixel by pixel in double and truncates. Exact arithmetic gives
-    the same, except where the true mean is a whole number: there the rounding errors decide, and have to be repeated.
+    The reference sums ``0.114 B + 0.587 G + 0.299 R`` pixel by pixel in double and truncates the mean. Exact arithmetic
+    gives the same, except where the true mean is a whole number: there the rounding errors decide and are repeated.
     """
     rows, columns, height, width = grid
-    mean = np.tensordot(_LUMINANCE, quarter_sums, 1) / (1000.0 * height * width)
+    mean = quarter_sums[3].ravel() / (1000.0 * height * width)
     area = np.floor(mean)
-    undecided = np.nonzero((mean == area) & (area > 0))
-    if undecided[0].size:
-        covered = image[: 2 * rows * height, : 2 * columns * width]
-        pixels = covered.reshape(2 * rows, height, 2 * columns, width, 3)[undecided[0], :, undecided[1]]
-        blue, green, red = np.moveaxis(pixels, -1, 0).reshape(3, len(pixels), -1).astype(np.float64)
-        luminance = (0.114 * blue + 0.587 * green) + 0.299 * red
-        total = luminance.cumsum(axis=1)[:, -1]  # cumsum adds in order, sum would add in pairs
+    undecided = np.flatnonzero((mean == area) & (area > 0))
+    if len(undecided):
+        i, j = np.divmod(undecided, 2 * columns)
+        pixels, stride = image.reshape(-1, 3), image.shape[1]
+        total = np.zeros(len(undecided))
+        for offset in (y * stride + x for y in range(height) for x in range(width)):
+            blue, green, red = pixels.take(i * height * stride + j * width + offset, axis=0).T
+            total += (0.114 * blue + 0.587 * green) + 0.299 * red
         area[undecided] = np.trunc(total * (4.0 / (4 * height * width)))
-    return area
+    by_quarter: FloatArray = area.reshape(rows, 2, columns, 2).transpose(1, 3, 0, 2).reshape(4, -1)
+    return by_quarter
 
 
-def _texture_classes(
-    image: ImageArray, quarter_sums: FloatArray, grid: _Grid
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Block and texture class of every vote, blocks in raster order; a block may be of several classes."""
-    area = _areas(image, quarter_sums, grid)
-    a, b, c, d = (area[i::2, j::2].ravel() for i in (0, 1) for j in (0, 1))
-    magnitudes = np.abs(
-        [
-            2 * a - 2 * b - 2 * c + 2 * d,
-            a + b - c - d,
-            a - b + c - d,
-            a * _SQRT2 - d * _SQRT2,
-            b * _SQRT2 - c * _SQRT2,
-        ]
-    )
+def _texture_votes(areas: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Texture class and block of every vote, blocks ascending in each class; a block may be of several classes."""
+    scaled = areas * _SQRT2
+    magnitudes = np.concatenate([_FILTERS @ areas, scaled[:2] - scaled[:1:-1]])  # the diagonals: a - d, b - c
+    np.abs(magnitudes, out=magnitudes)
     strongest = magnitudes.max(axis=0)
     is_edge = strongest >= _EDGE_THRESHOLD
-    votes = np.empty((6, strongest.size), np.bool_)
-    votes[_NO_EDGE] = ~is_edge
+    votes = np.empty((6, areas.shape[1]), np.bool_)
+    np.logical_not(is_edge, out=votes[0])
     np.greater(magnitudes / np.maximum(strongest, _EDGE_THRESHOLD), _CLASS_THRESHOLDS, out=votes[1:])
     votes[1:] &= is_edge
-    blocks, textures = np.nonzero(votes.T)
-    return blocks, textures
+    textures, blocks = np.divmod(np.flatnonzero(votes), areas.shape[1])
+    return textures, blocks
 
 
-def _hsv(blue: FloatArray, green: FloatArray, red: FloatArray) -> NDArray[np.intp]:
-    """Hue 0..358, saturation 0..255, value 0..255 of whole-number colours, (3, blocks)."""
-    rgb = np.stack([red, green, blue])
-    value = rgb.max(axis=0)
-    spread = value - rgb.min(axis=0)
+def _block_colours(quarter_sums: FloatArray, grid: _Grid) -> FloatArray:
+    """Mean B, G, R of the blocks, cut to whole numbers, (3, blocks)."""
+    *_, height, width = grid
+    halves = quarter_sums[:3, ::2] + quarter_sums[:3, 1::2]
+    sums = halves[:, :, ::2] + halves[:, :, 1::2]
+    return np.floor(sums / (4 * height * width)).reshape(3, -1)
+
+
+def _hsv(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[NDArray[np.intp], ...]:
+    """Hue 0..358, saturation 0..255 and value 0..255 of whole-number colours."""
+    value = np.maximum(np.maximum(red, green), blue)
+    spread = value - np.minimum(np.minimum(red, green), blue)
     saturation = 255 * spread / np.maximum(value, 1)
-    case = rgb.argmax(axis=0)  # the first of equals, as in the reference: red, green, blue
-    difference = np.choose(case, [green - blue, blue - red, red - green])
-    hue = np.where(difference < 0, np.choose(case, [359.0, 119.0, 239.0]), _HSV_OFFSET[case])
-    hue += 60 * difference / np.maximum(spread, 1)
-    return np.stack([hue, saturation, value]).astype(np.intp)
+    is_red, is_green = red == value, green == value
+    difference = np.where(is_red, green - blue, np.where(is_green, blue - red, red - green))
+    # 359, 119, 239 and not 360, 120, 240: the fuzzy sets are tuned to these
+    offset = np.where(is_red, 359.0 * (difference < 0), np.where(is_green, 119.0, 239.0))
+    hue = offset + 60 * difference / np.maximum(spread, 1)
+    return hue.astype(np.intp), saturation.astype(np.intp), value.astype(np.intp)
 
 
-def _colour_outputs(quarter_sums: FloatArray, grid: _Grid) -> tuple[NDArray[np.intp], FloatArray]:
-    """Outputs of the two fuzzy systems: colours 0..23 and their votes, (9, blocks) each.
+def _colour_outputs(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """Votes of the two fuzzy systems: the bins 0..23 each block votes for and the weights, (blocks, 9) each.
 
     At most two hue classes are active, so nine of the 24 outputs can differ from 0: white, grey, black, and the light,
     pure and dark shade of two colours.
     """
-    rows, columns, height, width = grid
-    sums = quarter_sums.reshape(3, rows, 2, columns, 2).sum(axis=(2, 4)).reshape(3, -1)
-    hue, saturation, value = _hsv(*np.floor(sums / (4 * height * width)))
+    hue, saturation, value = _hsv(blue, green, red)
 
-    # rules of the first system: hue class (2), saturation (2), value (3)
-    rules = np.minimum(SATURATION[:, None, saturation], VALUE[None, :, value])
-    active = np.minimum(HUE_WEIGHT[:, None, None, hue], rules)
+    # rules of the first system: saturation (2), value (3); then with the hue class (2)
+    rules = np.minimum(SATURATION.take(saturation, axis=1)[:, None], VALUE.take(value, axis=1))
+    active = np.minimum(HUE_WEIGHT.take(hue, axis=1)[:, None, None], rules)
     black = ((active[0, 0, 0] + active[0, 1, 0]) + active[1, 0, 0]) + active[1, 1, 0]
     grey, white = active[0, 0, 1:] + active[1, 0, 1:]
     coloured = active[:, 1, 1] + active[:, 1, 2]
 
-    # the second system: saturation (2), value (2)
-    shade = np.minimum(LOW_HIGH[:, None, saturation], LOW_HIGH[None, :, value])
+    # the second system: saturation (2), value (2), each low and high
+    shade = np.minimum(LOW_HIGH.take(saturation, axis=1)[:, None], LOW_HIGH.take(value, axis=1))
     shades = np.stack([shade[0, 1], shade[1, 1], shade[0, 0] + shade[1, 0]])
 
-    outputs = np.concatenate([np.stack([white, grey, black]), (coloured[:, None] * shades).reshape(6, -1)])
-    colours = np.empty(outputs.shape, np.intp)
-    colours[:3] = np.arange(3)[:, None]
-    colours[3:] = (3 + 3 * HUE_COLOUR[:, None, hue] + np.arange(3)[:, None]).reshape(6, -1)
-    return colours, outputs
+    outputs = np.concatenate([[white, grey, black], *(coloured[:, None] * shades)])
+    return HUE_BINS.take(hue, axis=0), np.ascontiguousarray(outputs.T)

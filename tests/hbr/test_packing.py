@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hbr import pack, unpack
+
+
+@given(arrays(np.uint8, 144, elements=st.integers(0, 7)))
+def test_unpack_restores_what_pack_wrote(levels: np.ndarray) -> None:
+    packed = pack(levels)
+    assert len(packed) == 54
+    assert (unpack(packed) == levels).all()
+
+
+@given(st.binary(min_size=54, max_size=54))
+def test_every_54_bytes_are_a_descriptor(packed: bytes) -> None:
+    assert pack(unpack(packed)) == packed
+
+
+def test_bin_0_comes_first_and_its_high_bit_first() -> None:
+    levels = np.zeros(144, np.uint8)
+    levels[:3] = 0b100, 0b011, 0b110
+    levels[-1] = 0b101
+    assert pack(levels) == bytes([0b10001111, 0b00000000]) + bytes(51) + bytes([0b101])
+
+
+def test_other_integers_are_welcome() -> None:
+    assert pack([7] * 144) == b"\xff" * 54  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("levels", "error", "message"),
+    [
+        (np.full(144, 8), ValueError, "not 0..7"),
+        (np.full(144, -1), ValueError, "not 0..7"),
+        (np.zeros((1, 144), np.uint8), ValueError, "one descriptor at a time"),
+        (np.zeros(143, np.uint8), ValueError, "shape"),
+        (np.zeros(144), TypeError, "integer levels"),
+    ],
+)
+def test_what_is_no_descriptor_is_refused(levels: np.ndarray, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        pack(levels)
+
+
+@pytest.mark.parametrize("count", [0, 53, 55])
+def test_a_wrong_number_of_bytes_is_refused(count: int) -> None:
+    with pytest.raises(ValueError, match=f"{count} bytes; a packed descriptor has 54"):
+        unpack(bytes(count))

@@ -1,0 +1,65 @@
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hbr import tanimoto
+
+
+def levels(rows: int) -> st.SearchStrategy[np.ndarray]:
+    return arrays(np.uint8, (rows, 144), elements=st.integers(0, 7), fill=st.sampled_from([0, 0, 7]))
+
+
+@settings(max_examples=50)
+@given(levels(3), levels(4))
+def test_equals_exact_fractions(a: np.ndarray, b: np.ndarray) -> None:
+    found = tanimoto(a, b)
+    assert found.shape == (3, 4)
+    for i, x in enumerate(a.astype(int)):
+        for j, y in enumerate(b.astype(int)):
+            dot = int(x @ y)
+            union = int(x @ x + y @ y) - dot
+            assert found[i, j] == (float(Fraction(dot, union)) if union else 0.0)
+
+
+def test_full_bytes_are_exact_too() -> None:
+    a = np.full((1, 144), 255, np.uint8)
+    b = a.copy()
+    b[0, 0] = 254
+    dot = 143 * 255**2 + 255 * 254
+    assert tanimoto(a, b)[0, 0] == dot / (144 * 255**2 + 143 * 255**2 + 254**2 - dot)
+
+
+def test_long_rows_of_bytes_are_exact() -> None:
+    a = np.full((1, 301), 255, np.uint8)
+    b = np.full((1, 301), 253, np.uint8)
+    dot = 301 * 255 * 253
+    assert tanimoto(a, b)[0, 0] == dot / (301 * 255**2 + 301 * 253**2 - dot)
+
+
+def test_equal_ratios_of_different_integers_are_equal() -> None:
+    query = np.zeros(144, np.uint8)
+    query[:2] = 1
+    rows = np.zeros((2, 144), np.uint8)
+    rows[0, 0] = 1  # 1 / (2 + 1 - 1)
+    rows[1, :4] = 1  # 2 / (2 + 4 - 2)
+    assert tanimoto(query, rows).tolist() == [[0.5, 0.5]]
+
+
+def test_zero_rows_are_unlike_everything() -> None:
+    zero, one = np.zeros(144, np.uint8), np.ones(144, np.uint8)
+    assert tanimoto(np.stack([zero, one]), np.stack([zero, one])).tolist() == [[0, 0], [0, 1]]
+
+
+def test_real_valued_averages_are_compared_as_they_are() -> None:
+    a, b = np.array([0.5, 1.5]), np.array([2.0, 0.25])
+    dot = 0.5 * 2.0 + 1.5 * 0.25
+    assert tanimoto(a, b)[0, 0] == pytest.approx(dot / (2.5 + 4.0625 - dot), abs=1e-15)
+
+
+def test_rows_of_different_length_are_refused() -> None:
+    with pytest.raises(ValueError, match="same d"):
+        tanimoto(np.zeros(144, np.uint8), np.zeros(143, np.uint8))
