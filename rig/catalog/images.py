@@ -17,11 +17,11 @@ from rig.errors import CatalogError, UsageError
 IMAGE_FOLDER: Final = "images"
 MAX_SLUG_LENGTH: Final = 40
 
-# Of the lossless settings the fastest within 1 % of the smallest on noisy frames, where searching for repeats is lost
-# time. OpenCV before 4.12 chooses its filter by itself.
+# The fastest lossless settings for camera frames, and among the smallest: noise hides the repeats that the other
+# strategies search for. OpenCV before 4.12 chooses its filter by itself.
 PNG_SETTINGS: Final = [
     cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
     *([cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG] if hasattr(cv2, "IMWRITE_PNG_FILTER") else []),
 ]
 

@@ -149,7 +149,7 @@ def model_set(connection: Connection) -> tuple[hbr.Views, NDArray[np.int64]]:
         return hbr.Views.empty(), np.empty(0, np.int64)
     object_ids, view_ids, azimuths_deg, packed = zip(*rows, strict=True)
     known_ids, object_index = np.unique(np.array(object_ids, np.int64), return_inverse=True)
-    names = dict(connection.execute(select(objects.c.id, objects.c.name)).tuples().all())
+    names = {object_id: name for object_id, name in connection.execute(select(objects.c.id, objects.c.name))}
     loaded = hbr.Views(
         descriptors=unpack_rows(b"".join(packed)),
         azimuth_deg=np.array(azimuths_deg, np.float64),
@@ -161,13 +161,12 @@ def model_set(connection: Connection) -> tuple[hbr.Views, NDArray[np.int64]]:
 
 def unpack_rows(packed: bytes) -> NDArray[np.uint8]:
     """Unpack joined descriptors, 54 bytes each, to levels, uint8 (n, 144): `hbr.unpack` for all of them at once."""
-    levels_of_24_bits = np.frombuffer(packed, np.uint8).reshape(-1, 18, 3).astype(np.uint32) @ _BYTE_WEIGHTS
-    levels = (levels_of_24_bits[:, :, None] >> _LEVEL_SHIFTS) & 7
-    return levels.astype(np.uint8).reshape(-1, 144)
-
-
-_BYTE_WEIGHTS = np.array([1 << 16, 1 << 8, 1], np.uint32)
-_LEVEL_SHIFTS = np.arange(21, -1, -3, dtype=np.uint32)
+    eights = np.frombuffer(packed, np.uint8).reshape(-1, 18, 3).astype(np.uint32)  # 3 bytes are 8 levels of 3 bits
+    bits = eights[..., 0] << 16 | eights[..., 1] << 8 | eights[..., 2]
+    levels = np.empty((*bits.shape, 8), np.uint8)
+    for place in range(8):
+        levels[..., place] = bits >> (21 - 3 * place) & 7
+    return levels.reshape(-1, 144)
 
 
 def _sitting(row: Row[Any]) -> Sitting:
