@@ -25,6 +25,7 @@ from rig.catalog.records import (
     Sitting,
     StoredView,
     check_azimuth,
+    check_text,
     clean_name,
 )
 from rig.catalog.schema import enrollments, objects, sittings, views
@@ -143,13 +144,15 @@ class Catalog:
             raise UsageError("an enrollment with no views is planned", next_step="plan at least one view")
         for azimuth_deg in plan:
             check_azimuth(azimuth_deg)
+        given = {key: text for key, text in (("label", label), ("note", note)) if text is not None}
+        for key, text in given.items():
+            check_text(text, key)
         now = self._clock.utc()
         with self._database.write() as connection:
             object_id = connection.scalar(select(objects.c.id).where(objects.c.name == name))
             if object_id is None:
-                object_id = insert_row(
-                    connection, objects, name=name, label=label or "", note=note or "", created_utc=now
-                )
+                texts = {"label": "", "note": ""} | given
+                object_id = insert_row(connection, objects, name=name, created_utc=now, **texts)
             else:
                 if not replace:
                     _check_not_enrolled(connection, object_id, name)
@@ -158,7 +161,6 @@ class Catalog:
                     .where(_current(object_id, EnrollmentStatus.IN_PROGRESS))
                     .values(status=EnrollmentStatus.ABANDONED, finished_utc=now)
                 )
-                given = {key: value for key, value in (("label", label), ("note", note)) if value is not None}
                 if given:
                     connection.execute(update(objects).where(objects.c.id == object_id).values(given))
             enrollment_id = insert_row(
@@ -169,9 +171,7 @@ class Catalog:
                 started_utc=now,
                 planned_azimuth_deg=plan,
             )
-            enrollment = self._sit_down(connection, enrollment_id, object_id, name, plan, provenance)
-            images.make_folder(self.path / enrollment.folder, within=self.path)
-        return enrollment
+            return self._sit_down(connection, enrollment_id, object_id, name, plan, provenance)
 
     def resumable(self, name: str) -> EnrollmentSummary | None:
         """Return the unfinished enrollment of an object, with the views it has, or None.
@@ -291,7 +291,7 @@ class Catalog:
             devices=provenance.devices,
             conditions=provenance.conditions,
         )
-        return Enrollment(
+        enrollment = Enrollment(
             self._database,
             self._clock,
             id=enrollment_id,
@@ -300,6 +300,8 @@ class Catalog:
             sitting=Sitting(sitting_id, now, provenance),
             planned_azimuth_deg=plan,
         )
+        images.make_folder(self.path / enrollment.folder, within=self.path)
+        return enrollment
 
 
 def _current(object_id: int, status: EnrollmentStatus) -> ColumnElement[bool]:

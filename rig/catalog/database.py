@@ -82,14 +82,11 @@ class Database:
         """Turn the errors of SQLite and of the file system into the catalog's."""
         try:
             yield
-        except DBAPIError as error:
-            if isinstance(error.orig, sqlite3.Error) and (told := self._of_sqlite(error.orig)):
-                raise told from error
-            raise
-        except sqlite3.Error as error:
-            if told := self._of_sqlite(error):
-                raise told from error
-            raise
+        except (DBAPIError, sqlite3.Error) as error:
+            told = self._of_sqlite(error.orig if isinstance(error, DBAPIError) else error)
+            if told is None:
+                raise
+            raise told from error
         except OSError as error:
             raise self._of_system(error) from error
 
@@ -141,12 +138,7 @@ class Database:
 
     def _create_tables(self) -> None:
         with closing(self._connect()) as connection:  # the journal mode is set outside of transactions
-            (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
-        if mode != "wal":
-            raise CatalogError(
-                f"the disk of {self.root} cannot hold a catalog (SQLite offers journal mode {mode}, not wal)",
-                next_step="put the catalog on a local disk",
-            )
+            connection.execute("PRAGMA journal_mode = WAL")
         with self.write() as transaction:
             if _is_empty(transaction):  # nobody else was faster
                 METADATA.create_all(transaction)
@@ -167,7 +159,7 @@ class Database:
                 evidence={"found": version, "known": SCHEMA_VERSION},
             )
 
-    def _of_sqlite(self, error: sqlite3.Error) -> RigError | None:
+    def _of_sqlite(self, error: BaseException | None) -> RigError | None:
         evidence = {"sqlite": str(error)}
         match getattr(error, "sqlite_errorcode", 0) & 0xFF:
             case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED:
@@ -210,8 +202,8 @@ class Database:
                 evidence=evidence,
             )
         return CatalogError(
-            f"the catalog {self.root} cannot be used: {error}; this change was not stored, all earlier ones are safe",
-            next_step="check the folder and its disk",
+            f"the catalog {self.root} cannot be used: {error}",
+            next_step="check the folder and its disk; a catalog belongs on a local disk",
             evidence=evidence,
         )
 

@@ -77,7 +77,7 @@ class Enrollment:
         CatalogBusy
             Another process is writing for longer than the timeout.
         """
-        index = int(record.index)
+        index = record.index
         if index >= len(self.planned_azimuth_deg):
             raise UsageError(
                 f"view {index} is not one of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r}",
@@ -104,16 +104,16 @@ class Enrollment:
                 enrollment_id=self.id,
                 view_index=index,
                 sitting_id=self.sitting.id,
-                commanded_deg=float(record.commanded_deg),
-                encoder_deg=float(record.encoder_deg),
-                imu_deg=None if record.imu_deg is None else float(record.imu_deg),
-                imu_sigma_deg=None if record.imu_sigma_deg is None else float(record.imu_sigma_deg),
-                azimuth_deg=float(record.azimuth_deg),
+                commanded_deg=record.commanded_deg,
+                encoder_deg=record.encoder_deg,
+                imu_deg=record.imu_deg,
+                imu_sigma_deg=record.imu_sigma_deg,
+                azimuth_deg=record.azimuth_deg,
                 descriptor_kind=DESCRIPTOR_KIND,
                 descriptor_version=DESCRIPTOR_VERSION,
                 descriptor=packed,
                 captured_utc=captured_utc,
-                captured_ns=int(record.captured_ns),
+                captured_ns=record.captured_ns,
                 image=image.as_posix(),
                 image_sha256=sha256,
                 image_bytes=len(png),

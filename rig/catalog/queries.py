@@ -149,7 +149,7 @@ def model_set(connection: Connection) -> tuple[hbr.Views, NDArray[np.int64]]:
         return hbr.Views.empty(), np.empty(0, np.int64)
     object_ids, view_ids, azimuths_deg, packed = zip(*rows, strict=True)
     known_ids, object_index = np.unique(np.array(object_ids, np.int64), return_inverse=True)
-    names = {object_id: name for object_id, name in connection.execute(select(objects.c.id, objects.c.name))}
+    names = {row.id: row.name for row in connection.execute(select(objects.c.id, objects.c.name))}
     loaded = hbr.Views(
         descriptors=unpack_rows(b"".join(packed)),
         azimuth_deg=np.array(azimuths_deg, np.float64),

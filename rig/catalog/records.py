@@ -2,6 +2,7 @@
 
 import json
 import math
+import operator
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -114,6 +115,17 @@ class ViewRecord:
     evidence: JsonObject = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name in ("index", "captured_ns"):
+            object.__setattr__(self, name, operator.index(getattr(self, name)))
+        for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if not math.isfinite(value):
+                raise UsageError(
+                    f"view {self.index} has {name} = {value}", next_step="store views with angles that were measured"
+                )
+            object.__setattr__(self, name, float(value))
         if self.index < 0:
             raise UsageError(f"view index {self.index} is negative", next_step="number the views of a plan from 0")
         if (self.imu_deg is None) != (self.imu_sigma_deg is None):
@@ -121,12 +133,6 @@ class ViewRecord:
                 f"view {self.index} has an IMU angle of {self.imu_deg} with an uncertainty of {self.imu_sigma_deg}",
                 next_step="give both, or None for both where the IMU has no answer",
             )
-        for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                raise UsageError(
-                    f"view {self.index} has {name} = {value}", next_step="store views with angles that were measured"
-                )
         check_azimuth(self.azimuth_deg)
         if self.imu_sigma_deg is not None and self.imu_sigma_deg < 0:
             raise UsageError(
@@ -212,6 +218,14 @@ def clean_name(name: str) -> str:
             next_step="shorten the name and put the rest into the note",
         )
     return cleaned
+
+
+def check_text(text: str, what: str) -> None:
+    """Refuse text that cannot be stored, such as bytes of another encoding from a terminal, with a `UsageError`."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise UsageError(f"the {what} {text!r} is not text", next_step="type it in UTF-8") from error
 
 
 def check_azimuth(azimuth_deg: float) -> None:

@@ -86,13 +86,11 @@ enrollments = Table(
 )
 
 for _status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS):
-    _only = enrollments.c.status == _status.value
     Index(
         f"uq_enrollments_one_{_status.name.lower()}",
         enrollments.c.object_id,
         unique=True,
-        sqlite_where=_only,
-        postgresql_where=_only,
+        sqlite_where=enrollments.c.status == _status.value,
     )
 
 # A resumed enrollment may go on with another bench, program or calibration, and the bench's clock starts anew.
