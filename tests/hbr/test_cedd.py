@@ -8,12 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from cedd_reference import cedd_reference, colours, hsv
+from cedd_reference import area, cedd_reference, colours, hsv, texture_classes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hbr import cedd, describe
-from hbr.cedd import _colour_outputs, _covered_size, _hsv
+from hbr.cedd import _areas, _colour_outputs, _covered_size, _grid, _hsv, _quarter_sums, _texture_votes
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
 
@@ -67,6 +67,40 @@ def test_equals_the_literal_definition_on_large_images(height: int, width: int) 
     image = noise(height, width)
     image[: height // 2] = image[: height // 2, :, :1] // 128 * 118  # greys where exact means are whole numbers
     assert cedd(image).tolist() == cedd_reference(image)
+
+
+@pytest.mark.parametrize("side", [2, 3, 38, 39, 40, 41, 79, 80, 81, 119, 120, 159, 160])
+def test_equals_the_literal_definition_at_the_borders_of_the_grids(side: int) -> None:
+    for image in (noise(side, side), noise(side + 1, side), noise(side, side + 40)):
+        assert cedd(image).tolist() == cedd_reference(image)
+
+
+def test_sums_of_tall_blocks_do_not_overflow() -> None:
+    """Quarters of 260 rows: their white sums to more than 16 bits hold."""
+    image = noise(10_400, 40) | np.uint8(254)
+    assert cedd(image).tolist() == cedd_reference(image)
+
+
+def test_areas_with_a_whole_mean_round_like_the_reference() -> None:
+    """Colours whose luminance is a whole number: the order of the additions decides it."""
+    colours_bgr = np.random.default_rng(4).integers(0, 256, (800_000, 3), dtype=np.uint8)
+    whole = colours_bgr[(colours_bgr @ np.array([114, 587, 299])) % 1000 == 0][:800].reshape(2, -1, 3)
+    quarters = _areas(whole, _quarter_sums(whole, grid := _grid(*whole.shape[:2])), grid)
+    assert quarters.shape == (4, 200)
+    found = quarters.reshape(2, 2, 200).transpose(0, 2, 1).reshape(2, -1)
+    expected = [[area(whole[i : i + 1, j : j + 1], 2, 2) for j in range(400)] for i in range(2)]
+    assert found.tolist() == expected
+
+
+def test_texture_classes_equal_the_literal_definition() -> None:
+    """Small areas, so that ratios fall on the thresholds (49 / 50 is not above 0.98)."""
+    areas = np.random.default_rng(3).integers(0, 60, (4, 20_000))
+    areas[:, 0] = 50, 0, 1, 0
+    found: list[list[int]] = [[] for _ in areas.T]
+    for texture, block in zip(*_texture_votes(areas.astype(np.float64)), strict=True):
+        found[block].append(int(texture))
+    expected = [texture_classes(*column) for column in areas.T.tolist()]
+    assert found == expected
 
 
 @pytest.mark.parametrize("height", [560, 568])
