@@ -84,7 +84,7 @@ class Motor:
     @property
     def busy(self) -> bool:
         """Whether the load varies: the shaft turns, or is held up while driven."""
-        return self._driven and (self._jammed or self.profile_ongoing or self.commanded.velocity_dps[-1] != 0)
+        return self._driven and (self._jammed or self.profile_ongoing or bool(self.commanded.velocity_dps[-1]))
 
     @property
     def overloaded(self) -> bool:

@@ -1,14 +1,11 @@
 """An in-memory serial port: pyserial's interface, on the virtual clock, with the simulated bus at its other end."""
 
 import errno
-from collections import deque
-from itertools import count
+from bisect import insort
 
 import serial
 
 from sim.servo.bus import Frame, ServoBus
-
-_PORT_NUMBERS = count()
 
 
 class SimSerial:
@@ -20,6 +17,8 @@ class SimSerial:
         The line behind the adapter.
     baudrate, timeout
         As of `serial.Serial`: ``timeout`` in seconds, 0 to return what is there, None to wait for ever.
+    port
+        What the port calls itself in messages.
 
     Raises
     ------
@@ -27,13 +26,13 @@ class SimSerial:
         The bus has a host already.
     """
 
-    def __init__(self, bus: ServoBus, baudrate: int = 57_600, timeout: float | None = None) -> None:
-        self.port = self.name = f"sim:{next(_PORT_NUMBERS)}"
+    def __init__(self, bus: ServoBus, baudrate: int = 57_600, timeout: float | None = None, port: str = "sim") -> None:
+        self.port = self.name = port
         self.baudrate = baudrate
         self.timeout = timeout
         self._bus = bus
         self._received = bytearray()
-        self._coming: deque[Frame] = deque()
+        self._coming: list[Frame] = []
         self._taken = 0  # bytes of the first coming frame that have been received
         self._sent_until_ns = 0
         self._unplugged = False
@@ -84,7 +83,7 @@ class SimSerial:
         clock = self._bus.clock
         deadline_ns = None if self.timeout is None else clock.now_ns() + round(self.timeout * 1e9)
         self._collect()
-        while len(self._received) < size and clock.now_ns() != deadline_ns:
+        while len(self._received) < size and (deadline_ns is None or clock.now_ns() < deadline_ns):
             wake_ns = [t for t in (deadline_ns, clock.next_event_ns(), self._arrival_ns(size)) if t is not None]
             if not wake_ns:
                 raise RuntimeError("this read would never return: no byte is on its way, give the port a timeout")
@@ -119,7 +118,7 @@ class SimSerial:
             raise serial.PortNotOpenError()
 
     def _deliver(self, frame: Frame) -> None:
-        self._coming.append(frame)
+        insort(self._coming, frame, key=lambda f: f.start_ns)  # a frame may have been held up
 
     def _collect(self) -> None:
         """Take over the bytes that have arrived by now; what came at another baud rate than the port's is lost."""
@@ -132,7 +131,7 @@ class SimSerial:
             self._taken = arrived
             if arrived < len(frame.data):
                 return
-            self._coming.popleft()
+            del self._coming[0]
             self._taken = 0
 
     def _arrival_ns(self, size: int) -> int | None:
@@ -142,7 +141,8 @@ class SimSerial:
         arrival_ns = None
         for frame in self._coming:
             available = len(frame.data) - taken
-            arrival_ns = frame.arrival_ns(taken + min(missing, available))
+            # Frames that overlap are handed over one after the other, so that none is there before the one ahead of it.
+            arrival_ns = max(arrival_ns or 0, frame.arrival_ns(taken + min(missing, available)))
             missing -= available
             if missing <= 0:
                 break

@@ -1,0 +1,10 @@
+import pytest
+from servo_line import Line
+
+
+@pytest.fixture
+def line() -> Line:
+    """One XL430 with id 1 at 1 MBd on a perfect bench."""
+    line = Line()
+    line.add()
+    return line

@@ -1,0 +1,276 @@
+"""What goes wrong with a servo, when it notices, and what brings it back."""
+
+import pytest
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from servo_line import ALERT, Line, extended
+
+from sim.servo.device import (
+    BOOT_S,
+    ELECTRICAL_ERROR,
+    ENCODER_ERROR,
+    OVERHEATING_ERROR,
+    OVERLOAD_ERROR,
+    SUPERVISION_S,
+    VOLTAGE_ERROR,
+)
+from sim.servo.models import DEG_PER_COUNT, MODELS
+from sim.servo.motor import OVERLOAD_S, PWM_PER_COUNT
+from sim.servo.protocol2 import StatusError
+
+FOLLOWING_ERROR = 0x08
+
+
+# -- Bus Watchdog ---------------------------------------------------------------------------------------------------
+
+
+@given(units=st.integers(1, 127), last_read_s=st.floats(0.0, 1.0))
+@settings(max_examples=20, deadline=None)
+def test_the_watchdog_trips_its_time_after_the_last_instruction(units: int, last_read_s: float) -> None:
+    line = Line()
+    servo = line.add()
+    line.put(Operating_Mode=1, Torque_Enable=1, Goal_Velocity=50, Bus_Watchdog=units)
+    if last_read_s < units * 0.02 - 0.005:
+        line.sleep(last_read_s)
+        line.read("Present Position")
+    heard_ns = [frame for frame in line.frames if frame.source.value == "host"][-1].end_ns
+    line.clock.advance_to(heard_ns + units * 20_000_000 - 1)
+    assert servo.memory["Bus Watchdog"] == units
+    assert line.worlds[1].shaft()[1] > 0
+    line.clock.advance_to(heard_ns + units * 20_000_000)
+    assert servo.memory["Bus Watchdog"] == 0xFF
+    line.sleep(0.2)
+    assert line.worlds[1].shaft()[1] == 0.0
+
+
+def test_a_tripped_watchdog_refuses_goals_until_it_is_cleared(line: Line) -> None:
+    extended(line)
+    line.put(Bus_Watchdog=5, Goal_Position=9000)
+    line.sleep(0.5)
+    stopped = line.shaft()
+    assert 0 < stopped < 60
+    assert line.read("Bus Watchdog") == 0xFF
+    assert line.read("Torque Enable") == 1
+    assert (line.read("Profile Velocity"), line.read("Profile Acceleration")) == (0, 0)
+    for goal in ("Goal Position", "Goal Velocity", "Goal PWM"):
+        assert line.write(goal, 1) == StatusError.DATA_RANGE
+    assert line.write("Bus Watchdog", 5) == StatusError.DATA_RANGE
+    line.put(Bus_Watchdog=0)
+    line.sleep(1.0)
+    assert line.shaft() == stopped  # clearing it moves nothing
+    line.put(Goal_Position=2048)
+    line.sleep(1.0)
+    assert line.shaft() == pytest.approx(0.0)
+
+
+def test_a_fed_watchdog_does_not_trip(line: Line) -> None:
+    extended(line)
+    line.put(Bus_Watchdog=5, Goal_Position=9000)
+    for _ in range(60):
+        line.sleep(0.09)
+        line.read("Present Position")
+    assert line.read("Bus Watchdog") == 5
+
+
+def test_instructions_to_others_do_not_feed_the_watchdog(line: Line) -> None:
+    line.add(2)
+    extended(line)
+    line.put(Bus_Watchdog=5)
+    for _ in range(4):
+        line.sleep(0.03)
+        line.sdk.ping(line.port, 2)
+    assert line.read("Bus Watchdog") == 0xFF
+
+
+def test_the_watchdog_sleeps_while_torque_is_off(line: Line) -> None:
+    line.put(Bus_Watchdog=1)
+    line.sleep(5.0)
+    assert line.read("Bus Watchdog") == 1
+    line.put(Torque_Enable=1)
+    line.sleep(0.1)
+    assert line.read("Bus Watchdog") == 0xFF
+
+
+# -- hardware errors ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [OVERLOAD_ERROR, OVERHEATING_ERROR, ELECTRICAL_ERROR])
+def test_an_error_of_the_shutdown_mask_takes_torque_away_until_reboot(line: Line, error: int) -> None:
+    line.put(Torque_Enable=1)
+    line.servos[1].fail(error)
+    assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, ALERT)
+    assert line.read("Hardware Error Status") == error
+    assert line.read("Torque Enable") == 0
+    assert line.write("Torque Enable", 1) == ALERT
+    assert line.read("Torque Enable") == 0
+    line.sdk.reboot(line.port, 1)
+    line.sleep(BOOT_S)
+    line.put(Torque_Enable=1)
+    assert line.read("Torque Enable") == 1
+
+
+def test_an_error_outside_the_mask_only_raises_the_alert(line: Line) -> None:
+    line.put(Torque_Enable=1)
+    line.servos[1].fail(ENCODER_ERROR)
+    assert line.sdk.ping(line.port, 1)[2] == ALERT
+    assert line.read("Torque Enable") == 1
+
+
+@pytest.mark.parametrize(("supply_v", "alert"), [(5.9, True), (6.0, False), (14.0, False), (14.1, True)])
+def test_the_supply_is_judged_by_its_limits(line: Line, supply_v: float, alert: bool) -> None:
+    line.put(Torque_Enable=1)
+    line.servos[1].set_voltage(supply_v)
+    assert (line.sdk.ping(line.port, 1)[2] == ALERT) is alert
+    assert line.read("Hardware Error Status") == (VOLTAGE_ERROR if alert else 0)
+    assert line.read("Present Input Voltage") == round(supply_v * 10)
+    assert line.read("Torque Enable") == 1  # the XL430's mask leaves the voltage out
+    line.servos[1].set_voltage(12.0)
+    assert (line.sdk.ping(line.port, 1)[2] == ALERT) is alert  # once raised, it stays
+
+
+def test_the_xl330_shuts_down_on_its_supply() -> None:
+    line = Line()
+    servo = line.add(1, "xl330_m288")
+    line.put(Torque_Enable=1)
+    servo.set_voltage(3.0)
+    assert line.read("Torque Enable") == 0
+
+
+def test_overheating_is_judged_by_its_limit(line: Line) -> None:
+    line.put(Torque_Enable=1)
+    line.servos[1].set_temperature(72.0)
+    assert line.read("Hardware Error Status") == 0
+    line.servos[1].set_temperature(72.1)
+    assert line.read("Hardware Error Status") == OVERHEATING_ERROR
+    assert line.read("Present Temperature") == 72
+
+
+def test_a_lowered_limit_is_judged_at_once(line: Line) -> None:
+    assert line.write("Temperature Limit", 30) == ALERT
+    assert line.read("Hardware Error Status") == OVERHEATING_ERROR
+
+
+def test_the_case_cools_down_without_load(line: Line) -> None:
+    line.servos[1].set_temperature(70.0)
+    readings = []
+    for _ in range(5):
+        readings.append(line.read("Present Temperature"))
+        line.sleep(400.0)
+    assert readings == sorted(readings, reverse=True)
+    assert readings[1] == pytest.approx(33 + 37 / 2.718, abs=1)
+
+
+# -- a jammed table -------------------------------------------------------------------------------------------------
+
+
+def test_a_jam_shows_as_following_error_then_load_then_overload(line: Line) -> None:
+    extended(line)
+    line.put(Goal_Position=9000)
+    line.sleep(1.0)
+    servo = line.servos[1]
+    servo.jam()
+    jammed_ns, stuck = line.clock.now_ns(), line.shaft()
+    line.sleep(0.3)
+    assert line.shaft() == stuck
+    assert line.read("Present Velocity") == 0
+    assert line.read("Moving Status") & FOLLOWING_ERROR
+    line.sleep(0.3)
+    assert line.read("Present Load") == 1000
+    assert line.read("Hardware Error Status") == 0
+    while not servo.memory["Hardware Error Status"] and line.clock.now_ns() < jammed_ns + 10_000_000_000:
+        line.sleep(0.01)
+    elapsed_s = (line.clock.now_ns() - jammed_ns) * 1e-9
+    # The load saturates when the error has grown to 885 / PWM_PER_COUNT counts at 44 units of speed.
+    saturation_s = 885 / PWM_PER_COUNT * DEG_PER_COUNT / (44 * 1.374)
+    assert elapsed_s == pytest.approx(saturation_s + OVERLOAD_S, abs=2 * SUPERVISION_S)
+    assert line.read("Hardware Error Status") == OVERLOAD_ERROR
+    assert line.read("Torque Enable") == 0
+    assert line.read("Present Load") == 0
+    servo.free()
+    line.sleep(1.0)
+    assert line.shaft() == stuck
+
+
+def test_a_jam_that_is_freed_in_time_is_made_up_for(line: Line) -> None:
+    extended(line)
+    line.put(Goal_Position=4000)
+    line.sleep(0.5)
+    line.servos[1].jam()
+    line.sleep(1.0)
+    line.servos[1].free()
+    line.sleep(3.0)
+    assert line.read("Present Position") == 4000
+    assert line.read("Hardware Error Status") == 0
+
+
+def test_a_jammed_wheel_goes_on_when_freed(line: Line) -> None:
+    line.put(Operating_Mode=1, Torque_Enable=1, Goal_Velocity=50)
+    line.servos[1].jam()
+    line.sleep(0.2)
+    assert line.read("Present Velocity") == 0
+    line.servos[1].free()
+    line.sleep(0.5)
+    assert line.read("Present Velocity") == 50
+
+
+def test_a_jam_without_torque_strains_nothing(line: Line) -> None:
+    line.servos[1].jam()
+    line.sleep(10.0)
+    assert line.read("Hardware Error Status") == 0
+    with pytest.raises(ValueError, match="held"):
+        line.servos[1].turn_by_hand(10.0)
+
+
+def test_stalling_heats_the_case(line: Line) -> None:
+    line.put(Shutdown=4)  # no overload shutdown
+    extended(line)
+    line.servos[1].jam()
+    line.put(Goal_Position=9000)
+    line.sleep(100.0)
+    assert line.read("Present Temperature") == pytest.approx(33 + 90 * (1 - 2.71828**-0.25), abs=2)
+    line.sleep(300.0)
+    assert line.read("Hardware Error Status") & OVERHEATING_ERROR
+    assert line.read("Torque Enable") == 0
+
+
+# -- power ----------------------------------------------------------------------------------------------------------
+
+
+def test_without_power_there_is_silence_and_no_torque(line: Line) -> None:
+    extended(line, velocity=100)
+    line.put(Goal_Position=20_000)
+    line.sleep(1.0)
+    line.servos[1].power_off()
+    line.sleep(1.0)
+    stopped = line.shaft()
+    assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
+    line.servos[1].turn_by_hand(30.0)
+    line.sleep(5.0)
+    assert line.shaft() == pytest.approx(stopped + 30)
+    line.servos[1].power_on()
+    line.sleep(BOOT_S)
+    assert line.read("Torque Enable") == 0
+    assert line.read("Present Position") == round((stopped + 30) / DEG_PER_COUNT + 2048) % 4096
+
+
+def test_power_that_comes_and_goes_boots_once(line: Line) -> None:
+    for _ in range(3):
+        line.servos[1].power_cycle()
+        line.sleep(BOOT_S / 2)
+    assert not line.servos[1].powered
+    line.servos[1].power_off()
+    line.sleep(5.0)
+    assert not line.servos[1].powered
+
+
+@pytest.mark.parametrize(("option", "value"), [("bus_id", 253), ("baudrate", 56_000)])
+def test_servos_that_cannot_be_are_refused(option: str, value: int) -> None:
+    with pytest.raises(ValueError, match=str(value)):
+        Line().add(**{option: value})
+
+
+def test_an_unknown_model_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"xl999.*xl430_w250"):
+        Line().add(1, "xl999")
+    assert set(MODELS) == {"xl430_w250", "xm430_w350", "xl330_m288", "mx_28"}

@@ -1,0 +1,339 @@
+"""Every instruction, sent by the unmodified SDK."""
+
+import pytest
+from dynamixel_sdk import (
+    COMM_RX_TIMEOUT,
+    COMM_SUCCESS,
+    GroupBulkRead,
+    GroupBulkWrite,
+    GroupSyncRead,
+    GroupSyncWrite,
+)
+from servo_line import ALERT, Line, extended
+
+from sim.servo import Source
+from sim.servo.device import BOOT_S, OVERLOAD_ERROR
+from sim.servo.models import MODELS
+from sim.servo.protocol2 import StatusError, with_crc
+
+
+def word(value: int) -> list[int]:
+    return [value & 0xFF, value >> 8 & 0xFF]
+
+
+def double(value: int) -> list[int]:
+    return list(value.to_bytes(4, "little", signed=True))
+
+
+@pytest.fixture
+def three(line: Line) -> Line:
+    line.add(7, "xm430_w350")
+    line.add(4, "xl330_m288")
+    return line
+
+
+# -- ping, read, write ---------------------------------------------------------------------------------------------
+
+
+def test_ping_is_the_emanuals_to_the_byte(line: Line) -> None:
+    assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, 0)
+    assert line.sent(Source.HOST) == [bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))]
+
+
+@pytest.mark.parametrize(
+    ("model", "number"), [("xl430_w250", 1060), ("xm430_w350", 1020), ("xl330_m288", 1200), ("mx_28", 30)]
+)
+def test_every_model_answers_with_its_number_and_initial_values(model: str, number: int) -> None:
+    line = Line()
+    servo = line.add(1, model)
+    assert line.sdk.ping(line.port, 1)[0] == number
+    assert line.read("Firmware Version") == MODELS[model].firmware
+    for name, value in servo.model.initial.items():
+        if name not in ("Baud Rate", "Secondary ID") and name in line.table(1):
+            assert line.read(name) == value, name
+    assert line.read("Present Input Voltage") == round(servo.model.supply_v * 10)
+    assert line.read("Hardware Error Status") == 0
+
+
+def test_broadcast_ping_finds_all_in_the_order_of_their_ids(three: Line) -> None:
+    found, result = three.sdk.broadcastPing(three.port)
+    assert result == COMM_SUCCESS
+    assert found == {1: [1060, 46], 4: [1200, 52], 7: [1020, 46]}
+    assert [data[4] for data in three.sent(Source.DEVICE)] == [1, 4, 7]
+
+
+def test_two_servos_with_one_id_are_not_taken_for_one(line: Line) -> None:
+    line.sdk.ping(line.port, 1)
+    alone = line.sent(Source.DEVICE)[-1]
+    line.add(1)
+    _, result, _ = line.sdk.ping(line.port, 1)
+    assert result != COMM_SUCCESS
+    assert line.sent(Source.DEVICE)[-1] != alone
+
+
+def test_registers_of_every_size_go_there_and_back(line: Line) -> None:
+    line.put(LED=1, Position_P_Gain=1234, Profile_Velocity=23_456)
+    assert [line.read(n) for n in ("LED", "Position P Gain", "Profile Velocity")] == [1, 1234, 23_456]
+    line.put(Homing_Offset=-1_044_479)
+    assert line.read("Homing Offset") == -1_044_479
+
+
+def test_the_bytes_on_the_wire_are_the_sdks(line: Line) -> None:
+    recorded = []
+    write = line.port.writePort
+    line.port.writePort = lambda packet: recorded.append(bytes(packet)) or write(packet)
+    line.write("Goal Position", 512)
+    assert recorded == line.sent(Source.HOST) == [bytes.fromhex("FFFFFD00010900037400000200 00CA89".replace(" ", ""))]
+
+
+@pytest.mark.parametrize(
+    ("address", "data", "error"),
+    [
+        (132, [0, 0, 0, 0], StatusError.ACCESS),  # Present Position is read only
+        (0, [0, 0], StatusError.ACCESS),  # Model Number is
+        (66, [0], StatusError.ACCESS),  # nothing is there
+        (660, [0] * 4, StatusError.ACCESS),  # beyond the end
+        (116, [0, 0], StatusError.DATA_LENGTH),  # half a Goal Position
+        (118, [0, 0], StatusError.DATA_LENGTH),  # its other half
+        (64, [2], StatusError.DATA_RANGE),
+        (7, [253], StatusError.DATA_RANGE),
+        (11, [16], StatusError.DATA_RANGE),  # PWM control is not emulated
+        (98, [128], StatusError.DATA_RANGE),
+        (116, double(4096), StatusError.DATA_LIMIT),  # Max Position Limit in position mode
+        (104, double(266), StatusError.DATA_LIMIT),  # Velocity Limit
+        (104, double(-266), StatusError.DATA_LIMIT),
+        (100, word(886), StatusError.DATA_LIMIT),  # PWM Limit
+    ],
+)
+def test_writes_are_refused_with_the_emanuals_error(line: Line, address: int, data: list[int], error: int) -> None:
+    before = bytes(line.servos[1].memory.read(0, 662))
+    assert line.sdk.writeTxRx(line.port, 1, address, len(data), data) == (COMM_SUCCESS, error)
+    assert line.servos[1].memory.read(0, 662) == before
+
+
+def test_a_block_is_written_as_a_whole_or_not_at_all(line: Line) -> None:
+    block = double(7) + double(8) + double(4096)  # profile acceleration, profile velocity, goal beyond its limit
+    assert line.sdk.writeTxRx(line.port, 1, 108, 12, block) == (COMM_SUCCESS, StatusError.DATA_LIMIT)
+    assert (line.read("Profile Acceleration"), line.read("Profile Velocity")) == (0, 0)
+    assert line.sdk.writeTxRx(line.port, 1, 108, 12, double(7) + double(8) + double(100)) == (COMM_SUCCESS, 0)
+    assert [line.read(f"{n}") for n in ("Profile Acceleration", "Profile Velocity", "Goal Position")] == [7, 8, 100]
+
+
+def test_reads_beyond_the_table_are_refused(line: Line) -> None:
+    data, result, error = line.sdk.readTxRx(line.port, 1, 650, 20)
+    assert (result, error) == (COMM_SUCCESS, StatusError.ACCESS)
+
+
+def test_an_unknown_instruction_is_answered_so(line: Line) -> None:
+    line.serial.write(with_crc(bytes.fromhex("FFFFFD0001030077")))
+    line.sleep(0.01)
+    assert line.serial.read(11)[8] == StatusError.INSTRUCTION
+
+
+def test_a_damaged_instruction_is_answered_with_a_crc_error_and_not_done(line: Line) -> None:
+    frame = bytearray(with_crc(bytes.fromhex("FFFFFD000106000341 0001".replace(" ", ""))))  # LED = 1
+    frame[-1] ^= 0x40
+    line.serial.write(frame)
+    line.sleep(0.01)
+    assert line.serial.read(11)[8] == StatusError.CRC
+    assert line.read("LED") == 0
+
+
+# -- registered and group instructions -----------------------------------------------------------------------------
+
+
+def test_reg_write_waits_for_action(line: Line) -> None:
+    assert line.sdk.regWriteTxRx(line.port, 1, 65, 1, [1]) == (COMM_SUCCESS, 0)
+    assert (line.read("LED"), line.read("Registered Instruction")) == (0, 1)
+    assert line.sdk.action(line.port, 0xFE) == COMM_SUCCESS
+    line.sleep(0.01)
+    assert (line.read("LED"), line.read("Registered Instruction")) == (1, 0)
+
+
+def test_reg_write_is_judged_when_it_is_registered(line: Line) -> None:
+    assert line.sdk.regWriteTxRx(line.port, 1, 132, 4, [0] * 4) == (COMM_SUCCESS, StatusError.ACCESS)
+    assert line.read("Registered Instruction") == 0
+
+
+def test_action_without_reg_write_is_an_instruction_error(line: Line) -> None:
+    line.sdk.action(line.port, 1)
+    line.sleep(0.01)
+    assert line.serial.read(11)[8] == StatusError.INSTRUCTION
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_sync_read_answers_in_the_order_asked(three: Line, fast: bool) -> None:
+    for bus_id, position in ((1, 10.0), (7, 20.0), (4, 30.0)):
+        three.servos[bus_id].turn_by_hand(position)
+    three.sleep(2.0)
+    group = GroupSyncRead(three.port, three.sdk, 132, 4)
+    for bus_id in (4, 7, 1):
+        assert group.addParam(bus_id)
+    assert (group.fastSyncRead() if fast else group.txRxPacket()) == COMM_SUCCESS
+    degrees = {bus_id: (group.getData(bus_id, 132, 4) - 2048) * 360 / 4096 for bus_id in (1, 7, 4)}
+    assert degrees == pytest.approx({1: 10, 7: 20, 4: 30}, abs=0.05)
+    replies = [frame for frame in three.frames if frame.source is Source.DEVICE]
+    assert len(replies) == 3
+    for earlier, later in zip(replies, replies[1:], strict=False):
+        assert later.start_ns >= earlier.end_ns
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_bulk_read_asks_each_for_its_own(three: Line, fast: bool) -> None:
+    three.servos[7].set_temperature(41.0)
+    group = GroupBulkRead(three.port, three.sdk)
+    group.addParam(7, 146, 1)
+    group.addParam(1, 144, 2)
+    assert (group.fastBulkRead() if fast else group.txRxPacket()) == COMM_SUCCESS
+    assert (group.getData(7, 146, 1), group.getData(1, 144, 2)) == (41, 120)
+
+
+def test_a_chain_ends_at_the_first_silent_servo(three: Line) -> None:
+    three.servos[7].power_off()
+    group = GroupSyncRead(three.port, three.sdk, 132, 4)
+    for bus_id in (1, 7, 4):
+        group.addParam(bus_id)
+    assert group.txRxPacket() == COMM_RX_TIMEOUT
+    assert [data[4] for data in three.sent(Source.DEVICE)] == [1]
+
+
+def test_sync_write_and_bulk_write_reach_each_servo_unanswered(three: Line) -> None:
+    sync = GroupSyncWrite(three.port, three.sdk, 65, 1)
+    sync.addParam(1, [1])
+    sync.addParam(4, [1])
+    assert sync.txPacket() == COMM_SUCCESS
+    three.sleep(0.01)
+    assert [three.read("LED", i) for i in (1, 7, 4)] == [1, 0, 1]
+    bulk = GroupBulkWrite(three.port, three.sdk)
+    bulk.addParam(7, 112, 4, double(77))
+    bulk.addParam(1, 65, 1, [0])
+    assert bulk.txPacket() == COMM_SUCCESS
+    three.sleep(0.01)
+    assert (three.read("Profile Velocity", 7), three.read("LED", 1), three.read("LED", 4)) == (77, 0, 1)
+    answers_to_reads = 6
+    assert len(three.sent(Source.DEVICE)) == answers_to_reads
+
+
+def test_the_group_of_a_secondary_id_obeys_in_silence(three: Line) -> None:
+    for bus_id in (1, 7, 4):
+        three.put(bus_id, Secondary_ID=100)
+    result, _ = three.sdk.write1ByteTxRx(three.port, 100, 65, 1)
+    assert result == COMM_RX_TIMEOUT
+    assert [three.read("LED", i) for i in (1, 7, 4)] == [1, 1, 1]
+    three.sdk.write1ByteTxRx(three.port, 100, 9, 0)  # EEPROM is closed to a group
+    assert three.read("Return Delay Time") == 250
+
+
+# -- what the servo is set to ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("level", "read", "write"), [(0, False, False), (1, True, False), (2, True, True)])
+def test_status_return_level_decides_who_is_answered(line: Line, level: int, read: bool, write: bool) -> None:
+    line.put(Status_Return_Level=level)
+    assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
+    assert (line.sdk.read1ByteTxRx(line.port, 1, 65)[1] == COMM_SUCCESS) is read
+    assert (line.sdk.write1ByteTxRx(line.port, 1, 65, 1)[0] == COMM_SUCCESS) is write
+    assert line.servos[1].memory["LED"] == 1
+
+
+def test_a_new_id_holds_from_the_next_instruction_on(line: Line) -> None:
+    assert line.write("ID", 9) == 0  # answered under the old id, else the SDK would find no answer
+    assert line.sdk.ping(line.port, 9) == (1060, COMM_SUCCESS, 0)
+    assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
+
+
+def test_a_new_baud_rate_holds_from_the_next_instruction_on(line: Line) -> None:
+    assert line.write("Baud Rate", 2) == 0
+    assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
+    line.serial.baudrate = 115_200
+    assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
+
+
+def test_eeprom_is_locked_while_torque_is_on(line: Line) -> None:
+    line.put(Torque_Enable=1)
+    assert line.write("Return Delay Time", 0) == StatusError.ACCESS
+    line.put(Torque_Enable=0, Return_Delay_Time=0)
+    assert line.read("Return Delay Time") == 0
+
+
+def test_indirect_data_stands_for_the_bytes_it_points_to(line: Line) -> None:
+    for i, target in enumerate((132, 133, 134, 135, 65)):
+        assert line.sdk.write2ByteTxRx(line.port, 1, 168 + 2 * i, target) == (COMM_SUCCESS, 0)
+    line.servos[1].turn_by_hand(90.0)
+    line.sleep(3.0)
+    data, _, error = line.sdk.readTxRx(line.port, 1, 224, 5)
+    assert (int.from_bytes(bytes(data[:4]), "little"), data[4], error) == (2048 + 1024, 0, 0)
+    assert line.sdk.write1ByteTxRx(line.port, 1, 228, 1) == (COMM_SUCCESS, 0)
+    assert line.read("LED") == 1
+    assert line.sdk.write1ByteTxRx(line.port, 1, 224, 0) == (COMM_SUCCESS, StatusError.ACCESS)
+    assert line.sdk.write2ByteTxRx(line.port, 1, 168, 7) == (COMM_SUCCESS, StatusError.DATA_RANGE)  # not of EEPROM
+
+
+def test_indirect_data_that_points_nowhere_is_a_byte_of_its_own(line: Line) -> None:
+    assert line.sdk.write1ByteTxRx(line.port, 1, 224, 42) == (COMM_SUCCESS, 0)
+    assert line.sdk.read1ByteTxRx(line.port, 1, 224) == (42, COMM_SUCCESS, 0)
+
+
+# -- reboot, factory reset, clear ----------------------------------------------------------------------------------
+
+
+def test_reboot_is_answered_then_silent_then_as_new_but_for_the_eeprom(line: Line) -> None:
+    extended(line)
+    line.put(LED=1)
+    assert line.sdk.reboot(line.port, 1) == (COMM_SUCCESS, 0)
+    started_ns = line.clock.now_ns()
+    assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
+    line.clock.advance_to(started_ns + round(BOOT_S * 1e9))
+    assert [line.read(n) for n in ("Torque Enable", "LED", "Profile Velocity", "Operating Mode")] == [0, 0, 0, 4]
+    assert line.read("Realtime Tick") < 10
+
+
+def test_reboot_forgets_the_turns(line: Line) -> None:
+    extended(line, velocity=200)
+    line.put(Goal_Position=2048 + 3 * 4096 + 100)
+    line.sleep(8.0)
+    assert line.read("Present Position") == 2048 + 3 * 4096 + 100
+    line.sdk.reboot(line.port, 1)
+    line.sleep(0.5)
+    assert line.read("Present Position") == 2148
+    assert line.shaft() == pytest.approx(3 * 360 + 100 * 360 / 4096)
+
+
+def test_reboot_clears_hardware_errors(line: Line) -> None:
+    line.servos[1].fail(OVERLOAD_ERROR)
+    assert line.sdk.ping(line.port, 1)[2] == ALERT
+    line.sdk.reboot(line.port, 1)
+    line.sleep(0.5)
+    assert line.sdk.ping(line.port, 1)[2] == 0
+    assert line.read("Hardware Error Status") == 0
+
+
+@pytest.mark.parametrize(("option", "bus_id", "baudrate"), [(0xFF, 1, 57_600), (0x01, 5, 57_600), (0x02, 5, 1_000_000)])
+def test_factory_reset_keeps_what_the_option_says(option: int, bus_id: int, baudrate: int) -> None:
+    line = Line()
+    line.add(5)
+    line.put(5, Return_Delay_Time=7, Operating_Mode=4)
+    assert line.sdk.factoryReset(line.port, 5, option) == (COMM_SUCCESS, 0)
+    line.sleep(0.5)
+    line.serial.baudrate = baudrate
+    assert line.sdk.ping(line.port, bus_id)[1] == COMM_SUCCESS
+    assert line.sdk.read1ByteTxRx(line.port, bus_id, 9)[0] == 250
+    assert line.sdk.read1ByteTxRx(line.port, bus_id, 11)[0] == 3
+
+
+def test_factory_reset_of_everything_is_no_broadcast(line: Line) -> None:
+    line.put(Return_Delay_Time=7)
+    line.sdk.factoryReset(line.port, 0xFE, 0xFF)
+    line.sleep(0.5)
+    assert line.read("Return Delay Time") == 7
+
+
+def test_clear_forgets_the_turns_of_a_standing_servo_only(line: Line) -> None:
+    extended(line, velocity=100)
+    line.put(Goal_Position=2048 + 2 * 4096)
+    line.sleep(0.5)
+    assert line.sdk.clearMultiTurn(line.port, 1) == (COMM_SUCCESS, StatusError.RESULT_FAIL)
+    line.sleep(8.0)
+    assert line.read("Present Position") == 2048 + 2 * 4096
+    assert line.sdk.clearMultiTurn(line.port, 1) == (COMM_SUCCESS, 0)
+    assert line.read("Present Position") == line.read("Goal Position") == 2048

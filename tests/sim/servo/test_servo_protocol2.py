@@ -1,0 +1,127 @@
+"""The slave's codec against the SDK's own and against the e-manual's examples."""
+
+import pytest
+from dynamixel_sdk import Protocol2PacketHandler
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim.servo.protocol2 import (
+    BROADCAST_ID,
+    InstructionPacket,
+    PacketParser,
+    Status,
+    crc16,
+    fast_status_parts,
+    status_packet,
+    with_crc,
+)
+
+SDK = Protocol2PacketHandler()
+
+# Bytes that make headers, stuffing and near misses of both likely.
+tricky_bytes = st.lists(st.sampled_from([0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x01, 0x55, 0xAB]), max_size=40).map(bytes)
+payloads = st.binary(max_size=40) | tricky_bytes
+ids = st.integers(0, 252) | st.just(BROADCAST_ID)
+
+
+def instruction_frame(bus_id: int, instruction: int, parameters: bytes) -> bytes:
+    """Return the packet as a host sends it, stuffed by the SDK's `addStuffing` (its `txPacket` throws the result away)."""
+    length = len(parameters) + 3
+    packet = [0xFF, 0xFF, 0xFD, 0, bus_id, length & 0xFF, length >> 8, instruction, *parameters, 0, 0]
+    stuffed = SDK.addStuffing(packet)
+    size = 7 + (stuffed[5] | stuffed[6] << 8)
+    return with_crc(bytes(stuffed[: size - 2]))
+
+
+packets = st.builds(InstructionPacket, ids, st.integers(1, 0x9A), payloads)
+
+
+@given(st.binary(max_size=200))
+def test_crc_is_the_sdks(data: bytes) -> None:
+    assert crc16(data) == SDK.updateCRC(0, data, len(data))
+
+
+@pytest.mark.parametrize(
+    ("frame", "packet"),
+    [
+        ("FF FF FD 00 01 03 00 01 19 4E", InstructionPacket(1, 0x01, b"")),
+        ("FF FF FD 00 FE 03 00 01 31 42", InstructionPacket(0xFE, 0x01, b"")),
+        ("FF FF FD 00 01 07 00 02 84 00 04 00 1D 15", InstructionPacket(1, 0x02, b"\x84\0\x04\0")),
+        ("FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89", InstructionPacket(1, 0x03, b"\x74\0\0\x02\0\0")),
+        ("FF FF FD 00 01 04 00 06 01 A1 E6", InstructionPacket(1, 0x06, b"\x01")),
+        ("FF FF FD 00 01 03 00 08 2F 4E", InstructionPacket(1, 0x08, b"")),
+        ("FF FF FD 00 01 08 00 10 01 44 58 4C 22 B1 DC", InstructionPacket(1, 0x10, b"\x01DXL\x22")),
+        ("FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA", InstructionPacket(0xFE, 0x82, b"\x84\0\x04\0\x01\x02")),
+    ],
+)
+def test_emanual_instruction_packets_are_understood(frame: str, packet: InstructionPacket) -> None:
+    assert PacketParser().feed(bytes.fromhex(frame)) == [packet]
+
+
+@pytest.mark.parametrize(
+    ("bus_id", "status", "frame"),
+    [
+        (1, Status(0, b"\x06\x04\x26"), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
+        (2, Status(0, b"\x06\x04\x26"), "FF FF FD 00 02 07 00 55 00 06 04 26 6F 6D"),
+        (1, Status(0, b"\xa6\0\0\0"), "FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0"),
+        (1, Status(0), "FF FF FD 00 01 04 00 55 00 A1 0C"),
+        (2, Status(0, b"\x24"), "FF FF FD 00 02 05 00 55 00 24 8B A9"),
+    ],
+)
+def test_status_packets_are_the_emanuals(bus_id: int, status: Status, frame: str) -> None:
+    assert status_packet(bus_id, status) == bytes.fromhex(frame)
+
+
+def test_fast_sync_read_status_is_the_emanuals() -> None:
+    answers = [
+        (3, Status(0, (166).to_bytes(4, "little"))),
+        (7, Status(0, (2079).to_bytes(4, "little"))),
+        (4, Status(0, (1023).to_bytes(4, "little"))),
+    ]
+    assert fast_status_parts([4, 4, 4], answers) == [
+        bytes.fromhex("FF FF FD 00 FE 19 00 55 00 03 A6 00 00 00 84 08"),
+        bytes.fromhex("00 07 1F 08 00 00 16 CA"),
+        bytes.fromhex("00 04 FF 03 00 00 D1 9E"),
+    ]
+
+
+@given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
+def test_the_sdk_unstuffs_what_the_servo_stuffs(bus_id: int, error: int, data: bytes) -> None:
+    frame = list(status_packet(bus_id, Status(error, data)))
+    assert b"\xff\xff\xfd\x00" not in bytes(frame[4:-2])
+    assert SDK.updateCRC(0, frame, len(frame) - 2) == frame[-2] | frame[-1] << 8
+    plain = SDK.removeStuffing(frame)
+    length = plain[5] | plain[6] << 8
+    assert plain[4] == bus_id
+    assert bytes(plain[7 : 7 + length - 2]) == bytes((0x55, error)) + data
+
+
+@given(sent=st.lists(st.tuples(payloads, packets), max_size=6), cuts=st.lists(st.integers(0, 400), max_size=8))
+def test_packets_are_found_among_noise_and_in_any_pieces(
+    sent: list[tuple[bytes, InstructionPacket]], cuts: list[int]
+) -> None:
+    stream = b"".join(noise + instruction_frame(p.bus_id, p.instruction, p.parameters) for noise, p in sent)
+    stream += bytes(1100)  # completes whatever the noise may have announced
+    parser = PacketParser()
+    found = []
+    start = 0
+    for cut in [*sorted(cuts), len(stream)]:
+        found += parser.feed(stream[start:cut])
+        start = max(start, cut)
+    assert [p for p in found if p.intact] == [p for _, p in sent]
+
+
+@given(packet=packets, data=st.data())
+def test_a_flipped_bit_is_never_accepted(packet: InstructionPacket, data: st.DataObject) -> None:
+    frame = bytearray(instruction_frame(packet.bus_id, packet.instruction, packet.parameters))
+    bit = data.draw(st.integers(0, 8 * len(frame) - 1))
+    frame[bit // 8] ^= 1 << bit % 8
+    assert not [p for p in PacketParser().feed(bytes(frame) + bytes(1100)) if p.intact]
+
+
+@given(noise=st.binary(max_size=300))
+def test_noise_leaves_no_more_than_one_packet_waiting(noise: bytes) -> None:
+    parser = PacketParser()
+    parser.feed(noise)
+    parser.reset()
+    assert parser.feed(instruction_frame(1, 1, b"")) == [InstructionPacket(1, 1, b"")]
