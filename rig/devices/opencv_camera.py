@@ -1,0 +1,317 @@
+"""A camera through OpenCV: settings locked and read back, frames chosen by when they were exposed.
+
+A UVC camera's driver keeps up to ten old frames, so what `VideoCapture` hands out next may show the past. Three kinds
+of source tell in different ways when a frame was exposed (`TimeBase`); which one applies is found out when the camera
+is opened:
+
+- stamped: ``CAP_PROP_POS_MSEC`` is the bench's monotonic clock in milliseconds, as V4L2 has it; each frame is judged by
+  its stamp;
+- paced: a live source whose stamps are something else. A frame for which `grab` had to wait is new, and its exposure
+  began no earlier than ``latency_s`` before it came; the frames before it drain a buffer of any length;
+- recorded: a source with a known number of frames, such as a video file. It has no past: a frame counts as exposed when
+  it is read.
+"""
+
+import os
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from rig.clock import Clock, seconds_between
+from rig.devices.camera import CameraIdentity, CameraLocks, Frame
+from rig.errors import DeviceFault, DeviceNotFound, DeviceSilent
+
+V4L2_EXPOSURE_MANUAL = 1
+_V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera chooses the time
+_EXPOSURE_UNIT_US = 100.0  # V4L2_CID_EXPOSURE_ABSOLUTE
+
+_PROBES = 16  # frames to look at when opened: more than a driver keeps
+_RETRIES = 5  # grabs in a row that may fail
+_FRESH_S = 1.0  # a frame that the camera has just delivered is younger
+_STAMP_ERROR_NS = 2_000_000  # how far a stamp may lie ahead of the clock
+
+
+class Capture(Protocol):
+    """What the driver uses of `cv2.VideoCapture`."""
+
+    def isOpened(self) -> bool: ...  # noqa: N802
+
+    def grab(self) -> bool: ...
+
+    def retrieve(self) -> tuple[bool, Any]: ...
+
+    def get(self, propId: int, /) -> float: ...
+
+    def set(self, propId: int, value: float, /) -> bool: ...
+
+    def release(self) -> None: ...
+
+
+class TimeBase(Enum):
+    """How the time of a frame is known."""
+
+    STAMPED = "stamped"
+    PACED = "paced"
+    RECORDED = "recorded"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What the camera is asked for; None leaves a setting to the camera.
+
+    ``gain`` and ``focus`` are in the camera's own units, as `v4l2-ctl --list-ctrls` shows them.
+    """
+
+    width: int | None = 640
+    height: int | None = 480
+    fps: float | None = 30.0
+    exposure_us: float | None = 10_000.0
+    gain: float | None = 0.0
+    white_balance_k: float | None = 5000.0
+    focus: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "fps", "exposure_us", "white_balance_k"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ValueError(f"{name} = {value!r}: give a positive number, or None to leave it to the camera")
+
+
+@dataclass(frozen=True, slots=True)
+class NotTaken:
+    """A setting that the camera did not take: what it was asked for, and what it reports."""
+
+    setting: str
+    asked: float
+    reported: float
+
+
+class OpenCvCamera:
+    """`rig.devices.camera.Camera` on anything that behaves like `cv2.VideoCapture`.
+
+    Parameters
+    ----------
+    capture
+        An open source, such as `open_capture` returns. The camera owns it from here on.
+    clock
+        The bench's clock.
+    settings
+        What to ask of the camera. What it does not take is in `not_taken`, and `read_locks` tells what it does instead.
+    name
+        Its name in records.
+    timeout_s
+        How long `capture` waits for a frame that is new enough.
+    latency_s
+        For a paced source: the longest time from the start of an exposure until `grab` has it; three frames if None.
+
+    Raises
+    ------
+    DeviceSilent
+        The camera delivers no frames.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        *,
+        clock: Clock,
+        settings: CameraSettings | None = None,
+        name: str = "camera",
+        timeout_s: float = 3.0,
+        latency_s: float | None = None,
+    ) -> None:
+        self._capture = capture
+        self._clock = clock
+        self._timeout_s = timeout_s
+        self._supported: set[int] = set()
+        self.not_taken: tuple[NotTaken, ...] = self._configure(settings or CameraSettings())
+        self._identity = CameraIdentity(
+            name,
+            round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+            round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+            capture.get(cv2.CAP_PROP_FPS),
+        )
+        self._period_s = 1 / self._identity.fps if 1 <= self._identity.fps <= 1000 else 1 / 30
+        self._latency_ns = round((3 * self._period_s if latency_s is None else latency_s) * 1e9)
+        self._last_stamp_ns = -1
+        self.time_base: TimeBase = TimeBase.STAMPED
+        self.time_base = self._find_time_base()
+
+    @property
+    def identity(self) -> CameraIdentity:
+        return self._identity
+
+    def capture(self, after_ns: int) -> Frame:
+        """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
+
+        Raises
+        ------
+        DeviceSilent
+            No such frame came within the time-out, or the camera has stopped delivering.
+        """
+        deadline_ns = max(self._clock.now_ns(), after_ns) + round(self._timeout_s * 1e9)
+        dropped = 0
+        while True:
+            if self.time_base is TimeBase.RECORDED:
+                self._clock.sleep(seconds_between(self._clock.now_ns(), after_ns))
+            exposed_ns = self._grab()
+            if exposed_ns is not None and exposed_ns >= after_ns:
+                return Frame(self._retrieve(), exposed_ns)
+            dropped += 1
+            if self._clock.now_ns() > deadline_ns:
+                raise DeviceSilent(
+                    f"{self._identity.name} delivered no new frame in {self._timeout_s:g} s",
+                    next_step="check the camera's cable; a long exposure or a busy USB bus needs a longer time-out",
+                    evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
+                )
+
+    def read_locks(self) -> CameraLocks:
+        exposure = self._known(cv2.CAP_PROP_EXPOSURE)
+        auto_exposure = self._known(cv2.CAP_PROP_AUTO_EXPOSURE)
+        auto_white_balance = self._known(cv2.CAP_PROP_AUTO_WB)
+        return CameraLocks(
+            exposure_us=None if exposure is None else exposure * _EXPOSURE_UNIT_US,
+            gain=self._known(cv2.CAP_PROP_GAIN),
+            white_balance_k=self._known(cv2.CAP_PROP_WB_TEMPERATURE),
+            auto_exposure=None if auto_exposure is None else auto_exposure in _V4L2_EXPOSURE_AUTO,
+            auto_white_balance=None if auto_white_balance is None else auto_white_balance != 0,
+        )
+
+    def close(self) -> None:
+        self._capture.release()
+
+    # -- settings -----------------------------------------------------------------------------------------------------
+
+    def _configure(self, settings: CameraSettings) -> tuple[NotTaken, ...]:
+        """Ask for every setting; an automatic is switched off before its value is set, as UVC needs it."""
+        asked: list[tuple[str, int, float]] = []
+
+        def ask(name: str, prop: int, value: float | None) -> None:
+            if value is not None:
+                asked.append((name, prop, value))
+                if self._capture.set(prop, value):
+                    self._supported.add(prop)
+
+        ask("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width)
+        ask("height", cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
+        ask("fps", cv2.CAP_PROP_FPS, settings.fps)
+        if settings.exposure_us is not None:
+            ask("auto_exposure", cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_EXPOSURE_MANUAL)
+            ask("exposure_100us", cv2.CAP_PROP_EXPOSURE, round(settings.exposure_us / _EXPOSURE_UNIT_US))
+        ask("gain", cv2.CAP_PROP_GAIN, settings.gain)
+        if settings.white_balance_k is not None:
+            ask("auto_white_balance", cv2.CAP_PROP_AUTO_WB, 0)
+            ask("white_balance_k", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k)
+        if settings.focus is not None:
+            ask("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0)
+            ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
+        read_back = [(name, prop, value, self._capture.get(prop)) for name, prop, value in asked]
+        return tuple(
+            NotTaken(name, value, reported)
+            for name, prop, value, reported in read_back
+            if prop not in self._supported or abs(reported - value) > 0.01 * abs(value)
+        )
+
+    def _known(self, prop: int) -> float | None:
+        """Return a property, or None where OpenCV's 0 or -1 stands for "does not tell"."""
+        value = self._capture.get(prop)
+        return value if value > 0 or (value == 0 and prop in self._supported) else None
+
+    # -- frames -------------------------------------------------------------------------------------------------------
+
+    def _find_time_base(self) -> TimeBase:
+        """Look at the first frames: past the old ones, those of a stamped source have only just been exposed."""
+        if self._capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0:
+            return TimeBase.RECORDED
+        for _ in range(_PROBES):
+            exposed_ns = self._grab()
+            if self.time_base is TimeBase.PACED:
+                break
+            if exposed_ns is not None and seconds_between(exposed_ns, self._clock.now_ns()) < _FRESH_S:
+                return TimeBase.STAMPED
+        return TimeBase.PACED
+
+    def _grab(self) -> int | None:
+        """Take the next frame; return when its exposure began on the bench's clock, or None if that may be long ago."""
+        for _ in range(_RETRIES):
+            asked_ns = self._clock.now_ns()
+            if self._capture.grab():
+                return self._exposed_ns(asked_ns)
+            self._clock.sleep(self._period_s)
+        raise DeviceSilent(
+            f"{self._identity.name} delivers no frames: {_RETRIES} attempts in a row failed",
+            next_step="a recording is at its end"
+            if self._capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0
+            else "check the camera's cable, and that no other program uses it",
+            evidence={"attempts": _RETRIES, "still_open": self._capture.isOpened()},
+        )
+
+    def _exposed_ns(self, asked_ns: int) -> int | None:
+        now_ns = self._clock.now_ns()
+        if self.time_base is TimeBase.RECORDED:
+            return asked_ns
+        if self.time_base is TimeBase.STAMPED:
+            stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            if self._last_stamp_ns < stamp_ns <= now_ns + _STAMP_ERROR_NS:
+                self._last_stamp_ns = stamp_ns
+                return stamp_ns
+            self.time_base = TimeBase.PACED  # stamps that repeat or lie in the future are not this clock's
+        waited = seconds_between(asked_ns, now_ns) > self._period_s / 4
+        return now_ns - self._latency_ns if waited else None
+
+    def _retrieve(self) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        ok, image = self._capture.retrieve()
+        if not ok or image is None:
+            raise DeviceSilent(
+                f"{self._identity.name} lost a frame between grabbing and decoding it",
+                next_step="try again; if it repeats, try another cable or USB port",
+            )
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise DeviceFault(
+                f"{self._identity.name} delivers {image.dtype} images of shape {image.shape}, not 8-bit colour",
+                next_step="choose a colour format that OpenCV converts (v4l2-ctl --list-formats)",
+            )
+        return np.asarray(image, dtype=np.uint8)
+
+
+def open_capture(source: int | str | Path) -> cv2.VideoCapture:
+    """Open a camera by number or device path, or a video file, an image sequence (``img_%03d.png``) or a stream's URL.
+
+    Raises
+    ------
+    DeviceNotFound
+        Nothing is there, it may not be opened, or another program holds it; the next step says which.
+    """
+    if isinstance(source, int) or str(source).isdigit():
+        source = f"/dev/video{source}"
+    path = str(source)
+    if not path.startswith("/dev/"):
+        return _opened(path, cv2.CAP_ANY, "check the path or address, and that OpenCV can decode its format")
+    if not Path(path).exists():
+        there = sorted(str(p) for p in Path("/dev").glob("video*"))
+        raise DeviceNotFound(
+            f"there is no camera {path}",
+            next_step=f"connect the camera, or choose one of {', '.join(there)}" if there else "connect the camera",
+            evidence={"path": path, "found": there},
+        )
+    if not os.access(path, os.R_OK | os.W_OK):
+        raise DeviceNotFound(
+            f"no permission to open {path}",
+            next_step="add yourself to the group video (sudo usermod -aG video $USER), log out and in again",
+            evidence={"path": path},
+        )
+    return _opened(
+        path, cv2.CAP_V4L2, f"close the program that uses it (fuser -v {path}), or try the camera's next number"
+    )
+
+
+def _opened(path: str, backend: int, next_step: str) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(path, backend)
+    if not capture.isOpened():
+        capture.release()
+        raise DeviceNotFound(f"cannot open {path}", next_step=next_step, evidence={"path": path})
+    return capture

@@ -1,0 +1,282 @@
+"""The simulated camera: a UVC device at the seam of `cv2.VideoCapture`, looking at the world's platter."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from math import ceil, cos, radians, sin
+from zlib import crc32
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
+from sim.objects.solid import empty_platter
+from sim.sensor import Gains, Sensor, white_balance
+from sim.world import HISTORY_S, Scene, World
+
+FPS = 30
+NOMINAL_EXPOSURE = 100
+"""Exposure at which a scene's grey levels are the frame's, in V4L2's unit of 100 µs."""
+READOUT_NS = 15_000_000
+"""From the end of the exposure until the computer has the frame."""
+V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY = 1, 3
+
+_EXPOSURE_RANGE = (1, 10_000 // FPS)
+_GAIN_RANGE_DB = (0, 24)
+_KELVIN_RANGE = (2800, 6500)
+_FOCUS_RANGE = (0, 255)
+_SHARP_AT = 120
+_BUFFERS_RANGE = (1, 10)
+
+_METER_FRAMES = 5  # how often the automatics act
+_METER_TARGET = 70.0
+_EDGE_PX_PER_DEG = radians(80 * PX_PER_MM)  # how fast what stands 80 mm from the axis crosses the image
+_STILL_PX = 0.25
+_MAX_SUBFRAMES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Controls:
+    """The camera's settings: exposure in 100 µs, gain in dB, white balance in kelvin."""
+
+    auto_exposure: bool = True
+    exposure: float = NOMINAL_EXPOSURE
+    gain_db: float = 0.0
+    auto_white_balance: bool = True
+    kelvin: float = 4600.0
+    autofocus: bool = True
+    focus: float = _SHARP_AT
+    buffers: int = 4
+
+    @property
+    def gains(self) -> Gains:
+        gain = 10 ** (self.gain_db / 20)
+        b, g, r = white_balance(self.kelvin)
+        return gain * b, gain * g, gain * r
+
+
+class SimCapture:
+    """What `cv2.VideoCapture` is to a driver, on the world's clock.
+
+    Frame k is exposed from k / 30 s on and arrives `READOUT_NS` after its exposure. Up to four frames that nobody
+    fetches are kept, the oldest; then new ones are lost until there is room, as V4L2 does. A frame is drawn when it is
+    retrieved, from the world's past at its own exposure, so frames that are dropped cost nothing and change nothing.
+    Properties follow OpenCV's V4L2 backend: its units, False from `set` and 0 from `get` for what the camera lacks.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._clock = world.clock
+        self._sensor = Sensor(world.noise, world.rng("camera"))
+        self._backdrop = empty_platter()
+        self._open = True
+        self._queue: deque[int] = deque()
+        self._next = _frame_after(self._clock.now_ns())
+        self._grabbed: int | None = None
+        self._controls: list[tuple[int, Controls]] = [(self._clock.now_ns(), Controls())]
+        self._metered = self._next
+
+    # -- the side of the world --------------------------------------------------------------------------------------
+
+    def unplug(self) -> None:
+        """Pull the cable: from now on no frame arrives."""
+        self._open = False
+
+    # -- the side of cv2.VideoCapture ---------------------------------------------------------------------------------
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return self._open
+
+    def getBackendName(self) -> str:  # noqa: N802
+        return "SIM"
+
+    def release(self) -> None:
+        self._open = False
+
+    def read(self) -> tuple[bool, Image | None]:
+        return self.retrieve() if self.grab() else (False, None)
+
+    def grab(self) -> bool:
+        """Take the oldest waiting frame, or wait for the next one."""
+        if not self._open:
+            return False
+        self._receive()
+        if not self._queue:
+            self._clock.advance_to(self._arrival_ns(self._next))
+            self._receive()
+        self._grabbed = self._queue.popleft()
+        return True
+
+    def retrieve(self) -> tuple[bool, Image | None]:
+        """Return the frame that was grabbed last, uint8 (480, 640, 3)."""
+        if self._grabbed is None or not self._open:
+            return False, None
+        return True, self._frame(self._grabbed)
+
+    def get(self, prop: int) -> float:
+        self._meter()
+        now = self._controls[-1][1]
+        values: dict[int, float] = {
+            cv2.CAP_PROP_FRAME_WIDTH: WIDTH,
+            cv2.CAP_PROP_FRAME_HEIGHT: HEIGHT,
+            cv2.CAP_PROP_FPS: FPS,
+            cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else start_ns(self._grabbed) * 1e-6,
+            cv2.CAP_PROP_BUFFERSIZE: now.buffers,
+            cv2.CAP_PROP_AUTO_EXPOSURE: V4L2_EXPOSURE_APERTURE_PRIORITY if now.auto_exposure else V4L2_EXPOSURE_MANUAL,
+            cv2.CAP_PROP_EXPOSURE: round(now.exposure),
+            cv2.CAP_PROP_GAIN: now.gain_db,
+            cv2.CAP_PROP_AUTO_WB: now.auto_white_balance,
+            cv2.CAP_PROP_WB_TEMPERATURE: round(now.kelvin),
+            cv2.CAP_PROP_AUTOFOCUS: now.autofocus,
+            cv2.CAP_PROP_FOCUS: now.focus,
+        }
+        return float(values.get(prop, 0.0))
+
+    def set(self, prop: int, value: float) -> bool:
+        """Change a setting for the frames exposed from now on; what the camera controls itself is refused."""
+        self._meter()
+        now = self._controls[-1][1]
+        match prop:
+            case cv2.CAP_PROP_FRAME_WIDTH | cv2.CAP_PROP_FRAME_HEIGHT | cv2.CAP_PROP_FPS:
+                return value == self.get(prop)
+            case cv2.CAP_PROP_BUFFERSIZE if _BUFFERS_RANGE[0] <= value <= _BUFFERS_RANGE[1]:
+                self._queue.clear()  # OpenCV gives its buffers back and starts the stream anew
+                self._next = _frame_after(self._clock.now_ns())
+                now = replace(now, buffers=int(value))
+            case cv2.CAP_PROP_AUTO_EXPOSURE if value in (V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY):
+                auto = value == V4L2_EXPOSURE_APERTURE_PRIORITY
+                now = replace(now, auto_exposure=auto, exposure=round(now.exposure))
+            case cv2.CAP_PROP_EXPOSURE if not now.auto_exposure:
+                now = replace(now, exposure=_within(value, _EXPOSURE_RANGE))
+            case cv2.CAP_PROP_GAIN:
+                now = replace(now, gain_db=_within(value, _GAIN_RANGE_DB))
+            case cv2.CAP_PROP_AUTO_WB:
+                now = replace(now, auto_white_balance=bool(value), kelvin=round(now.kelvin))
+            case cv2.CAP_PROP_WB_TEMPERATURE if not now.auto_white_balance:
+                now = replace(now, kelvin=_within(value, _KELVIN_RANGE))
+            case cv2.CAP_PROP_AUTOFOCUS:
+                now = replace(now, autofocus=bool(value), focus=_SHARP_AT if value else now.focus)
+            case cv2.CAP_PROP_FOCUS if not now.autofocus:
+                now = replace(now, focus=_within(value, _FOCUS_RANGE))
+            case _:
+                return False
+        self._change(self._clock.now_ns(), now)
+        return True
+
+    # -- time ---------------------------------------------------------------------------------------------------------
+
+    def _receive(self) -> None:
+        """Queue what has arrived since the last look, as far as there is room; the rest is lost."""
+        self._meter()
+        now_ns = self._clock.now_ns()
+        room = self._controls[-1][1].buffers
+        while len(self._queue) < room and self._arrival_ns(self._next) <= now_ns:
+            self._queue.append(self._next)
+            self._next += 1
+        if len(self._queue) == room:
+            self._next = max(self._next, _frame_after(now_ns) - 2)
+            while self._arrival_ns(self._next) <= now_ns:
+                self._next += 1
+
+    def _arrival_ns(self, frame: int) -> int:
+        start = start_ns(frame)
+        return start + _exposure_ns(self._controls_at(start)) + READOUT_NS
+
+    def _controls_at(self, time_ns: int) -> Controls:
+        return next((c for since, c in reversed(self._controls) if since <= time_ns), self._controls[0][1])
+
+    def _change(self, time_ns: int, controls: Controls) -> None:
+        self._controls.append((time_ns, controls))
+        horizon = self._clock.now_ns() - round(HISTORY_S * 1e9)
+        while len(self._controls) > 1 and self._controls[1][0] <= horizon:
+            del self._controls[0]
+
+    # -- light --------------------------------------------------------------------------------------------------------
+
+    def _frame(self, frame: int) -> Image:
+        start = start_ns(frame)
+        controls, scene = self._controls_at(start), self._world.scene_at(start)
+        times = self._subframes(start, _exposure_ns(controls))
+        angles = self._world.table_motion(times)[0]
+        seen: NDArray[np.uint8] | NDArray[np.float32]
+        if len(angles) == 1:
+            seen = self._picture(scene, float(angles[0]))
+        else:
+            total = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
+            for angle in angles:
+                cv2.accumulate(self._picture(scene, float(angle)), total)
+            seen = total * np.float32(1 / len(angles))
+        blur = abs(controls.focus - _SHARP_AT) * 0.04
+        if blur > 0.1:
+            seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
+        return self._sensor.expose(
+            seen,
+            light=scene.light,
+            exposure=controls.exposure / NOMINAL_EXPOSURE,
+            gains=controls.gains,
+            rng=np.random.default_rng([self._world.seed, crc32(b"camera frame"), frame]),
+        )
+
+    def _subframes(self, start: int, exposure: int) -> NDArray[np.int64]:
+        """Return the moments whose pictures make up the exposure: one at rest, one a pixel of motion otherwise."""
+        probes = start + np.linspace(0, exposure, 9).astype(np.int64)
+        path_px = np.abs(np.diff(self._world.table_motion(probes)[0])).sum() * _EDGE_PX_PER_DEG
+        n = 1 if path_px < _STILL_PX else min(1 + ceil(path_px), _MAX_SUBFRAMES)
+        return start + ((np.arange(n) + 0.5) / n * exposure).astype(np.int64)
+
+    def _picture(self, scene: Scene, table_deg: float) -> Image:
+        """Return what the lens sees of a scene under nominal light."""
+        image = self._backdrop.copy()
+        if scene.thing is None:
+            return image
+        if not isinstance(scene.thing, Visible):
+            raise TypeError(f"{scene.thing!r} cannot be seen: put something with a method draw on the platter")
+        x, y = scene.offset_mm
+        c, s = cos(radians(table_deg)), sin(radians(table_deg))
+        scene.thing.draw(image, table_deg + scene.yaw_deg, (c * x - s * y, s * x + c * y))
+        return image
+
+    def _meter(self) -> None:
+        """Let the automatics that are on act on the frames since the last look.
+
+        Automatic exposure pulls the mean brightness to a target; automatic white balance pulls red and blue together
+        (the grey world), whatever colour the object on the platter has.
+        """
+        now_ns = self._clock.now_ns()
+        self._metered = max(self._metered, _frame_after(now_ns - round(HISTORY_S * 1e9)))
+        while start_ns(self._metered + _METER_FRAMES) <= now_ns:
+            self._metered += _METER_FRAMES
+            time_ns = start_ns(self._metered)
+            controls = self._controls[-1][1]
+            if not (controls.auto_exposure or controls.auto_white_balance):
+                continue
+            scene = self._world.scene_at(time_ns)
+            mean = np.array(cv2.mean(self._picture(scene, self._world.table_deg(time_ns)))[:3])
+            mean *= np.array(scene.light) * controls.gains * controls.exposure / NOMINAL_EXPOSURE
+            if controls.auto_exposure:
+                step = np.clip(_METER_TARGET / max(mean.mean(), 1e-3), 0.25, 4.0) ** 0.5
+                controls = replace(controls, exposure=float(np.clip(controls.exposure * step, *_EXPOSURE_RANGE)))
+            if controls.auto_white_balance and mean.min() > 0:
+                step = (mean[0] / mean[2]) ** 0.3
+                controls = replace(controls, kelvin=float(np.clip(controls.kelvin * step, *_KELVIN_RANGE)))
+            self._change(time_ns, controls)
+
+
+def start_ns(frame: int) -> int:
+    """Return when the exposure of a frame begins; V4L2 stamps whole microseconds."""
+    return frame * 1_000_000 // FPS * 1000
+
+
+def _frame_after(time_ns: int) -> int:
+    """Return the first frame that begins at or after a time."""
+    frame = max(time_ns, 0) * FPS // 1_000_000_000
+    return frame if start_ns(frame) >= time_ns else frame + 1
+
+
+def _exposure_ns(controls: Controls) -> int:
+    return round(controls.exposure * 100_000)
+
+
+def _within(value: float, limits: tuple[int, int]) -> int:
+    """Return ``value`` as V4L2 takes it: a whole number, brought into the range."""
+    return int(min(max(int(value), limits[0]), limits[1]))

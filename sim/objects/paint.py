@@ -1,0 +1,160 @@
+"""Brushes for the textures of the built-in objects.
+
+A texture is painted in units of its own size: u runs across from 0 (left) to 1 (right), v down from 0 (top) to 1
+(bottom). On a body of revolution u = 0.5 is the front, and the sheet closes to a ring: what is painted at any u may run
+over the seam.
+"""
+
+from collections.abc import Callable, Sequence
+from math import cos, pi, sin
+
+import cv2
+import numpy as np
+
+from sim.objects.projection import Image
+
+Colour = tuple[int, int, int]
+"""B, G, R."""
+Brush = Callable[["Sheet"], None]
+Paint = Callable[[tuple[int, int]], Image]
+"""Returns a texture for its (rows, columns)."""
+
+WHITE: Colour = (238, 240, 240)
+CREAM: Colour = (196, 226, 238)
+BLACK: Colour = (34, 32, 32)
+GREY: Colour = (150, 150, 148)
+RED: Colour = (44, 40, 196)
+ORANGE: Colour = (30, 120, 232)
+YELLOW: Colour = (50, 205, 240)
+GREEN: Colour = (70, 140, 50)
+DARK_GREEN: Colour = (52, 80, 26)
+TEAL: Colour = (150, 150, 40)
+BLUE: Colour = (180, 90, 30)
+NAVY: Colour = (100, 48, 24)
+PURPLE: Colour = (140, 50, 110)
+PINK: Colour = (190, 150, 235)
+BROWN: Colour = (40, 70, 118)
+WOOD: Colour = (110, 165, 205)
+TERRACOTTA: Colour = (72, 104, 190)
+
+_SHIFT = 4
+
+
+class Sheet:
+    """A texture under the brush, uint8 (rows, columns, 3)."""
+
+    def __init__(self, shape: tuple[int, int], ground: Colour) -> None:
+        self.pixels = np.empty((*shape, 3), dtype=np.uint8)
+        self.pixels[:] = ground
+
+    @property
+    def rows(self) -> int:
+        return self.pixels.shape[0]
+
+    @property
+    def columns(self) -> int:
+        return self.pixels.shape[1]
+
+    def band(self, top: float, bottom: float, colour: Colour) -> None:
+        """Fill all the way across between two heights."""
+        self.panel(0.0, top, 1.0, bottom, colour)
+
+    def panel(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
+        self.polygon([(left, top), (right, top), (right, bottom), (left, bottom)], colour)
+
+    def polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
+        scale = np.array([self.columns, self.rows], dtype=np.float64)
+        fixed = np.round((np.array(points) * scale - 0.5) * (1 << _SHIFT)).astype(np.int32)
+        cv2.fillPoly(self.pixels, [fixed], colour, cv2.LINE_AA, _SHIFT)
+
+    def stripes(self, n: int, colour: Colour, *, share: float = 0.5, top: float = 0.0, bottom: float = 1.0) -> None:
+        """Paint ``n`` upright stripes, each ``share`` of its period wide."""
+        for i in range(n):
+            middle = (i + 0.5) / n
+            self.panel(middle - share / (2 * n), top, middle + share / (2 * n), bottom, colour)
+
+    def disc(self, u: float, v: float, radius: float, colour: Colour) -> None:
+        """Paint a round spot; ``radius`` as a share of the sheet's height."""
+        centre = (round((u * self.columns - 0.5) * (1 << _SHIFT)), round((v * self.rows - 0.5) * (1 << _SHIFT)))
+        cv2.circle(self.pixels, centre, round(radius * self.rows * (1 << _SHIFT)), colour, -1, cv2.LINE_AA, _SHIFT)
+
+    def star(self, u: float, v: float, radius: float, colour: Colour, *, points: int = 5, waist: float = 0.42) -> None:
+        """Paint a star; with a waist near 1 a rosette."""
+        aspect = self.rows / self.columns
+        corners = []
+        for i in range(2 * points):
+            r = radius * (waist if i % 2 else 1.0)
+            corners.append((u + r * sin(i * pi / points) * aspect, v - r * cos(i * pi / points)))
+        self.polygon(corners, colour)
+
+    def dots(
+        self, across: int, down: int, radius: float, colour: Colour, *, top: float = 0.0, bottom: float = 1.0
+    ) -> None:
+        """Paint a grid of spots, every other row shifted by half a step."""
+        for j in range(down):
+            v = top + (j + 0.5) / down * (bottom - top)
+            for i in range(across):
+                self.disc((i + (0.25 if j % 2 else 0.75)) / across, v, radius, colour)
+
+    def text(self, words: str, u: float, v: float, height: float, colour: Colour, *, width: float = 1.0) -> None:
+        """Write ``words`` centred at (u, v), capitals ``height`` of the sheet high, at most ``width`` of it wide."""
+        font, thickness = cv2.FONT_HERSHEY_DUPLEX, 2
+        (w, h), _ = cv2.getTextSize(words, font, 1.0, thickness)
+        scale = min(height * self.rows / h, width * self.columns / w)
+        thickness = max(round(scale * 2), 1)
+        (w, h), _ = cv2.getTextSize(words, font, scale, thickness)
+        origin = (round(u * self.columns - w / 2), round(v * self.rows + h / 2))
+        cv2.putText(self.pixels, words, origin, font, scale, colour, thickness, cv2.LINE_AA)
+
+    def lines(self, left: float, top: float, right: float, bottom: float, n: int, colour: Colour, seed: int) -> None:
+        """Suggest ``n`` lines of small print."""
+        lengths = np.random.default_rng(seed).uniform(0.55, 1.0, n)
+        for i, length in enumerate(lengths):
+            v = top + (i + 0.2) * (bottom - top) / n
+            self.panel(left, v, left + (right - left) * float(length), v + 0.5 * (bottom - top) / n, colour)
+
+    def mottle(self, strength: float, size: tuple[float, float], seed: int) -> None:
+        """Cloud the sheet with smooth noise of ``strength`` grey levels, its grains ``size`` (u, v) of the sheet."""
+        rng = np.random.default_rng(seed)
+        cells = (max(round(1 / size[1]), 1), max(round(1 / size[0]), 1))
+        coarse = rng.standard_normal(cells, dtype=np.float32)
+        coarse = np.pad(coarse, 2, mode="wrap")
+        scale = (self.rows / cells[0], self.columns / cells[1])
+        fine = cv2.resize(
+            coarse,
+            (round(coarse.shape[1] * scale[1]), round(coarse.shape[0] * scale[0])),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        top, left = round(2 * scale[0]), round(2 * scale[1])
+        cloud = fine[top : top + self.rows, left : left + self.columns, None] * strength
+        self.pixels[:] = np.clip(self.pixels + cloud, 0, 255).astype(np.uint8)
+
+    def around(self, turn_deg: float, brush: Brush) -> None:
+        """Let ``brush`` paint with its front turned counter-clockwise by ``turn_deg`` on a ring."""
+        by = round(turn_deg / 360 * self.columns)
+        self.pixels = np.roll(self.pixels, -by, axis=1)
+        brush(self)
+        self.pixels = np.roll(self.pixels, by, axis=1)
+
+
+def painted(ground: Colour, *brushes: Brush) -> Callable[[tuple[int, int]], Image]:
+    """Return a texture that is ``ground`` with ``brushes`` applied in turn."""
+
+    def paint(shape: tuple[int, int]) -> Image:
+        sheet = Sheet(shape, ground)
+        for brush in brushes:
+            brush(sheet)
+        # Printing is no sharper than the lens: edges of a texel alias when the surface is seen at a slant.
+        return np.asarray(cv2.GaussianBlur(sheet.pixels, (0, 0), 0.7), dtype=np.uint8)
+
+    return paint
+
+
+def wood(seed: int) -> Brush:
+    """Return a grain that runs across the sheet."""
+
+    def brush(sheet: Sheet) -> None:
+        sheet.mottle(9.0, (0.5, 0.03), seed)
+        sheet.mottle(5.0, (0.2, 0.012), seed + 1)
+
+    return brush

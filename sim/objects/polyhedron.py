@@ -1,0 +1,245 @@
+"""Convex solids with flat faces: boxes, prisms, roofs, lying cylinders. A face is one affine warp of its texture."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import cos, pi, radians, sin, sqrt
+
+import cv2
+import numpy as np
+
+from sim.objects.layers import blend
+from sim.objects.projection import Drawing, Floats, Image, Pose, nearness, shade
+
+TEXELS_PER_MM = 2.0
+_SHIFT = 4  # fractional bits of the coordinates that OpenCV draws with
+
+Colour = tuple[int, int, int]
+Paint = Callable[[tuple[int, int]], Image]
+"""Returns a texture for its (rows, columns)."""
+
+
+@dataclass(frozen=True)
+class Face:
+    """One face: its corners (k, 3) in millimetres, counter-clockwise seen from outside, and what is printed on it.
+
+    A painted face's texture spans the parallelogram of the upper left, upper right and lower left corner in ``frame``.
+    """
+
+    corners: Floats
+    paint: Paint | Colour
+    frame: tuple[Floats, Floats, Floats]
+
+    @cached_property
+    def texture(self) -> Image | None:
+        if isinstance(self.paint, tuple):
+            return None
+        origin, right, down = self.frame
+        rows = round(float(np.linalg.norm(down - origin)) * TEXELS_PER_MM)
+        columns = round(float(np.linalg.norm(right - origin)) * TEXELS_PER_MM)
+        return self.paint((rows, columns))
+
+    @cached_property
+    def normal(self) -> Floats:
+        a, b, c = self.corners[:3]
+        across = np.cross(b - a, c - a)
+        return np.asarray(across / np.linalg.norm(across))
+
+
+def quad(corners: Sequence[Sequence[float]] | Floats, paint: Paint | Colour) -> Face:
+    """Return a parallelogram from its upper left, lower left, lower right and upper right corner, seen from outside."""
+    c = np.array(corners, dtype=np.float64)
+    return Face(c, paint, (c[0], c[3], c[1]))
+
+
+def triangle(corners: Sequence[Sequence[float]] | Floats, colour: Colour) -> Face:
+    """Return a triangle in one colour."""
+    c = np.array(corners, dtype=np.float64)
+    return Face(c, colour, (c[0], c[1], c[2]))
+
+
+@dataclass(frozen=True)
+class Polyhedron:
+    """A convex solid made of faces; ``layer`` as in `sim.objects.revolution.Revolution`.
+
+    Of two parts in a layer the one whose ``depth_at`` (x, y in the thing's frame; the middle if not given) is nearer to
+    the camera covers the other. That is exact where the line between these points crosses a plane that separates the
+    parts at a right angle.
+    """
+
+    faces: tuple[Face, ...]
+    layer: int = 0
+    depth_at: tuple[float, float] | None = None
+
+    @property
+    def reach_mm(self) -> float:
+        """Return the radius of a circle as large as its outline seen from above."""
+        outline = cv2.convexHull(np.concatenate([face.corners[:, :2] for face in self.faces]).astype(np.float32))
+        return sqrt(cv2.contourArea(outline) / pi)
+
+    def drawings(self, pose: Pose) -> list[Drawing]:
+        return [Drawing((self.layer, pose.depth(*self._depth_at)), lambda image: self._draw(image, pose))]
+
+    @cached_property
+    def _depth_at(self) -> tuple[float, float]:
+        if self.depth_at is not None:
+            return self.depth_at
+        x, y, _ = np.concatenate([face.corners for face in self.faces]).mean(axis=0)
+        return float(x), float(y)
+
+    def _draw(self, image: Image, pose: Pose) -> None:
+        corners = [pose.to_image(pose.to_room(face.corners)) for face in self.faces]
+        hull = cv2.convexHull(np.concatenate(corners).astype(np.float32)).reshape(-1, 2)
+        left, top = np.maximum(np.floor(hull.min(axis=0)).astype(int) - 2, 0)
+        right, bottom = np.minimum(np.ceil(hull.max(axis=0)).astype(int) + 3, (image.shape[1], image.shape[0]))
+        if left >= right or top >= bottom:
+            return
+        corner = np.array([left, top], dtype=np.float64)
+        size = (int(right - left), int(bottom - top))
+        normals = pose.turn(np.array([face.normal for face in self.faces]))
+        seen = [i for i in np.argsort(nearness(normals)) if nearness(normals[i]) > 0]
+        solid = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        for n, i in enumerate(seen):
+            face, light = self.faces[i], float(shade(normals[i]))
+            polygon = corners[i] - corner
+            if face.texture is None:
+                self._flat(solid, face, polygon, light, whole=n == 0)
+            else:
+                frame = pose.to_image(pose.to_room(np.array(face.frame))) - corner
+                self._printed(solid, face.texture, frame, polygon, light, whole=n == 0)
+        cover = np.zeros((size[1], size[0]), dtype=np.uint8)
+        _fill(cover, hull - corner, 255)
+        blend(image[top:bottom, left:right], solid, cover)
+
+    @staticmethod
+    def _flat(solid: Image, face: Face, polygon: Floats, light: float, *, whole: bool) -> None:
+        assert isinstance(face.paint, tuple)
+        b, g, r = (c * light for c in face.paint)
+        if whole:  # what shows through the smoothed seams of the next faces is this one
+            solid[:] = np.round((b, g, r)).astype(np.uint8)
+        else:
+            cv2.fillConvexPoly(solid, _fixed(polygon), (b, g, r), cv2.LINE_AA, _SHIFT)
+
+    @staticmethod
+    def _printed(solid: Image, texture: Image, frame: Floats, polygon: Floats, light: float, *, whole: bool) -> None:
+        rows, columns = texture.shape[:2]
+        if whole:
+            x0, y0, x1, y1 = 0, 0, solid.shape[1], solid.shape[0]
+        else:
+            x0, y0 = np.maximum(np.floor(polygon.min(axis=0)).astype(int) - 1, 0)
+            x1, y1 = np.minimum(np.ceil(polygon.max(axis=0)).astype(int) + 2, (solid.shape[1], solid.shape[0]))
+        on_texture = np.array([[-0.5, -0.5], [columns - 0.5, -0.5], [-0.5, rows - 0.5]], dtype=np.float32)
+        move = cv2.getAffineTransform(on_texture, (frame - (x0, y0)).astype(np.float32))
+        size = (int(x1 - x0), int(y1 - y0))
+        layer = cv2.warpAffine(texture, move, size, borderMode=cv2.BORDER_REPLICATE)
+        lit = np.asarray(cv2.convertScaleAbs(layer, alpha=light), dtype=np.uint8)
+        if whole:
+            solid[:] = lit
+            return
+        cover = np.zeros((size[1], size[0]), dtype=np.uint8)
+        _fill(cover, polygon - (x0, y0), 255)
+        blend(solid[y0:y1, x0:x1], lit, cover)
+
+
+def _fixed(polygon: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
+    return np.round(polygon * (1 << _SHIFT)).astype(np.int32)
+
+
+def _fill(cover: Image, polygon: Floats, value: int) -> None:
+    cv2.fillConvexPoly(cover, _fixed(polygon), (value,), cv2.LINE_AA, _SHIFT)
+
+
+# -- solids -----------------------------------------------------------------------------------------------------------
+
+
+def box(
+    size_mm: tuple[float, float, float],
+    *,
+    front: Paint | Colour,
+    right: Paint | Colour,
+    back: Paint | Colour,
+    left: Paint | Colour,
+    top: Paint | Colour,
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    turned_deg: float = 0.0,
+    layer: int = 0,
+) -> Polyhedron:
+    """Return a box (width, depth, height) that stands at ``at``, turned about its own axis; it needs no bottom."""
+    w, d, h = size_mm[0] / 2, size_mm[1] / 2, size_mm[2]
+    ring = [(-w, -d), (w, -d), (w, d), (-w, d)]
+    walls = [
+        quad([(*ring[i], h), (*ring[i], 0), (*ring[(i + 1) % 4], 0), (*ring[(i + 1) % 4], h)], paint)
+        for i, paint in enumerate((front, right, back, left))
+    ]
+    lid = quad([(-w, d, h), (-w, -d, h), (w, -d, h), (w, d, h)], top)
+    return moved(Polyhedron((*walls, lid), layer), at, turned_deg)
+
+
+def prism(sides: int, radius_mm: float, height_mm: float, *, wall: Paint | Colour, top: Paint | Colour) -> Polyhedron:
+    """Return an upright prism over a regular polygon, a face to the front; every wall is printed alike."""
+    ring = [
+        (radius_mm * cos(a), radius_mm * sin(a))
+        for a in (radians(-90) + (2 * i - 1) * pi / sides for i in range(sides + 1))
+    ]
+    walls = [quad([(*a, height_mm), (*a, 0), (*b, 0), (*b, height_mm)], wall) for a, b in pairwise(ring)]
+    lid = np.array([(*p, height_mm) for p in ring[:-1]])
+    r, z = radius_mm, height_mm
+    return Polyhedron((*walls, Face(lid, top, (np.array([-r, r, z]), np.array([r, r, z]), np.array([-r, -r, z])))))
+
+
+def lying_cylinder(
+    radius_mm: float,
+    length_mm: float,
+    *,
+    wall: Colour,
+    end: Paint | Colour,
+    at: tuple[float, float, float],
+    turned_deg: float = 0.0,
+    layer: int = 0,
+    depth_at: tuple[float, float] | None = None,
+    sides: int = 36,
+) -> Polyhedron:
+    """Return a cylinder whose axis lies level, its printed end to the front, its back end at ``at``."""
+    ring = [(radius_mm * cos(2 * pi * i / sides), radius_mm * sin(2 * pi * i / sides)) for i in range(sides + 1)]
+    y = -length_mm
+    walls = [
+        quad([(a[0], 0, a[1]), (b[0], 0, b[1]), (b[0], y, b[1]), (a[0], y, a[1])], wall) for a, b in pairwise(ring)
+    ]
+    r = radius_mm
+    near = np.array([(x, y, z) for x, z in ring[:-1]])
+    far = np.array([(x, 0.0, z) for x, z in ring[:-1]])[::-1].copy()
+    lid = Face(near, end, (np.array([-r, y, r]), np.array([r, y, r]), np.array([-r, y, -r])))
+    cap = Face(far, wall, (far[0], far[1], far[2]))
+    return moved(Polyhedron((*walls, lid, cap), layer, depth_at), at, turned_deg)
+
+
+def roof(
+    size_mm: tuple[float, float, float], *, slope: Paint, gable: Colour, at: tuple[float, float, float], layer: int = 1
+) -> Polyhedron:
+    """Return a gabled roof (width, depth, height) whose ridge runs from left to right."""
+    w, d, h = size_mm[0] / 2, size_mm[1] / 2, size_mm[2]
+    a, b, c, e = (-w, -d, 0.0), (w, -d, 0.0), (w, d, 0.0), (-w, d, 0.0)
+    left, right = (-w, 0.0, h), (w, 0.0, h)
+    triangles = [np.array(t, dtype=np.float64) for t in ((e, a, left), (b, c, right))]
+    faces = (
+        quad([left, a, b, right], slope),
+        quad([right, c, e, left], slope),
+        *(Face(t, gable, (t[0], t[1], t[2])) for t in triangles),
+    )
+    return moved(Polyhedron(faces, layer), at, 0.0)
+
+
+def moved(solid: Polyhedron, at: tuple[float, float, float], turned_deg: float) -> Polyhedron:
+    """Return ``solid`` turned about its own axis and put at ``at`` in the thing's frame."""
+    turn = Pose(turned_deg)
+
+    def there(points: Floats) -> Floats:
+        return np.asarray(turn.turn(points) + np.array(at))
+
+    faces = tuple(Face(there(f.corners), f.paint, _three(there(np.array(f.frame)))) for f in solid.faces)
+    return Polyhedron(faces, solid.layer, solid.depth_at)
+
+
+def _three(points: Floats) -> tuple[Floats, Floats, Floats]:
+    return points[0], points[1], points[2]

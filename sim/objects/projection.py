@@ -1,0 +1,112 @@
+"""How the simulated camera looks at the platter: geometry, light, and what a thing must offer to be seen.
+
+Room frame, millimetres: origin at the centre of the platter's top, x to the camera's right, y away from it, z up. The
+camera stands at the front (-y), `ELEVATION_DEG` above the horizon. Turning counter-clockwise seen from above moves the
+front of a thing to the right of the image. The projection is weak perspective: parallel for the points of one thing,
+whose scale follows the distance of its axis.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import cos, radians, sin
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+WIDTH, HEIGHT = 640, 480
+ELEVATION_DEG = 15.0
+PX_PER_MM = 2.0
+DISTANCE_MM = 800.0
+CENTRE_PX = (320.0, 398.0)
+"""Where the image shows the centre of the platter's top."""
+
+SIN, COS = sin(radians(ELEVATION_DEG)), cos(radians(ELEVATION_DEG))
+TO_CAMERA: Floats = np.array([0.0, -COS, SIN])
+TO_LIGHT: Floats = np.array([-0.50, -0.62, 0.605]) / np.linalg.norm([-0.50, -0.62, 0.605])
+AMBIENT = 0.42
+"""Part of the light that comes from everywhere; the rest comes from the lamp at the front left."""
+
+
+@runtime_checkable
+class Visible(Protocol):
+    """A `sim.world.Thing` that the simulated camera can see."""
+
+    @property
+    def name(self) -> str: ...
+
+    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
+        """Draw the thing into ``image``, uint8 (480, 640, 3), which shows the empty platter.
+
+        ``azimuth_deg`` is how far the thing is turned, counter-clockwise seen from above; ``offset_mm`` where its axis
+        stands in the room.
+        """
+        ...
+
+
+class Drawing(NamedTuple):
+    """One step of the painter; what has the lower ``order`` (layer, then nearness to the camera) is drawn first."""
+
+    order: tuple[int, float]
+    onto: Callable[[Image], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a thing stands: turned by ``azimuth_deg``, its axis at (``x_mm``, ``y_mm``) in the room."""
+
+    azimuth_deg: float = 0.0
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+
+    @property
+    def scale(self) -> float:
+        """Return pixels a millimetre at the axis' distance."""
+        return PX_PER_MM * DISTANCE_MM / (DISTANCE_MM + self.y_mm * COS)
+
+    def to_room(self, points_mm: Floats) -> Floats:
+        """Return points (n, 3) of the thing as the room sees them."""
+        turned = self.turn(points_mm)
+        turned[:, :2] += self.x_mm, self.y_mm
+        return turned
+
+    def turn(self, vectors: Floats) -> Floats:
+        """Return vectors (n, 3) turned by the azimuth."""
+        c, s = cos(radians(self.azimuth_deg)), sin(radians(self.azimuth_deg))
+        return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+
+    def depth(self, x_mm: float, y_mm: float) -> float:
+        """Return how far a point of the thing stands to the front of the room, whatever its height."""
+        a = radians(self.azimuth_deg)
+        return -(self.y_mm + x_mm * sin(a) + y_mm * cos(a))
+
+    def to_image(self, room_mm: Floats) -> Floats:
+        """Return pixel coordinates (n, 2) of points (n, 3) in the room; whole numbers are pixel centres."""
+        axis = np.array([self.x_mm, self.y_mm, 0.0])
+        return np.array(CENTRE_PX) + _on_image(axis[None]) * PX_PER_MM + _on_image(room_mm - axis) * self.scale
+
+
+def _on_image(room_mm: Floats) -> Floats:
+    """Return points (n, 3) as the image's axes, right and down, have them, in millimetres (n, 2)."""
+    x, y, z = room_mm.T
+    return np.column_stack([x, -(y * SIN + z * COS)])
+
+
+def nearness(room_mm: Floats) -> Floats:
+    """Return how far points (..., 3) lie towards the camera, in millimetres."""
+    return np.asarray(room_mm @ TO_CAMERA)
+
+
+def shade(normals: Floats) -> Floats:
+    """Return the relative light (Lambert and ambient) on surfaces with unit ``normals`` (..., 3) in the room."""
+    return AMBIENT + (1 - AMBIENT) * np.maximum(normals @ TO_LIGHT, 0.0)
+
+
+def gloss(normals: Floats, sharpness: float) -> Floats:
+    """Return the highlight (Blinn-Phong) on surfaces with unit ``normals`` (..., 3) in the room, 0..1."""
+    half = TO_LIGHT + TO_CAMERA
+    half = half / np.linalg.norm(half)
+    return np.asarray(np.maximum(normals @ half, 0.0) ** sharpness)

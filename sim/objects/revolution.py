@@ -1,0 +1,205 @@
+"""Bodies of revolution about a vertical axis, drawn with one remap of their texture.
+
+A body that turns about its own axis keeps its silhouette and its shading; only the texture moves. So what each pixel
+sees is worked out once: with the profile sampled from its top to its bottom as (r, h), a pixel at x right of the axis
+and v above its foot looks along v = y sin e + h cos e; sample k is the circle of radius r_k, which the pixel's column
+meets where x² = r_k² - y_k² =: g_k. Coming from the camera, the ray meets high samples first: it hits the first k with
+g_k >= x². If that is k = 0 it has gone through the mouth of a vessel and goes on to the first inner sample with g_k <=
+x².
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from sim.objects.curves import Curve, evenly
+from sim.objects.layers import place
+from sim.objects.projection import COS, PX_PER_MM, SIN, Drawing, Floats, Image, Pose, gloss, shade
+
+TEXELS_PER_MM = 2.0
+_STEP_MM = 0.25
+_SUBROWS = 4
+_LINING_ROWS = 4
+
+
+@dataclass(frozen=True)
+class Revolution:
+    """A textured surface of revolution.
+
+    Parameters
+    ----------
+    profile
+        (radius, height) in millimetres from the top down to the foot, heights not rising. A vessel's begins at the
+        inner edge of its rim.
+    paint
+        Returns the texture of the outside for its (rows, columns): uint8 (rows, columns, 3). Rows run along the
+        profile, columns once around, counter-clockwise, the front (azimuth 0) in the middle.
+    inside
+        (radius, height) from the rim down to the centre of the vessel's floor; empty for a closed body.
+    lining
+        Colour of the inside, B, G, R.
+    at
+        Where the axis stands in the thing's frame, in millimetres.
+    shine
+        Strength of the highlight, 0..1.
+    layer
+        Parts of higher layers lie on those of lower ones.
+    """
+
+    profile: Curve
+    paint: Callable[[tuple[int, int]], Image]
+    inside: Curve = ()
+    lining: tuple[int, int, int] = (235, 238, 238)
+    at: tuple[float, float] = (0.0, 0.0)
+    shine: float = 0.0
+    layer: int = 0
+
+    def drawings(self, pose: Pose) -> list[Drawing]:
+        axis = pose.to_room(np.array([[*self.at, 0.0]]))
+        return [
+            Drawing((self.layer, pose.depth(*self.at)), lambda image: self._paste(image, pose, pose.to_image(axis)[0]))
+        ]
+
+    @property
+    def reach_mm(self) -> float:
+        """Return the radius of the foot, on which the shadow depends."""
+        return self.profile[-1][0]
+
+    def _paste(self, image: Image, pose: Pose, foot_px: Floats) -> None:
+        look = self._look
+        texture = self._texture
+        columns = look.columns
+        shift = -pose.azimuth_deg / 360 * columns
+        whole = int(np.floor(shift))
+        turned = texture[:, whole % columns :]
+        seen = cv2.remap(turned, look.column + np.float32(shift - whole), look.row, cv2.INTER_LINEAR)
+        lit = np.asarray(cv2.multiply(seen, look.light, scale=1 / 255), dtype=np.uint8)
+        cv2.add(lit, look.highlight, dst=lit)
+        place(image, lit, look.clear, foot_px - look.foot_px * (pose.scale / PX_PER_MM), pose.scale / PX_PER_MM)
+
+    @cached_property
+    def _outside(self) -> Floats:
+        return evenly(self.profile, _STEP_MM, dimensions=2)
+
+    @cached_property
+    def _texture(self) -> Image:
+        """The texture twice side by side, so that every turn of it is one slice, and the two columns beyond."""
+        radius = max(r for r, _ in self.profile)
+        rows = round(len(self._outside) * _STEP_MM * TEXELS_PER_MM)
+        texture = self.paint((rows, round(2 * np.pi * radius * TEXELS_PER_MM)))
+        texture = np.vstack([texture, np.full((_LINING_ROWS, texture.shape[1], 3), self.lining, dtype=np.uint8)])
+        return np.ascontiguousarray(np.hstack([texture, texture, texture[:, :2]]))
+
+    @cached_property
+    def _look(self) -> "_Look":
+        inside = evenly(self.inside, _STEP_MM, dimensions=2) if self.inside else None
+        rows, width, _ = self._texture.shape
+        return _trace(self._outside, inside, rows - _LINING_ROWS, (width - 2) // 2, self.shine)
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What each pixel of a body sees at azimuth 0, (h, w); `foot_px` is where its axis meets z = 0."""
+
+    column: NDArray[np.float32]
+    row: NDArray[np.float32]
+    light: Image  # (h, w, 3): shading times cover
+    highlight: Image  # (h, w, 3)
+    clear: Image  # (h, w, 3): 255 - cover
+    foot_px: Floats
+    columns: int  # once around the texture
+
+
+def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shine: float) -> _Look:
+    half = int(np.ceil(outside[:, 0].max() * PX_PER_MM)) + 2
+    top = int(np.ceil(outside[:, 1].max() * PX_PER_MM * COS + half * SIN)) + 2
+    up = np.arange(top, -int(np.ceil(half * SIN)) - 3, -1, dtype=np.float64)
+    x = np.abs(np.arange(-half, half + 1)) / PX_PER_MM
+    cover = _cover(outside, up, half)
+
+    sample = np.empty((len(up), len(x)))
+    depth = np.empty_like(sample)  # y of the hit, in mm away from the camera
+    normal_r, normal_z = _normals(outside)
+    g, y = _sections(outside, up / PX_PER_MM)
+    reach = np.maximum.accumulate(g, axis=1)
+    hollow = np.zeros(sample.shape, dtype=bool)
+    for i in range(len(up)):
+        square = np.minimum(x**2, reach[i, -1])  # a pixel that is covered in part may have its centre outside
+        k = np.searchsorted(reach[i], square)
+        sample[i] = _between(g[i], np.minimum(k, len(outside) - 1), square)
+        depth[i] = np.interp(sample[i], np.arange(len(outside)), y[i])
+        hollow[i] = (k == 0) & (square < g[i, 0])
+    radial = np.interp(sample, np.arange(len(outside)), normal_r)
+    rising = np.interp(sample, np.arange(len(outside)), normal_z)
+    if inside is not None:
+        g, y = _sections(inside, up / PX_PER_MM)
+        reach = np.minimum.accumulate(g, axis=1)
+        normal_r, normal_z = _normals(inside)
+        for i in map(int, np.flatnonzero(hollow.any(axis=1))):
+            here = hollow[i]
+            square = x[here] ** 2
+            k = np.minimum(np.searchsorted(-reach[i], -square), len(inside) - 1)
+            s = _between(g[i], k, square)
+            depth[i, here] = np.interp(s, np.arange(len(inside)), y[i])
+            radial[i, here] = -np.interp(s, np.arange(len(inside)), normal_r)
+            rising[i, here] = -np.interp(s, np.arange(len(inside)), normal_z)
+
+    across = np.broadcast_to(np.arange(-half, half + 1) / PX_PER_MM, sample.shape)
+    azimuth = np.arctan2(depth, across)  # in the room, 0 to the right; the front is at -90°
+    column = ((azimuth / (2 * np.pi) + 0.75) * columns - 0.5) % columns
+    row = np.clip(sample / (len(outside) - 1) * rows - 0.5, 0, rows - 1)
+    normals = np.stack([radial * np.cos(azimuth), radial * np.sin(azimuth), rising], axis=-1)
+    light = shade(normals)
+    if inside is not None:
+        light[hollow] *= 0.85  # less of the room is seen from within
+        row[hollow] = rows + _LINING_ROWS / 2
+    return _Look(
+        column=column.astype(np.float32),
+        row=row.astype(np.float32),
+        light=_three(light * cover * 255),
+        highlight=_three(gloss(normals, 40.0) * shine * cover * 255),
+        clear=_three(255 - np.round(cover * 255)),
+        foot_px=np.array([half, float(up[0])]),
+        columns=columns,
+    )
+
+
+def _sections(profile: Floats, up_mm: Floats) -> tuple[Floats, Floats]:
+    """Return g and y of every profile sample (columns) for every row of pixels."""
+    r, h = profile.T
+    y = (up_mm[:, None] - h[None] * COS) / SIN
+    return r**2 - y**2, y
+
+
+def _between(g: Floats, k: NDArray[np.intp], square: Floats) -> Floats:
+    """Return the fractional sample at which g reaches ``square`` between samples k - 1 and k."""
+    before, after = g[np.maximum(k - 1, 0)], g[k]
+    step = np.where(after == before, 1.0, after - before)
+    return np.maximum(k - 1 + np.clip((square - before) / step, 0.0, 1.0), 0.0)
+
+
+def _normals(profile: Floats) -> tuple[Floats, Floats]:
+    """Return the outward normal's radial and vertical part at every sample, edges rounded over 2 mm."""
+    dr, dh = uniform_filter1d(np.gradient(profile, axis=0), round(2 / _STEP_MM), axis=0).T
+    length = np.hypot(dr, dh)
+    return -dh / length, dr / length
+
+
+def _cover(outside: Floats, up: Floats, half: int) -> Floats:
+    """Return which part of each pixel the body covers: exact across, `_SUBROWS` samples down."""
+    offsets = (np.arange(_SUBROWS) + 0.5) / _SUBROWS - 0.5
+    rows = (up[:, None] + offsets).reshape(-1)
+    widest = _sections(outside, rows / PX_PER_MM)[0].max(axis=1)
+    edge = np.sqrt(np.maximum(widest, 0.0)) * PX_PER_MM
+    x = np.abs(np.arange(-half, half + 1))
+    cover = np.clip(edge[:, None] + 0.5 - x, 0.0, 1.0) * (widest > 0)[:, None]
+    return np.asarray(cover.reshape(len(up), _SUBROWS, -1).mean(axis=1))
+
+
+def _three(plane: Floats) -> Image:
+    return np.ascontiguousarray(np.repeat(np.clip(np.round(plane), 0, 255).astype(np.uint8)[..., None], 3, axis=2))

@@ -1,0 +1,75 @@
+"""A thing made of parts, as it stands on the platter."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from sim.objects.layers import place
+from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Drawing, Floats, Image, Pose
+
+
+class Part(Protocol):
+    """A piece of a solid: it knows how to be drawn and how far it reaches on the platter."""
+
+    @property
+    def reach_mm(self) -> float: ...
+
+    def drawings(self, pose: Pose) -> list[Drawing]: ...
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A thing of the built-in shelf.
+
+    Parameters
+    ----------
+    name
+        Its name in catalogs and reports.
+    parts
+        What it is made of.
+    symmetry_deg
+        The smallest turn after which it looks the same: 360 for none, 360 / n for n-fold, 0 for any turn at all.
+    """
+
+    name: str
+    parts: tuple[Part, ...] = field(repr=False)
+    symmetry_deg: float = 360.0
+
+    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Draw the thing into ``image`` as `sim.objects.projection.Visible` describes."""
+        pose = Pose(azimuth_deg, *offset_mm)
+        clear, foot = self._shadow
+        foot_px = pose.to_image(np.array([[*offset_mm, 0.0]]))[0]
+        place(image, np.zeros_like(clear), clear, foot_px - foot, 1.0)
+        drawings = [drawing for part in self.parts for drawing in part.drawings(pose)]
+        for drawing in sorted(drawings, key=lambda d: d.order):
+            drawing.onto(image)
+
+    @cached_property
+    def _shadow(self) -> tuple[Image, Floats]:
+        """The soft dark spot where it touches the platter: (what is left of the light there, its centre in pixels)."""
+        reach = max(part.reach_mm for part in self.parts) * PX_PER_MM * 1.08
+        half = (int(reach * 1.25) + 6, int(reach * 1.25 * SIN) + 6)
+        clear = np.full((2 * half[1] + 1, 2 * half[0] + 1, 3), 255, dtype=np.uint8)
+        cv2.ellipse(
+            clear, (half[0], half[1]), (int(reach), int(reach * SIN) + 2), 0, 0, 360, (96, 96, 96), -1, cv2.LINE_AA
+        )
+        sigma = reach * 0.06 + 1
+        soft = cv2.GaussianBlur(clear, (0, 0), sigma, sigmaY=sigma * 0.5)
+        return np.asarray(soft, dtype=np.uint8), np.array(half, dtype=np.float64)
+
+
+def empty_platter() -> Image:
+    """Return what the camera sees without a thing: a plain backdrop and the platter, uint8 (480, 640, 3)."""
+    image = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    image[:] = (44, 40, 38)
+    x, y = (int(v) for v in CENTRE_PX)
+    axes = (int(105 * PX_PER_MM), int(105 * PX_PER_MM * SIN))
+    thickness = int(6 * PX_PER_MM * COS)
+    for down, colour in ((thickness, (58, 56, 54)), (0, (84, 82, 80))):
+        for step in range(thickness if down else 1):
+            cv2.ellipse(image, (x, y + down - step), axes, 0, 0, 360, colour, -1, cv2.LINE_AA)
+    return image

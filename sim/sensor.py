@@ -1,0 +1,109 @@
+"""Image formation: from the light that a scene sends to the numbers that a camera's sensor makes of it.
+
+The sensor is linear (gamma 1). The scene's 0..255 are its signal at nominal exposure, gain and light, so that a
+saturated pixel there holds `NoiseModel.full_well_e` electrons. Noise follows EMVA 1288: its variance in electrons is
+the number of electrons (shot noise) plus the square of the read noise.
+"""
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.noise import NoiseModel
+from sim.objects.projection import HEIGHT, WIDTH, Image
+
+Gains = tuple[float, float, float]
+"""Factors of B, G, R."""
+
+NOMINAL_KELVIN = 5000.0
+_WAVELENGTHS_NM = (465.0, 540.0, 610.0)
+_TILE_MARGIN = 128
+
+
+class Sensor:
+    """A colour sensor with its lens' vignetting and its noise.
+
+    Parameters
+    ----------
+    noise
+        Its imperfections.
+    rng
+        Draws the noise that all frames take their part of.
+    """
+
+    def __init__(self, noise: NoiseModel, rng: np.random.Generator) -> None:
+        self._noise = noise
+        self._volts = 255 / (noise.full_well_e or NoiseModel().full_well_e)  # grey levels an electron
+        self._shot = self._volts if noise.full_well_e else 0.0
+        self._dark_variance = np.full((HEIGHT, WIDTH, 3), (self._volts * noise.read_noise_e) ** 2, dtype=np.float32)
+        self._noisy = noise.full_well_e > 0 or noise.read_noise_e > 0
+        shape = (HEIGHT + _TILE_MARGIN, WIDTH + _TILE_MARGIN, 3)
+        self._tile = rng.standard_normal(shape, dtype=np.float32) if self._noisy else None
+        self._vignette = _vignette(noise.vignetting)
+        self._light_key: Gains | None = None
+        self._light_map = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
+        self._gain_key: Gains | None = None
+        self._gain_map = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
+
+    def expose(
+        self,
+        scene: Image | NDArray[np.float32],
+        *,
+        light: Gains,
+        exposure: float,
+        gains: Gains,
+        rng: np.random.Generator,
+    ) -> Image:
+        """Return one frame, uint8 (480, 640, 3).
+
+        Parameters
+        ----------
+        scene
+            What the camera looks at under nominal light, 0..255, (480, 640, 3).
+        light
+            The light relative to the nominal one.
+        exposure
+            Exposure time relative to the nominal one.
+        gains
+            Amplification, white balance included.
+        rng
+            This frame's own generator: the flicker of the light, and which part of the noise tile it takes.
+        """
+        flicker = 1 + self._noise.light_flicker * rng.standard_normal()
+        if light != self._light_key:
+            self._light_key, self._light_map = light, self._vignette * np.array(light, dtype=np.float32)
+        if gains != self._gain_key:
+            self._gain_key = gains
+            self._gain_map[:] = gains
+        signal = cv2.multiply(scene, self._light_map, scale=max(flicker, 0.0) * exposure, dtype=cv2.CV_32F)
+        if self._tile is not None:
+            y, x = rng.integers(0, _TILE_MARGIN, 2, endpoint=True)
+            sigma = cv2.scaleAdd(signal, self._shot, self._dark_variance)
+            cv2.sqrt(sigma, dst=sigma)
+            cv2.multiply(sigma, self._tile[y : y + HEIGHT, x : x + WIDTH], dst=sigma)
+            cv2.add(signal, sigma, dst=signal)
+        return np.asarray(cv2.multiply(signal, self._gain_map, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def _vignette(loss: float) -> NDArray[np.float32]:
+    """Return the share of light that reaches each pixel, falling with the square of the distance from the middle."""
+    x = (np.arange(WIDTH) - (WIDTH - 1) / 2)[None, :, None]
+    y = (np.arange(HEIGHT) - (HEIGHT - 1) / 2)[:, None, None]
+    square = (x**2 + y**2) / (((WIDTH - 1) / 2) ** 2 + ((HEIGHT - 1) / 2) ** 2)
+    return np.repeat(1 - loss * square, 3, axis=2).astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def white_balance(kelvin: float) -> Gains:
+    """Return the gains that make a black body's light at ``kelvin`` look as it does at 5000 K (Planck's law)."""
+    nominal, there = _planck(NOMINAL_KELVIN), _planck(kelvin)
+    ratio = (nominal / nominal[1]) / (there / there[1])
+    return float(ratio[0]), float(ratio[1]), float(ratio[2])
+
+
+def _planck(kelvin: float) -> NDArray[np.float64]:
+    """Return the relative spectral radiance at the colours' wavelengths."""
+    wavelength = np.array(_WAVELENGTHS_NM) * 1e-9
+    return np.asarray(wavelength**-5 / np.expm1(1.438777e-2 / (wavelength * kelvin)))
