@@ -4,7 +4,7 @@ Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`
 """
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
@@ -43,7 +43,7 @@ class Bench(AbstractContextManager["Bench"]):
     """The open devices of one bench, on one clock.
 
     ``conditions`` says under which noise model or calibration the bench works, ``findings`` what opening it revealed
-    that a person should know; both are kept with every enrollment.
+    that a person should know; both are kept with every enrollment. ``wires`` is what must be closed after the devices.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Bench(AbstractContextManager["Bench"]):
     operator: Operator = field(default_factory=ObjectStandsThere)
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
+    wires: ExitStack = field(default_factory=ExitStack, repr=False)
 
     def __enter__(self) -> Self:
         return self
@@ -71,7 +72,7 @@ class Bench(AbstractContextManager["Bench"]):
     def close(self) -> None:
         """Torque off, then let go of the devices; a device that fails here does not keep the others open."""
         failures: list[Exception] = []
-        for step in (self.servo.torque_off, self.servo.close, self.imu.close, self.camera.close):
+        for step in (self.servo.torque_off, self.servo.close, self.imu.close, self.camera.close, self.wires.close):
             try:
                 step()
             except (RigError, OSError) as failure:

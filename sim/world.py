@@ -56,7 +56,8 @@ class World:
         self._scenes: list[tuple[int, Scene]] = [(0, Scene())]
         first = self._platter()
         first.follow(rest(0.0, 0.0), None)
-        self._motions: list[tuple[int, Platter, float]] = [(0, first, 0.0)]
+        self._motions: list[tuple[int, Platter]] = [(0, first)]
+        self._slips: list[tuple[float, float, float]] = []
 
     def rng(self, name: str) -> np.random.Generator:
         """Return a fresh generator for the stream ``name`` of this world's seed."""
@@ -67,17 +68,14 @@ class World:
     def drive(self, shaft: Trajectory) -> None:
         """Let the servo's shaft follow ``shaft`` from now on."""
         now_ns = self.clock.now_ns()
-        _, previous, slip = self._motions[-1]
         platter = self._platter()
-        platter.follow(shaft, previous)
-        self._motions.append((now_ns, platter, slip))
+        platter.follow(shaft, self._motions[-1][1])
+        self._motions.append((now_ns, platter))
         self._forget(self._motions, now_ns)
 
-    def slip(self, angle_deg: float) -> None:
-        """Turn the platter by ``angle_deg`` against the shaft, at once: a loose platter, a bumped table."""
-        now_ns = self.clock.now_ns()
-        _, platter, slipped = self._motions[-1]
-        self._motions.append((now_ns, platter, slipped + angle_deg))
+    def slip(self, angle_deg: float, seconds: float = 0.001) -> None:
+        """Turn the platter by ``angle_deg`` against the shaft, evenly from now on: a loose platter, a bumped table."""
+        self._slips.append((self.clock.now_ns() * 1e-9, seconds, angle_deg))
 
     def shaft(self, time_ns: int | None = None) -> tuple[float, float]:
         """Return angle (°) and speed (°/s) of the servo's shaft."""
@@ -92,14 +90,16 @@ class World:
     def table_motion(self, times_ns: ArrayLike) -> tuple[Floats, Floats]:
         """Return the platter's true angle (°) and rate (°/s) at each of the given times, int64 (n,)."""
         t: NDArray[np.int64] = np.atleast_1d(np.asarray(times_ns, dtype=np.int64))
-        starts = np.array([start for start, _, _ in self._motions])
+        starts = np.array([start for start, _ in self._motions])
         which = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
         angle, rate = np.empty(t.shape), np.empty(t.shape)
         for i in np.unique(which):
             here = which == i
-            _, platter, slipped = self._motions[i]
-            angle[here], rate[here] = platter.at(t[here] * 1e-9)
-            angle[here] += slipped
+            angle[here], rate[here] = self._motions[i][1].at(t[here] * 1e-9)
+        for start_s, seconds, slip_deg in self._slips:
+            share = (t * 1e-9 - start_s) / seconds
+            angle += slip_deg * np.clip(share, 0.0, 1.0)
+            rate += np.where((share >= 0) & (share < 1), slip_deg / seconds, 0.0)
         return angle, rate
 
     # -- what stands on it ----------------------------------------------------------------------------------------

@@ -188,3 +188,29 @@ class DynamixelServo:
     def _hardware_errors(self) -> tuple[str, ...]:
         bits = self._read("Hardware Error Status")
         return tuple(name for bit, name in _HARDWARE_ERRORS.items() if bits >> bit & 1)
+
+
+def prepare_servo(servo: DynamixelServo, *, write: bool) -> tuple[str, ...]:
+    """Compare the servo's EEPROM with what the rig needs; write the differences where that is allowed.
+
+    Raises
+    ------
+    DeviceMismatch
+        Settings differ and writing is not allowed.
+    """
+    differences = servo.setting_differences()
+    if not differences:
+        return ()
+    if not write:
+        raise DeviceMismatch(
+            f"{len(differences)} EEPROM settings of the servo are not as the rig needs them.",
+            next_step="Set servo.write_settings = true once (--set servo.write_settings=true): "
+            "the rig then writes these values, with torque off.",
+            evidence={d.register: _found_wanted(d) for d in differences},
+        )
+    servo.write_settings(differences)
+    return tuple(f"servo: {d.register} was {d.found}, is now {d.wanted}" for d in differences)
+
+
+def _found_wanted(difference: SettingDifference) -> str:
+    return f"found {difference.found}, wanted {difference.wanted}"
