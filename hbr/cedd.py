@@ -181,9 +181,11 @@ def _areas(image: ImageArray, quarter_sums: FloatArray, grid: _Grid) -> FloatArr
     gives the same, except where the true mean is a whole number: there the rounding errors decide and are repeated.
     """
     rows, columns, height, width = grid
-    mean = quarter_sums[3].ravel() / (1000.0 * height * width)
+    count = height * width
+    mean = quarter_sums[3].ravel() / (1000.0 * count)
     area = np.floor(mean)
-    undecided = np.flatnonzero((mean == area) & (area > 0))
+    area[mean == 255] = np.trunc(255.0 * count * (4.0 / (4 * count)))  # white adds up without rounding; 254 at times
+    undecided = np.flatnonzero((mean == area) & (mean > 0) & (mean < 255))
     if len(undecided):
         i, j = np.divmod(undecided, 2 * columns)
         pixels, stride = image.reshape(-1, 3), image.shape[1]
@@ -191,7 +193,7 @@ def _areas(image: ImageArray, quarter_sums: FloatArray, grid: _Grid) -> FloatArr
         for offset in (y * stride + x for y in range(height) for x in range(width)):
             blue, green, red = pixels.take(i * height * stride + j * width + offset, axis=0).T
             total += (0.114 * blue + 0.587 * green) + 0.299 * red
-        area[undecided] = np.trunc(total * (4.0 / (4 * height * width)))
+        area[undecided] = np.trunc(total * (4.0 / (4 * count)))
     by_quarter: FloatArray = area.reshape(rows, 2, columns, 2).transpose(1, 3, 0, 2).reshape(4, -1)
     return by_quarter
 

@@ -105,8 +105,13 @@ def test_texture_classes_equal_the_literal_definition() -> None:
 
 @pytest.mark.parametrize("height", [560, 568])
 def test_white_follows_the_rounding_of_the_reference(height: int) -> None:
-    """The reciprocal of 49 pixels rounds such that white has luminance 254: next to 255 it is still no edge."""
-    assert cedd(flat((255, 255, 255), height, height)).tolist() == cedd_reference(flat((255, 255, 255), height, height))
+    """The reciprocal of 49 pixels (560 x 560) rounds such that white has luminance 254."""
+    image = noise(height, height)
+    image[:, height // 3 :] = 255
+    assert cedd(image).tolist() == cedd_reference(image)
+    grid = _grid(height, height)
+    (luminance,) = set(_areas(image, _quarter_sums(image, grid), grid)[:, -1].tolist())
+    assert luminance == area(image[-7:, -7:], 14, 14)
 
 
 def test_all_colour_outputs_equal_the_literal_definition() -> None:

@@ -1,0 +1,52 @@
+"""CEDD against OpenCV shrinking the same frame to 80 x 80, one thread."""
+
+import statistics
+import timeit
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from hbr import cedd, describe
+from hbr.cedd import ImageArray
+
+REPEATS = 300
+
+
+def frame(width: int, height: int) -> ImageArray:
+    """A textured, coloured scene with sensor noise on a plain background."""
+    rng = np.random.default_rng(0)
+    scene = cv2.resize(
+        rng.integers(0, 256, (12, 16, 3), dtype=np.uint8), (width, height), interpolation=cv2.INTER_CUBIC
+    )
+    scene[: height // 4] = (60, 80, 70)
+    noisy: ImageArray = np.clip(scene + rng.normal(0, 3, scene.shape), 0, 255).astype(np.uint8)
+    return noisy
+
+
+def microseconds(function: Callable[[], object]) -> tuple[float, float]:
+    """Minimum and median of a call."""
+    function()
+    times = timeit.repeat(function, number=1, repeat=REPEATS)
+    return min(times) * 1e6, statistics.median(times) * 1e6
+
+
+def main() -> None:
+    cv2.setNumThreads(1)
+    print(f"{'frame':>10} {'call':<34} {'min µs':>8} {'median µs':>10} {'ratio':>6}")
+    for width, height in ((640, 480), (160, 160), (128, 128)):
+        image = frame(width, height)
+        grey = np.repeat(image[:, :, 1:2], 3, axis=2)
+        peer = microseconds(lambda image=image: cv2.resize(image, (80, 80), interpolation=cv2.INTER_AREA))  # type: ignore[misc]
+        calls: dict[str, Callable[[], object]] = {
+            "hbr.cedd": lambda image=image: cedd(image),  # type: ignore[misc]
+            "hbr.cedd, grey (most roundings)": lambda grey=grey: cedd(grey),  # type: ignore[misc]
+            "hbr.describe": lambda image=image: describe(image),  # type: ignore[misc]
+        }
+        rows = {"cv2.resize to 80 x 80, INTER_AREA": peer} | {name: microseconds(call) for name, call in calls.items()}
+        for name, (least, median) in rows.items():
+            print(f"{width:>6}x{height} {name:<34} {least:8.1f} {median:10.1f} {least / peer[0]:6.2f}")
+
+
+if __name__ == "__main__":
+    main()
