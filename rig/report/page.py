@@ -1,0 +1,269 @@
+"""The report: one HTML file that needs nothing but itself."""
+
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import cv2
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+from hbr.angles import wrap360
+from rig.errors import UsageError
+from rig.report.azimuth_ring import RingView, azimuth_ring
+from rig.report.contact_sheet import Image, contact_sheet, thumbnail
+from rig.report.polar_path import polar_path
+from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
+from rig.report.score_chart import score_chart
+from rig.report.summary import Fact, enrollment_facts, totals
+from rig.report.words import answer_words, counted, decision_words, listed, move_words, sentence
+
+JPEG_QUALITY: Final = 84
+_STAMP: Final = (56, 56)
+_FEW: Final = 3
+"""So many retrievals or objects are all unfolded at once; of more, the first and those that went wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Meta:
+    """What a report says about its run.
+
+    ``conditions`` determine the run (noise model, seed, versions): the same ones give the same page. ``wall_clock``
+    holds whatever differs between two equal runs (date, duration, host); it stands apart, at the foot. Values may be
+    mappings: they become groups.
+    """
+
+    conditions: Mapping[str, Any] = field(default_factory=dict)
+    wall_clock: Mapping[str, Any] = field(default_factory=dict)
+
+
+def render_report(
+    title: str,
+    summary: str,
+    enrollments: Sequence[EnrollmentRecord],
+    identifications: Sequence[IdentificationRecord],
+    *,
+    meta: Meta,
+) -> str:
+    """Return the page; what there is nothing of is left out.
+
+    Parameters
+    ----------
+    title, summary
+        The headline and a sentence below it, plain text.
+    enrollments, identifications
+        In the order they are to appear.
+    meta
+        Conditions and wall-clock times.
+    """
+    return _template().render(
+        title=title,
+        summary=summary,
+        totals=totals(enrollments, identifications),
+        retrievals=[
+            _retrieval(number, record, unfold=number == 1 or len(identifications) <= _FEW)
+            for number, record in enumerate(identifications, 1)
+        ],
+        objects=[
+            _object(number, record, unfold=number == 1 or len(enrollments) <= _FEW)
+            for number, record in enumerate(enrollments, 1)
+        ],
+        judged=any(record.truth is not None for record in identifications),
+        conditions=_groups(meta.conditions),
+        wall_clock=_groups(meta.wall_clock),
+    )
+
+
+def write_report(path: Path, html: str) -> None:
+    """Write the page to ``path``, whole or not at all; missing folders are made.
+
+    Raises
+    ------
+    UsageError
+        The file cannot be written there.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(html, encoding="utf-8", newline="\n")
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise UsageError(
+            f"The report cannot be written to {path}.",
+            next_step="Name a folder that you may write to with --out, with space on its disk.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+
+
+@cache
+def _template() -> Template:
+    environment = Environment(
+        loader=PackageLoader("rig.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template("page.html.j2")
+
+
+class _Frame(NamedTuple):
+    number: int
+    picture: str
+    where: str
+    refused: str
+    leading: list[tuple[str, str]]
+    margin: str
+    moved: str
+    decision: str
+
+
+class _Retrieval(NamedTuple):
+    number: int
+    stamp: str
+    truth: str
+    answer: str
+    correct: bool | None
+    views: str
+    travelled: str
+    pose_error: str
+    score: str
+    margin: str
+    words: str
+    path: Markup
+    scores: Markup
+    frames: list[_Frame]
+    unfold: bool
+
+
+class _Object(NamedTuple):
+    number: int
+    stamp: str
+    name: str
+    line: str
+    retakes: int
+    sheet: str
+    ring: Markup
+    facts: list[Fact]
+    unfold: bool
+
+
+def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _Retrieval:
+    answer, views = record.answer, record.views
+    error_deg = record.pose_error_deg
+    path = scores = Markup()
+    if views:
+        start_deg = _as_drawn(record, views[0].azimuth_deg)
+        scale = "azimuth on the table" if record.yaw_deg is None else "azimuth as enrolled"
+        path = Markup(polar_path(start_deg, record.turns, scale=scale))
+    if record.ranked:
+        rounds = [{c.name: c.score for c in ranked.candidates} for ranked in record.ranked]
+        truth = record.truth.name if record.truth else None
+        scores = Markup(
+            score_chart(rounds, winner=answer.name if answer else None, truth=truth, min_score=record.min_score)
+        )
+    return _Retrieval(
+        number=number,
+        stamp=_data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
+        truth=_truth(record),
+        answer=(answer.name or "unknown") if answer else "no answer",
+        correct=record.correct,
+        views=f"{answer.views if answer else len(views)}",
+        travelled=f"{answer.travelled_deg:.0f}°" if answer else "–",
+        pose_error="–" if error_deg is None else f"{error_deg:.1f}°",
+        score=f"{answer.score:.3f}" if answer else "–",
+        margin=f"{answer.margin:.3f}" if answer else "–",
+        words=answer_words(answer) if answer else "The search ended before an answer.",
+        path=path,
+        scores=scores,
+        frames=_frames(record),
+        unfold=unfold or record.correct is False,
+    )
+
+
+def _truth(record: IdentificationRecord) -> str:
+    if record.truth is None:
+        return ""
+    if record.truth.name is not None:
+        return record.truth.name
+    return f"{record.truth.description} (never enrolled)" if record.truth.description else "never enrolled"
+
+
+def _as_drawn(record: IdentificationRecord, azimuth_deg: float) -> float:
+    """An azimuth on the scale of the report: the enrolled one where the object was found, else the table's."""
+    return wrap360(azimuth_deg - (record.yaw_deg or 0.0))
+
+
+def _frames(record: IdentificationRecord) -> list[_Frame]:
+    ranked = {event.index: event for event in record.ranked}
+    decided = {event.index: event for event in record.decided}
+    frames = []
+    for view in record.views:
+        thought = ranked.get(view.index)
+        decision = decided.get(view.index)
+        frames.append(
+            _Frame(
+                number=view.index + 1,
+                picture=_data_uri(view.picture_bgr),
+                where=f"{_as_drawn(record, view.azimuth_deg):.1f}°",
+                refused=listed(view.refused),
+                leading=[(c.name, f"{c.score:.3f}") for c in thought.candidates[:3]] if thought else [],
+                margin=f"{thought.margin:.3f}" if thought else "",
+                moved=sentence(move_words(view.move)) if view.move and view.index else "",
+                decision=decision_words(decision) if decision else "",
+            )
+        )
+    return frames
+
+
+def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> _Object:
+    views = record.views
+    sheet = stamp = ""
+    ring = Markup()
+    if views:
+        pictures = [view.picture_bgr for view in views]
+        sheet = _data_uri(contact_sheet(pictures, [view.azimuth_deg for view in views], tile=TILE))
+        stamp = _data_uri(thumbnail(pictures[0], _STAMP))
+        ring = Markup(azimuth_ring([RingView(v.azimuth_deg, v.evidence.sharpness, len(v.refused)) for v in views]))
+    retakes = record.retakes
+    line = counted(len(views), "view")
+    if record.result is None:
+        line += f" of {record.planned}: not finished"
+    if retakes:
+        line += f", {counted(retakes, 'retake')}"
+    return _Object(number, stamp, record.name, line, retakes, sheet, ring, enrollment_facts(record), unfold)
+
+
+def _data_uri(image_bgr: Image) -> str:
+    encoded, jpeg = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    assert encoded  # uint8 (H, W, 3) with pixels: `thumbnail` has made it
+    return f"data:image/jpeg;base64,{b64encode(jpeg.tobytes()).decode('ascii')}"
+
+
+def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return rows of text in groups: single values first, then each mapping under its name."""
+    plain = [(key, _shown(value)) for key, value in values.items() if not isinstance(value, Mapping)]
+    groups = [("", plain)] if plain else []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            groups.extend((f"{key} {name}".strip(), rows) for name, rows in _groups(value))
+    return groups
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(_shown(item) for item in value)
+    return str(value)

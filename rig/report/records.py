@@ -1,0 +1,200 @@
+"""What a report needs of a plan's event stream, collected while the plan runs: thumbnails instead of frames."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from hbr.angles import wrap180
+from rig.plans.events import (
+    Accepted,
+    Decided,
+    Enrolled,
+    Event,
+    Identified,
+    Moved,
+    Ranked,
+    Rejected,
+    Started,
+)
+from rig.report.contact_sheet import Image, Region, thumbnail
+from rig.report.polar_path import Turn
+from rig.view import ViewEvidence
+
+TILE: Final = (96, 96)
+"""Width and height of a view on a contact sheet, pixels."""
+
+FRAME: Final = (240, 240)
+"""Width and height of a frame of a retrieval, pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """An accepted view: its picture, its evidence, the move that led to it and why frames before it were refused."""
+
+    index: int
+    azimuth_deg: float
+    picture_bgr: Image
+    evidence: ViewEvidence
+    move: Moved | None
+    refused: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class _Looks:
+    """Turns the events of a view into a `Look`."""
+
+    size: tuple[int, int]
+    region: Region | None
+    views: list[Look] = field(default_factory=list)
+    _move: Moved | None = None
+    _refused: list[str] = field(default_factory=list)
+
+    def add(self, event: Event) -> None:
+        match event:
+            case Moved():
+                self._move = event
+            case Rejected():
+                self._refused.append(", ".join(event.reasons))
+            case Accepted():
+                picture = thumbnail(event.image_bgr, self.size, self.region)
+                refused, self._refused = tuple(self._refused), []
+                self.views.append(Look(event.index, event.azimuth_deg, picture, event.evidence, self._move, refused))
+            case _:
+                pass
+
+
+class EnrollmentRecord:
+    """One enrollment, event by event.
+
+    Parameters
+    ----------
+    region
+        The part of the frames to show: x, y, width, height; as `view.roi` of the configuration. None shows all.
+    """
+
+    def __init__(self, *, region: Region | None = None) -> None:
+        self.name = ""
+        self.planned = 0
+        self.conditions: Mapping[str, Any] = {}
+        self.result: Enrolled | None = None
+        self._looks = _Looks(TILE, region)
+
+    @property
+    def views(self) -> list[Look]:
+        """The accepted views, in the order they were taken."""
+        return self._looks.views
+
+    @property
+    def retakes(self) -> int:
+        """How many frames were refused before a view was accepted, in all views."""
+        return sum(len(view.refused) for view in self.views)
+
+    def add(self, event: Event) -> None:
+        """Take the next event of the stream."""
+        self._looks.add(event)
+        if isinstance(event, Started):
+            self.name, self.planned, self.conditions = event.name or "", event.views, event.conditions
+        elif isinstance(event, Enrolled):
+            self.result = event
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What really stands on the table.
+
+    ``name`` is None for an object that was never enrolled. ``yaw_deg`` is how far it stands turned counter-clockwise
+    against its enrollment, None where nobody knows. ``symmetry_deg`` is the smallest turn after which it looks the
+    same: 360 for an object without symmetry, 0 for one that looks the same from everywhere. ``description`` is what
+    people call an object that was never enrolled.
+    """
+
+    name: str | None
+    yaw_deg: float | None = None
+    symmetry_deg: float = 360.0
+    description: str = ""
+
+
+class IdentificationRecord:
+    """One retrieval, event by event.
+
+    Parameters
+    ----------
+    truth
+        What really stands on the table; None where nobody knows.
+    min_score
+        The score per view below which an object is unknown (`identify.min_score`), to draw.
+    region
+        The part of the frames to show: x, y, width, height; as `view.roi` of the configuration. None shows all.
+    """
+
+    def __init__(
+        self, *, truth: Truth | None = None, min_score: float | None = None, region: Region | None = None
+    ) -> None:
+        self.truth = truth
+        self.min_score = min_score
+        self.conditions: Mapping[str, Any] = {}
+        self.ranked: list[Ranked] = []
+        self.decided: list[Decided] = []
+        self.answer: Identified | None = None
+        self._looks = _Looks(FRAME, region)
+
+    @property
+    def views(self) -> list[Look]:
+        """The accepted views, in the order they were taken."""
+        return self._looks.views
+
+    def add(self, event: Event) -> None:
+        """Take the next event of the stream."""
+        self._looks.add(event)
+        match event:
+            case Started():
+                self.conditions = event.conditions
+            case Ranked():
+                self.ranked.append(event)
+            case Decided():
+                self.decided.append(event)
+            case Identified():
+                self.answer = event
+            case _:
+                pass
+
+    @property
+    def correct(self) -> bool | None:
+        """Whether the answer is the truth; None while either is missing."""
+        if self.truth is None or self.answer is None:
+            return None
+        return self.answer.name == self.truth.name
+
+    @property
+    def pose_error_deg(self) -> float | None:
+        """Distance of the answer's yaw from the true one, modulo the object's symmetry; None where it means nothing."""
+        truth, answer = self.truth, self.answer
+        if truth is None or answer is None or answer.name is None or not self.correct:
+            return None
+        if truth.yaw_deg is None or truth.symmetry_deg <= 0:
+            return None
+        # One period of the symmetry is one turn of the circle.
+        periods = 360.0 / truth.symmetry_deg
+        return abs(wrap180((answer.yaw_deg - truth.yaw_deg) * periods)) / periods
+
+    @property
+    def yaw_deg(self) -> float | None:
+        """How far the object was found to stand turned against its enrollment; None without an object."""
+        return self.answer.yaw_deg if self.answer is not None and self.answer.name is not None else None
+
+    @property
+    def turns(self) -> list[Turn]:
+        """The camera's rotations between the views, as the table made them.
+
+        The cable's limits may send the table the long way round: the azimuths tell where a rotation ended, the encoder
+        how many times around it went.
+        """
+        turns = []
+        for k in range(1, len(self.views)):
+            before, after = self.views[k - 1], self.views[k]
+            rotation_deg = wrap180(after.azimuth_deg - before.azimuth_deg)
+            if after.move is not None:
+                rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
+            decided = self.decided[k - 1]  # every view but the last is followed by a decision
+            turns.append(Turn(rotation_deg, decided.s_left, decided.s_right))
+        return turns

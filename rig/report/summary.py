@@ -1,0 +1,97 @@
+"""The numbers at the top of a report, counted from the records and from nothing else."""
+
+from collections.abc import Sequence
+from statistics import fmean, median
+from typing import NamedTuple
+
+from rig.report.records import EnrollmentRecord, IdentificationRecord
+from rig.report.words import counted, listed
+
+
+class Fact(NamedTuple):
+    """A number with its name and a remark."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+def totals(enrollments: Sequence[EnrollmentRecord], identifications: Sequence[IdentificationRecord]) -> list[Fact]:
+    """Return the headline numbers of a run; those of a single object where there is but one."""
+    facts = []
+    if len(enrollments) == 1 and not identifications:
+        return enrollment_facts(enrollments[0])
+    if enrollments:
+        views = sum(len(record.views) for record in enrollments)
+        retakes = sum(record.retakes for record in enrollments)
+        finished = sum(record.result is not None for record in enrollments)
+        facts.append(Fact("objects enrolled", f"{finished}", f"{counted(views, 'view')}, {counted(retakes, 'retake')}"))
+    answered = [record for record in identifications if record.answer is not None]
+    if len(identifications) == 1 and not identifications[0].truth:
+        return facts + (_answer_facts(answered[0]) if answered else [])
+    known = [record for record in answered if record.truth and record.truth.name is not None]
+    unknown = [record for record in answered if record.truth and record.truth.name is None]
+    if known:
+        right = sum(record.correct is True for record in known)
+        facts.append(Fact("found", f"{right}/{len(known)}", "enrolled objects named rightly"))
+    if unknown:
+        right = sum(record.correct is True for record in unknown)
+        facts.append(Fact("unknown recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
+    if answered:
+        views_taken = [record.answer.views for record in answered if record.answer]
+        travelled = [record.answer.travelled_deg for record in answered if record.answer]
+        facts.append(
+            Fact("views to an answer", f"{fmean(views_taken):.1f}", f"mean; {min(views_taken)} to {max(views_taken)}")
+        )
+        facts.append(Fact("travelled", f"{fmean(travelled):.0f}°", f"mean a retrieval; {sum(travelled):.0f}° in all"))
+    errors = [record.pose_error_deg for record in answered if record.pose_error_deg is not None]
+    if errors:
+        facts.append(
+            Fact("pose error", f"{median(errors):.1f}°", f"median of {len(errors)}; largest {max(errors):.1f}°")
+        )
+    return facts
+
+
+def enrollment_facts(record: EnrollmentRecord) -> list[Fact]:
+    """Return the evidence of one enrollment."""
+    views = record.views
+    facts = [Fact("views", f"{len(views)}", f"of {record.planned} planned")]
+    reasons = listed(reason for view in views for reason in view.refused)
+    facts.append(Fact("retakes", f"{record.retakes}", reasons))
+    if views:
+        sharpness = [view.evidence.sharpness for view in views]
+        levels = [view.evidence.mean_level for view in views]
+        facts.append(
+            Fact("sharpness", f"{median(sharpness):.0f}", f"median; {min(sharpness):.0f} to {max(sharpness):.0f}")
+        )
+        facts.append(Fact("mean level", f"{fmean(levels):.0f}", f"of 255; {min(levels):.0f} to {max(levels):.0f}"))
+    moves = [view.move for view in views if view.move is not None]
+    if moves:
+        off = max(abs(move.encoder_deg - move.commanded_deg) for move in moves)
+        facts.append(Fact("off the angle asked", f"{off:.2f}°", "largest, by the encoder"))
+    gaps = [
+        abs(move.rotation_encoder_deg - move.rotation_imu_deg) for move in moves if move.rotation_imu_deg is not None
+    ]
+    if gaps:
+        agree = sum(move.agrees for move in moves)
+        facts.append(
+            Fact(
+                "encoder against gyro", f"{max(gaps):.2f}°", f"largest difference; {agree} of {len(moves)} moves agree"
+            )
+        )
+    if record.result:
+        facts.append(Fact("bench time", f"{record.result.seconds:.0f} s"))
+    return facts
+
+
+def _answer_facts(record: IdentificationRecord) -> list[Fact]:
+    answer = record.answer
+    if answer is None:
+        return []
+    return [
+        Fact("answer", answer.name or "unknown"),
+        Fact("score", f"{answer.score:.3f}", f"per view; leads by {answer.margin:.3f}"),
+        Fact("views", f"{answer.views}"),
+        Fact("travelled", f"{answer.travelled_deg:.0f}°"),
+        Fact("bench time", f"{answer.seconds:.1f} s"),
+    ]

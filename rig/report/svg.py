@@ -1,0 +1,60 @@
+"""The little of SVG that the charts need: text that is safe to embed, the same bytes for the same numbers.
+
+Colours and fonts are the page's: shapes carry classes, the page's style sheet gives them their look, light and dark.
+"""
+
+from collections.abc import Iterable
+from html import escape
+
+Point = tuple[float, float]
+
+
+def number(value: float) -> str:
+    """Return ``value`` with at most two decimals, without trailing zeros and without a negative zero."""
+    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def element(tag: str, *content: str, **attributes: str | float) -> str:
+    """Return an element; ``content`` is markup, attribute values are escaped.
+
+    Underscores in the names of attributes stand for hyphens; a trailing one, as in ``class_``, is dropped.
+    """
+    text = "".join(
+        f' {name.rstrip("_").replace("_", "-")}="{escape(value) if isinstance(value, str) else number(value)}"'
+        for name, value in attributes.items()
+    )
+    return f"<{tag}{text}>{''.join(content)}</{tag}>" if content else f"<{tag}{text}/>"
+
+
+def text(words: str, at: Point, class_: str, *, anchor: str = "middle") -> str:
+    """Return a line of text (escaped) at its baseline's ``anchor``."""
+    return element("text", escape(words), x=at[0], y=at[1], class_=class_, text_anchor=anchor)
+
+
+def title(words: str) -> str:
+    """Return the tooltip of the element that it is put into."""
+    return element("title", escape(words))
+
+
+def path(points: Iterable[Point], class_: str, *content: str, close: bool = False) -> str:
+    """Return a polyline or, closed, a polygon."""
+    d = "M" + "L".join(f"{number(x)} {number(y)}" for x, y in points)
+    return element("path", *content, d=d + ("Z" if close else ""), class_=class_)
+
+
+def line(a: Point, b: Point, class_: str, *content: str) -> str:
+    """Return a straight line."""
+    return element("line", *content, x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_)
+
+
+def circle(at: Point, radius: float, class_: str, *content: str) -> str:
+    """Return a circle."""
+    return element("circle", *content, cx=at[0], cy=at[1], r=radius, class_=class_)
+
+
+def drawing(width: float, height: float, label: str, parts: Iterable[str]) -> str:
+    """Return the whole picture; ``label`` is what a screen reader says of it."""
+    return element(
+        "svg", *parts, viewBox=f"0 0 {number(width)} {number(height)}", role="img", aria_label=label, class_="chart"
+    )

@@ -1,0 +1,70 @@
+"""What happened, in the words of the report."""
+
+from collections.abc import Iterable
+
+from rig.plans.events import Decided, Identified, Moved
+
+
+def decision_words(decided: Decided) -> str:
+    """Return why the camera goes to a side, and how far: "left: the rivals look less alike there …; turning 47.3°"."""
+    turning = f"turning {abs(decided.rotation_deg):.1f}°"
+    if decided.s_left is None or decided.s_right is None:
+        return f"{decided.side}: the first turn is fixed; {turning}."
+    left, right = distinct(decided.s_left, decided.s_right)
+    if decided.s_left == decided.s_right:
+        why = f"the leading candidates look as much alike on both sides: S_left {left} = S_right {right}"
+    elif decided.side == "left":
+        why = f"the leading candidates look less alike there: S_left {left} < S_right {right}"
+    else:
+        why = f"the leading candidates look less alike there: S_right {right} < S_left {left}"
+    # The step itself is at most 90°; what exceeds it leads past views that were taken before (`hbr.next_view`).
+    past = " past what was seen already" if round(abs(decided.rotation_deg), 1) > 90 else ""
+    return f"{decided.side}: {why}; {turning}{past}."
+
+
+def move_words(moved: Moved) -> str:
+    """Return how far the table turned by encoder and gyro, and whether they agree."""
+    words = f"table {_signed(moved.rotation_encoder_deg)}° by the encoder"
+    if moved.rotation_imu_deg is None:
+        return f"{words}, the gyro has no answer"
+    sigma = "" if moved.imu_sigma_deg is None else f" ± {moved.imu_sigma_deg:.2f}"
+    words += f", {_signed(moved.rotation_imu_deg)}{sigma}° by the gyro"
+    if moved.agrees:
+        return words
+    bound = "" if moved.bound_deg is None else f" by more than {moved.bound_deg:.2f}°"
+    return f"{words}; they disagree{bound}, the gyro is believed"
+
+
+def answer_words(answer: Identified) -> str:
+    """Return the answer and why the search ended; an unknown object with its nearest three."""
+    if answer.name is None:
+        nearest = ", ".join(f"{c.name} {c.score:.3f}" for c in answer.candidates[:3])
+        found = f"Unknown: the nearest are {nearest}"
+    else:
+        found = f"{answer.name}, standing {answer.yaw_deg:.1f}° counter-clockwise of how it was enrolled"
+    return f"{found}. {sentence(answer.reason)}"
+
+
+def sentence(words: str) -> str:
+    """Return ``words`` with a capital and a full stop."""
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def counted(n: int, noun: str) -> str:
+    """Return "1 view", "2 views"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def listed(items: Iterable[str]) -> str:
+    """Return distinct items, in the order of their first appearance, separated by semicolons."""
+    return "; ".join(dict.fromkeys(items))
+
+
+def distinct(a: float, b: float) -> tuple[str, str]:
+    """Return two numbers with as many decimals as tell them apart: two at least, five at most."""
+    decimals = next((d for d in range(2, 5) if f"{a:.{d}f}" != f"{b:.{d}f}"), 5) if a != b else 2
+    return f"{a:.{decimals}f}", f"{b:.{decimals}f}"
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.2f}".replace("-", "−")
