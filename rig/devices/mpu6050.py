@@ -278,7 +278,7 @@ class Mpu6050:
 def _settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:
     """Return the values to write, and to find again, by their first register."""
     mistakes: dict[str, Any] = {}
-    divider = round(1000 / rate_hz) if rate_hz > 0 else 0
+    divider = round(1000 / rate_hz) if 3.9 < rate_hz <= 1000 else 0
     if not (1 <= divider <= 256 and abs(1000 / divider - rate_hz) < 1e-6 * rate_hz):
         mistakes["rate_hz"] = f"{rate_hz:g}: give 1000 divided by a whole number up to 256"
     if range_dps not in _LSB_PER_DPS:

@@ -5,8 +5,8 @@ names and numbers are written down here once more, not shared with the driver, s
 the other.
 
 Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, the interrupt
-pin, the motion processor, and start-up times. The low-pass is of first order, and the accelerometer follows the gyro's
-rate and bandwidth.
+pin, the signal paths' reset, the motion processor, and start-up times. The low-pass is of second order, and the
+accelerometer follows the gyro's rate and bandwidth.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from sim.world import World
 
 SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, FIFO_EN = 0x19, 0x1A, 0x1B, 0x1C, 0x23
 INT_STATUS, ACCEL_XOUT_H, TEMP_OUT_H, GYRO_XOUT_H, GYRO_ZOUT_L = 0x3A, 0x3B, 0x41, 0x43, 0x48
-SIGNAL_PATH_RESET, USER_CTRL, PWR_MGMT_1 = 0x68, 0x6A, 0x6B
+USER_CTRL, PWR_MGMT_1 = 0x6A, 0x6B
 FIFO_COUNTH, FIFO_COUNTL, FIFO_R_W, WHO_AM_I = 0x72, 0x73, 0x74, 0x75
 
 DATA_RDY, FIFO_OFLOW = 0x01, 0x10
@@ -126,8 +126,6 @@ class SimMpu6050:
                 self._fifo.clear()
             if value & SIG_COND_RESET:
                 self._clear_data()
-        elif register == SIGNAL_PATH_RESET and value & 0x07:
-            self.inertial.restart()
         elif register in _SAMPLING and changed:
             self._begin_sampling()
 
@@ -158,11 +156,12 @@ class SimMpu6050:
         due = (self._clock.now_ns() - self._epoch_ns) // period_ns
         if due == self._taken:
             return
-        first = max(self._taken, due - FIFO_SIZE)  # nobody can ask for older ones
-        times_ns = self._epoch_ns + period_ns * np.arange(first + 1, due + 1)
+        first = max(self._taken, due - FIFO_SIZE // 2)  # the FIFO holds no more: a frame has a word at least
         self._taken = due
-        gyro, accel = self.inertial.sample(times_ns, internal_hz, BANDWIDTH_HZ[filter_setting], decimation)
-        words = self._quantised(gyro, accel)
+        ticks = np.arange(first * decimation + 1, due * decimation + 1)
+        times_ns = self._epoch_ns + period_ns // decimation * ticks
+        gyro, accel = self.inertial.sample(times_ns, internal_hz, BANDWIDTH_HZ[filter_setting])
+        words = self._quantised(gyro[decimation - 1 :: decimation], accel[decimation - 1 :: decimation])
         registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = words[-1].tobytes()
         registers[INT_STATUS] |= DATA_RDY
         chosen = [i for i, bit in enumerate(_FIFO_BITS) if registers[FIFO_EN] & bit]
