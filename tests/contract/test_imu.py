@@ -1,0 +1,158 @@
+"""What every `rig.devices.imu.Imu` must keep; a new driver joins by an entry in `SENSORS`."""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from rig.devices.imu import Imu
+from rig.devices.mpu6050 import Mpu6050
+from rig.errors import DeviceSilent
+from sim.i2c import SimI2cBus
+from sim.imu.mpu6050 import SimMpu6050
+from sim.motion import to_position, to_velocity
+from sim.noise import NoiseModel
+from sim.world import World
+
+
+@dataclass
+class Sensor:
+    """An opened IMU in its world; `unplug` pulls its cable; its z axis points up, ``latency_s`` is its filter's lag."""
+
+    imu: Imu
+    world: World
+    unplug: Callable[[], None]
+    latency_s: float
+
+
+@contextmanager
+def mpu6050(noise: NoiseModel) -> Iterator[Sensor]:
+    world = World(noise=noise, seed=1)
+    with SimI2cBus(world.clock) as bus:
+        bus.attach(0x68, SimMpu6050(world))
+        imu = Mpu6050(bus.path, clock=world.clock)
+        try:
+            yield Sensor(imu, world, lambda: bus.detach(0x68) and None, 0.005)
+        finally:
+            imu.close()
+
+
+SENSORS: dict[str, Callable[[NoiseModel], AbstractContextManager[Sensor]]] = {"mpu6050": mpu6050}
+
+
+@pytest.fixture(params=SENSORS)
+def open_sensor(request: pytest.FixtureRequest) -> Callable[[NoiseModel], AbstractContextManager[Sensor]]:
+    return SENSORS[request.param]
+
+
+@pytest.fixture
+def sensor(open_sensor: Callable[[NoiseModel], AbstractContextManager[Sensor]]) -> Iterator[Sensor]:
+    with open_sensor(NoiseModel.none()) as s:
+        yield s
+
+
+def spin(world: World, dps: float) -> None:
+    world.drive(to_velocity(world.clock.now_ns() * 1e-9, world.table_deg(), dps, dps, 1.0))
+
+
+def test_it_says_who_it_is(sensor: Sensor) -> None:
+    assert sensor.imu.identity.model
+    assert 0 < sensor.imu.identity.gyro_noise_dps_rthz < 0.1
+    assert sensor.imu.rate_hz > 0
+    assert sensor.imu.range_dps >= 125
+
+
+def test_samples_come_once_in_order_at_the_stated_rate(sensor: Sensor) -> None:
+    sensor.imu.read_samples()
+    start_ns = sensor.world.clock.now_ns()
+    parts = []
+    for pause_s in (0.0, 0.001, 0.3, 0.02, 0.1, 0.25):
+        sensor.world.clock.sleep(pause_s)
+        parts.append(sensor.imu.read_samples())
+    time_ns = np.concatenate([p.time_ns for p in parts])
+    assert all(p.gyro_dps.shape == (p.time_ns.size, 3) and p.lost == 0 for p in parts)
+    assert all(p.time_ns.dtype == np.int64 and p.gyro_dps.dtype == np.float64 for p in parts)
+    assert all(np.diff(time_ns) > 0)
+    assert all(time_ns <= sensor.world.clock.now_ns())
+    elapsed_s = (sensor.world.clock.now_ns() - start_ns) * 1e-9
+    assert time_ns.size == pytest.approx(elapsed_s * sensor.imu.rate_hz, abs=4)
+
+
+@pytest.mark.parametrize("dps", [-100.0, -1.0, 0.0, 20.0, 100.0])
+def test_counter_clockwise_is_positive(sensor: Sensor, dps: float) -> None:
+    spin(sensor.world, dps)
+    sensor.world.clock.sleep(0.1)
+    sensor.imu.read_samples()
+    sensor.world.clock.sleep(0.2)
+    assert sensor.imu.read_samples().gyro_dps == pytest.approx(
+        np.tile([0, 0, dps], (round(0.2 * sensor.imu.rate_hz), 1)), abs=0.02
+    )
+
+
+@pytest.mark.parametrize("angle_deg", [-90.0, 5.0, 37.0, 180.0])
+def test_the_integral_between_two_rests_is_the_rotation(sensor: Sensor, angle_deg: float) -> None:
+    sensor.imu.read_samples()
+    sensor.world.drive(to_position(sensor.world.clock.now_ns() * 1e-9, 0.0, 0.0, angle_deg, 90.0, 300.0))
+    turned = 0.0
+    for _ in range(30):
+        sensor.world.clock.sleep(0.1)
+        samples = sensor.imu.read_samples()
+        assert samples.lost == 0
+        turned += samples.gyro_dps[:, 2].sum() / sensor.imu.rate_hz
+    assert turned == pytest.approx(angle_deg, abs=0.02)
+
+
+def test_times_tell_when_the_table_turned(sensor: Sensor) -> None:
+    sensor.imu.read_samples()
+    sensor.world.clock.sleep(0.1)
+    begun_ns = sensor.world.clock.now_ns()
+    spin(sensor.world, 50.0)
+    sensor.world.clock.sleep(0.1)
+    samples = sensor.imu.read_samples()
+    first = samples.time_ns[np.argmax(samples.gyro_dps[:, 2] > 25.0)]
+    assert 0 <= (first - begun_ns) * 1e-9 + 1 / sensor.imu.rate_hz <= sensor.latency_s + 2 / sensor.imu.rate_hz
+
+
+def test_a_late_reader_learns_that_samples_are_lost(sensor: Sensor) -> None:
+    sensor.imu.read_samples()
+    sensor.world.clock.sleep(60.0)
+    late = sensor.imu.read_samples()
+    assert late.lost > 0
+    assert late.lost + late.time_ns.size == pytest.approx(60 * sensor.imu.rate_hz, rel=0.02)
+    sensor.world.clock.sleep(0.1)
+    assert sensor.imu.read_samples().lost == 0
+
+
+def test_gravity_points_up_with_its_norm(sensor: Sensor) -> None:
+    sensor.world.clock.sleep(0.1)
+    assert sensor.imu.read_gravity_g() == pytest.approx([0, 0, 1], abs=0.01)
+    assert 10 < sensor.imu.temperature_c() < 50
+
+
+def test_noise_stays_below_what_the_identity_states(
+    open_sensor: Callable[[NoiseModel], AbstractContextManager[Sensor]],
+) -> None:
+    with open_sensor(NoiseModel()) as sensor:
+        rates = []
+        for _ in range(20):
+            sensor.world.clock.sleep(0.3)
+            rates.append(sensor.imu.read_samples().gyro_dps)
+        sigma = np.concatenate(rates).std(axis=0)
+        white = sensor.imu.identity.gyro_noise_dps_rthz * np.sqrt(sensor.imu.rate_hz / 2)
+        assert all(sigma > 0.3 * white)
+        assert all(sigma < 1.3 * white)
+
+
+def test_a_pulled_cable_is_an_error(sensor: Sensor) -> None:
+    sensor.unplug()
+    for reading in (sensor.imu.read_samples, sensor.imu.read_gravity_g, sensor.imu.temperature_c):
+        with pytest.raises(DeviceSilent) as caught:
+            reading()
+        assert caught.value.next_step
+
+
+def test_closing_twice_is_harmless(sensor: Sensor) -> None:
+    sensor.imu.close()
+    sensor.imu.close()
