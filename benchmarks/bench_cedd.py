@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hbr import cedd, describe
-from hbr.cedd import ImageArray
+from hbr.arrays import ImageArray
 
 REPEATS = 300
 

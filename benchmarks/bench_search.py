@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hbr import ViewIndex, Views, next_view, retrieve
-from hbr.angles import FloatArray
-from hbr.cedd import LevelArray
+from hbr.arrays import FloatArray, LevelArray
 
 VIEWS_OF_AN_OBJECT = 72
 QUERIES = 12

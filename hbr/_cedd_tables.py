@@ -7,9 +7,9 @@ of the LIRE reference (``features.global.CEDD``), which settles what the paper l
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from hbr.arrays import FloatArray, IndexArray
+
 Trapezoid = tuple[float, float, float, float]
 
 
@@ -41,7 +41,7 @@ VALUE: Final = np.stack([_membership(_LEVELS, t) for t in ((0, 0, 10, 75), (10, 
 LOW_HIGH: Final = np.stack([_membership(_LEVELS, t) for t in ((0, 0, 68, 188), (68, 188, 255, 255))])
 
 
-def _hue_tables() -> tuple[FloatArray, NDArray[np.intp]]:
+def _hue_tables() -> tuple[FloatArray, IndexArray]:
     hues = np.arange(360)
     memberships = np.stack([_membership(hues.astype(np.float64), t) for t in _HUES])
     first = (memberships > 0).argmax(axis=0)

@@ -1,19 +1,18 @@
 """Arrays of unequal length laid end to end."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-_IndexArray = NDArray[np.intp]
+from hbr.arrays import FloatArray, IndexArray
 
 
-def ranges(start: _IndexArray, count: _IndexArray) -> tuple[_IndexArray, _IndexArray]:
+def ranges(start: IndexArray, count: IndexArray) -> tuple[IndexArray, IndexArray]:
     """``start[i] .. start[i] + count[i] - 1`` for all i, end to end, and where each begins."""
     end = np.cumsum(count)
     begin = end - count
     return np.arange(end[-1] if len(end) else 0) + np.repeat(start - begin, count), begin
 
 
-def first_maximum(values: NDArray[np.float64], begin: _IndexArray) -> _IndexArray:
+def first_maximum(values: FloatArray, begin: IndexArray) -> IndexArray:
     """Index of the maximum of each segment, the first of equals; no segment may be empty."""
     maxima = np.maximum.reduceat(values, begin)
     reached = np.flatnonzero(values == np.repeat(maxima, np.diff(begin, append=len(values))))

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from hbr.angles import FloatArray, wrap180, wrap360
+from hbr.angles import wrap180, wrap360
+from hbr.arrays import FloatArray, IndexArray
 from hbr.hough import Ranking
 from hbr.tanimoto import tanimoto
 from hbr.views import Views
@@ -101,14 +102,14 @@ def next_view(ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit
     return Decision(side, rotation, s_left, s_right, tuple(candidates.tolist()), wrap360(here + rotation), detour)
 
 
-def _next_sector(pose_deg: FloatArray, sign: int) -> tuple[NDArray[np.intp], FloatArray]:
+def _next_sector(pose_deg: FloatArray, sign: int) -> tuple[IndexArray, FloatArray]:
     """The sector whose centre comes next to the left (+1) or right (-1), and the turn to it, in (0, 90]."""
     gap_deg = wrap360(sign * (_CENTRES_DEG - pose_deg[:, None]))
     gap_deg[gap_deg == 0] = 360.0
     return gap_deg.argmin(axis=1), gap_deg.min(axis=1)
 
 
-def _likeness(views: Views, candidates: NDArray[np.intp], sectors: NDArray[np.intp]) -> float:
+def _likeness(views: Views, candidates: IndexArray, sectors: IndexArray) -> float:
     """Sum of the similarities of all pairs of candidates, each seen in its sector (Eq. 6)."""
     averages = np.stack([_average_view(views, int(j), int(s)) for j, s in zip(candidates, sectors, strict=True)])
     return float(np.triu(tanimoto(averages, averages), k=1).sum())

@@ -10,20 +10,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from hbr._cedd_tables import (
-    HUE_BINS,
-    HUE_WEIGHT,
-    LOW_HIGH,
-    REPRESENTATIVES,
-    SATURATION,
-    VALUE,
-    FloatArray,
-)
-
-ImageArray = NDArray[np.uint8]
-LevelArray = NDArray[np.uint8]
+from hbr._cedd_tables import HUE_BINS, HUE_WEIGHT, LOW_HIGH, REPRESENTATIVES, SATURATION, VALUE
+from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 
 #: Bins of the descriptor: 6 texture classes of 24 colours, bin = 24 * texture + colour.
 BINS: Final = 144
@@ -77,7 +66,7 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
         minlength=BINS,
     )
     shares = histogram / histogram.cumsum()[-1]
-    levels: NDArray[np.intp] = np.abs(shares[:, None] - REPRESENTATIVES).argmin(axis=1)
+    levels: IndexArray = np.abs(shares[:, None] - REPRESENTATIVES).argmin(axis=1)
     return levels.astype(np.uint8)
 
 
@@ -198,7 +187,7 @@ def _areas(image: ImageArray, quarter_sums: FloatArray, grid: _Grid) -> FloatArr
     return by_quarter
 
 
-def _texture_votes(areas: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _texture_votes(areas: FloatArray) -> tuple[IndexArray, IndexArray]:
     """Texture class and block of every vote, blocks ascending in each class; a block may be of several classes."""
     scaled = areas * _SQRT2
     magnitudes = np.concatenate([_FILTERS @ areas, scaled[:2] - scaled[:1:-1]])  # the diagonals: a - d, b - c
@@ -221,7 +210,7 @@ def _block_colours(quarter_sums: FloatArray, grid: _Grid) -> FloatArray:
     return np.floor(sums / (4 * height * width)).reshape(3, -1)
 
 
-def _hsv(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[NDArray[np.intp], ...]:
+def _hsv(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[IndexArray, ...]:
     """Hue 0..358, saturation 0..255 and value 0..255 of whole-number colours."""
     value = np.maximum(np.maximum(red, green), blue)
     spread = value - np.minimum(np.minimum(red, green), blue)
@@ -234,7 +223,7 @@ def _hsv(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[NDArray[
     return hue.astype(np.intp), saturation.astype(np.intp), value.astype(np.intp)
 
 
-def _colour_outputs(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+def _colour_outputs(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[IndexArray, FloatArray]:
     """Votes of the two fuzzy systems: the bins 0..23 each block votes for and the weights, (blocks, 9) each.
 
     At most two hue classes are active, so nine of the 24 outputs can differ from 0: white, grey, black, and the light,

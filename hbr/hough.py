@@ -8,19 +8,18 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hbr._segments import first_maximum, ranges
-from hbr.angles import FloatArray, turns_between, wrap180
-from hbr.cedd import LevelArray
+from hbr.angles import turns_between, wrap180
+from hbr.arrays import FloatArray, IndexArray, LevelArray
 from hbr.index import ViewIndex, check_queries
 from hbr.tanimoto import tanimoto
 from hbr.views import Views
 
 Extension = Literal["visual", "orient", "orient_all"]
-_IndexArray = NDArray[np.intp]
 #: View indices for each query.
-_Columns = list[_IndexArray]
+_Columns = list[IndexArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +44,11 @@ class Ranking:
         The model set that the indices refer to.
     """
 
-    object_index: _IndexArray
+    object_index: IndexArray
     scores: FloatArray
     pose_deg: FloatArray
-    paths: _IndexArray
-    lists: tuple[_IndexArray, ...]
+    paths: IndexArray
+    lists: tuple[IndexArray, ...]
     orientation_deg: FloatArray
     views: Views
 
@@ -110,7 +109,7 @@ def retrieve(
     TypeError, ValueError
         No query, not one finite orientation for each, an empty index, or a setting out of range.
     """
-    queries, orientations = np.asarray(queries), np.asarray(orientation_deg, np.float64)
+    queries, orientations = np.asarray(queries), np.array(orientation_deg, np.float64)
     _check(queries, orientations, index, omega, list_length, extension)
     views = index.views
     lists = [index.search(query, list_length)[0] for query in queries]
@@ -198,7 +197,7 @@ def _extend_orient_all(lists: _Columns, orientations: FloatArray, views: Views) 
     return columns
 
 
-def _turned(anchors: _IndexArray, turn_deg: FloatArray, views: Views) -> _IndexArray:
+def _turned(anchors: IndexArray, turn_deg: FloatArray, views: Views) -> IndexArray:
     """ρ: for each view the one of its object whose azimuth is closest to turn_deg further on."""
     if not len(anchors):
         return anchors
@@ -209,7 +208,7 @@ def _turned(anchors: _IndexArray, turn_deg: FloatArray, views: Views) -> _IndexA
     return rows[first_maximum(-miss_deg, begin)]
 
 
-def _by_object(rows: _IndexArray, views: Views) -> _IndexArray:
+def _by_object(rows: IndexArray, views: Views) -> IndexArray:
     """The distinct views, ascending by object, then by index."""
     rows = np.unique(rows)
     return rows[np.argsort(views.object_index[rows], kind="stable")]
@@ -217,7 +216,7 @@ def _by_object(rows: _IndexArray, views: Views) -> _IndexArray:
 
 def _best_paths(
     columns: _Columns, queries: LevelArray, orientations: FloatArray, views: Views, omega: float
-) -> tuple[FloatArray, _IndexArray]:
+) -> tuple[FloatArray, IndexArray]:
     """Score (C,) and path (C, N) of every object, ascending by object; every object is in every column."""
     azimuth_deg = views.azimuth_deg
     value = tanimoto(queries[0], views.descriptors[columns[0]])[0]

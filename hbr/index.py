@@ -5,13 +5,12 @@ from typing import Final, Literal, TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.angles import FloatArray
-from hbr.cedd import BINS, LevelArray
+from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.cedd import BINS
 from hbr.tanimoto import squares, tanimoto, tanimoto_of_dots
 from hbr.views import Views
 
 Method = Literal["auto", "flat", "bound"]
-_IndexArray = NDArray[np.intp]
 _T = TypeVar("_T", np.float32, np.float64)
 
 #: Below this many views one product over all 144 levels is as quick as the bound.
@@ -47,7 +46,7 @@ class ViewIndex:
     def __len__(self) -> int:
         return len(self.views)
 
-    def search(self, query: LevelArray, k: int) -> tuple[_IndexArray, FloatArray]:
+    def search(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
         """Find the `k` views with the largest Tanimoto similarity to the query.
 
         Parameters
@@ -95,7 +94,7 @@ class _Flat:
         self._rows = descriptors.astype(np.float32)
         self._squares = squares(self._rows)
 
-    def top(self, query: LevelArray, k: int) -> tuple[_IndexArray, FloatArray]:
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
         q = query.astype(np.float32)
         dots = (self._rows @ q).astype(np.float64)
         return _best(tanimoto_of_dots(dots, squares(q[None]), self._squares), k)
@@ -126,7 +125,7 @@ class _Bound:
         residual = np.linalg.norm(x - inside @ self._axes.T, axis=1)
         return np.column_stack([inside, residual]), squares(x)
 
-    def top(self, query: LevelArray, k: int) -> tuple[_IndexArray, FloatArray]:
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
         columns, own_squares = self._project(query[None])
         own = float(own_squares[0])
         if own == 0:
@@ -140,12 +139,12 @@ class _Bound:
         best, similarities = _best(self._similarities(query, rows), k)
         return rows[best], similarities
 
-    def _similarities(self, query: LevelArray, rows: _IndexArray) -> FloatArray:
+    def _similarities(self, query: LevelArray, rows: IndexArray) -> FloatArray:
         parts = (rows[start : start + _CHUNK] for start in range(0, len(rows), _CHUNK))
         return np.concatenate([tanimoto(query, self._descriptors[part])[0] for part in parts])
 
 
-def _best(values: FloatArray, k: int) -> tuple[_IndexArray, FloatArray]:
+def _best(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:
     """Indices and values of the `k` largest, best first, equal values by lower index."""
     rows = np.arange(len(values))
     if len(values) >= k * _GROUP:
@@ -156,7 +155,7 @@ def _best(values: FloatArray, k: int) -> tuple[_IndexArray, FloatArray]:
     return best, values[best]
 
 
-def _promising(values: NDArray[np.float32], k: int) -> _IndexArray:
+def _promising(values: NDArray[np.float32], k: int) -> IndexArray:
     """Some `k` indices or more, of large values."""
     wanted = 4 * k
     if len(values) < wanted * _GROUP:
@@ -164,7 +163,7 @@ def _promising(values: NDArray[np.float32], k: int) -> _IndexArray:
     maxima = _group_maxima(values)
     groups = np.argpartition(maxima, -wanted)[-wanted:]
     in_group = groups + len(maxima) * np.arange(_GROUP)[:, None]
-    rows: _IndexArray = in_group[values[in_group].argmax(axis=0), np.arange(wanted)]
+    rows: IndexArray = in_group[values[in_group].argmax(axis=0), np.arange(wanted)]
     return rows
 
 

@@ -5,7 +5,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.cedd import BINS, LevelArray
+from hbr.arrays import LevelArray
+from hbr.cedd import BINS
 
 BITS: Final = 3
 PACKED_BYTES: Final = BINS * BITS // 8

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from hbr.arrays import FloatArray
+
 Descriptors = NDArray[np.uint8] | FloatArray
 
 

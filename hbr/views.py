@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hbr._segments import ranges
-from hbr.angles import FloatArray, wrap360
-from hbr.cedd import BINS, LevelArray
+from hbr.angles import wrap360
+from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.cedd import BINS
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -40,7 +41,7 @@ class Views:
 
     descriptors: LevelArray
     azimuth_deg: FloatArray
-    object_index: NDArray[np.intp]
+    object_index: IndexArray
     object_names: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -84,22 +85,22 @@ class Views:
             names,
         )
 
-    def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Views":
+    def select(self, rows: IndexArray | NDArray[np.bool_]) -> "Views":
         """The views of these indices, or where a mask holds; every object keeps its index and name."""
         return Views(self.descriptors[rows], self.azimuth_deg[rows], self.object_index[rows], self.object_names)
 
-    def of(self, object_index: int) -> NDArray[np.intp]:
+    def of(self, object_index: int) -> IndexArray:
         """Indices of the views of an object, ascending."""
         return self.of_each(np.array([object_index]))[0]
 
-    def of_each(self, object_index: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def of_each(self, object_index: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Indices of the views of these objects, one object after the other, and where each object begins."""
         order, start = self._by_object
         positions, begin = ranges(start[object_index], start[object_index + 1] - start[object_index])
         return order[positions], begin
 
     @cached_property
-    def _by_object(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _by_object(self) -> tuple[IndexArray, IndexArray]:
         order = np.argsort(self.object_index, kind="stable")
         start = np.searchsorted(self.object_index[order], np.arange(len(self.object_names) + 1))
         return order, start
