@@ -103,6 +103,9 @@ class CameraConfig(Section):
     exposure_us: float | None = Field(8000.0, gt=0, le=1e6, description="locked exposure; none leaves the camera's")
     gain: float | None = Field(None, ge=0, description="locked gain in the camera's own unit; none leaves the camera's")
     white_balance_k: float | None = Field(5000.0, ge=1000, le=20000, description="locked white balance")
+    focus: float | None = Field(
+        None, ge=0, description="locked focus in the camera's own unit; none leaves the camera's"
+    )
 
 
 class ViewConfig(Section):

@@ -12,7 +12,7 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, Wire, open_serial
 from rig.devices.dynamixel.servo import DynamixelServo, prepare_servo
 from rig.devices.mpu6050 import Mpu6050
-from rig.devices.opencv_camera import OpenCvCamera, VideoCapture, open_capture
+from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
 
 
 class NoOptions(Section):
@@ -36,9 +36,7 @@ class HardwareBench:
             return bench
 
 
-def assemble(
-    name: str, config: RigConfig, clock: Clock, *, wire: Wire, i2c_bus: int | str, capture: VideoCapture
-) -> Bench:
+def assemble(name: str, config: RigConfig, clock: Clock, *, wire: Wire, i2c_bus: int | str, capture: Capture) -> Bench:
     """Put the drivers on their wires; a simulated bench is assembled by the same lines as a real one.
 
     Raises
@@ -58,8 +56,16 @@ def assemble(
             i2c_bus, address=config.imu.address, clock=clock, range_dps=config.imu.range_dps, rate_hz=config.imu.rate_hz
         )
         opened.callback(imu.close)
-        camera = OpenCvCamera(capture, clock=clock)
+        camera = OpenCvCamera(
+            capture,
+            clock=clock,
+            settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
+            name=f"camera {config.camera.source}",
+        )
         opened.pop_all()
+    findings += tuple(
+        f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}" for n in camera.not_taken
+    )
     return Bench(name, config, clock, servo, imu, camera, findings=findings)
 
 

@@ -1,0 +1,124 @@
+"""The simulated bench: one world, and the real drivers on simulated wires."""
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field, field_validator
+
+from rig.bench import Bench, BenchKind
+from rig.clock import SystemClock
+from rig.config import RigConfig, Section
+from rig.devices.dynamixel.port import READ_SLICE_S
+from rig.errors import ObjectNotFound
+from rig.hardware import assemble
+from sim.camera import SimCapture
+from sim.clock import VirtualClock
+from sim.i2c import SimI2cBus
+from sim.imu.mpu6050 import SimMpu6050
+from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
+from sim.servo import ServoBus, SimSerial, XSeriesServo
+from sim.world import Thing, World
+
+
+class SimOptions(Section):
+    """The section ``[bench.sim]``."""
+
+    objects: Path | None = Field(None, description="folder of photographs obj{N}__{A}.png; none: the built-in objects")
+    object: str | None = Field(None, description="what stands on the table to be identified; none: drawn by the seed")
+    yaw_deg: float | None = Field(None, ge=-360, le=360, description="how it stands; none: drawn by the seed")
+    noise: dict[str, float] = Field(default_factory=dict, description="values of the noise model that differ")
+
+    @field_validator("noise")
+    @classmethod
+    def _known(cls, values: dict[str, float]) -> dict[str, float]:
+        known = [f.name for f in fields(NoiseModel)]
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise ValueError(f"unknown: {', '.join(unknown)}; there are {', '.join(known)}")
+        NoiseModel(**values)  # its own check of the ranges
+        return values
+
+
+class ShelfOperator:
+    """The hand that takes things from the shelf: to be enrolled they stand at yaw 0, to be identified anyhow.
+
+    Every placement misses the table's axis by a little, as hands do.
+    """
+
+    def __init__(
+        self, world: World, things: Mapping[str, Thing], *, next_object: str | None = None, yaw_deg: float | None = None
+    ) -> None:
+        self.world = world
+        self.things = things
+        self.next_object = next_object
+        self.yaw_deg = yaw_deg
+        self._rng = world.rng("operator")
+
+    def place(self, name: str | None) -> None:
+        """Put the thing called ``name`` on the table, or the next one to be identified.
+
+        Raises
+        ------
+        ObjectNotFound
+            There is no such thing on the shelf.
+        """
+        dx_mm, dy_mm = self._rng.normal(0.0, self.world.noise.placement_mm, 2).tolist()
+        yaw_deg = 0.0
+        if name is None:
+            drawn, drawn_deg = str(self._rng.choice(sorted(self.things))), float(self._rng.uniform(0.0, 360.0))
+            name = self.next_object or drawn
+            yaw_deg = drawn_deg if self.yaw_deg is None else self.yaw_deg
+        if name not in self.things:
+            raise ObjectNotFound(
+                f"There is no {name!r} on the simulated shelf.",
+                next_step="Choose one of the objects listed, or give a folder of photographs: --set bench.sim.objects=…",
+                evidence={"objects": list(self.things)},
+            )
+        self.world.put(self.things[name], yaw_deg, (dx_mm, dy_mm))
+
+
+def open_sim_bench(config: RigConfig, operator: ShelfOperator) -> Bench:
+    """Put the real drivers on the simulated wires of the operator's world, by the lines that open a real bench.
+
+    The simulated servo comes as from the factory and is set up over its wire.
+    """
+    world = operator.world
+    config = config.model_copy(update={"servo": config.servo.model_copy(update={"write_settings": True})})
+    servo_bus = ServoBus(world.clock)
+    servo_bus.attach(XSeriesServo(world, config.servo.model, bus_id=config.servo.id, baudrate=config.servo.baud))
+    with ExitStack() as wires:
+        i2c = wires.enter_context(SimI2cBus(world.clock))
+        i2c.attach(config.imu.address, SimMpu6050(world, ad0=config.imu.address == 0x69))
+        bench = assemble(
+            "sim",
+            config,
+            world.clock,
+            wire=SimSerial(servo_bus, config.servo.baud, READ_SLICE_S),
+            i2c_bus=i2c.path,
+            capture=SimCapture(world),
+        )
+        bench.wires = wires.pop_all()
+    bench.operator = operator
+    bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
+    return bench
+
+
+class SimBenchKind:
+    """Opens a simulated bench with a world of its own, which begins now: what it stores carries today's date."""
+
+    options: type[BaseModel] = SimOptions
+
+    def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
+        assert isinstance(options, SimOptions)
+        things = photographs(options.objects) if options.objects else shelf()
+        clock = VirtualClock(start_utc=SystemClock().utc())
+        world = World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock)
+        operator = ShelfOperator(world, things, next_object=options.object, yaw_deg=options.yaw_deg)
+        return open_sim_bench(config, operator)
+
+
+SIM: BenchKind = SimBenchKind()

@@ -1,0 +1,35 @@
+"""`rig demo`: the main job on the simulated bench."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.command import Settings, command
+
+DEFAULT_COUNT = 16
+EXIT_QUALITY = 6
+
+
+@command
+def demo(
+    settings: Settings,
+    objects: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Photographs obj{N}__{A}.png instead of the built-in objects.")
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option(min=2, help=f"Objects to enroll: {DEFAULT_COUNT}, or the whole folder up to 20.")
+    ] = None,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html is written.")] = Path("rig-demo"),
+) -> None:
+    """Enroll objects on the simulated bench, then find each of them again, and two that were never enrolled.
+
+    Example: rig demo --seed 7 --out /tmp/demo
+    """
+    from sim.demo.run import run_demo
+
+    result = run_demo(settings, objects=objects, count=count, out=out)
+    if settings.json:
+        settings.print_json(result.as_dict())
+    if not result.good:
+        raise typer.Exit(EXIT_QUALITY)

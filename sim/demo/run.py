@@ -1,0 +1,252 @@
+"""The demonstration: a shelf of objects enrolled and found again, every number out of the simulated chain.
+
+servo → encoder and IMU → camera → CEDD → votes → decision → servo.
+"""
+
+import statistics
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+import hbr
+from rig.bench import Bench
+from rig.catalog import Catalog
+from rig.cli.command import Settings
+from rig.cli.present import Progress, sentence
+from rig.clock import SystemClock, seconds_between
+from rig.errors import ConfigError, UsageError
+from rig.plans.enroll import enroll
+from rig.plans.events import Accepted, Started
+from rig.plans.identify import identify
+from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
+from sim.bench import ShelfOperator, SimOptions, open_sim_bench
+from sim.noise import NoiseModel
+from sim.objects.photographs import Photographed, photographs
+from sim.objects.shelf import shelf
+from sim.objects.solid import Solid
+from sim.world import World
+
+COUNT = 16
+COUNT_OF_FOLDER = 20
+STRANGERS = 2
+"""Objects that are shown to the bench without having been enrolled."""
+
+GOOD_SHARE = 0.9
+"""Share of right answers below which the demonstration counts as failed."""
+
+Thing = Solid | Photographed
+
+
+@dataclass(frozen=True, slots=True)
+class DemoResult:
+    """What was measured, and the page that shows it; the wall clock's part stands apart from what a seed determines."""
+
+    enrollments: tuple[EnrollmentRecord, ...]
+    trials: tuple[IdentificationRecord, ...]
+    seed: int
+    bench_s: float
+    wall_s: float
+    report: Path
+
+    @property
+    def good(self) -> bool:
+        return sum(bool(trial.correct) for trial in self.trials) >= GOOD_SHARE * len(self.trials)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the totals and every trial as plain data."""
+        known = [trial for trial in self.trials if trial.truth and trial.truth.name is not None]
+        strangers = [trial for trial in self.trials if trial.truth and trial.truth.name is None]
+        errors = [error for trial in self.trials if (error := trial.pose_error_deg) is not None]
+        answers = [trial.answer for trial in self.trials if trial.answer]
+        return {
+            "seed": self.seed,
+            "enrolled": len(self.enrollments),
+            "views_enrolled": sum(len(record.views) for record in self.enrollments),
+            "found": sum(bool(trial.correct) for trial in known),
+            "of": len(known),
+            "unknown_recognised": sum(bool(trial.correct) for trial in strangers),
+            "of_unknown": len(strangers),
+            "mean_views": statistics.fmean(answer.views for answer in answers),
+            "travelled_deg": sum(answer.travelled_deg for answer in answers),
+            "median_pose_error_deg": statistics.median(errors) if errors else None,
+            "bench_seconds": self.bench_s,
+            "wall_seconds": self.wall_s,
+            "report": str(self.report),
+            "trials": [_trial(trial) for trial in self.trials],
+        }
+
+
+def run_demo(settings: Settings, *, objects: Path | None, count: int | None, out: Path) -> DemoResult:
+    """Enroll a shelf, find each object again and two strangers, print what happens, and write ``out/report.html``.
+
+    Raises
+    ------
+    UsageError
+        There are fewer objects than ``count``, or ``out`` cannot be written to.
+    """
+    if settings.bench not in (None, "sim"):
+        raise UsageError(
+            f"The demonstration runs on the simulated bench, not on {settings.bench!r}.",
+            next_step="Leave --bench out; on a real bench use rig enroll and rig identify.",
+        )
+    system = SystemClock()
+    wall_ns, begun = system.now_ns(), system.utc()
+    config = settings.load()
+    options = SimOptions.model_validate(config.bench.get("sim", {}))
+    enrolled, strangers = _choose(objects or options.objects, count)
+    seed = settings.seed or 0
+    world = World(noise=NoiseModel(**options.noise), seed=seed)
+    operator = ShelfOperator(world, {**enrolled, **strangers})
+    _make_folder(out)
+    with tempfile.TemporaryDirectory(prefix=".catalog-", dir=out) as folder, open_sim_bench(config, operator) as bench:
+        with Catalog.open(folder, clock=bench.clock) as catalog:
+            enrollments = _enroll_all(bench, catalog, list(enrolled), say=not settings.json)
+            index = hbr.ViewIndex(catalog.views().views)
+        trials = [
+            _identify(bench, index, operator, thing, enrolled=name in enrolled, say=number == 0 and not settings.json)
+            for number, (name, thing) in enumerate({**enrolled, **strangers}.items())
+        ]
+        bench_s = bench.clock.now_ns() * 1e-9
+        devices = bench.devices()
+    wall_s = seconds_between(wall_ns, system.now_ns())
+    result = DemoResult(tuple(enrollments), tuple(trials), seed, bench_s, wall_s, out / "report.html")
+    meta = Meta(
+        conditions={
+            "seed": seed,
+            "software": f"hbr-rig {version('hbr-rig')}",
+            "identify": config.identify.model_dump(mode="json"),
+            "noise model": asdict(world.noise),
+            **{f"device: {name}": facts for name, facts in devices.items()},
+        },
+        wall_clock={"run at": f"{begun:%Y-%m-%d %H:%M} UTC", "took": f"{wall_s:.1f} s"},
+    )
+    totals = result.as_dict()
+    summary = (
+        f"{totals['enrolled']} objects enrolled, {totals['found']} of {totals['of']} found again, "
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} strangers recognised as unknown, "
+        "on the simulated bench."
+    )
+    write_report(result.report, render_report("The rig's demonstration", summary, enrollments, trials, meta=meta))
+    if not settings.json:
+        _print_totals(result)
+    return result
+
+
+def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, Thing], Mapping[str, Thing]]:
+    """Return what is enrolled and what is not; a folder that is enrolled whole gets strangers from the shelf."""
+    things: dict[str, Thing] = dict(photographs(folder)) if folder else dict(shelf())
+    wanted = count or (min(COUNT_OF_FOLDER, len(things)) if folder else COUNT)
+    available = len(things) if folder else len(things) - STRANGERS
+    if wanted > available:
+        raise UsageError(
+            f"There are {available} objects to enroll, not {wanted}.",
+            next_step=f"Give --count {available} or less{', or a folder with more objects' if folder else ''}.",
+        )
+    names = list(things)
+    strangers = [name for name in names[wanted:]][-STRANGERS:]
+    others = dict(shelf()) if len(strangers) < STRANGERS else things
+    chosen = strangers if len(strangers) == STRANGERS else list(others)[:STRANGERS]
+    return {name: things[name] for name in names[:wanted]}, {name: others[name] for name in chosen}
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            f"The folder {out} cannot be made.",
+            next_step="Give another one with --out.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+
+
+def _enroll_all(bench: Bench, catalog: Catalog, names: Sequence[str], *, say: bool) -> list[EnrollmentRecord]:
+    records = []
+    with Progress("enrolling") as progress:
+        progress.start(len(names) * bench.config.enroll.views)
+        for name in names:
+            record = EnrollmentRecord(region=bench.config.view.roi)
+            for event in enroll(bench, catalog, name):
+                record.add(event)
+                if isinstance(event, Accepted):
+                    progress.advance()
+            records.append(record)
+            if say and record.result:
+                progress.note(sentence(record.result))
+    return records
+
+
+def _identify(
+    bench: Bench, index: hbr.ViewIndex, operator: ShelfOperator, thing: Thing, *, enrolled: bool, say: bool
+) -> IdentificationRecord:
+    """Put a thing on the table anyhow, and let the bench find out which it is."""
+    operator.next_object = thing.name
+    record = IdentificationRecord(min_score=bench.config.identify.min_score, region=bench.config.view.roi)
+    if say:
+        print(f"\nWhat stands on the table? (it is {thing.name})")
+    for event in identify(bench, index):
+        if isinstance(event, Accepted) and record.truth is None:
+            record.truth = Truth(
+                name=thing.name if enrolled else None,
+                yaw_deg=operator.world.scene.yaw_deg % 360.0 if enrolled else None,
+                symmetry_deg=thing.symmetry_deg,
+                description=thing.name,
+            )
+        record.add(event)
+        if say and (text := sentence(event)):
+            print(text, flush=True)
+    return record
+
+
+def _trial(trial: IdentificationRecord) -> dict[str, Any]:
+    assert trial.truth is not None
+    assert trial.answer is not None
+    return {
+        "object": trial.truth.description,
+        "enrolled": trial.truth.name is not None,
+        "found_as": trial.answer.name,
+        "right": trial.correct,
+        "views": trial.answer.views,
+        "travelled_deg": trial.answer.travelled_deg,
+        "pose_error_deg": trial.pose_error_deg,
+        "score": trial.answer.score,
+        "margin": trial.answer.margin,
+    }
+
+
+def _print_totals(result: DemoResult) -> None:
+    totals = result.as_dict()
+    table = Table("", "on the table", "found as", box=None, pad_edge=False)
+    for heading in ("views", "travelled", "pose error", "score", "margin"):
+        table.add_column(heading, justify="right")
+    for trial in totals["trials"]:
+        error = trial["pose_error_deg"]
+        table.add_row(
+            "✓" if trial["right"] else "✗",
+            trial["object"] if trial["enrolled"] else f"{trial['object']} (never enrolled)",
+            trial["found_as"] or "unknown",
+            str(trial["views"]),
+            f"{trial['travelled_deg']:.0f}°",
+            "–" if error is None else f"{error:.1f}°",
+            f"{trial['score']:.3f}",
+            f"{trial['margin']:.3f}",
+        )
+    print()
+    Console(file=sys.stdout).print(table)
+    error = totals["median_pose_error_deg"]
+    print(
+        f"\n{totals['enrolled']} objects enrolled with {totals['views_enrolled']} views; "
+        f"{totals['found']} of {totals['of']} found again, "
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} strangers recognised as unknown.\n"
+        f"{totals['mean_views']:.1f} views an answer, {totals['travelled_deg']:.0f}° travelled, "
+        f"median pose error {'–' if error is None else f'{error:.1f}°'}.\n"
+        f"The bench worked {result.bench_s / 60:.0f} minutes of its own time in {result.wall_s:.0f} s.\n"
+        f"Report: {result.report}"
+    )
