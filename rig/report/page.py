@@ -138,6 +138,7 @@ class _Retrieval(NamedTuple):
     margin: str
     words: str
     path: Markup
+    compared: bool
     scores: Markup
     frames: list[_Frame]
     unfold: bool
@@ -182,6 +183,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         margin=f"{answer.margin:.3f}" if answer else "–",
         words=answer_words(answer) if answer else "The search ended before an answer.",
         path=path,
+        compared=any(event.s_left is not None for event in record.decided),
         scores=scores,
         frames=_frames(record),
         unfold=unfold or record.correct is False,

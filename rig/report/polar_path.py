@@ -19,6 +19,7 @@ _LABEL_SPOTS: Final = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 _LABEL_ASIDE_PX: Final = (22.0, -22.0)
 _LIST_X: Final = SIZE + 14
 _LIST_WIDTH: Final = 206.0
+_LIST_TOP: Final = 66.0
 _LIST_ROW: Final = 38.0
 
 
@@ -71,7 +72,8 @@ def polar_path(start_deg: float, turns: Sequence[Turn], *, scale: str) -> str:
         parts.append(svg.text(f"{abs(turn.rotation_deg):.1f}°", (x, y + 4), "turn-label"))
     where = ", ".join(f"{a % 360:.1f}°" for a in azimuth_deg)
     label = f"Camera positions seen from above, view by view: {where}"
-    return svg.drawing(_LIST_X + _LIST_WIDTH, SIZE, label, [*parts, *_list(turns, scale)])
+    height = max(SIZE, _LIST_TOP + _LIST_ROW * len(turns))
+    return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *_list(turns, scale)])
 
 
 def _radii(n: int) -> list[float]:
@@ -126,9 +128,8 @@ def _list(turns: Sequence[Turn], scale: str) -> list[str]:
         svg.text(scale, (_LIST_X, 16), "small", anchor="start"),
         svg.text("left is counter-clockwise", (_LIST_X, 31), "small", anchor="start"),
     ]
-    top = max(66.0, (SIZE - _LIST_ROW * len(turns)) / 2)
     for k, turn in enumerate(turns):
-        y = top + _LIST_ROW * k
+        y = _LIST_TOP + _LIST_ROW * k
         parts.append(svg.text(f"{k + 1} → {k + 2}", (_LIST_X, y), "small", anchor="start"))
         parts.append(svg.text(turn.words, (_LIST_X + 44, y), "turn-name", anchor="start"))
         if turn.s_left is None or turn.s_right is None:

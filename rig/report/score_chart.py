@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from math import ceil, floor
+from math import ceil, floor, inf
 from typing import Final
 
 from rig.report import svg
@@ -55,7 +55,7 @@ def score_chart(
         raise ValueError("a score chart needs at least one round, and a candidate in each")
     names = sorted(rounds[-1], key=lambda name: -rounds[-1][name])[:top]
     shown = [scores[name] for scores in rounds for name in names if name in scores]
-    ticks = _ticks(shown, min_score)
+    ticks = _ticks(shown, min_score, rivals=len(names) > 1)
     low, high = ticks[0], ticks[-1]
 
     def at(view: int, score: float) -> Point:
@@ -94,21 +94,22 @@ def score_chart(
     return svg.drawing(_WIDTH, _HEIGHT, label, parts)
 
 
-def _ticks(values: Sequence[float], min_score: float | None) -> list[float]:
-    """Round numbers that span ``values``, at most seven of them, and ``min_score`` where it is not far off.
+def _ticks(values: Sequence[float], min_score: float | None, *, rivals: bool) -> list[float]:
+    """Round numbers that span ``values``, three to seven of them, and ``min_score`` too.
 
-    A threshold far off would press lines that differ in the third decimal into one.
+    Not a threshold that is far off, though: it would press the lines of ``rivals``, which may differ in the third
+    decimal, into one.
     """
     low, high = min(values), max(values)
     if min_score is not None:
-        reach = _FAR * max(high - low, _STEPS[0])
+        reach = _FAR * (high - low) if rivals else inf
         if low - reach <= min_score <= high + reach:
             low, high = min(low, min_score), max(high, min_score)
     for step in _STEPS:
         first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
         if last - first <= 6:
             break
-    return [step * i for i in range(first, max(last, first + 1) + 1)]
+    return [step * i for i in range(min(first, last - 2), last + 1)]
 
 
 def _look(rank: int, wins: bool) -> str:

@@ -17,11 +17,9 @@ class Fact(NamedTuple):
 
 
 def totals(enrollments: Sequence[EnrollmentRecord], identifications: Sequence[IdentificationRecord]) -> list[Fact]:
-    """Return the headline numbers of a run; those of a single object where there is but one."""
+    """Return the headline numbers of a run; a single object's own numbers stand with it, not here."""
     facts = []
-    if len(enrollments) == 1 and not identifications:
-        return enrollment_facts(enrollments[0])
-    if enrollments:
+    if len(enrollments) + len(identifications) > 1 and enrollments:
         views = sum(len(record.views) for record in enrollments)
         retakes = sum(record.retakes for record in enrollments)
         finished = sum(record.result is not None for record in enrollments)
