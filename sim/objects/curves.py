@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 Curve = tuple[tuple[float, ...], ...]
 
 
-def smooth(*corners: tuple[float, ...], rounds: int = 3) -> Curve:
+def smooth(*corners: tuple[float, ...], rounds: int = 4) -> Curve:
     """Return the curve through ``corners`` with its edges rounded (Chaikin's corner cutting); its ends stay."""
     points = np.array(corners, dtype=np.float64)
     for _ in range(rounds):

@@ -2,8 +2,9 @@
 
 from sim.objects import paint as p
 from sim.objects.curves import smooth
-from sim.objects.paint import Brush, Colour, Sheet, painted, wood
+from sim.objects.paint import Brush, Sheet, painted, wood
 from sim.objects.polyhedron import Polyhedron, box, prism, quad, triangle
+from sim.objects.projection import Colour
 from sim.objects.revolution import Revolution
 from sim.objects.solid import Solid
 from sim.objects.tube import Tube, handle

@@ -1,8 +1,8 @@
 """Brushes for the textures of the built-in objects.
 
 A texture is painted in units of its own size: u runs across from 0 (left) to 1 (right), v down from 0 (top) to 1
-(bottom). On a body of revolution u = 0.5 is the front, and the sheet closes to a ring: what is painted at any u may run
-over the seam.
+(bottom). On a body of revolution u = 0.5 is the front, and the sheet closes to a ring: shapes that run over one edge
+come in at the other.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,13 +11,9 @@ from math import cos, pi, sin
 import cv2
 import numpy as np
 
-from sim.objects.projection import Image
+from sim.objects.projection import Colour, Image, Paint
 
-Colour = tuple[int, int, int]
-"""B, G, R."""
 Brush = Callable[["Sheet"], None]
-Paint = Callable[[tuple[int, int]], Image]
-"""Returns a texture for its (rows, columns)."""
 
 WHITE: Colour = (238, 240, 240)
 CREAM: Colour = (196, 226, 238)
@@ -64,8 +60,10 @@ class Sheet:
 
     def polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
         scale = np.array([self.columns, self.rows], dtype=np.float64)
-        fixed = np.round((np.array(points) * scale - 0.5) * (1 << _SHIFT)).astype(np.int32)
-        cv2.fillPoly(self.pixels, [fixed], colour, cv2.LINE_AA, _SHIFT)
+        for turn in _turns(min(u for u, _ in points), max(u for u, _ in points)):
+            corners = (np.array(points) + np.array([turn, 0.0])) * scale - 0.5
+            fixed = np.round(corners * (1 << _SHIFT)).astype(np.int32)
+            cv2.fillPoly(self.pixels, [fixed], colour, cv2.LINE_AA, _SHIFT)
 
     def stripes(self, n: int, colour: Colour, *, share: float = 0.5, top: float = 0.0, bottom: float = 1.0) -> None:
         """Paint ``n`` upright stripes, each ``share`` of its period wide."""
@@ -75,8 +73,11 @@ class Sheet:
 
     def disc(self, u: float, v: float, radius: float, colour: Colour) -> None:
         """Paint a round spot; ``radius`` as a share of the sheet's height."""
-        centre = (round((u * self.columns - 0.5) * (1 << _SHIFT)), round((v * self.rows - 0.5) * (1 << _SHIFT)))
-        cv2.circle(self.pixels, centre, round(radius * self.rows * (1 << _SHIFT)), colour, -1, cv2.LINE_AA, _SHIFT)
+        reach = radius * self.rows / self.columns
+        size, y = round(radius * self.rows * (1 << _SHIFT)), round((v * self.rows - 0.5) * (1 << _SHIFT))
+        for turn in _turns(u - reach, u + reach):
+            x = round(((u + turn) * self.columns - 0.5) * (1 << _SHIFT))
+            cv2.circle(self.pixels, (x, y), size, colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
 
     def star(self, u: float, v: float, radius: float, colour: Colour, *, points: int = 5, waist: float = 0.42) -> None:
         """Paint a star; with a waist near 1 a rosette."""
@@ -137,7 +138,12 @@ class Sheet:
         self.pixels = np.roll(self.pixels, by, axis=1)
 
 
-def painted(ground: Colour, *brushes: Brush) -> Callable[[tuple[int, int]], Image]:
+def _turns(left: float, right: float) -> range:
+    """Return by how many rings a shape is repeated so that what runs over one edge comes in at the other."""
+    return range(-1 if right > 1 else 0, 2 if left < 0 else 1)
+
+
+def painted(ground: Colour, *brushes: Brush) -> Paint:
     """Return a texture that is ``ground`` with ``brushes`` applied in turn."""
 
     def paint(shape: tuple[int, int]) -> Image:

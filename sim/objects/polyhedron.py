@@ -1,8 +1,8 @@
 """Convex solids with flat faces: boxes, prisms, roofs, lying cylinders. A face is one affine warp of its texture."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from math import cos, pi, radians, sin, sqrt
 
@@ -10,14 +10,10 @@ import cv2
 import numpy as np
 
 from sim.objects.layers import blend
-from sim.objects.projection import Drawing, Floats, Image, Pose, nearness, shade
+from sim.objects.projection import Colour, Drawing, Floats, Image, Paint, Pose, nearness, shade
 
 TEXELS_PER_MM = 2.0
 _SHIFT = 4  # fractional bits of the coordinates that OpenCV draws with
-
-Colour = tuple[int, int, int]
-Paint = Callable[[tuple[int, int]], Image]
-"""Returns a texture for its (rows, columns)."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +26,10 @@ class Face:
     corners: Floats
     paint: Paint | Colour
     frame: tuple[Floats, Floats, Floats]
+
+    @property
+    def colour(self) -> Colour:
+        return self.paint if isinstance(self.paint, tuple) else (0, 0, 0)
 
     @cached_property
     def texture(self) -> Image | None:
@@ -79,7 +79,7 @@ class Polyhedron:
         return sqrt(cv2.contourArea(outline) / pi)
 
     def drawings(self, pose: Pose) -> list[Drawing]:
-        return [Drawing((self.layer, pose.depth(*self._depth_at)), lambda image: self._draw(image, pose))]
+        return [Drawing((self.layer, pose.depth(*self._depth_at)), partial(self._draw, pose))]
 
     @cached_property
     def _depth_at(self) -> tuple[float, float]:
@@ -88,66 +88,68 @@ class Polyhedron:
         x, y, _ = np.concatenate([face.corners for face in self.faces]).mean(axis=0)
         return float(x), float(y)
 
-    def _draw(self, image: Image, pose: Pose) -> None:
-        corners = [pose.to_image(pose.to_room(face.corners)) for face in self.faces]
-        hull = cv2.convexHull(np.concatenate(corners).astype(np.float32)).reshape(-1, 2)
-        left, top = np.maximum(np.floor(hull.min(axis=0)).astype(int) - 2, 0)
-        right, bottom = np.minimum(np.ceil(hull.max(axis=0)).astype(int) + 3, (image.shape[1], image.shape[0]))
-        if left >= right or top >= bottom:
+    @cached_property
+    def _geometry(self) -> tuple[Floats, list[slice], Floats, Floats]:
+        """All corners (n, 3), which of them are each face's, the frames' points (3 m, 3), the normals (m, 3)."""
+        corners = np.concatenate([face.corners for face in self.faces])
+        ends = np.cumsum([len(face.corners) for face in self.faces])
+        frames = np.concatenate([np.stack(face.frame) for face in self.faces])
+        slices = [slice(int(end) - len(face.corners), int(end)) for face, end in zip(self.faces, ends, strict=True)]
+        return corners, slices, frames, np.array([face.normal for face in self.faces])
+
+    def _draw(self, pose: Pose, image: Image) -> None:
+        corners_mm, slices, frames_mm, normals = self._geometry
+        corners, normals = pose.to_image(corners_mm), pose.turn(normals)
+        left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2, 0).tolist()
+        size = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, image.shape[1::-1]) - (left, top)
+        if (size <= 0).any():
             return
-        corner = np.array([left, top], dtype=np.float64)
-        size = (int(right - left), int(bottom - top))
-        normals = pose.turn(np.array([face.normal for face in self.faces]))
-        seen = [i for i in np.argsort(nearness(normals)) if nearness(normals[i]) > 0]
+        corners -= left, top
+        frames = pose.to_image(frames_mm).reshape(-1, 3, 2) - (left, top)
         solid = np.empty((size[1], size[0], 3), dtype=np.uint8)
-        for n, i in enumerate(seen):
-            face, light = self.faces[i], float(shade(normals[i]))
-            polygon = corners[i] - corner
+        facing = nearness(normals)
+        lights = shade(normals).tolist()
+        # The face seen best goes everywhere first, so that the smoothed seams show nothing but the solid itself.
+        for n, i in enumerate(i for i in np.argsort(-facing).tolist() if facing[i] > 0):
+            face, polygon = self.faces[i], None if n == 0 else corners[slices[i]]
             if face.texture is None:
-                self._flat(solid, face, polygon, light, whole=n == 0)
+                _paint_flat(solid, face.colour, polygon, lights[i])
             else:
-                frame = pose.to_image(pose.to_room(np.array(face.frame))) - corner
-                self._printed(solid, face.texture, frame, polygon, light, whole=n == 0)
+                _paint_printed(solid, face.texture, frames[i], polygon, lights[i])
         cover = np.zeros((size[1], size[0]), dtype=np.uint8)
-        _fill(cover, hull - corner, 255)
-        blend(image[top:bottom, left:right], solid, cover)
+        hull = cv2.convexHull(corners.astype(np.float32)).reshape(-1, 2)
+        _fill(cover, hull.astype(np.float64), (255,))
+        blend(image[top : top + size[1], left : left + size[0]], solid, cover)
 
-    @staticmethod
-    def _flat(solid: Image, face: Face, polygon: Floats, light: float, *, whole: bool) -> None:
-        assert isinstance(face.paint, tuple)
-        b, g, r = (c * light for c in face.paint)
-        if whole:  # what shows through the smoothed seams of the next faces is this one
-            solid[:] = np.round((b, g, r)).astype(np.uint8)
-        else:
-            cv2.fillConvexPoly(solid, _fixed(polygon), (b, g, r), cv2.LINE_AA, _SHIFT)
 
-    @staticmethod
-    def _printed(solid: Image, texture: Image, frame: Floats, polygon: Floats, light: float, *, whole: bool) -> None:
-        rows, columns = texture.shape[:2]
-        if whole:
-            x0, y0, x1, y1 = 0, 0, solid.shape[1], solid.shape[0]
-        else:
-            x0, y0 = np.maximum(np.floor(polygon.min(axis=0)).astype(int) - 1, 0)
-            x1, y1 = np.minimum(np.ceil(polygon.max(axis=0)).astype(int) + 2, (solid.shape[1], solid.shape[0]))
-        on_texture = np.array([[-0.5, -0.5], [columns - 0.5, -0.5], [-0.5, rows - 0.5]], dtype=np.float32)
-        move = cv2.getAffineTransform(on_texture, (frame - (x0, y0)).astype(np.float32))
-        size = (int(x1 - x0), int(y1 - y0))
-        layer = cv2.warpAffine(texture, move, size, borderMode=cv2.BORDER_REPLICATE)
-        lit = np.asarray(cv2.convertScaleAbs(layer, alpha=light), dtype=np.uint8)
-        if whole:
-            solid[:] = lit
-            return
-        cover = np.zeros((size[1], size[0]), dtype=np.uint8)
-        _fill(cover, polygon - (x0, y0), 255)
+def _paint_flat(solid: Image, colour: Colour, polygon: Floats | None, light: float) -> None:
+    b, g, r = (c * light for c in colour)
+    if polygon is None:
+        solid[:] = np.round((b, g, r)).astype(np.uint8)
+    else:
+        _fill(solid, polygon, (b, g, r))
+
+
+def _paint_printed(solid: Image, texture: Image, frame: Floats, polygon: Floats | None, light: float) -> None:
+    x0, y0, x1, y1 = 0, 0, solid.shape[1], solid.shape[0]
+    if polygon is not None:
+        x0, y0 = np.maximum(np.floor(polygon.min(axis=0)).astype(int) - 1, 0).tolist()
+        x1, y1 = np.minimum(np.ceil(polygon.max(axis=0)).astype(int) + 2, (x1, y1)).tolist()
+    rows, columns = texture.shape[:2]
+    on_texture = np.array([[-0.5, -0.5], [columns - 0.5, -0.5], [-0.5, rows - 0.5]], dtype=np.float32)
+    move = cv2.getAffineTransform(on_texture, (frame - (x0, y0)).astype(np.float32))
+    seen = cv2.warpAffine(texture, move, (x1 - x0, y1 - y0), borderMode=cv2.BORDER_REPLICATE)
+    lit = np.asarray(cv2.convertScaleAbs(seen, alpha=light), dtype=np.uint8)
+    if polygon is None:
+        solid[:] = lit
+    else:
+        cover = np.zeros(lit.shape[:2], dtype=np.uint8)
+        _fill(cover, polygon - (x0, y0), (255,))
         blend(solid[y0:y1, x0:x1], lit, cover)
 
 
-def _fixed(polygon: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
-    return np.round(polygon * (1 << _SHIFT)).astype(np.int32)
-
-
-def _fill(cover: Image, polygon: Floats, value: int) -> None:
-    cv2.fillConvexPoly(cover, _fixed(polygon), (value,), cv2.LINE_AA, _SHIFT)
+def _fill(image: Image, polygon: Floats, colour: Sequence[float]) -> None:
+    cv2.fillConvexPoly(image, np.round(polygon * (1 << _SHIFT)).astype(np.int32), colour, cv2.LINE_AA, _SHIFT)
 
 
 # -- solids -----------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from math import cos, pi, sin
 from sim.objects import paint as p
 from sim.objects.curves import Curve, smooth
 from sim.objects.paint import Brush, Sheet, painted
+from sim.objects.projection import Colour
 from sim.objects.revolution import Revolution
 from sim.objects.solid import Solid
 from sim.objects.tube import Tube, handle, ray
@@ -15,7 +16,7 @@ _MUG = ((41.0, 98.0), (44.0, 98.0), (44.0, 12.0), (42.0, 4.0), (38.0, 0.0))
 _MUG_INSIDE = ((41.0, 98.0), (41.0, 10.0), (36.0, 6.0), (0.0, 6.0))
 
 
-def _mug(name: str, ground: p.Colour, *brushes: Brush, lining: p.Colour = p.WHITE) -> Solid:
+def _mug(name: str, ground: Colour, *brushes: Brush, lining: Colour = p.WHITE) -> Solid:
     body = Revolution(_MUG, painted(ground, *brushes), inside=_MUG_INSIDE, lining=lining, shine=0.45)
     return Solid(name, (body, Tube(handle(43, 82, 24, 27, 5.5, 90), ground)))
 
@@ -41,7 +42,7 @@ def _teapot() -> Solid:
         sheet.band(0.28, 0.31, p.TEAL)
         sheet.band(0.0, 0.09, p.TEAL)
 
-    body = smooth((0, 108), (14, 108), (34, 99), (36, 94), (58, 80), (66, 52), (58, 18), (40, 4), (38, 0), rounds=3)
+    body = smooth((0, 108), (14, 108), (34, 99), (36, 94), (58, 80), (66, 52), (58, 18), (40, 4), (38, 0))
     spout = ray(270, (52, 34, 12), (68, 46, 9), (80, 72, 6.5), (92, 90, 5.5))
     return Solid(
         "teapot",
@@ -54,7 +55,7 @@ def _teapot() -> Solid:
     )
 
 
-def _bowl(name: str, ground: p.Colour, brush: Brush, symmetry_deg: float, lining: p.Colour) -> Solid:
+def _bowl(name: str, ground: Colour, brush: Brush, symmetry_deg: float, lining: Colour) -> Solid:
     outside = ((78.0, 74.0), (82.0, 74.0), *smooth((82, 72), (76, 40), (52, 14), (34, 9)), (34.0, 0.0))
     inside = smooth((78, 74), (72, 42), (48, 17), (0, 12))
     return Solid(
@@ -86,7 +87,7 @@ _VASE = (
 _VASE_INSIDE = ((27.0, 176.0), (16.0, 140.0), (16.0, 100.0), (0.0, 100.0))
 
 
-def _vase(name: str, ground: p.Colour, *brushes: Brush, symmetry_deg: float = 360.0) -> Solid:
+def _vase(name: str, ground: Colour, *brushes: Brush, symmetry_deg: float = 360.0) -> Solid:
     body = Revolution(_VASE, painted(ground, *brushes), inside=_VASE_INSIDE, lining=ground, shine=0.6)
     return Solid(name, (body,), symmetry_deg)
 

@@ -2,8 +2,8 @@
 
 Room frame, millimetres: origin at the centre of the platter's top, x to the camera's right, y away from it, z up. The
 camera stands at the front (-y), `ELEVATION_DEG` above the horizon. Turning counter-clockwise seen from above moves the
-front of a thing to the right of the image. The projection is weak perspective: parallel for the points of one thing,
-whose scale follows the distance of its axis.
+front of a thing to the right of the image. The projection is weak perspective: parallel, at the scale of the platter's
+centre, as through a long lens.
 """
 
 from collections.abc import Callable
@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+Colour = tuple[int, int, int]
+"""B, G, R."""
+Paint = Callable[[tuple[int, int]], Image]
+"""Returns a texture, uint8 (rows, columns, 3), for its (rows, columns)."""
 
 WIDTH, HEIGHT = 640, 480
 ELEVATION_DEG = 15.0
 PX_PER_MM = 2.0
-DISTANCE_MM = 800.0
-CENTRE_PX = (320.0, 398.0)
+CENTRE_PX = (320, 398)
 """Where the image shows the centre of the platter's top."""
 
 SIN, COS = sin(radians(ELEVATION_DEG)), cos(radians(ELEVATION_DEG))
@@ -62,11 +65,6 @@ class Pose:
     x_mm: float = 0.0
     y_mm: float = 0.0
 
-    @property
-    def scale(self) -> float:
-        """Return pixels a millimetre at the axis' distance."""
-        return PX_PER_MM * DISTANCE_MM / (DISTANCE_MM + self.y_mm * COS)
-
     def to_room(self, points_mm: Floats) -> Floats:
         """Return points (n, 3) of the thing as the room sees them."""
         turned = self.turn(points_mm)
@@ -83,16 +81,10 @@ class Pose:
         a = radians(self.azimuth_deg)
         return -(self.y_mm + x_mm * sin(a) + y_mm * cos(a))
 
-    def to_image(self, room_mm: Floats) -> Floats:
-        """Return pixel coordinates (n, 2) of points (n, 3) in the room; whole numbers are pixel centres."""
-        axis = np.array([self.x_mm, self.y_mm, 0.0])
-        return np.array(CENTRE_PX) + _on_image(axis[None]) * PX_PER_MM + _on_image(room_mm - axis) * self.scale
-
-
-def _on_image(room_mm: Floats) -> Floats:
-    """Return points (n, 3) as the image's axes, right and down, have them, in millimetres (n, 2)."""
-    x, y, z = room_mm.T
-    return np.column_stack([x, -(y * SIN + z * COS)])
+    def to_image(self, points_mm: Floats) -> Floats:
+        """Return pixel coordinates (n, 2) of points (n, 3) of the thing; whole numbers are pixel centres."""
+        x, y, z = self.to_room(points_mm).T
+        return np.column_stack([CENTRE_PX[0] + PX_PER_MM * x, CENTRE_PX[1] - PX_PER_MM * (y * SIN + z * COS)])
 
 
 def nearness(room_mm: Floats) -> Floats:

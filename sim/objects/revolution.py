@@ -8,7 +8,6 @@ g_k >= x². If that is k = 0 it has gone through the mouth of a vessel and goes 
 x².
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +18,7 @@ from scipy.ndimage import uniform_filter1d
 
 from sim.objects.curves import Curve, evenly
 from sim.objects.layers import place
-from sim.objects.projection import COS, PX_PER_MM, SIN, Drawing, Floats, Image, Pose, gloss, shade
+from sim.objects.projection import COS, PX_PER_MM, SIN, Colour, Drawing, Floats, Image, Paint, Pose, gloss, shade
 
 TEXELS_PER_MM = 2.0
 _STEP_MM = 0.25
@@ -52,18 +51,16 @@ class Revolution:
     """
 
     profile: Curve
-    paint: Callable[[tuple[int, int]], Image]
+    paint: Paint
     inside: Curve = ()
-    lining: tuple[int, int, int] = (235, 238, 238)
+    lining: Colour = (235, 238, 238)
     at: tuple[float, float] = (0.0, 0.0)
     shine: float = 0.0
     layer: int = 0
 
     def drawings(self, pose: Pose) -> list[Drawing]:
-        axis = pose.to_room(np.array([[*self.at, 0.0]]))
-        return [
-            Drawing((self.layer, pose.depth(*self.at)), lambda image: self._paste(image, pose, pose.to_image(axis)[0]))
-        ]
+        foot_px = pose.to_image(np.array([[*self.at, 0.0]]))[0]
+        return [Drawing((self.layer, pose.depth(*self.at)), lambda image: self._paste(image, pose, foot_px))]
 
     @property
     def reach_mm(self) -> float:
@@ -80,7 +77,7 @@ class Revolution:
         seen = cv2.remap(turned, look.column + np.float32(shift - whole), look.row, cv2.INTER_LINEAR)
         lit = np.asarray(cv2.multiply(seen, look.light, scale=1 / 255), dtype=np.uint8)
         cv2.add(lit, look.highlight, dst=lit)
-        place(image, lit, look.clear, foot_px - look.foot_px * (pose.scale / PX_PER_MM), pose.scale / PX_PER_MM)
+        place(image, lit, look.clear, foot_px - look.foot_px)
 
     @cached_property
     def _outside(self) -> Floats:

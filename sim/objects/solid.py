@@ -42,8 +42,7 @@ class Solid:
         """Draw the thing into ``image`` as `sim.objects.projection.Visible` describes."""
         pose = Pose(azimuth_deg, *offset_mm)
         clear, foot = self._shadow
-        foot_px = pose.to_image(np.array([[*offset_mm, 0.0]]))[0]
-        place(image, np.zeros_like(clear), clear, foot_px - foot, 1.0)
+        place(image, np.zeros_like(clear), clear, pose.to_image(np.zeros((1, 3)))[0] - foot)
         drawings = [drawing for part in self.parts for drawing in part.drawings(pose)]
         for drawing in sorted(drawings, key=lambda d: d.order):
             drawing.onto(image)

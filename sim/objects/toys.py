@@ -4,8 +4,9 @@ from math import cos, pi, sin
 
 from sim.objects import paint as p
 from sim.objects.curves import smooth
-from sim.objects.paint import Brush, Colour, Sheet, painted, wood
+from sim.objects.paint import Brush, Sheet, painted, wood
 from sim.objects.polyhedron import Polyhedron, box, lying_cylinder, quad, roof
+from sim.objects.projection import Colour, Paint
 from sim.objects.revolution import Revolution
 from sim.objects.solid import Solid
 from sim.objects.tube import Tube, ray
@@ -56,7 +57,7 @@ def _wreath(s: Sheet) -> None:
 
 
 def _blocks() -> Solid:
-    def face(letter: str, ink: Colour) -> p.Paint:
+    def face(letter: str, ink: Colour) -> Paint:
         def brush(s: Sheet) -> None:
             s.panel(0.07, 0.07, 0.93, 0.93, ink)
             s.panel(0.13, 0.13, 0.87, 0.87, p.CREAM)
@@ -235,7 +236,7 @@ def _dice() -> Solid:
         5: ((0.26, 0.26), (0.74, 0.26), (0.5, 0.5), (0.26, 0.74), (0.74, 0.74)),
     }
 
-    def face(n: int) -> p.Paint:
+    def face(n: int) -> Paint:
         def brush(s: Sheet) -> None:
             for u, v in spots[n]:
                 s.disc(u, v, 0.09, p.WHITE)
@@ -272,7 +273,6 @@ def _nutcracker() -> Solid:
         (20, 44),
         (20, 12),
         (30, 10),
-        rounds=2,
     )
     arms = [Tube(ray(side, (27, 92, 6), (35, 70, 6), (29, 48, 6)), p.RED) for side in (90, 270)]
     stand = Revolution(((0.0, 12.0), (40.0, 12.0), (40.0, 0.0)), painted(p.DARK_GREEN), layer=-1)

@@ -1,20 +1,21 @@
-"""Handles, spouts, knobs: a sphere swept along a curve, which is exact in parallel projection as a chain of discs."""
+"""Handles and spouts: a sphere swept along a curve, which parallel projection shows as a thick line."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from math import cos, pi, radians, sin
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.objects.curves import Curve, evenly
-from sim.objects.projection import PX_PER_MM, TO_CAMERA, TO_LIGHT, Drawing, Floats, Image, Pose, nearness
+from sim.objects.projection import COS, PX_PER_MM, SIN, TO_LIGHT, Colour, Drawing, Floats, Image, Pose, nearness
 
 _SHIFT = 4
-_STEP_MM = 1.2
-_RINGS = ((1.0, 0.62), (0.78, 0.84), (0.5, 1.0))
+_STEP_MM = 4.0
+_RINGS = ((1.0, 0.60), (0.84, 0.76), (0.66, 0.88), (0.46, 0.97), (0.24, 1.05))
 """(radius, brightness) of the discs that shade a sphere, from its edge to the side of the light."""
+_LEAN = np.array([TO_LIGHT[0], -(TO_LIGHT[1] * SIN + TO_LIGHT[2] * COS)])  # where the image shows the light to be
 
 
 @dataclass(frozen=True)
@@ -32,50 +33,39 @@ class Tube:
     """
 
     path: Curve
-    colour: tuple[int, int, int]
+    colour: Colour
     layer: int = 0
 
     reach_mm = 0.0
 
     def drawings(self, pose: Pose) -> list[Drawing]:
         """Return what lies behind the thing's axis and what lies before it: a handle passes its body on both sides."""
-        centres = pose.to_room(self._spheres[:, :3].copy())
-        before = centres[:, 1] < pose.y_mm
+        points = self._points
+        centres = pose.to_room(points[:, :3])
+        pixels = pose.to_image(points[:, :3])
+        middles = (centres[1:, 1] + centres[:-1, 1]) / 2
+        before = middles < pose.y_mm
         return [
-            Drawing((self.layer, -float(centres[part, 1].mean())), self._drawing(pose, centres, part))
+            Drawing((self.layer, -float(middles[part].mean())), partial(self._draw, part, centres, pixels))
             for part in (np.flatnonzero(~before), np.flatnonzero(before))
             if len(part)
         ]
 
     @cached_property
-    def _spheres(self) -> Floats:
+    def _points(self) -> Floats:
         return evenly(self.path, _STEP_MM, dimensions=3)
 
-    def _drawing(
-        self, pose: Pose, centres: Floats, part: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
-    ) -> Callable[[Image], None]:
-        order = part[np.argsort(nearness(centres[part]))]
-        middle = pose.to_image(centres[order])
-        radius = self._spheres[order, 3] * pose.scale
-        # The lit side of every sphere: the light's direction as the image shows it.
-        lean = (
-            Pose().to_image(TO_LIGHT[None] - TO_CAMERA * (TO_LIGHT @ TO_CAMERA)) - Pose().to_image(np.zeros((1, 3)))
-        )[0]
-        lean /= PX_PER_MM
-
-        def draw(image: Image) -> None:
-            for size, brightness in _RINGS:
-                b, g, r = (c * brightness for c in self.colour)
-                fixed = (
-                    np.round((middle + lean * ((1 - size) * 0.6) * radius[:, None]) * (1 << _SHIFT))
-                    .astype(int)
-                    .tolist()
-                )
-                sizes = np.round(radius * size * (1 << _SHIFT)).astype(int).tolist()
-                for (x, y), disc in zip(fixed, sizes, strict=True):
-                    cv2.circle(image, (x, y), disc, (b, g, r), cv2.FILLED, cv2.LINE_AA, _SHIFT)
-
-        return draw
+    def _draw(self, part: NDArray[np.intp], centres: Floats, pixels: Floats, image: Image) -> None:
+        order = part[np.argsort(nearness(centres[part] + centres[part + 1]))]
+        radius = (self._points[order, 3] + self._points[order + 1, 3]) / 2 * PX_PER_MM
+        for size, brightness in _RINGS:
+            b, g, r = (min(c * brightness, 255.0) for c in self.colour)
+            lean = _LEAN * ((1 - size) * 0.55) * radius[:, None]
+            starts = np.round((pixels[order] + lean) * (1 << _SHIFT)).astype(int).tolist()
+            ends = np.round((pixels[order + 1] + lean) * (1 << _SHIFT)).astype(int).tolist()
+            widths = np.maximum(np.round(2 * radius * size), 1).astype(int).tolist()
+            for start, end, width in zip(starts, ends, widths, strict=True):
+                cv2.line(image, start, end, (b, g, r), width, cv2.LINE_AA, _SHIFT)
 
 
 def handle(radius: float, top: float, bottom: float, reach: float, thickness: float, azimuth_deg: float) -> Curve:
