@@ -229,7 +229,7 @@ class Mpu6050:
     def _empty_fifo(self) -> None:
         self._write(_USER_CTRL, _FIFO_RESET)  # works only while FIFO_EN is 0 (register 106)
         self._write(_USER_CTRL, _FIFO_ENABLE)
-        self._newest_ns = self._clock.now_ns()
+        self._newest_ns = self._clock.now_ns() - self._period_ns // 2  # the next sample comes within a period
 
     # -- the bus --------------------------------------------------------------------------------------------------
 
