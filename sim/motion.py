@@ -87,7 +87,7 @@ def to_position(
         braking = [((u0 - v_max) / a_max, -direction * a_max)]
     x1 = position_deg + sum(v0 * d + 0.5 * a * d * d for d, a in braking)
     u1 = min(u0, v_max)
-    distance = max((goal_deg - x1) * direction, 0.0)
+    distance = (goal_deg - x1) * direction  # negative where the shaft runs away from the goal and has to come back
     u_peak = min(v_max, sqrt(max(distance * a_max + 0.5 * u1 * u1, 0.0)))
     ramps = (2 * u_peak**2 - u1 * u1) / (2 * a_max)
     cruise = max(distance - ramps, 0.0) / u_peak if u_peak > 0 else 0.0
