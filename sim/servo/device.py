@@ -297,7 +297,7 @@ class XSeriesServo:
             self.motor.release()
         elif self._shut_down():
             self.memory["Torque Enable"] = 0
-        else:
+        elif not self.motor.driven:  # written again, it disturbs no motion
             self._torque_on()
 
     def _torque_on(self) -> None:

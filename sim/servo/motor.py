@@ -73,8 +73,8 @@ class Motor:
         return self._model.acceleration_dps2
 
     @property
-    def jammed(self) -> bool:
-        return self._jammed
+    def driven(self) -> bool:
+        return self._driven
 
     @property
     def profile_ongoing(self) -> bool:

@@ -1,5 +1,7 @@
 """Every instruction, sent by the unmodified SDK."""
 
+from itertools import pairwise
+
 import pytest
 from dynamixel_sdk import (
     COMM_RX_TIMEOUT,
@@ -120,7 +122,7 @@ def test_a_block_is_written_as_a_whole_or_not_at_all(line: Line) -> None:
 
 
 def test_reads_beyond_the_table_are_refused(line: Line) -> None:
-    data, result, error = line.sdk.readTxRx(line.port, 1, 650, 20)
+    _, result, error = line.sdk.readTxRx(line.port, 1, 650, 20)
     assert (result, error) == (COMM_SUCCESS, StatusError.ACCESS)
 
 
@@ -174,7 +176,7 @@ def test_sync_read_answers_in_the_order_asked(three: Line, fast: bool) -> None:
     assert degrees == pytest.approx({1: 10, 7: 20, 4: 30}, abs=0.05)
     replies = [frame for frame in three.frames if frame.source is Source.DEVICE]
     assert len(replies) == 3
-    for earlier, later in zip(replies, replies[1:], strict=False):
+    for earlier, later in pairwise(replies):
         assert later.start_ns >= earlier.end_ns
 
 

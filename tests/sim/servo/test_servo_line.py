@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import serial
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from servo_line import Line
 
@@ -33,6 +33,7 @@ def test_a_ping_takes_its_bytes_and_the_return_delay(baudrate: int, delay: int) 
     assert line.clock.now_ns() == pytest.approx(reply.start_ns + 14 * byte_ns, abs=1)
 
 
+@settings(max_examples=60, deadline=None)
 @given(baudrate=st.sampled_from(BAUD_RATES), start_ns=st.integers(0, 10**15), now=st.integers(-10, 10**8))
 def test_a_byte_has_arrived_when_its_time_is_up(baudrate: int, start_ns: int, now: int) -> None:
     frame = Frame(Source.DEVICE, start_ns, baudrate, bytes(50))
@@ -110,7 +111,7 @@ def test_a_crc_error_on_the_wire_is_the_sdks_corrupt_packet(line: Line, index: i
 
 
 def test_a_lost_reply_is_the_sdks_timeout(line: Line) -> None:
-    line.bus.tampers.append(lambda frame: None)
+    line.bus.tampers.append(lambda _: None)
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
     assert line.sent(Source.DEVICE) == []
 
@@ -154,6 +155,7 @@ def test_a_packet_that_breaks_off_costs_no_more_than_itself(line: Line) -> None:
     assert results[-1] == COMM_SUCCESS
 
 
+@settings(max_examples=60, deadline=None)
 @given(st.binary(min_size=1, max_size=12), st.binary(min_size=1, max_size=12))
 def test_two_senders_at_once_can_only_pull_the_line_low(one: bytes, other: bytes) -> None:
     frames = [Frame(Source.DEVICE, 0, 1_000_000, one), Frame(Source.DEVICE, 0, 1_000_000, other)]

@@ -115,6 +115,15 @@ def test_a_goal_rewritten_on_the_way_changes_nothing(line: Line) -> None:
     assert line.servos[1].motor.commanded.end_s == pytest.approx(end_s, abs=1e-6)
 
 
+def test_torque_switched_on_again_disturbs_no_motion(line: Line) -> None:
+    extended(line)
+    line.put(Goal_Position=6000)
+    line.sleep(0.5)
+    line.put(Torque_Enable=1)
+    line.sleep(8.0)
+    assert line.read("Present Position") == line.read("Goal Position") == 6000
+
+
 def test_a_new_goal_on_the_way_is_met_without_a_jerk(line: Line) -> None:
     extended(line)
     line.put(Goal_Position=6000)

@@ -2,7 +2,7 @@
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim.servo.protocol2 import (
@@ -17,6 +17,7 @@ from sim.servo.protocol2 import (
 )
 
 SDK = Protocol2PacketHandler()
+quick = settings(max_examples=100, deadline=None)
 
 # Bytes that make headers, stuffing and near misses of both likely.
 tricky_bytes = st.lists(st.sampled_from([0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x01, 0x55, 0xAB]), max_size=40).map(bytes)
@@ -25,7 +26,7 @@ ids = st.integers(0, 252) | st.just(BROADCAST_ID)
 
 
 def instruction_frame(bus_id: int, instruction: int, parameters: bytes) -> bytes:
-    """Return the packet as a host sends it, stuffed by the SDK's `addStuffing` (its `txPacket` throws the result away)."""
+    """Return the packet as a host sends it, stuffed by the SDK's `addStuffing` (whose result its `txPacket` drops)."""
     length = len(parameters) + 3
     packet = [0xFF, 0xFF, 0xFD, 0, bus_id, length & 0xFF, length >> 8, instruction, *parameters, 0, 0]
     stuffed = SDK.addStuffing(packet)
@@ -36,6 +37,7 @@ def instruction_frame(bus_id: int, instruction: int, parameters: bytes) -> bytes
 packets = st.builds(InstructionPacket, ids, st.integers(1, 0x9A), payloads)
 
 
+@quick
 @given(st.binary(max_size=200))
 def test_crc_is_the_sdks(data: bytes) -> None:
     assert crc16(data) == SDK.updateCRC(0, data, len(data))
@@ -85,6 +87,7 @@ def test_fast_sync_read_status_is_the_emanuals() -> None:
     ]
 
 
+@quick
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
 def test_the_sdk_unstuffs_what_the_servo_stuffs(bus_id: int, error: int, data: bytes) -> None:
     frame = list(status_packet(bus_id, Status(error, data)))
@@ -96,6 +99,7 @@ def test_the_sdk_unstuffs_what_the_servo_stuffs(bus_id: int, error: int, data: b
     assert bytes(plain[7 : 7 + length - 2]) == bytes((0x55, error)) + data
 
 
+@quick
 @given(sent=st.lists(st.tuples(payloads, packets), max_size=6), cuts=st.lists(st.integers(0, 400), max_size=8))
 def test_packets_are_found_among_noise_and_in_any_pieces(
     sent: list[tuple[bytes, InstructionPacket]], cuts: list[int]
@@ -111,6 +115,7 @@ def test_packets_are_found_among_noise_and_in_any_pieces(
     assert [p for p in found if p.intact] == [p for _, p in sent]
 
 
+@quick
 @given(packet=packets, data=st.data())
 def test_a_flipped_bit_is_never_accepted(packet: InstructionPacket, data: st.DataObject) -> None:
     frame = bytearray(instruction_frame(packet.bus_id, packet.instruction, packet.parameters))
@@ -119,6 +124,7 @@ def test_a_flipped_bit_is_never_accepted(packet: InstructionPacket, data: st.Dat
     assert not [p for p in PacketParser().feed(bytes(frame) + bytes(1100)) if p.intact]
 
 
+@quick
 @given(noise=st.binary(max_size=300))
 def test_noise_leaves_no_more_than_one_packet_waiting(noise: bytes) -> None:
     parser = PacketParser()
