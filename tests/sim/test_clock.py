@@ -1,0 +1,110 @@
+"""The virtual clock: time moves only for who waits, and timers fire at their time and in their order."""
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.clock import EPOCH, VirtualClock
+
+quick = settings(max_examples=60, deadline=None)
+times = st.lists(st.integers(0, 1_000), max_size=30)
+
+
+@quick
+@given(at=times, until=st.integers(0, 1_200))
+def test_timers_fire_at_their_time_in_the_order_of_scheduling(at: list[int], until: int) -> None:
+    clock = VirtualClock()
+    fired: list[tuple[int, int]] = []
+    for k, t in enumerate(at):
+        clock.call_at(t, lambda k=k: fired.append((clock.now_ns(), k)))
+    clock.advance_to(until)
+    assert fired == sorted((t, k) for k, t in enumerate(at) if t <= until)
+    assert clock.now_ns() == until
+    assert clock.next_event_ns() == min((t for t in at if t > until), default=None)
+
+
+@quick
+@given(at=times, stops=st.lists(st.integers(0, 1_000), max_size=10))
+def test_it_does_not_matter_in_how_many_steps_time_passes(at: list[int], stops: list[int]) -> None:
+    def run(steps: list[int]) -> list[int]:
+        clock = VirtualClock()
+        fired: list[int] = []
+        for t in at:
+            clock.call_at(t, lambda: fired.append(clock.now_ns()))
+        for stop in steps:
+            clock.advance_to(stop)
+        return fired
+
+    assert run([*sorted(stops), 1_000]) == run([1_000])
+
+
+@quick
+@given(at=times, cancelled=st.sets(st.integers(0, 29)))
+def test_a_cancelled_timer_does_not_fire(at: list[int], cancelled: set[int]) -> None:
+    clock = VirtualClock()
+    fired: list[int] = []
+    timers = [clock.call_at(t, lambda k=k: fired.append(k)) for k, t in enumerate(at)]
+    for k in cancelled & set(range(len(at))):
+        timers[k].cancel()
+    clock.advance_to(1_000)
+    assert sorted(fired) == [k for k in range(len(at)) if k not in cancelled]
+    assert not any(timer.pending for timer in timers)
+
+
+def test_a_timer_may_set_timers_that_fall_due_on_the_same_way() -> None:
+    clock = VirtualClock()
+    fired: list[int] = []
+
+    def again() -> None:
+        fired.append(clock.now_ns())
+        if len(fired) < 4:
+            clock.call_at(clock.now_ns() + 10, again)
+
+    clock.call_at(10, again)
+    clock.advance_to(35)
+    assert fired == [10, 20, 30]
+    assert clock.next_event_ns() == 40
+
+
+def test_a_time_that_has_passed_means_now_and_time_never_runs_back() -> None:
+    clock = VirtualClock()
+    clock.advance_to(100)
+    fired: list[int] = []
+    clock.call_at(20, lambda: fired.append(clock.now_ns()))
+    clock.advance_to(50)
+    assert fired == []
+    assert clock.now_ns() == 100
+    clock.advance_to(100)
+    assert fired == [100]
+
+
+@quick
+@given(st.floats(-5.0, 5.0))
+def test_sleep_passes_its_seconds_and_nothing_for_less(seconds: float) -> None:
+    clock = VirtualClock()
+    clock.sleep(seconds)
+    assert clock.now_ns() == max(round(seconds * 1e9), 0)
+
+
+def test_civil_time_starts_where_it_is_told_and_runs_along() -> None:
+    assert VirtualClock().utc() == EPOCH
+    clock = VirtualClock(start_utc=datetime(2024, 2, 29, 12, tzinfo=UTC))
+    clock.sleep(86_400.0)
+    assert clock.utc() - timedelta(days=1) == datetime(2024, 2, 29, 12, tzinfo=UTC)
+
+
+def test_an_error_in_a_timer_reaches_who_waits_and_costs_no_other_timer() -> None:
+    clock = VirtualClock()
+    fired: list[int] = []
+
+    def fail() -> None:
+        raise ValueError("broken")
+
+    clock.call_at(10, fail)
+    clock.call_at(20, lambda: fired.append(clock.now_ns()))
+    with pytest.raises(ValueError, match="broken"):
+        clock.advance_to(30)
+    clock.advance_to(30)
+    assert fired == [20]

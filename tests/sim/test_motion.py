@@ -1,0 +1,242 @@
+"""Trajectories and the platter's answer to them, as properties of any motion."""
+
+from math import sqrt
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from sim.motion import Platter, Trajectory, rest, to_position, to_velocity
+
+quick = settings(max_examples=60, deadline=None)
+angles = st.floats(-2_000, 2_000)
+speeds = st.floats(-300, 300)
+limits = st.floats(1, 400)
+ramps = st.floats(5, 4_000)
+starts = st.floats(0, 1_000)
+
+
+@st.composite
+def trajectories(draw: st.DrawFn, max_moves: int = 4) -> Trajectory:
+    """Draw the last of a few moves, each begun where the one before was interrupted."""
+    t, x, v = 0.0, draw(angles), 0.0
+    path = rest(t, x)
+    for _ in range(draw(st.integers(1, max_moves))):
+        if draw(st.booleans()):
+            path = to_position(t, x, v, draw(angles), draw(limits), draw(ramps))
+        else:
+            path = to_velocity(t, x, v, draw(speeds), draw(ramps))
+        t += draw(st.floats(0.01, 5.0))
+        x, v = (float(value) for value in path.at(t))
+    return path
+
+
+def samples(path: Trajectory, n: int = 400, beyond_s: float = 1.0) -> np.ndarray:
+    return np.unique(np.concatenate([np.linspace(path.start_s[0], path.end_s + beyond_s, n), path.start_s]))
+
+
+# -- trajectories ---------------------------------------------------------------------------------------------------
+
+
+@quick
+@given(starts, angles, speeds, angles, limits, ramps)
+def test_a_move_arrives_exactly_and_stays(
+    t: float, x: float, v: float, goal: float, v_max: float, a_max: float
+) -> None:
+    path = to_position(t, x, v, goal, v_max, a_max)
+    for later in (0.0, 1e-9, 1.0, 1e4):
+        position, velocity = path.at(path.end_s + later)
+        assert position == goal
+        assert velocity == 0.0
+
+
+@quick
+@given(starts, angles, speeds, angles, limits, ramps)
+def test_a_move_keeps_to_its_limits(t: float, x: float, v: float, goal: float, v_max: float, a_max: float) -> None:
+    path = to_position(t, x, v, goal, v_max, a_max)
+    times = samples(path)
+    _, velocity = path.at(times)
+    assert np.abs(velocity).max() <= max(v_max, abs(v)) * (1 + 1e-9) + 1e-9
+    assert np.abs(path.acceleration_at(times)).max() <= a_max * (1 + 1e-12)
+    braking_s = max(abs(v) - v_max, 0) / a_max
+    _, velocity = path.at(times[times >= t + braking_s + 1e-6])
+    assert np.abs(velocity).max() <= v_max * (1 + 1e-6) + 1e-6
+
+
+@quick
+@given(starts, angles, speeds, angles, limits, ramps)
+def test_a_move_starts_where_the_shaft_is(
+    t: float, x: float, v: float, goal: float, v_max: float, a_max: float
+) -> None:
+    position, velocity = to_position(t, x, v, goal, v_max, a_max).at(t)
+    assert (position, velocity) == pytest.approx((x, v), abs=1e-9)
+
+
+@quick
+@given(angles, angles, limits, ramps)
+def test_a_move_from_rest_takes_the_closed_forms_time(x: float, goal: float, v_max: float, a_max: float) -> None:
+    path = to_position(0.0, x, 0.0, goal, v_max, a_max)
+    distance = abs(goal - x)
+    reaches_v_max = distance * a_max > v_max**2
+    expected = distance / v_max + v_max / a_max if reaches_v_max else 2 * sqrt(distance / a_max)
+    assert path.end_s == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    position, _ = path.at(samples(path))
+    assert np.all(np.diff(position) * np.sign(goal - x) >= -1e-9)  # straight there
+
+
+@quick
+@given(trajectories())
+def test_position_and_velocity_are_continuous(path: Trajectory) -> None:
+    knots = path.start_s[1:]
+    step = 1e-7
+    before, after = path.at(knots - step), path.at(knots)
+    scale = 1e-6 + step * 4_000
+    assert np.abs(after[0] - before[0] - before[1] * step).max(initial=0) <= 1e-6
+    assert np.abs(after[1] - before[1]).max(initial=0) <= scale
+
+
+def test_a_goal_too_near_to_stop_at_is_overshot_without_a_jump() -> None:
+    path = to_position(0.0, 0.0, 10.0, 4.0, 100.0, 10.0)  # standstill at 5, then back to 4
+    assert path.at([0.5, 1.0])[0] == pytest.approx([3.75, 5.0])
+    assert path.end_s == pytest.approx(1.0 + 2 * sqrt(1.0 / 10.0))
+    assert path.at(path.end_s - 1e-9)[0] == pytest.approx(4.0)
+
+
+@quick
+@given(trajectories())
+def test_velocity_is_the_derivative_of_position(path: Trajectory) -> None:
+    times = np.linspace(path.start_s[0], path.end_s + 1, 200)
+    assume(path.end_s > path.start_s[0])
+    h = 1e-6
+    inside = np.abs(times[:, None] - path.start_s).min(axis=1) > 2 * h
+    t = times[inside]
+    slope = (path.at(t + h)[0] - path.at(t - h)[0]) / (2 * h)
+    assert slope == pytest.approx(path.at(t)[1], abs=2e-3)
+
+
+@quick
+@given(trajectories())
+def test_pieces_are_monotone(path: Trajectory) -> None:
+    """The platter relies on it: within a piece the shaft does not turn back."""
+    for start, end, v, a in zip(
+        path.start_s, path.start_s[1:], path.velocity_dps, path.acceleration_dps2, strict=False
+    ):
+        assert v * (v + a * (end - start)) >= -1e-6
+
+
+@quick
+@given(starts, angles, speeds, speeds, ramps, st.floats(0, 10))
+def test_a_speed_is_reached_and_held(t: float, x: float, v: float, goal: float, a_max: float, after: float) -> None:
+    path = to_velocity(t, x, v, goal, a_max)
+    assert path.end_s - t == pytest.approx(abs(goal - v) / a_max, abs=1e-9)
+    position, velocity = path.at(path.end_s + after)
+    assert velocity == goal
+    assert position - path.at(path.end_s)[0] == pytest.approx(goal * after, abs=1e-9)
+
+
+@quick
+@given(starts, angles, st.floats(-1e4, 1e4))
+def test_rest_rests(t: float, x: float, later: float) -> None:
+    position, velocity = rest(t, x).at(t + later)
+    assert (position, velocity) == (x, 0.0)
+
+
+# -- the platter ----------------------------------------------------------------------------------------------------
+
+
+def platter(play_deg: float, structure_hz: float = 0.0, damping: float = 0.15) -> Platter:
+    result = Platter(play_deg, structure_hz, damping)
+    result.follow(rest(0.0, 0.0), None)
+    return result
+
+
+def play_operator(shaft: np.ndarray, start: float, half_play: float) -> np.ndarray:
+    """Return the play operator by its definition, sample by sample."""
+    angle, held = np.empty_like(shaft), start
+    for i, x in enumerate(shaft):
+        held = min(max(held, x - half_play), x + half_play)
+        angle[i] = held
+    return angle
+
+
+@quick
+@given(trajectories(), st.floats(0, 3))
+def test_play_is_the_play_operator_and_stays_within_its_half(path: Trajectory, play_deg: float) -> None:
+    follower = Platter(play_deg, 0.0, 0.0)
+    follower.follow(path, None)
+    times = samples(path, 2_000)
+    shaft, _ = path.at(times)
+    angle, _ = follower.at(times)
+    assert np.abs(angle - shaft).max() <= play_deg / 2 + 1e-9
+    assert angle == pytest.approx(play_operator(shaft, shaft[0], play_deg / 2), abs=1e-6)
+
+
+@quick
+@given(st.floats(0.01, 3), st.floats(5, 100), st.floats(5, 100))
+def test_play_is_a_hysteresis(play_deg: float, there: float, back: float) -> None:
+    """Coming from below the platter lags by half the play, from above it leads by half."""
+    follower = platter(play_deg)
+    for k, goal in enumerate((there, there - back)):
+        x = float(follower.at(10.0 * k)[0]) if k else 0.0
+        nxt = Platter(play_deg, 0.0, 0.0)
+        shaft = follower.shaft.at(10.0 * k)
+        nxt.follow(to_position(10.0 * k, float(shaft[0]), 0.0, goal, 50.0, 500.0), follower)
+        assert float(nxt.at(10.0 * k)[0]) == pytest.approx(x)  # nothing jumps
+        follower = nxt
+        side = 1 if k else -1
+        assert float(follower.at(10.0 * k + 9.0)[0]) == pytest.approx(goal + side * play_deg / 2)
+
+
+@quick
+@given(trajectories(), st.floats(0, 2), st.sampled_from([0.0, 8.0, 30.0]), st.integers(0, 2**32 - 1))
+def test_the_rate_is_the_derivative_of_the_platters_angle(
+    path: Trajectory, play_deg: float, structure_hz: float, seed: int
+) -> None:
+    follower = Platter(play_deg, structure_hz, 0.15)
+    follower.follow(path, None)
+    h = 1e-5
+    t = np.random.default_rng(seed).uniform(path.start_s[0] + 2 * h, path.end_s + 0.5, 300)
+    (before, rate_before), (after, rate_after) = follower.at(t - h), follower.at(t + h)
+    slope = (after - before) / (2 * h)
+    # Nothing jumps, not even where the play engages and with it the rate.
+    rate = follower.at(t)[1]
+    fastest = np.maximum(np.maximum(np.abs(rate_before), np.abs(rate_after)), np.abs(rate))
+    assert np.all(np.abs(slope) <= fastest + 0.5)
+    smooth = np.abs(rate_after - rate_before) < 0.5
+    assert smooth.mean() > 0.9
+    assert slope[smooth] == pytest.approx(rate[smooth], abs=0.5)
+
+
+def test_a_stop_rings_at_the_structures_frequency_and_dies_out() -> None:
+    hz, damping, a_max = 11.0, 0.15, 400.0
+    follower = platter(0.0, hz, damping)
+    path = to_position(0.0, 0.0, 0.0, 90.0, 60.0, a_max)
+    ringing = Platter(0.0, hz, damping)
+    ringing.follow(path, follower)
+    times = path.end_s + np.linspace(0, 1.0, 20_001)
+    angle, _ = ringing.at(times)
+    deflection = angle - 90.0
+    # Before it stops, the shaft brakes long enough for the deflection to settle at a / ω².
+    omega = 2 * np.pi * hz
+    assert np.abs(deflection).max() == pytest.approx(a_max / omega**2, rel=0.2)
+    crossings = times[1:][np.diff(np.sign(deflection)) != 0]
+    period = 2 * np.diff(crossings[:6]).mean()
+    assert period == pytest.approx(1 / (hz * sqrt(1 - damping**2)), rel=0.01)
+    envelope = np.exp(-damping * omega * 0.5)
+    assert np.abs(deflection[10_000:]).max() <= 1.3 * a_max / omega**2 * envelope
+
+
+@quick
+@given(st.floats(0, 2), st.sampled_from([0.0, 11.0]), st.floats(0.05, 3.0), angles, angles)
+def test_a_move_interrupted_by_another_leaves_no_jump(
+    play_deg: float, structure_hz: float, when: float, goal: float, other: float
+) -> None:
+    first = Platter(play_deg, structure_hz, 0.15)
+    first.follow(to_position(0.0, 0.0, 0.0, goal, 60.0, 300.0), platter(play_deg, structure_hz))
+    x, v = (float(value) for value in first.shaft.at(when))
+    second = Platter(play_deg, structure_hz, 0.15)
+    second.follow(to_position(when, x, v, other, 60.0, 300.0), first)
+    assert second.at(when)[0] == pytest.approx(first.at(when)[0], abs=1e-9)
+    if structure_hz == 0.0 and play_deg == 0.0:
+        assert second.at(when)[1] == pytest.approx(first.at(when)[1], abs=1e-6)

@@ -1,0 +1,169 @@
+"""The world: one motion for all who look, now and in the past, and the scene on the platter."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.motion import rest, to_position, to_velocity
+from sim.noise import NoiseModel
+from sim.world import HISTORY_S, Scene, World
+
+quick = settings(max_examples=40, deadline=None)
+perfect = NoiseModel.none()
+
+
+def drive(world: World, goal: float, v_max: float = 60.0, a_max: float = 300.0) -> None:
+    """Send the shaft to ``goal`` from wherever it is."""
+    world.drive(to_position(world.clock.now_ns() * 1e-9, *world.shaft(), goal, v_max, a_max))
+
+
+moves = st.lists(st.tuples(st.floats(-400, 400), st.floats(0.01, 3.0)), min_size=1, max_size=5)
+
+
+def run(moves_made: list[tuple[float, float]], noise: NoiseModel, look: Callable[[World], None]) -> World:
+    world = World(noise=noise)
+    for goal, seconds in moves_made:
+        drive(world, goal)
+        world.clock.sleep(seconds)
+        look(world)
+    return world
+
+
+@quick
+@given(moves)
+def test_the_past_is_what_it_was(moves_made: list[tuple[float, float]]) -> None:
+    seen: list[tuple[int, float]] = []
+    world = run(moves_made, NoiseModel(), lambda w: seen.append((w.clock.now_ns(), w.table_deg())))
+    kept = [(t, angle) for t, angle in seen if t > world.clock.now_ns() - HISTORY_S * 1e9]
+    times = [t for t, _ in kept]
+    assert world.table_motion(times)[0] == pytest.approx([angle for _, angle in kept], abs=1e-9)
+    assert [world.table_deg(t) for t in times] == pytest.approx([angle for _, angle in kept], abs=1e-9)
+
+
+@quick
+@given(moves, st.integers(2, 200))
+def test_looking_in_between_changes_nothing(moves_made: list[tuple[float, float]], looks: int) -> None:
+    def stare(world: World) -> None:
+        for t in np.linspace(0, world.clock.now_ns(), looks).astype(np.int64):
+            world.table_deg(int(t))
+
+    watched = run(moves_made, NoiseModel(), stare)
+    unwatched = run(moves_made, NoiseModel(), lambda _: None)
+    assert watched.table_deg() == unwatched.table_deg()
+
+
+@quick
+@given(moves)
+def test_the_table_stays_within_the_play_and_the_ringing(moves_made: list[tuple[float, float]]) -> None:
+    world = run(moves_made, NoiseModel(structure_hz=0.0), lambda _: None)
+    t = np.arange(0, world.clock.now_ns(), 1_000_000)
+    table, _ = world.table_motion(t)
+    shaft = np.array([world.shaft(int(when))[0] for when in t])
+    assert np.abs(table - shaft).max() <= world.noise.backlash_deg / 2 + 1e-9
+
+
+@quick
+@given(moves)
+def test_without_play_and_ringing_the_table_is_the_shaft(moves_made: list[tuple[float, float]]) -> None:
+    world = run(moves_made, perfect, lambda _: None)
+    for t in np.linspace(0, world.clock.now_ns(), 50).astype(np.int64):
+        angle, rate = world.table_motion([t])
+        assert (angle[0], rate[0]) == pytest.approx(world.shaft(int(t)), abs=1e-9)
+
+
+def test_motion_continues_where_the_one_before_is_interrupted() -> None:
+    world = World(noise=NoiseModel(backlash_deg=0.5, structure_hz=11.0))
+    drive(world, 90.0)
+    world.clock.sleep(0.7)
+    before = world.table_deg()
+    drive(world, -90.0)
+    assert world.table_deg() == pytest.approx(before, abs=1e-9)
+    world.clock.sleep(6.0)
+    assert world.shaft() == (-90.0, 0.0)
+    assert world.table_deg() == pytest.approx(-90.0 + 0.25, abs=1e-3)
+
+
+def test_a_slip_turns_the_platter_and_not_the_shaft() -> None:
+    world = World(noise=perfect)
+    drive(world, 30.0)
+    world.clock.sleep(2.0)
+    slipped_ns = world.clock.now_ns()
+    world.slip(-4.0, seconds=0.1)
+    assert world.table_deg() == pytest.approx(30.0)
+    world.clock.sleep(0.05)
+    assert np.ravel(world.table_motion([world.clock.now_ns()])) == pytest.approx([28.0, -40.0])
+    world.clock.sleep(0.45)
+    assert world.shaft()[0] == 30.0
+    assert np.ravel(world.table_motion([world.clock.now_ns()])) == pytest.approx([26.0, 0.0])
+    assert world.table_deg(slipped_ns) == pytest.approx(30.0)
+    world.slip(1.0)
+    drive(world, 60.0)
+    world.clock.sleep(2.0)
+    assert world.table_deg() == pytest.approx(57.0)
+
+
+def test_history_reaches_as_far_as_promised_and_is_then_forgotten() -> None:
+    world = World(noise=perfect)
+    for k in range(200):
+        drive(world, 10.0 * (k % 2))
+        world.clock.sleep(1.0)
+    oldest_ns = world.clock.now_ns() - round(HISTORY_S * 1e9)
+    assert world.table_deg(oldest_ns + 900_000_000) == pytest.approx(10.0 * ((oldest_ns // 10**9) % 2), abs=1e-6)
+    assert len(world._motions) <= HISTORY_S + 2
+
+
+def test_turning_for_ever_needs_no_history() -> None:
+    world = World(noise=perfect)
+    world.drive(to_velocity(0.0, 0.0, 0.0, 36.0, 1000.0))
+    world.clock.sleep(3600.0)
+    assert world.table_motion([world.clock.now_ns()])[1][0] == 36.0
+    assert world.table_deg() == pytest.approx(36.0 * 3600 - 36.0**2 / 2000, rel=1e-9)
+
+
+# -- the scene -----------------------------------------------------------------------------------------------------
+
+
+class Mug:
+    name = "mug"
+
+
+def test_a_thing_is_put_down_against_the_room() -> None:
+    world = World(noise=perfect)
+    world.drive(rest(0.0, 40.0))
+    world.put(Mug(), yaw_deg=100.0, offset_mm=(1.0, -2.0))
+    assert world.scene.yaw_deg == pytest.approx(60.0)  # against the platter
+    assert world.scene.offset_mm == (1.0, -2.0)
+    assert world.scene.thing is not None
+    world.put(None)
+    assert world.scene.thing is None
+
+
+def test_scenes_change_in_time_and_the_past_keeps_its_own() -> None:
+    world = World(noise=perfect)
+    dark = (0.1, 0.1, 0.1)
+    world.clock.sleep(1.0)
+    world.put(Mug())
+    world.clock.sleep(1.0)
+    with world.changed(light=dark):
+        world.clock.sleep(1.0)
+        assert world.scene.light == dark
+    world.clock.sleep(1.0)
+    lights = [world.scene_at(t).light for t in (500_000_000, 1_500_000_000, 2_500_000_000, 3_500_000_000)]
+    assert lights == [(1.0, 1.0, 1.0), (1.0, 1.0, 1.0), dark, (1.0, 1.0, 1.0)]
+    assert world.scene_at(500_000_000) == Scene()
+    assert world.scene_at(2_500_000_000).thing is world.scene.thing
+
+
+# -- randomness ----------------------------------------------------------------------------------------------------
+
+
+def test_streams_are_the_seeds_and_the_names() -> None:
+    def draws(seed: int, name: str) -> list[float]:
+        return World(seed=seed).rng(name).standard_normal(4).tolist()
+
+    assert draws(1, "imu") == draws(1, "imu")
+    assert draws(1, "imu") != draws(2, "imu")
+    assert draws(1, "imu") != draws(1, "servo-1")
