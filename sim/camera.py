@@ -101,7 +101,7 @@ class SimCapture:
         if not self._open:
             return False
         self._receive()
-        if not self._queue:
+        while not self._queue:
             self._clock.advance_to(self._arrival_ns(self._next))
             self._receive()
         self._grabbed = self._queue.popleft()

@@ -9,7 +9,7 @@ x².
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -60,18 +60,18 @@ class Revolution:
 
     def drawings(self, pose: Pose) -> list[Drawing]:
         foot_px = pose.to_image(np.array([[*self.at, 0.0]]))[0]
-        return [Drawing((self.layer, pose.depth(*self.at)), lambda image: self._paste(image, pose, foot_px))]
+        return [Drawing((self.layer, pose.depth(*self.at)), partial(self._draw, pose.azimuth_deg, foot_px))]
 
     @property
     def reach_mm(self) -> float:
         """Return the radius of the foot, on which the shadow depends."""
         return self.profile[-1][0]
 
-    def _paste(self, image: Image, pose: Pose, foot_px: Floats) -> None:
+    def _draw(self, azimuth_deg: float, foot_px: Floats, image: Image) -> None:
         look = self._look
         texture = self._texture
         columns = look.columns
-        shift = -pose.azimuth_deg / 360 * columns
+        shift = -azimuth_deg / 360 * columns
         whole = int(np.floor(shift))
         turned = texture[:, whole % columns :]
         seen = cv2.remap(turned, look.column + np.float32(shift - whole), look.row, cv2.INTER_LINEAR)
@@ -116,54 +116,52 @@ def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shin
     half = int(np.ceil(outside[:, 0].max() * PX_PER_MM)) + 2
     top = int(np.ceil(outside[:, 1].max() * PX_PER_MM * COS + half * SIN)) + 2
     up = np.arange(top, -int(np.ceil(half * SIN)) - 3, -1, dtype=np.float64)
-    x = np.abs(np.arange(-half, half + 1)) / PX_PER_MM
+    x = np.arange(-half, half + 1) / PX_PER_MM
     cover = _cover(outside, up, half)
 
-    sample = np.empty((len(up), len(x)))
-    depth = np.empty_like(sample)  # y of the hit, in mm away from the camera
-    normal_r, normal_z = _normals(outside)
-    g, y = _sections(outside, up / PX_PER_MM)
-    reach = np.maximum.accumulate(g, axis=1)
-    hollow = np.zeros(sample.shape, dtype=bool)
-    for i in range(len(up)):
-        square = np.minimum(x**2, reach[i, -1])  # a pixel that is covered in part may have its centre outside
-        k = np.searchsorted(reach[i], square)
-        sample[i] = _between(g[i], np.minimum(k, len(outside) - 1), square)
-        depth[i] = np.interp(sample[i], np.arange(len(outside)), y[i])
-        hollow[i] = (k == 0) & (square < g[i, 0])
-    radial = np.interp(sample, np.arange(len(outside)), normal_r)
-    rising = np.interp(sample, np.arange(len(outside)), normal_z)
-    if inside is not None:
-        g, y = _sections(inside, up / PX_PER_MM)
-        reach = np.minimum.accumulate(g, axis=1)
-        normal_r, normal_z = _normals(inside)
-        for i in map(int, np.flatnonzero(hollow.any(axis=1))):
-            here = hollow[i]
-            square = x[here] ** 2
-            k = np.minimum(np.searchsorted(-reach[i], -square), len(inside) - 1)
-            s = _between(g[i], k, square)
-            depth[i, here] = np.interp(s, np.arange(len(inside)), y[i])
-            radial[i, here] = -np.interp(s, np.arange(len(inside)), normal_r)
-            rising[i, here] = -np.interp(s, np.arange(len(inside)), normal_z)
-
-    across = np.broadcast_to(np.arange(-half, half + 1) / PX_PER_MM, sample.shape)
-    azimuth = np.arctan2(depth, across)  # in the room, 0 to the right; the front is at -90°
-    column = ((azimuth / (2 * np.pi) + 0.75) * columns - 0.5) % columns
+    sample, y = _hits(outside, up / PX_PER_MM, x, entering=True)
+    radial, rising = (np.interp(sample, np.arange(len(outside)), n) for n in _normals(outside))
     row = np.clip(sample / (len(outside) - 1) * rows - 0.5, 0, rows - 1)
-    normals = np.stack([radial * np.cos(azimuth), radial * np.sin(azimuth), rising], axis=-1)
-    light = shade(normals)
+    hollow = x**2 < _sections(outside[:1], up / PX_PER_MM)[0]
     if inside is not None:
-        light[hollow] *= 0.85  # less of the room is seen from within
-        row[hollow] = rows + _LINING_ROWS / 2
+        within, y_within = _hits(inside, up / PX_PER_MM, x, entering=False)
+        radial_within, rising_within = (np.interp(within, np.arange(len(inside)), n) for n in _normals(inside))
+        y = np.where(hollow, y_within, y)
+        radial, rising = np.where(hollow, -radial_within, radial), np.where(hollow, -rising_within, rising)
+        row = np.where(hollow, rows + _LINING_ROWS / 2, row)
+
+    azimuth = np.arctan2(y, x)  # in the room, 0 to the right; the front is at -90°
+    column = ((azimuth / (2 * np.pi) + 0.75) * columns - 0.5) % columns
+    normals = np.stack([radial * np.cos(azimuth), radial * np.sin(azimuth), rising], axis=-1)
+    light = shade(normals) * np.where(hollow, 0.85, 1.0)  # less of the room is seen from within
     return _Look(
         column=column.astype(np.float32),
         row=row.astype(np.float32),
         light=_three(light * cover * 255),
         highlight=_three(gloss(normals, 40.0) * shine * cover * 255),
         clear=_three(255 - np.round(cover * 255)),
-        foot_px=np.array([half, float(up[0])]),
+        foot_px=np.array([half, top], dtype=np.float64),
         columns=columns,
     )
+
+
+def _hits(profile: Floats, up_mm: Floats, x_mm: Floats, *, entering: bool) -> tuple[Floats, Floats]:
+    """Return where each pixel's ray first comes into a profile's body, or out of it: the fractional sample, and y."""
+    g, y = _sections(profile, up_mm)
+    sign = 1.0 if entering else -1.0
+    g *= sign
+    reach = np.maximum.accumulate(g, axis=1)
+    samples = np.arange(len(profile))
+    sample = np.empty((len(up_mm), len(x_mm)))
+    depth = np.empty_like(sample)
+    for i in range(len(up_mm)):
+        square = np.minimum(sign * x_mm**2, reach[i, -1])  # a pixel that is covered in part may have its centre outside
+        after = np.searchsorted(reach[i], square)
+        before = np.maximum(after - 1, 0)
+        step = np.where(after > before, g[i, after] - g[i, before], 1.0)
+        sample[i] = before + np.clip((square - g[i, before]) / step, 0.0, 1.0)
+        depth[i] = np.interp(sample[i], samples, y[i])
+    return sample, depth
 
 
 def _sections(profile: Floats, up_mm: Floats) -> tuple[Floats, Floats]:
@@ -171,13 +169,6 @@ def _sections(profile: Floats, up_mm: Floats) -> tuple[Floats, Floats]:
     r, h = profile.T
     y = (up_mm[:, None] - h[None] * COS) / SIN
     return r**2 - y**2, y
-
-
-def _between(g: Floats, k: NDArray[np.intp], square: Floats) -> Floats:
-    """Return the fractional sample at which g reaches ``square`` between samples k - 1 and k."""
-    before, after = g[np.maximum(k - 1, 0)], g[k]
-    step = np.where(after == before, 1.0, after - before)
-    return np.maximum(k - 1 + np.clip((square - before) / step, 0.0, 1.0), 0.0)
 
 
 def _normals(profile: Floats) -> tuple[Floats, Floats]:
