@@ -4,6 +4,7 @@ from hbr.active import Decision, Side, next_view
 from hbr.cedd import cedd, describe
 from hbr.hough import Extension, Ranking, retrieve
 from hbr.index import ViewIndex
+from hbr.lead import lead
 from hbr.packing import pack, unpack
 from hbr.tanimoto import tanimoto
 from hbr.views import Views
@@ -17,6 +18,7 @@ __all__ = [
     "Views",
     "cedd",
     "describe",
+    "lead",
     "next_view",
     "pack",
     "retrieve",

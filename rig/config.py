@@ -146,8 +146,8 @@ class IdentifyConfig(Section):
     extension: Literal["visual", "orient", "orient_all"] = Field(
         "orient_all", description="how missing views are filled in"
     )
-    margin: float = Field(0.08, ge=0, le=1, description="stop when the best score leads by this much a view")
-    min_score: float = Field(0.75, ge=0, le=1, description="below this score a view the object is unknown")
+    margin: float = Field(0.02, ge=0, le=1, description="stop when the best score surely leads by this much a view")
+    min_score: float = Field(0.96, ge=0, le=1, description="below this score a view the object is unknown")
 
     @model_validator(mode="after")
     def _views_in_order(self) -> Self:

@@ -71,7 +71,10 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """What is thought after a view; ``margin`` is the lead of the first candidate in score per view."""
+    """What is thought after a view; ``margin`` is how far, in score per view, the first candidate surely leads.
+
+    It leads any other enrolled object by at least that (`hbr.lead`); it may be negative.
+    """
 
     index: int
     candidates: tuple[Candidate, ...]

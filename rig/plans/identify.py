@@ -24,8 +24,8 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
     """Identify the object on the table against the enrolled views; yields events and returns the answer.
 
     The first two views are a fixed step apart, every later one lies where the rivals look less alike (Eq. 5-7). The
-    search ends when the best object leads by ``identify.margin`` a view, or after ``identify.max_views``; an object
-    whose score a view stays below ``identify.min_score`` is unknown. Closing the generator takes the torque off.
+    search ends when a known object leads all others by ``identify.margin`` a view, or after ``identify.max_views``; an
+    object whose score a view stays below ``identify.min_score`` is unknown. Closing the generator takes the torque off.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
                 list_length=config.list_length,
                 extension=config.extension,
             )
-            ranked = _ranked(number, ranking)
+            ranked = _ranked(number, ranking, hbr.lead(ranking, np.array(descriptors)))
             yield ranked
             reason = _finished(config, ranked, number + 1)
             if reason:
@@ -91,18 +91,19 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
     return answer
 
 
-def _ranked(number: int, ranking: hbr.Ranking) -> Ranked:
+def _ranked(number: int, ranking: hbr.Ranking, lead: float) -> Ranked:
     views = number + 1
     candidates = tuple(
         Candidate(name, float(score) / views, float(pose_deg))
         for name, score, pose_deg in zip(ranking.names[:SHOWN], ranking.scores, ranking.pose_deg, strict=False)
     )
-    return Ranked(number, candidates, ranking.margin / views)
+    return Ranked(number, candidates, lead / views)
 
 
 def _finished(config: IdentifyConfig, ranked: Ranked, views: int) -> str:
-    """Return why the search ends, or nothing where it goes on."""
-    if views >= config.min_views and ranked.margin >= config.margin:
+    """Return why the search ends, or nothing where it goes on: nobody is called unknown at a first glance."""
+    known = ranked.candidates[0].score >= config.min_score
+    if views >= config.min_views and known and ranked.margin >= config.margin:
         return f"the lead of {ranked.margin:.3f} a view passes {config.margin:g}"
     if views >= config.max_views:
         return f"{config.max_views} views were taken"

@@ -7,7 +7,6 @@ import typer
 
 from rig.cli.command import Settings, command
 
-DEFAULT_COUNT = 16
 EXIT_QUALITY = 6
 
 
@@ -17,9 +16,7 @@ def demo(
     objects: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Photographs obj{N}__{A}.png instead of the built-in objects.")
     ] = None,
-    count: Annotated[
-        int | None, typer.Option(min=2, help=f"Objects to enroll: {DEFAULT_COUNT}, or the whole folder up to 20.")
-    ] = None,
+    count: Annotated[int | None, typer.Option(min=2, help="Objects to enroll: 16, or the folder's first 20.")] = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html is written.")] = Path("rig-demo"),
 ) -> None:
     """Enroll objects on the simulated bench, then find each of them again, and two that were never enrolled.

@@ -1,0 +1,37 @@
+"""Fixtures for the whole suite: a simulated bench with its world in reach."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import pytest
+
+from rig.bench import Bench
+from rig.config import load_config
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
+from sim.world import World
+
+
+@dataclass(frozen=True)
+class SimulatedBench:
+    """A bench, and the hands and the world behind it."""
+
+    bench: Bench
+    operator: ShelfOperator
+    world: World
+
+
+@pytest.fixture
+def simulated() -> Iterator[Callable[..., SimulatedBench]]:
+    """Return a function that opens a simulated bench: settings as ``KEY=VALUE``, ``noise=``, ``seed=``."""
+    with ExitStack() as benches:
+
+        def open_one(*settings: str, noise: NoiseModel | None = None, seed: int = 0) -> SimulatedBench:
+            world = World(noise=noise, seed=seed)
+            operator = ShelfOperator(world, shelf())
+            bench = benches.enter_context(open_sim_bench(load_config(None, settings), operator))
+            return SimulatedBench(bench, operator, world)
+
+        yield open_one
