@@ -130,9 +130,9 @@ class Mpu6050:
     def read_samples(self) -> ImuSamples:
         """Return what the FIFO holds.
 
-        The newest sample was taken at most one period before the count was read; each sample follows the one before
-        by a period, and the row is moved only as far as that demands, so that the sensor's clock may run a little fast
-        or slow.
+        The newest sample is dated whole periods after the newest of the last call, corrected where that leaves the
+        period before the count was read; the others are spread evenly between the two. So the sensor's clock may run a
+        little fast or slow, and the times stay in order.
 
         Raises
         ------
@@ -154,11 +154,14 @@ class Mpu6050:
         data = self._pop(count) if count else b""
         if data is None:
             return self._start_over()
-        if samples:
-            predicted_ns = self._newest_ns + (samples + missing) * self._period_ns
-            self._newest_ns = min(max(predicted_ns, before_ns - self._period_ns), after_ns)
         gyro = np.frombuffer(data, ">i2").reshape(-1, 3) / _LSB_PER_DPS[self._range_dps]
-        return ImuSamples(self._newest_ns + self._period_ns * np.arange(1 - samples, 1), gyro, missing)
+        time_ns = np.empty(0, np.int64)
+        if steps := samples + missing:
+            newest_ns = self._newest_ns + steps * self._period_ns
+            newest_ns = min(max(newest_ns, before_ns - self._period_ns), after_ns)
+            time_ns = newest_ns - (newest_ns - self._newest_ns) * np.arange(samples - 1, -1, -1) // steps
+            self._newest_ns = newest_ns
+        return ImuSamples(time_ns, gyro, missing)
 
     def read_gravity_g(self) -> NDArray[np.float64]:
         """Return one accelerometer reading (3,), in g; raises as `read_samples` does."""

@@ -50,14 +50,15 @@ _FIFO_BITS = (0x08, 0x08, 0x08, 0x80, 0x40, 0x20, 0x10)
 class SimMpu6050:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
-    World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `who_am_i` (a clone answers
-    otherwise) and `power_cycle`.
+    World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `clock_error` (how much too fast its
+    clock runs, relatively; set before it wakes), `who_am_i` (a clone answers otherwise) and `power_cycle`.
     """
 
     def __init__(self, world: World, *, ad0: bool = False, who_am_i: int = 0x68) -> None:
         self.address = 0x69 if ad0 else 0x68
         self.inertial = InertialModel(world, f"imu-{self.address:02x}")
         self.temperature_c = 25.0
+        self.clock_error = 0.0
         self.who_am_i = who_am_i
         self._clock = world.clock
         self.power_cycle()
@@ -152,15 +153,14 @@ class SimMpu6050:
             return
         filter_setting, decimation = registers[CONFIG] & 0x07, 1 + registers[SMPLRT_DIV]
         internal_hz = 8000 if filter_setting in (0, 7) else 1000
-        period_ns = 1_000_000_000 // internal_hz * decimation
-        due = (self._clock.now_ns() - self._epoch_ns) // period_ns
+        tick_ns = round(1e9 / internal_hz / (1 + self.clock_error))
+        due = (self._clock.now_ns() - self._epoch_ns) // (tick_ns * decimation)
         if due == self._taken:
             return
         first = max(self._taken, due - FIFO_SIZE // 2)  # the FIFO holds no more: a frame has a word at least
         self._taken = due
         ticks = np.arange(first * decimation + 1, due * decimation + 1)
-        times_ns = self._epoch_ns + period_ns // decimation * ticks
-        gyro, accel = self.inertial.sample(times_ns, internal_hz, BANDWIDTH_HZ[filter_setting])
+        gyro, accel = self.inertial.sample(self._epoch_ns + tick_ns * ticks, internal_hz, BANDWIDTH_HZ[filter_setting])
         words = self._quantised(gyro[decimation - 1 :: decimation], accel[decimation - 1 :: decimation])
         registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = words[-1].tobytes()
         registers[INT_STATUS] |= DATA_RDY

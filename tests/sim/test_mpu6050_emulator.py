@@ -321,10 +321,11 @@ def test_the_bias_walks_at_the_models_pace() -> None:
     for seed in range(100):
         world = World(noise=NoiseModel.none().with_values(gyro_bias_walk_dps_rts=pace), seed=seed)
         sensor = SimMpu6050(world)
-        sensor.start(reading=False)
-        sensor.write(bytes([PWR, 0x01]))
-        for _ in range(4):
-            world.clock.sleep(1.0)
+        for setting in ([DIV, 0, 3], [PWR, 0x01]):
+            sensor.start(reading=False)
+            sensor.write(bytes(setting))
+        for _ in range(10):
+            world.clock.sleep(0.4)
             sensor.read(1)
         drifts.append(sensor.inertial.gyro_bias_dps)
     assert np.std(drifts) == pytest.approx(pace * 2, rel=0.15)
