@@ -54,7 +54,7 @@ def _can(name: str, colour: Colour, word: str, fruit: Colour, *extra: Brush) -> 
         s.star(0.47, 0.64, 0.06, p.GREEN, points=4, waist=0.3)
 
     profile = ((0.0, 116.0), (38.0, 116.0), (38.0, 0.0))
-    return Solid(name, (Revolution(profile, painted(colour, label, *extra), shine=0.5),))
+    return Solid(name, (Revolution(profile, painted(colour, label, *extra), shine=0.5),), 360.0 if extra else 180.0)
 
 
 def _offer(s: Sheet) -> None:

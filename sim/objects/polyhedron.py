@@ -13,6 +13,7 @@ from sim.objects.layers import blend
 from sim.objects.projection import Colour, Drawing, Floats, Image, Paint, Pose, nearness, shade
 
 TEXELS_PER_MM = 2.0
+_EDGE_ON = 0.004  # a face seen flatter than this is less than half a pixel wide
 _SHIFT = 4  # fractional bits of the coordinates that OpenCV draws with
 
 
@@ -110,7 +111,7 @@ class Polyhedron:
         facing = nearness(normals)
         lights = shade(normals).tolist()
         # The face seen best goes everywhere first, so that the smoothed seams show nothing but the solid itself.
-        for n, i in enumerate(i for i in np.argsort(-facing).tolist() if facing[i] > 0):
+        for n, i in enumerate(i for i in np.argsort(-facing).tolist() if facing[i] > _EDGE_ON):
             face, polygon = self.faces[i], None if n == 0 else corners[slices[i]]
             if face.texture is None:
                 _paint_flat(solid, face.colour, polygon, lights[i])

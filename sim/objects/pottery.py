@@ -18,7 +18,7 @@ _MUG_INSIDE = ((41.0, 98.0), (41.0, 10.0), (36.0, 6.0), (0.0, 6.0))
 
 def _mug(name: str, ground: Colour, *brushes: Brush, lining: Colour = p.WHITE) -> Solid:
     body = Revolution(_MUG, painted(ground, *brushes), inside=_MUG_INSIDE, lining=lining, shine=0.45)
-    return Solid(name, (body, Tube(handle(43, 82, 24, 27, 5.5, 90), ground)))
+    return Solid(name, (body, Tube(handle(44, 82, 24, 26, 5.5, 90), ground)))
 
 
 def _rings(sheet: Sheet) -> None:
@@ -43,13 +43,13 @@ def _teapot() -> Solid:
         sheet.band(0.0, 0.09, p.TEAL)
 
     body = smooth((0, 108), (14, 108), (34, 99), (36, 94), (58, 80), (66, 52), (58, 18), (40, 4), (38, 0))
-    spout = ray(270, (52, 34, 12), (68, 46, 9), (80, 72, 6.5), (92, 90, 5.5))
+    spout = ray(270, (58, 36, 12), (68, 46, 9), (80, 72, 6.5), (92, 90, 5.5))
     return Solid(
         "teapot",
         (
             Revolution(body, painted(p.CREAM, flowers), shine=0.5),
             Tube(handle(56, 88, 28, 36, 5.5, 90), p.TEAL),
-            Tube(spout, p.CREAM),
+            Tube(spout, p.CREAM, joints=1),
             Revolution(smooth((0, 124), (9, 124), (11, 116), (6, 108), (5, 104)), painted(p.TEAL), shine=0.5, layer=1),
         ),
     )
@@ -108,7 +108,7 @@ def _amphora() -> Solid:
                 sheet.panel((i + 0.2) / 24, top + 0.03, (i + 0.8) / 24, top + 0.06, p.BLACK)
         for turn in (0, 180):
             sheet.around(turn, lambda s: s.star(0.5, 0.57, 0.09, p.BLACK, points=8, waist=0.55))
-        sheet.mottle(5.0, (0.02, 0.02), 11)
+        sheet.mottle(6.0, (1.0, 0.02), 11)
 
     body = (
         (20.0, 168.0),

@@ -8,7 +8,7 @@ centre, as through a long lens.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import cos, radians, sin
+from math import cos, hypot, radians, sin
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -80,6 +80,10 @@ class Pose:
         """Return how far a point of the thing stands to the front of the room, whatever its height."""
         a = radians(self.azimuth_deg)
         return -(self.y_mm + x_mm * sin(a) + y_mm * cos(a))
+
+    def facing(self, x_mm: float, y_mm: float) -> float:
+        """Return how much the side of the thing at (x, y) of its frame looks towards the camera: 0 (not) to 1."""
+        return max((self.depth(x_mm, y_mm) + self.y_mm) / max(hypot(x_mm, y_mm), 1e-9), 0.0)
 
     def to_image(self, points_mm: Floats) -> Floats:
         """Return pixel coordinates (n, 2) of points (n, 3) of the thing; whole numbers are pixel centres."""

@@ -196,7 +196,9 @@ def _radio() -> Solid:
         lambda s: s.lines(0.25, 0.35, 0.75, 0.75, 7, p.GREY, 94),
     )
     body = box((150, 52, 92), front=painted(p.TERRACOTTA, front), right=grain, back=back, left=grain, top=grain)
-    handle = Tube(smooth((-58, 0, 90, 4), (-58, 0, 118, 4), (58, 0, 118, 4), (58, 0, 90, 4)), p.BLACK, layer=1)
+    handle = Tube(
+        smooth((-58, 0, 90, 4), (-58, 0, 118, 4), (58, 0, 118, 4), (58, 0, 90, 4)), p.BLACK, joints=0, layer=1
+    )
     return Solid("radio", (body, handle))
 
 
@@ -215,8 +217,8 @@ def _clock() -> Solid:
         Revolution(smooth((0, 142), (14, 142), (22, 126), (22, 122)), painted(p.GREY), at=(x, 0.0), shine=0.9, layer=1)
         for x in (-30.0, 30.0)
     ]
-    feet = [Tube(((x * 0.6, 0, 26, 5), (x, 0, 4, 5)), p.GREY, layer=-1) for x in (-44.0, 44.0)]
-    grip = Tube(smooth((-14, 0, 138, 3), (-14, 0, 156, 3), (14, 0, 156, 3), (14, 0, 138, 3)), p.GREY, layer=2)
+    feet = [Tube(((x * 0.6, 0, 26, 5), (x, 0, 4, 5)), p.GREY, joints=0, layer=-1) for x in (-44.0, 44.0)]
+    grip = Tube(smooth((-14, 0, 138, 3), (-14, 0, 156, 3), (14, 0, 156, 3), (14, 0, 138, 3)), p.GREY, joints=0, layer=2)
     return Solid("clock", (*feet, drum, *bells, grip))
 
 

@@ -13,6 +13,7 @@ from sim.objects.projection import COS, PX_PER_MM, SIN, TO_LIGHT, Colour, Drawin
 
 _SHIFT = 4
 _STEP_MM = 4.0
+_FAR_MM, _EDGE_ON_MM = 1e6, 1e-6
 _RINGS = ((1.0, 0.60), (0.84, 0.76), (0.66, 0.88), (0.46, 0.97), (0.24, 1.05))
 """(radius, brightness) of the discs that shade a sphere, from its edge to the side of the light."""
 _LEAN = np.array([TO_LIGHT[0], -(TO_LIGHT[1] * SIN + TO_LIGHT[2] * COS)])  # where the image shows the light to be
@@ -22,42 +23,61 @@ _LEAN = np.array([TO_LIGHT[0], -(TO_LIGHT[1] * SIN + TO_LIGHT[2] * COS)])  # whe
 class Tube:
     """A tube along a curve.
 
+    Where its ends are joined to the side of a body, what the body hides depends on the side it is seen from. So it is
+    drawn twice: behind the body, which then covers what is inside or behind it, and, as far as it stands on the
+    camera's side of the axis, before the body. There each round end lacks what would lie inside the body: nothing where
+    the joint faces the camera, all where it is seen from the side.
+
     Parameters
     ----------
     path
         (x, y, z, radius) in millimetres in the thing's frame; the curve runs straight between the points.
     colour
         B, G, R.
+    joints
+        How many ends are joined to the side of a body in the same layer: 2 (a handle), 1 (the first: a spout), or 0.
     layer
         As in `sim.objects.revolution.Revolution`.
     """
 
     path: Curve
     colour: Colour
+    joints: int = 2
     layer: int = 0
 
     reach_mm = 0.0
 
     def drawings(self, pose: Pose) -> list[Drawing]:
-        """Return what lies behind the thing's axis and what lies before it: a handle passes its body on both sides."""
-        points = self._points
-        centres = pose.to_room(points[:, :3])
-        pixels = pose.to_image(points[:, :3])
-        middles = (centres[1:, 1] + centres[:-1, 1]) / 2
-        before = middles < pose.y_mm
-        return [
-            Drawing((self.layer, -float(middles[part].mean())), partial(self._draw, part, centres, pixels))
-            for part in (np.flatnonzero(~before), np.flatnonzero(before))
-            if len(part)
-        ]
+        points, length = self._points
+        segments = np.arange(len(points) - 1)
+        if self.joints == 0:
+            x, y = points[:, :2].mean(axis=0).tolist()
+            return [Drawing((self.layer, pose.depth(x, y)), partial(self._draw, pose, points, segments))]
+        cuts = [radius * (1 - pose.facing(x, y)) for x, y, _, radius in points[[0, -1]].tolist()]
+        even = np.linspace(cuts[0], length[-1] - (cuts[1] if self.joints == 2 else 0.0), len(points))
+        trimmed = np.column_stack([np.interp(even, length, column) for column in points.T])
+        depth = -pose.turn(trimmed[:, :3])[:, 1]
+        depth = (depth[1:] + depth[:-1]) / 2
+        before = depth > _EDGE_ON_MM
+        joint = (length[:-1] < 2 * points[0, 3]) | (length[1:] > length[-1] - 2 * points[-1, 3])
+        drawings = [Drawing((self.layer, -_FAR_MM), partial(self._draw, pose, points, segments[~before | joint]))]
+        if before.any():
+            nearer = float(depth[before].mean()) + pose.depth(0.0, 0.0)
+            drawings.append(Drawing((self.layer, nearer), partial(self._draw, pose, trimmed, segments[before])))
+        return drawings
 
     @cached_property
-    def _points(self) -> Floats:
-        return evenly(self.path, _STEP_MM, dimensions=3)
+    def _points(self) -> tuple[Floats, Floats]:
+        """The path at even steps (n, 4), and its length up to each point (n,)."""
+        points = evenly(self.path, _STEP_MM, dimensions=3)
+        steps = np.linalg.norm(np.diff(points[:, :3], axis=0), axis=1)
+        return points, np.concatenate([[0.0], np.cumsum(steps)])
 
-    def _draw(self, part: NDArray[np.intp], centres: Floats, pixels: Floats, image: Image) -> None:
-        order = part[np.argsort(nearness(centres[part] + centres[part + 1]))]
-        radius = (self._points[order, 3] + self._points[order + 1, 3]) / 2 * PX_PER_MM
+    def _draw(self, pose: Pose, points: Floats, segments: NDArray[np.intp], image: Image) -> None:
+        near = nearness(pose.to_room(points[:, :3]))
+        order = segments[np.argsort(near[segments] + near[segments + 1])]
+        pixels = pose.to_image(points[:, :3])
+        radius = (points[order, 3] + points[order + 1, 3]) / 2 * PX_PER_MM
         for size, brightness in _RINGS:
             b, g, r = (min(c * brightness, 255.0) for c in self.colour)
             lean = _LEAN * ((1 - size) * 0.55) * radius[:, None]

@@ -1,0 +1,231 @@
+"""The built-in objects: geometry, orientation, symmetry, and what tells them apart."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hbr import describe, tanimoto
+from sim.objects import paint
+from sim.objects.curves import evenly, smooth
+from sim.objects.paint import Sheet, painted
+from sim.objects.polyhedron import box, lying_cylinder
+from sim.objects.pottery import pottery
+from sim.objects.projection import CENTRE_PX, COS, PX_PER_MM, SIN, Image, Visible
+from sim.objects.revolution import Revolution
+from sim.objects.shelf import CONFUSABLE, shelf
+from sim.objects.solid import Part, Solid, empty_platter
+from sim.objects.tube import Tube
+
+RED, BLUE = (30, 30, 220), (220, 30, 30)
+
+
+def render(thing: Visible, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> Image:
+    image = empty_platter()
+    thing.draw(image, azimuth_deg, offset_mm)
+    return image
+
+
+def middle(image: Image, colour: tuple[int, int, int]) -> tuple[float, float]:
+    """Return the centroid (x, y) of what is coloured like ``colour``, whatever its shading."""
+    hue = np.array(colour, dtype=float) / np.linalg.norm(colour)
+    pixels = image.astype(float)
+    length = np.linalg.norm(pixels, axis=2)
+    y, x = np.nonzero((pixels @ hue > 0.97 * length) & (length > 60))
+    assert len(x) > 20, "the colour is not to be seen"
+    return float(x.mean()), float(y.mean())
+
+
+def difference(a: Image, b: Image) -> float:
+    return float(np.abs(a.astype(int) - b).mean())
+
+
+def solid(*parts: Part) -> Solid:
+    return Solid("sample", parts)
+
+
+HALVES = painted(BLUE, lambda s: s.panel(0.0, 0.0, 0.5, 1.0, RED))
+PATCH = painted(paint.GREY, lambda s: s.panel(0.48, 0.4, 0.52, 0.6, RED))
+CYLINDER = solid(Revolution(((50.0, 100.0), (50.0, 0.0)), PATCH))
+DIE = solid(box((80, 80, 80), front=RED, right=BLUE, back=paint.GREEN, left=paint.YELLOW, top=paint.WHITE))
+
+
+# -- geometry and orientation -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("azimuth_deg", [-60.0, -30.0, 0.0, 30.0, 60.0, 390.0])
+def test_a_mark_on_a_turned_body_is_where_the_projection_says(azimuth_deg: float) -> None:
+    a = np.radians(azimuth_deg)
+    x, y = middle(render(CYLINDER, azimuth_deg), RED)
+    assert x == pytest.approx(CENTRE_PX[0] + 50 * np.sin(a) * PX_PER_MM, abs=1.5)
+    assert y == pytest.approx(CENTRE_PX[1] - (50 * COS - 50 * np.cos(a) * SIN) * PX_PER_MM, abs=1.5)
+
+
+def test_counter_clockwise_from_above_moves_the_front_to_the_right() -> None:
+    for thing in (CYLINDER, DIE):
+        positions = [middle(render(thing, azimuth), RED)[0] for azimuth in (-40.0, -20.0, 0.0, 20.0, 40.0)]
+        assert positions == sorted(positions)
+
+
+def test_the_side_of_a_box_that_faces_the_camera_is_the_one_named() -> None:
+    for azimuth, colour in ((0.0, RED), (-90.0, BLUE), (180.0, paint.GREEN), (90.0, paint.YELLOW)):
+        x, _ = middle(render(DIE, azimuth), colour)
+        assert x == pytest.approx(CENTRE_PX[0], abs=1.0)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        Revolution(((40.0, 80.0), (40.0, 0.0)), HALVES),
+        box((80, 80, 80), front=HALVES, right=RED, back=RED, left=RED, top=paint.GREY),
+        lying_cylinder(40, 60, wall=paint.GREY, end=HALVES, at=(0, 30, 40)),
+    ],
+    ids=["revolution", "box", "lying cylinder"],
+)
+def test_prints_are_not_mirrored(part: Part) -> None:
+    image = render(solid(part), 0.0)
+    assert middle(image, RED)[0] < CENTRE_PX[0] - 10 < CENTRE_PX[0] + 10 < middle(image, BLUE)[0]
+
+
+def test_the_offset_moves_a_thing_across_the_platter() -> None:
+    x0, y0 = middle(render(DIE, 0.0), RED)
+    for offset, move in (((10.3, 0.0), (20.6, 0.0)), ((0.0, 12.0), (0.0, -24 * SIN))):
+        x, y = middle(render(DIE, 0.0, offset), RED)
+        assert (x - x0, y - y0) == pytest.approx(move, abs=0.3)
+
+
+def test_a_turned_body_moves_by_fractions_of_a_pixel() -> None:
+    weight = np.arange(640)
+
+    def position(offset: float) -> float:
+        image = np.zeros((480, 640, 3), dtype=np.uint8)
+        CYLINDER.draw(image, 0.0, (offset, 0.0))
+        light = image.sum(axis=(0, 2), dtype=float)
+        return float((light * weight).sum() / light.sum())
+
+    for offset in (0.05, 0.1, 0.2, 0.35):
+        assert position(offset) - position(0.0) == pytest.approx(offset * PX_PER_MM, abs=0.04)
+
+
+def test_the_near_side_of_a_handle_covers_its_body_and_the_far_side_is_covered() -> None:
+    mug = solid(CYLINDER.parts[0], Tube(((0, -50, 80, 4), (0, -70, 60, 4), (0, -50, 20, 4)), RED))
+    facing, away = render(mug, 0.0), render(mug, 180.0)
+    assert middle(facing, RED)[0] == pytest.approx(CENTRE_PX[0], abs=1.0)
+    bare = render(solid(CYLINDER.parts[0]), 180.0)
+    body = np.s_[230:390, 225:415]
+    np.testing.assert_array_equal(away[body], bare[body])
+
+
+def test_the_inside_of_a_vessel_is_seen_through_its_mouth() -> None:
+    outside, floor = ((45.0, 60.0), (48.0, 60.0), (48.0, 0.0)), ((45.0, 60.0), (45.0, 5.0), (0.0, 5.0))
+    image = render(solid(Revolution(outside, painted(BLUE), inside=floor, lining=RED)), 0.0)
+    _, y = middle(image, RED)
+    assert y == pytest.approx(
+        CENTRE_PX[1] - 60 * COS * PX_PER_MM, abs=3.0
+    )  # the mouth is an ellipse about the rim's middle
+
+
+# -- the shelf --------------------------------------------------------------------------------------------------------
+
+
+def test_the_shelf_has_what_a_bench_needs() -> None:
+    things = shelf()
+    assert len(things) >= 24
+    assert all(name == thing.name and isinstance(thing, Visible) for name, thing in things.items())
+    assert len([t for t in things.values() if t.symmetry_deg == 0]) >= 3
+    assert {t.symmetry_deg for t in things.values()} >= {0.0, 90.0, 180.0, 360.0}
+    assert all(a in things and b in things for a, b in CONFUSABLE)
+
+
+@pytest.mark.parametrize("name", shelf())
+def test_every_thing_fits_the_frame_and_turns_smoothly(name: str) -> None:
+    thing, empty = shelf()[name], empty_platter()
+    for azimuth in (0.0, 77.0, 201.0):
+        image = render(thing, azimuth, (3.0, 2.0))
+        changed = (image != empty).any(axis=2)
+        assert changed.mean() > 0.03
+        assert not changed[:4].any()
+        assert not changed[-4:].any()
+        assert not changed[:, :4].any()
+        assert not changed[:, -4:].any()
+        little = difference(image, render(thing, azimuth + 0.1, (3.0, 2.0)))
+        much = difference(image, render(thing, azimuth + 3.0, (3.0, 2.0)))
+        assert little <= 0.35 * much + 0.02
+
+
+@pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg < 360])
+def test_symmetric_things_look_the_same_after_their_turn(name: str) -> None:
+    thing = shelf()[name]
+    turn = thing.symmetry_deg or 41.3
+    for azimuth in (0.0, 17.0):
+        a, b = render(thing, azimuth), render(thing, azimuth + turn)
+        assert difference(a, b) < 0.1
+        assert tanimoto(describe(a), describe(b)).item() > 0.99
+
+
+@pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg == 360])
+def test_the_others_do_not(name: str) -> None:
+    thing = shelf()[name]
+    views = [render(thing, azimuth) for azimuth in range(0, 360, 30)]
+    for turn in (2, 3, 4, 6):  # of 30°: 6-, 4-, 3- and 2-fold
+        assert max(difference(views[i], views[(i + turn) % 12]) for i in range(12)) > 0.3
+
+
+@pytest.mark.parametrize(("one", "other"), CONFUSABLE)
+def test_confusable_things_differ_from_some_sides_only(one: str, other: str) -> None:
+    a, b = shelf()[one], shelf()[other]
+    apart = np.array([difference(render(a, o), render(b, o)) for o in np.arange(0.0, 360.0, 20.0)])
+    assert 0.25 <= (apart < 0.02).mean() <= 0.9
+    assert apart.max() > 0.3
+
+
+def test_things_that_are_not_confusable_differ() -> None:
+    names = list(shelf())
+    descriptors = np.stack([describe(render(shelf()[name], 20.0)) for name in names])
+    likeness = tanimoto(descriptors, descriptors)
+    close = {(names[i], names[j]) for i, j in np.argwhere(np.triu(likeness > 0.995, 1))}
+    assert close <= set(CONFUSABLE)
+
+
+def test_textures_are_the_same_in_every_run() -> None:
+    for fresh in pottery():
+        np.testing.assert_array_equal(render(fresh, 33.0), render(shelf()[fresh.name], 33.0))
+
+
+def test_profiles_keep_what_the_tracing_relies_on() -> None:
+    for thing in shelf().values():
+        for part in thing.parts:
+            if isinstance(part, Revolution):
+                assert (np.diff([h for _, h in part.profile]) <= 1e-9).all(), thing.name
+                assert (np.diff([h for _, h in part.inside]) <= 1e-9).all(), thing.name
+                assert not part.inside or part.inside[0] == part.profile[0], thing.name
+
+
+# -- curves and brushes -----------------------------------------------------------------------------------------------
+
+points = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), min_size=2, max_size=8)
+
+
+@given(points)
+def test_smoothing_keeps_the_ends_and_the_order_of_heights(corners: list[tuple[float, float]]) -> None:
+    falling = sorted(corners, key=lambda p: -p[1])
+    curve = np.array(smooth(*falling))
+    np.testing.assert_allclose(curve[[0, -1]], [falling[0], falling[-1]])
+    assert (np.diff(curve[:, 1]) <= 1e-9).all()
+
+
+@given(points, st.floats(0.5, 20))
+def test_resampling_is_even_and_ends_where_the_curve_ends(corners: list[tuple[float, float]], step: float) -> None:
+    even = evenly(tuple(corners), step, dimensions=2)
+    np.testing.assert_allclose(even[[0, -1]], [corners[0], corners[-1]], atol=1e-9)
+    assert np.hypot(*np.diff(even, axis=0).T).max() <= step + 1e-9
+
+
+def test_shapes_run_over_the_seam_of_a_sheet() -> None:
+    seam, centre = Sheet((60, 120), (0, 0, 0)), Sheet((60, 120), (0, 0, 0))
+    for sheet, u in ((seam, 0.0), (centre, 0.5)):
+        sheet.disc(u, 0.4, 0.3, (255, 255, 255))
+        sheet.star(u, 0.8, 0.15, (0, 255, 0))
+    assert (
+        difference(np.roll(seam.pixels, 60, axis=1), centre.pixels) < 0.1
+    )  # but for smoothed edges on the seam itself
