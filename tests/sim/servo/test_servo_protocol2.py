@@ -124,6 +124,12 @@ def test_a_flipped_bit_is_never_accepted(packet: InstructionPacket, data: st.Dat
     assert not [p for p in PacketParser().feed(bytes(frame) + bytes(1100)) if p.intact]
 
 
+@pytest.mark.parametrize("reserved", [0x01, 0xFD, 0xFF])
+def test_only_a_reserved_byte_of_zero_makes_a_header(reserved: int) -> None:
+    frame = with_crc(bytes((0xFF, 0xFF, 0xFD, reserved, 1, 3, 0, 1)))
+    assert PacketParser().feed(frame + bytes(1100)) == []
+
+
 @quick
 @given(noise=st.binary(max_size=300))
 def test_noise_leaves_no_more_than_one_packet_waiting(noise: bytes) -> None:
