@@ -5,7 +5,8 @@ from statistics import median
 from typing import Final, NamedTuple
 
 from rig.report import svg
-from rig.report.compass import CENTRE, SIZE, polar, rim
+from rig.report.compass import CENTRE, RIM, SIZE, polar, rim
+from rig.report.words import azimuth_words
 
 _FLOOR: Final = 62.0
 _CEILING: Final = 150.0
@@ -37,11 +38,11 @@ def azimuth_ring(views: Sequence[RingView]) -> str:
     parts = [*rim(), svg.circle(CENTRE, _FLOOR, "baseline")]
     for view in views:
         retaken = f", {_times(view.retakes)} retaken" if view.retakes else ""
-        words = f"{view.azimuth_deg:.1f}°: sharpness {view.sharpness:.1f}{retaken}"
+        words = f"{azimuth_words(view.azimuth_deg)}°: sharpness {view.sharpness:.1f}{retaken}"
         ends = polar(_FLOOR, view.azimuth_deg), polar(_FLOOR + unit * view.sharpness, view.azimuth_deg)
         parts.append(svg.line(*ends, "bar retaken" if view.retakes else "bar", svg.title(words)))
         if view.retakes:
-            parts.append(svg.circle(polar((_CEILING + 160) / 2, view.azimuth_deg), 4, "retake", svg.title(words)))
+            parts.append(svg.circle(polar((_CEILING + RIM) / 2, view.azimuth_deg), 4, "retake", svg.title(words)))
     parts.append(svg.circle(CENTRE, _FLOOR + unit * middle, "median"))
     for row, words in enumerate(("sharpness", f"median {middle:.0f}", f"{_lowest(views):.0f} to {sharpest:.0f}")):
         parts.append(svg.text(words, (CENTRE[0], CENTRE[1] - 12 + 17 * row), "ring-text"))

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.report.words import azimuth_words
+
 Image = NDArray[np.uint8]
 Region = tuple[int, int, int, int]
 
@@ -94,10 +96,7 @@ def contact_sheet(
     for k, (image, azimuth) in enumerate(zip(images_bgr, azimuth_deg, strict=True)):
         y, x = GAP_PX + (k // columns) * down, GAP_PX + (k % columns) * across
         sheet[y : y + height, x : x + width] = thumbnail(image, tile)
-        # adding 0 and wrapping once more keeps "-0.0" and "360.0" off the sheet
-        sheet[y + height : y + height + CAPTION_PX, x : x + width] = _caption(
-            f"{round(azimuth, 1) % 360 + 0.0:.1f}", width
-        )
+        sheet[y + height : y + height + CAPTION_PX, x : x + width] = _caption(azimuth_words(azimuth), width)
     return sheet
 
 

@@ -20,7 +20,7 @@ from rig.report.polar_path import polar_path
 from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
 from rig.report.score_chart import score_chart
 from rig.report.summary import Fact, enrollment_facts, totals
-from rig.report.words import answer_words, counted, decision_words, listed, move_words, sentence
+from rig.report.words import answer_words, azimuth_words, counted, decision_words, listed, move_words, sentence
 
 JPEG_QUALITY: Final = 84
 _STAMP: Final = (56, 56)
@@ -214,7 +214,7 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
             _Frame(
                 number=view.index + 1,
                 picture=_data_uri(view.picture_bgr),
-                where=f"{_as_drawn(record, view.azimuth_deg):.1f}°",
+                where=f"{azimuth_words(_as_drawn(record, view.azimuth_deg))}°",
                 refused=listed(view.refused),
                 leading=[(c.name, f"{c.score:.3f}") for c in thought.candidates[:3]] if thought else [],
                 margin=f"{thought.margin:.3f}" if thought else "",

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 from rig.report import svg
 from rig.report.compass import CENTRE, SIZE, polar, rim
 from rig.report.svg import Point
-from rig.report.words import distinct
+from rig.report.words import azimuth_words, distinct
 
 _STOP_PX: Final = 10.0
 _ARROW_PX: Final = 9.0
@@ -65,12 +65,12 @@ def polar_path(start_deg: float, turns: Sequence[Turn], *, scale: str) -> str:
         parts.append(_arrowhead(arc))
     for k, (x, y) in enumerate(stops):
         look = " last" if k == len(turns) else ""
-        words = svg.title(f"view {k + 1} at {azimuth_deg[k] % 360:.1f}°")
+        words = svg.title(f"view {k + 1} at {azimuth_words(azimuth_deg[k])}°")
         parts.append(svg.circle((x, y), _STOP_PX, f"stop{look}", words))
         parts.append(svg.text(str(k + 1), (x, y + 4), f"stop-number{look}"))
     for turn, (x, y) in zip(turns, _label_spots(arcs, stops), strict=True):
         parts.append(svg.text(f"{abs(turn.rotation_deg):.1f}°", (x, y + 4), "turn-label"))
-    where = ", ".join(f"{a % 360:.1f}°" for a in azimuth_deg)
+    where = ", ".join(f"{azimuth_words(a)}°" for a in azimuth_deg)
     label = f"Camera positions seen from above, view by view: {where}"
     height = max(SIZE, _LIST_TOP + _LIST_ROW * len(turns))
     return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *_list(turns, scale)])

@@ -50,6 +50,11 @@ def sentence(words: str) -> str:
     return f"{words[:1].upper()}{words[1:]}."
 
 
+def azimuth_words(azimuth_deg: float) -> str:
+    """Return an azimuth to a tenth of a degree, from 0.0 to 359.9, without its sign for degrees."""
+    return f"{round(azimuth_deg, 1) % 360:.1f}"
+
+
 def counted(n: int, noun: str) -> str:
     """Return "1 view", "2 views"."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

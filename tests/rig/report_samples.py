@@ -1,0 +1,98 @@
+"""Event streams as the plans yield them, for the tests of the reports."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.angles import wrap360
+from rig.devices.camera import CameraLocks
+from rig.plans.events import (
+    Accepted,
+    Candidate,
+    Decided,
+    Enrolled,
+    Event,
+    Identified,
+    Moved,
+    Ranked,
+    Rejected,
+    Started,
+)
+from rig.report import EnrollmentRecord, IdentificationRecord, Truth
+from rig.view import Stillness, ViewEvidence
+
+NAMES = ("mug-white", "mug-star", "teapot", "vase-blue", "lamp")
+
+
+def evidence(sharpness: float = 100.0) -> ViewEvidence:
+    locks = CameraLocks(8000.0, None, 5000.0, False, False)
+    return ViewEvidence(10, 20, sharpness, 90.0, 0.0, 0.0, False, locks, True, Stillness(0.05, 0.0, True))
+
+
+def moved(index: int, commanded_deg: float, rotation_deg: float) -> Moved:
+    return Moved(index, commanded_deg, commanded_deg + 0.04, rotation_deg, rotation_deg + 0.1, 0.1, 0.5, True, 1.0)
+
+
+def noise(rng: np.random.Generator, shape: tuple[int, int] = (48, 64)) -> NDArray[np.uint8]:
+    return rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+
+
+def enrolling(
+    name: str = "mug-white", views: int = 8, *, retaken: Sequence[int] = (), shape: tuple[int, int] = (48, 64)
+) -> Iterator[Event]:
+    rng = np.random.default_rng(views)
+    yield Started("enroll", name, views, {})
+    for k in range(views):
+        yield moved(k, 360.0 * k / views, 360.0 / views if k else 0.0)
+        if k in retaken:
+            yield Rejected(k, 1, ("blurred (sharpness 2.0 < 3)",), evidence(2.0))
+        yield Accepted(k, float(wrap360(-360.0 * k / views)), evidence(100.0 + k), noise(rng, shape))
+    yield Enrolled(name, views, len(retaken), 12.0)
+
+
+def identifying(
+    answer: str | None = "mug-white",
+    rotations_deg: Sequence[float] = (90.0, 47.3, -120.5),
+    *,
+    yaw_deg: float = 30.0,
+    names: Sequence[str] = NAMES,
+    shape: tuple[int, int] = (48, 64),
+) -> Iterator[Event]:
+    """The camera turns by ``rotations_deg``; the scores of all candidates are (0.9 - 0.1 rank) + 0.01 a view."""
+    rng = np.random.default_rng(5)
+    yield Started("identify", None, 8, {})
+    orientation_deg = 0.0
+    for k in range(len(rotations_deg) + 1):
+        rotation_deg = rotations_deg[k - 1] if k else 0.0
+        orientation_deg += rotation_deg
+        yield moved(k, -orientation_deg, -rotation_deg)
+        yield Accepted(k, float(wrap360(orientation_deg)), evidence(), noise(rng, shape))
+        pose_deg = float(wrap360(orientation_deg - yaw_deg))
+        candidates = tuple(Candidate(n, 0.9 - 0.1 * i + 0.01 * k, pose_deg) for i, n in enumerate(names))
+        yield Ranked(k, candidates, 0.1)
+        if k < len(rotations_deg):
+            step_deg = rotations_deg[k]
+            sums = (None, None) if k == 0 else (0.41, 0.66) if step_deg >= 0 else (0.66, 0.41)
+            side = "left" if step_deg >= 0 else "right"
+            yield Decided(k, side, step_deg, -orientation_deg - step_deg, *sums, tuple(names))
+    travelled_deg = sum(map(abs, rotations_deg))
+    yield Identified(
+        answer, candidates, candidates[0].score, 0.1, pose_deg, yaw_deg, k + 1, travelled_deg, 9.5, "the lead passes"
+    )
+
+
+def enrolled(*args: object, **kwargs: object) -> EnrollmentRecord:
+    record = EnrollmentRecord()
+    for event in enrolling(*args, **kwargs):  # type: ignore[arg-type]
+        record.add(event)
+    return record
+
+
+def identified(
+    *args: object, truth: Truth | None = None, min_score: float | None = None, **kwargs: object
+) -> IdentificationRecord:
+    record = IdentificationRecord(truth=truth, min_score=min_score)
+    for event in identifying(*args, **kwargs):  # type: ignore[arg-type]
+        record.add(event)
+    return record
