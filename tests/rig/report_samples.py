@@ -73,9 +73,9 @@ def identifying(
         yield Ranked(k, candidates, 0.1)
         if k < len(rotations_deg):
             step_deg = rotations_deg[k]
-            sums = (None, None) if k == 0 else (0.41, 0.66) if step_deg >= 0 else (0.66, 0.41)
+            s_left, s_right = (None, None) if k == 0 else (0.41, 0.66) if step_deg >= 0 else (0.66, 0.41)
             side = "left" if step_deg >= 0 else "right"
-            yield Decided(k, side, step_deg, -orientation_deg - step_deg, *sums, tuple(names))
+            yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names))
     travelled_deg = sum(map(abs, rotations_deg))
     yield Identified(
         answer, candidates, candidates[0].score, 0.1, pose_deg, yaw_deg, k + 1, travelled_deg, 9.5, "the lead passes"

@@ -113,7 +113,7 @@ class TestPolarPath:
         others = [centre(e) for e in having(svg, "stop")]
         for k, a in enumerate(labels):
             for b in others + labels[:k]:
-                assert abs(a[0] - b[0]) >= 46 or abs(a[1] - b[1]) >= 14
+                assert abs(a[0] - b[0]) >= 46 or abs(a[1] - b[1]) >= 17
 
     def test_a_long_search_has_room_for_every_turn(self) -> None:
         svg = polar_path(0, [Turn(7.0, 1, 2)] * 40, scale="")
