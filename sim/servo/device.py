@@ -166,7 +166,7 @@ class XSeriesServo:
             case Instruction.FACTORY_RESET if parameters in (b"\xff", b"\x01", b"\x02"):
                 self._factory_reset(parameters[0], everyones)
             case Instruction.CLEAR if parameters == _CLEAR_MULTI_TURN:
-                if self.motor.busy:
+                if self.motor.state().speed_dps:
                     raise Refusal(StatusError.RESULT_FAIL)
                 self._controller.wrap_position()
             case _:

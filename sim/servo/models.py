@@ -85,7 +85,7 @@ class ServoModel:
     ranges
         Values that a register takes; a register not named takes all that fit.
     supply_v
-        Recommended supply.
+        Supply that it runs from, one for which the specifications give a speed.
     no_load_dps
         Speed without load at that supply, in °/s: the fastest that the shaft turns.
     acceleration_dps2
@@ -193,7 +193,7 @@ MODELS: Mapping[str, ServoModel] = MappingProxyType(
                     "PWM Slope": range(1, 256),
                 },
                 supply_v=5.0,
-                no_load_rpm=104.0,
+                no_load_rpm=103.0,
                 stall_current=1470,
             ),
             _model(
