@@ -138,7 +138,8 @@ class GyroHeading:
     def rest(self, duration_s: float = 0.5) -> Bias:
         """Measure the bias over the samples of the present rest, waiting until they fill ``duration_s``.
 
-        A slow and steady rotation looks just like a bias: that the table stands, the encoder must say.
+        A slow and steady rotation looks just like a bias: that the table stands, the encoder must say. A rotation that
+        was begun and not ended (its move was broken off) is dropped.
 
         Raises
         ------
@@ -149,12 +150,12 @@ class GyroHeading:
         UsageError
             When ``duration_s`` is not above 0, or above half of `MEMORY_S`.
         """
-        if self._moving:
-            raise NotReady("a rotation is being measured", next_step="End it before measuring the bias.")
         if not 0 < duration_s <= MEMORY_S / 2:
             raise UsageError(
                 f"a rest of {duration_s:g} s cannot be judged", next_step=f"Give up to {MEMORY_S / 2:g} s, above 0."
             )
+        if self._moving:
+            self._moving, self._resting_ns = False, self._clock.now_ns()
         rate = self._wait_for_rest(duration_s)
         mean = float(rate.mean())
         peak = float(np.abs(rate - mean).max())

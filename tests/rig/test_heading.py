@@ -294,11 +294,21 @@ def test_the_order_of_calls_is_kept(bench: Bench) -> None:
         bench.heading.end()
     bench.heading.rest()
     bench.heading.begin()
-    with pytest.raises(NotReady, match="being measured"):
-        bench.heading.rest()
     bench.heading.end()
     with pytest.raises(NotReady, match="begun"):
         bench.heading.end()
+
+
+def test_a_rest_drops_the_rotation_of_a_move_that_was_broken_off(bench: Bench) -> None:
+    bench.heading.rest()
+    bench.heading.begin()
+    bench.drive(20.0)
+    bench.clock.sleep(0.8)
+    bias = bench.heading.rest()  # judges only what comes from now on
+    assert bias.samples == pytest.approx(100, abs=3)
+    with pytest.raises(NotReady, match="begun"):
+        bench.heading.end()
+    assert bench.move(20.0).angle_deg == pytest.approx(20.0, rel=0.04)
 
 
 @pytest.mark.parametrize("wrong", [{"axis": "w"}, {"sign": 0}, {"scale": 0.0}, {"scale": -1.0}, {"scale_sigma": -0.1}])
