@@ -22,8 +22,8 @@ Axis = Literal["x", "y", "z"]
 
 MEMORY_S = 2.0
 """Rests longer than this teach the bias nothing more: it wanders meanwhile."""
-DRAIN_S = 0.2
-"""How long samples may wait in the sensor's FIFO (0.85 s of the MPU-6050's at 200 Hz); each drain costs bus time."""
+DRAIN_S, DRAIN_SAMPLES = 0.2, 60
+"""How long, and how many, samples may wait in the sensor's FIFO (the MPU-6050 holds 170): a drain costs bus time."""
 REST_PEAK_DPS = 0.5
 """A table at rest stays within this of its mean rate: eight sigma of the sensor's noise, a ringing of 0.01°."""
 MAX_BIAS_DPS = 25.0
@@ -86,8 +86,8 @@ def compare(
 class GyroHeading:
     """Rotations of the table by its gyro.
 
-    Use: `rest` while the table stands, `begin`, move and call `update` at least every half second, and when `peak_dps`
-    says that it stands again, `end`.
+    Use: `rest` while the table stands, `begin`, move and call `update` every few hundredths of a second, and when
+    `peak_dps` says that it stands again, `end`.
 
     Parameters
     ----------
@@ -127,6 +127,7 @@ class GyroHeading:
         self._saturated_dps = imu.range_dps
         self._time_ns: NDArray[np.int64] = np.empty(0, np.int64)
         self._rate_dps: NDArray[np.float64] = np.empty(0)
+        self._drain_s = min(DRAIN_S, DRAIN_SAMPLES / imu.rate_hz)
         self._drained_ns = clock.now_ns()
         self._resting_ns = clock.now_ns()
         self._moving = False
@@ -184,7 +185,7 @@ class GyroHeading:
 
     def update(self) -> None:
         """Collect what the sensor has measured; cheap to call often."""
-        if self._clock.now_ns() - self._drained_ns >= DRAIN_S * 1e9:
+        if self._clock.now_ns() - self._drained_ns >= self._drain_s * 1e9:
             self._drain()
 
     def end(self) -> Rotation:
@@ -254,7 +255,7 @@ class GyroHeading:
                     next_step="Check its cable and supply, then open the bench again.",
                     evidence={"samples": rate.size, "needed": needed},
                 )
-            self._clock.sleep(min((needed - rate.size + 0.5) / self._imu.rate_hz, DRAIN_S))
+            self._clock.sleep(min((needed - rate.size + 0.5) / self._imu.rate_hz, self._drain_s))
 
     def _noise(self, rate: NDArray[np.float64]) -> float:
         """Return the angle random walk in °/√s: the datasheet's, or what the samples show when that is more."""

@@ -21,13 +21,13 @@ from sim.world import World
 
 
 class Bench:
-    def __init__(self, noise: NoiseModel | None = None, seed: int = 0, **heading: Any) -> None:
+    def __init__(self, noise: NoiseModel | None = None, seed: int = 0, rate_hz: float = 200, **heading: Any) -> None:
         self.world = World(noise=noise or NoiseModel(), seed=seed)
         self.clock = self.world.clock
         self.sensor = SimMpu6050(self.world)
         self.bus = SimI2cBus(self.clock)
         self.bus.attach(0x68, self.sensor)
-        self.imu = Mpu6050(self.bus.path, clock=self.clock)
+        self.imu = Mpu6050(self.bus.path, clock=self.clock, rate_hz=rate_hz)
         self.heading = GyroHeading(self.imu, self.clock, **heading)
 
     def __enter__(self) -> "Bench":
@@ -146,6 +146,16 @@ def test_without_errors_the_rotation_is_exact(by_deg: float) -> None:
         rotation = bench.move(by_deg)
         assert rotation.valid
         assert rotation.angle_deg == pytest.approx(by_deg, abs=0.02)
+
+
+@pytest.mark.parametrize("rate_hz", [50, 100, 500, 1000])
+def test_no_rate_outruns_the_fifo(rate_hz: float) -> None:
+    with Bench(NoiseModel.none(), rate_hz=rate_hz) as bench:
+        bench.heading.rest()
+        rotation = bench.move(60.0)
+        assert rotation.valid
+        assert rotation.angle_deg == pytest.approx(60.0, abs=0.1)
+        assert bench.imu.statistics.overflows == 0
 
 
 @pytest.mark.parametrize(
