@@ -19,6 +19,7 @@ from sim.clock import VirtualClock
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
+from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
 from sim.servo import ServoBus, SimSerial, XSeriesServo
 from sim.world import Thing, World
@@ -44,7 +45,7 @@ class SimOptions(Section):
 
 
 class ShelfOperator:
-    """The hand that takes things from the shelf: to be enrolled they stand at yaw 0, to be identified anyhow.
+    """The hand that takes things from the shelf: to be enrolled they stand by the platter's mark, to be found anyhow.
 
     Every placement misses the table's axis by a little, as hands do.
     """
@@ -75,7 +76,7 @@ class ShelfOperator:
         if name not in self.things:
             raise ObjectNotFound(
                 f"There is no {name!r} on the simulated shelf.",
-                next_step="Choose one of the objects listed, or give a folder of photographs: --set bench.sim.objects=…",
+                next_step="Choose one of those listed, or give a folder of photographs: --set bench.sim.objects=FOLDER",
                 evidence={"objects": list(self.things)},
             )
         self.world.put(self.things[name], yaw_deg, (dx_mm, dy_mm))

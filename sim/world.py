@@ -90,12 +90,16 @@ class World:
     def table_motion(self, times_ns: ArrayLike) -> tuple[Floats, Floats]:
         """Return the platter's true angle (°) and rate (°/s) at each of the given times, int64 (n,)."""
         t: NDArray[np.int64] = np.atleast_1d(np.asarray(times_ns, dtype=np.int64))
-        starts = np.array([start for start, _ in self._motions])
-        which = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
-        angle, rate = np.empty(t.shape), np.empty(t.shape)
-        for i in np.unique(which):
-            here = which == i
-            angle[here], rate[here] = self._motions[i][1].at(t[here] * 1e-9)
+        first, last = self._index(int(t.min())), self._index(int(t.max()))
+        if first == last:
+            angle, rate = self._motions[first][1].at(t * 1e-9)
+        else:
+            starts = np.array([start for start, _ in self._motions])
+            which = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
+            angle, rate = np.empty(t.shape), np.empty(t.shape)
+            for i in range(first, last + 1):
+                here = which == i
+                angle[here], rate[here] = self._motions[i][1].at(t[here] * 1e-9)
         for start_s, seconds, slip_deg in self._slips:
             share = (t * 1e-9 - start_s) / seconds
             angle += slip_deg * np.clip(share, 0.0, 1.0)
@@ -118,8 +122,8 @@ class World:
         self._forget(self._scenes, now_ns)
 
     def put(self, thing: Thing | None, yaw_deg: float = 0.0, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Put ``thing`` (or nothing) on the platter, turned by ``yaw_deg`` against the room at this moment."""
-        self.change(thing=thing, yaw_deg=yaw_deg - self.table_deg(), offset_mm=offset_mm)
+        """Put ``thing`` (or nothing) on the platter, turned by ``yaw_deg`` against the platter's mark."""
+        self.change(thing=thing, yaw_deg=yaw_deg, offset_mm=offset_mm)
 
     @contextmanager
     def changed(self, **values: Any) -> Iterator[None]:

@@ -19,7 +19,7 @@ import hbr
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.cli.command import Settings
-from rig.cli.present import Progress, sentence
+from rig.cli.present import Progress, line
 from rig.clock import SystemClock, seconds_between
 from rig.errors import UsageError
 from rig.plans.enroll import enroll
@@ -201,7 +201,7 @@ def _enroll_all(bench: Bench, catalog: Catalog, names: Sequence[str], *, say: bo
                     progress.advance()
             records.append(record)
             if say and record.result:
-                progress.note(sentence(record.result))
+                progress.note(line(record.result))
     return records
 
 
@@ -210,7 +210,7 @@ def _identify(
 ) -> IdentificationRecord:
     """Put a thing on the table anyhow, and let the bench find out which it is."""
     operator.next_object = thing.name
-    record = IdentificationRecord(min_score=bench.config.identify.min_score, region=bench.config.view.roi)
+    record = IdentificationRecord(region=bench.config.view.roi)
     if say:
         print(f"\nWhat stands on the table? (it is {thing.name})")
     for event in identify(bench, index):
@@ -222,7 +222,7 @@ def _identify(
                 description=thing.name,
             )
         record.add(event)
-        if say and (text := sentence(event)):
+        if say and (text := line(event)):
             print(text, flush=True)
     return record
 

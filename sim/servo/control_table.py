@@ -156,11 +156,8 @@ class Memory:
 
 
 def _plain(table: ControlTable) -> Iterator[Register]:
-    """Yield the registers that are not part of an indirect block, under one spelling for all models."""
-    for register in table.values():
-        if not register.name.startswith("Indirect"):
-            name = register.name.replace("BUS Watchdog", "Bus Watchdog")  # MX models spell it so
-            yield Register(name, register.address, register.size, register.signed)
+    """Yield the registers that are not part of an indirect block."""
+    return (register for register in table.values() if not register.name.startswith("Indirect"))
 
 
 def _indirect_blocks(table: ControlTable) -> Iterator[tuple[int, int, int]]:

@@ -1,0 +1,116 @@
+"""What every `rig.devices.camera.Camera` keeps to, whatever is behind it."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rig.clock import Clock
+from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
+from rig.devices.opencv_camera import OpenCvCamera, open_capture
+from sim.camera import SimCapture
+from sim.objects.shelf import shelf
+from sim.world import World
+
+Opened = tuple[Camera, Clock]
+
+
+def simulated(_: Path) -> Opened:
+    world = World(seed=1)
+    world.put(shelf()["toy-house"])
+    return OpenCvCamera(SimCapture(world), clock=world.clock), world.clock
+
+
+def picture(k: int) -> np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]:
+    image = np.zeros((96, 128, 3), np.uint8)
+    cv2.circle(image, (20 + 8 * k, 48), 12, (40, 200, 250), cv2.FILLED)
+    return image
+
+
+def image_sequence(folder: Path) -> Opened:
+    for k in range(12):
+        cv2.imwrite(str(folder / f"img_{k:02d}.png"), picture(k))
+    world = World()
+    return OpenCvCamera(open_capture(folder / "img_%02d.png"), clock=world.clock), world.clock
+
+
+def video_file(folder: Path) -> Opened:
+    path = folder / "recording.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (128, 96))
+    for k in range(12):
+        writer.write(picture(k))
+    writer.release()
+    world = World()
+    return OpenCvCamera(open_capture(path), clock=world.clock), world.clock
+
+
+@pytest.fixture(params=[simulated, image_sequence, video_file], ids=lambda kind: kind.__name__)
+def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Opened:
+    kind: Callable[[Path], Opened] = request.param
+    return kind(tmp_path)
+
+
+def test_the_identity_tells_the_size_of_the_images(opened: Opened) -> None:
+    camera, clock = opened
+    identity = camera.identity
+    assert isinstance(identity, CameraIdentity)
+    assert identity.name
+    assert identity.fps == pytest.approx(30, abs=6)
+    assert camera.capture(clock.now_ns()).image_bgr.shape == (identity.height, identity.width, 3)
+
+
+def test_a_frame_is_eight_bit_colour_with_its_time(opened: Opened) -> None:
+    camera, clock = opened
+    frame = camera.capture(clock.now_ns())
+    assert isinstance(frame, Frame)
+    assert frame.image_bgr.dtype == np.uint8
+    assert isinstance(frame.exposed_ns, int)
+    assert frame.exposed_ns <= clock.now_ns()
+
+
+@pytest.mark.parametrize("ahead_ns", [0, 1, 5_000_000, 400_000_000])
+def test_no_frame_is_older_than_asked(opened: Opened, ahead_ns: int) -> None:
+    camera, clock = opened
+    for pause_s in (0.0, 0.02, 1.0):
+        clock.sleep(pause_s)
+        after_ns = clock.now_ns() + ahead_ns
+        assert camera.capture(after_ns).exposed_ns >= after_ns
+
+
+def test_frames_follow_each_other_and_are_not_repeated(opened: Opened) -> None:
+    camera, _ = opened
+    frames = [camera.capture(0)]
+    for _ in range(4):
+        frames.append(camera.capture(frames[-1].exposed_ns + 1))
+    times = [frame.exposed_ns for frame in frames]
+    assert times == sorted(set(times))
+    for one, other in pairwise(frames):
+        assert (one.image_bgr != other.image_bgr).any()
+
+
+def test_a_frame_keeps_its_pixels_when_the_next_one_comes(opened: Opened) -> None:
+    camera, _ = opened
+    frame = camera.capture(0)
+    before = frame.image_bgr.copy()
+    camera.capture(frame.exposed_ns + 1)
+    np.testing.assert_array_equal(frame.image_bgr, before)
+
+
+def test_locks_are_known_or_none(opened: Opened) -> None:
+    camera, clock = opened
+    locks = camera.read_locks()
+    assert isinstance(locks, CameraLocks)
+    for value in (locks.exposure_us, locks.gain, locks.white_balance_k):
+        assert value is None or value >= 0
+    assert locks.auto_exposure in (True, False, None)
+    camera.capture(clock.now_ns())
+    assert camera.read_locks() == locks
+
+
+def test_it_can_be_closed_twice(opened: Opened) -> None:
+    camera, _ = opened
+    camera.close()
+    camera.close()
