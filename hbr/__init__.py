@@ -2,6 +2,7 @@
 
 from hbr.active import Decision, Side, next_view
 from hbr.cedd import cedd, describe
+from hbr.familiar import familiar_score
 from hbr.hough import Extension, Ranking, retrieve
 from hbr.index import ViewIndex
 from hbr.lead import lead
@@ -18,6 +19,7 @@ __all__ = [
     "Views",
     "cedd",
     "describe",
+    "familiar_score",
     "lead",
     "next_view",
     "pack",

@@ -56,6 +56,7 @@ class Bench(AbstractContextManager["Bench"]):
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     wires: ExitStack = field(default_factory=ExitStack, repr=False)
+    _open: bool = field(default=True, init=False, repr=False)
 
     def __enter__(self) -> Self:
         return self
@@ -70,7 +71,13 @@ class Bench(AbstractContextManager["Bench"]):
                 raise
 
     def close(self) -> None:
-        """Torque off, then let go of the devices; a device that fails here does not keep the others open."""
+        """Torque off, then let go of the devices; a device that fails here does not keep the others open.
+
+        A second call does nothing.
+        """
+        if not self._open:
+            return
+        self._open = False
         failures: list[Exception] = []
         for step in (self.servo.torque_off, self.servo.close, self.imu.close, self.camera.close, self.wires.close):
             try:

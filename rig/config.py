@@ -66,7 +66,7 @@ class TableConfig(Section):
         0.5, ge=0, le=10, description="largest play between encoder and platter that is no fault"
     )
     quiet_dps: float = Field(0.35, gt=0, le=10, description="largest rate that the gyro may see at rest")
-    quiet_s: float = Field(0.12, ge=0.02, le=5, description="how long encoder and gyro must be quiet")
+    quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
     watchdog_s: float = Field(0.5, ge=0.1, le=2.5, description="the servo stops by itself after this much silence")
 
@@ -147,7 +147,12 @@ class IdentifyConfig(Section):
         "orient_all", description="how missing views are filled in"
     )
     margin: float = Field(0.02, ge=0, le=1, description="stop when the best score surely leads by this much a view")
-    min_score: float = Field(0.96, ge=0, le=1, description="below this score a view the object is unknown")
+    min_score: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="below this score a view the object is unknown; none: as the enrolled views suggest",
+    )
 
     @model_validator(mode="after")
     def _views_in_order(self) -> Self:

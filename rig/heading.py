@@ -63,6 +63,15 @@ class Agreement:
         return abs(self.difference_deg) <= self.bound_deg
 
 
+@dataclass(frozen=True, slots=True)
+class Stillness:
+    """What encoder and gyro saw between settling and the end of the exposure."""
+
+    peak_rate_dps: float
+    encoder_change_deg: float
+    still: bool
+
+
 def compare(
     encoder_deg: float, gyro: Rotation, *, encoder_sigma_deg: float, backlash_deg: float = 0.0, k: float = 4.0
 ) -> Agreement:

@@ -11,8 +11,7 @@ from rig.bench import Bench
 from rig.clock import seconds_between
 from rig.devices.servo import MotionProfile, ServoState
 from rig.errors import DeviceFault, LimitExceeded, MotionTimeout, NotReady, RigError
-from rig.heading import Agreement, GyroHeading, Rotation, compare
-from rig.view import Stillness
+from rig.heading import Agreement, GyroHeading, Rotation, Stillness, compare
 
 QUIET_COUNTS = 3
 """Encoder counts that readings at rest may differ by: one of quantisation, the rest of its noise."""

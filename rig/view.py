@@ -10,18 +10,10 @@ from numpy.typing import NDArray
 import hbr
 from rig.config import ViewConfig
 from rig.devices.camera import Camera, CameraLocks, Frame
+from rig.heading import Stillness
 
 DARK_LEVEL = 8
 """Grey levels below this carry no detail in an 8-bit frame."""
-
-
-@dataclass(frozen=True, slots=True)
-class Stillness:
-    """What encoder and gyro saw between settling and the end of the exposure."""
-
-    peak_rate_dps: float
-    encoder_change_deg: float
-    still: bool
 
 
 @dataclass(frozen=True, slots=True)

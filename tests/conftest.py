@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 import pytest
+from hypothesis import settings
 
 from rig.bench import Bench
 from rig.config import load_config
@@ -12,6 +13,10 @@ from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
+
+# A deadline measures the machine, not the code; pytest-timeout catches what hangs.
+settings.register_profile("rig", deadline=None)
+settings.load_profile("rig")
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def enroll(
 
     Example: rig enroll mug-white --bench sim --views 36
     """
-    from rig.cli.present import Progress, sentence
+    from rig.cli.present import Progress, line
     from rig.plans.enroll import enroll as plan
     from rig.plans.events import Accepted, Enrolled, Moved, Rejected, Started, event_dict
 
@@ -43,11 +43,11 @@ def enroll(
                         case Accepted():
                             progress.advance()
                         case Rejected():
-                            progress.note(sentence(event))
+                            progress.note(line(event))
                         case Moved(agrees=False):
-                            progress.note(sentence(event))
+                            progress.note(line(event))
                         case Enrolled() if not settings.json:
-                            progress.note(sentence(event))
+                            progress.note(line(event))
                         case _:
                             pass
         except BaseException:

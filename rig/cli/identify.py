@@ -21,7 +21,7 @@ def identify(
     Example: rig identify --bench sim --seed 3 --json
     """
     from hbr import ViewIndex
-    from rig.cli.present import sentence
+    from rig.cli.present import line
     from rig.plans.events import Identified, event_dict
     from rig.plans.identify import identify as plan
 
@@ -36,7 +36,7 @@ def identify(
             for event in events:
                 if settings.json:
                     settings.print_json(event_dict(event))
-                elif text := sentence(event):
+                elif text := line(event):
                     print(text, flush=True)
                 if isinstance(event, Identified):
                     answer = event

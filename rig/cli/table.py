@@ -16,7 +16,7 @@ def goto(
 
     Example: rig goto -90 --bench sim
     """
-    from rig.cli.present import sentence
+    from rig.cli.present import line
     from rig.plans.capture import moved
     from rig.plans.events import event_dict
     from rig.turntable import Turntable
@@ -26,7 +26,7 @@ def goto(
     if settings.json:
         settings.print_json(event_dict(event))
     else:
-        print(sentence(event))
+        print(line(event))
 
 
 @command

@@ -28,7 +28,8 @@ class ImuSamples:
     gyro_dps : float64 (n, 3)
         Angular rate about the sensor's x, y, z.
     lost : int
-        Samples that the sensor took but could not hand over (FIFO overflow) before these; an integral across them is void.
+        Samples that the sensor took but could not hand over (FIFO overflow) before these; an integral across them is
+        void.
     """
 
     time_ns: NDArray[np.int64]

@@ -112,15 +112,16 @@ class Enrolled:
 class Identified:
     """The answer: an object's name, or None for "unknown".
 
-    ``score`` and ``margin`` are per view; ``pose_deg`` the azimuth the camera sees last, in the catalog's frame,
-    ``yaw_deg`` how far the object stands turned counter-clockwise against its enrollment; ``reason`` why the search
-    ended.
+    ``score``, ``margin`` and ``min_score`` (below which an object counts as unknown) are per view; ``pose_deg`` the
+    azimuth the camera sees last, in the catalog's frame, ``yaw_deg`` how far the object stands turned counter-clockwise
+    against its enrollment; ``reason`` why the search ended.
     """
 
     name: str | None
     candidates: tuple[Candidate, ...]
     score: float
     margin: float
+    min_score: float
     pose_deg: float
     yaw_deg: float
     views: int

@@ -25,7 +25,8 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
 
     The first two views are a fixed step apart, every later one lies where the rivals look less alike (Eq. 5-7). The
     search ends when a known object leads all others by ``identify.margin`` a view, or after ``identify.max_views``; an
-    object whose score a view stays below ``identify.min_score`` is unknown. Closing the generator takes the torque off.
+    object whose score a view stays below ``identify.min_score`` is unknown; where that is not given, below what the
+    enrolled views let expect (`hbr.familiar_score`). Closing the generator takes the torque off.
 
     Raises
     ------
@@ -37,6 +38,7 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
     if not len(index.views):
         raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
     config = bench.config.identify
+    min_score = hbr.familiar_score(index.views) if config.min_score is None else config.min_score
     viewer = Viewer(bench.camera, bench.config.view)
     yield Started("identify", None, config.max_views, dict(bench.conditions))
     bench.operator.place(None)
@@ -64,7 +66,7 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
             )
             ranked = _ranked(number, ranking, hbr.lead(ranking, np.array(descriptors)))
             yield ranked
-            reason = _finished(config, ranked, number + 1)
+            reason = _finished(config, ranked, number + 1, min_score)
             if reason:
                 break
             decided = _decide(config, number, ranking, table)
@@ -76,10 +78,11 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
             )  # the camera goes around the object as the table turns under it, backwards
     best = ranked.candidates[0]
     answer = Identified(
-        name=best.name if best.score >= config.min_score else None,
+        name=best.name if best.score >= min_score else None,
         candidates=ranked.candidates,
         score=best.score,
         margin=ranked.margin,
+        min_score=min_score,
         pose_deg=best.pose_deg,
         yaw_deg=float(wrap360(orientation_deg - best.pose_deg)),
         views=len(descriptors),
@@ -100,9 +103,9 @@ def _ranked(number: int, ranking: hbr.Ranking, lead: float) -> Ranked:
     return Ranked(number, candidates, lead / views)
 
 
-def _finished(config: IdentifyConfig, ranked: Ranked, views: int) -> str:
+def _finished(config: IdentifyConfig, ranked: Ranked, views: int, min_score: float) -> str:
     """Return why the search ends, or nothing where it goes on: nobody is called unknown at a first glance."""
-    known = ranked.candidates[0].score >= config.min_score
+    known = ranked.candidates[0].score >= min_score
     if views >= config.min_views and known and ranked.margin >= config.margin:
         return f"the lead of {ranked.margin:.3f} a view passes {config.margin:g}"
     if views >= config.max_views:

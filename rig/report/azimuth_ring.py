@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from statistics import median
 from typing import Final, NamedTuple
 
+from rig.plans.words import azimuth_words
 from rig.report import svg
 from rig.report.compass import CENTRE, RIM, SIZE, polar, rim
-from rig.report.words import azimuth_words
 
 _FLOOR: Final = 62.0
 _CEILING: Final = 150.0

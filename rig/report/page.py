@@ -14,13 +14,13 @@ from markupsafe import Markup
 
 from hbr.angles import wrap360
 from rig.errors import UsageError
+from rig.plans.words import answer_words, azimuth_words, counted, decision_words, listed, move_words, sentence
 from rig.report.azimuth_ring import RingView, azimuth_ring
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.polar_path import polar_path
 from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
 from rig.report.score_chart import score_chart
 from rig.report.summary import Fact, enrollment_facts, totals
-from rig.report.words import answer_words, azimuth_words, counted, decision_words, listed, move_words, sentence
 
 JPEG_QUALITY: Final = 84
 _STAMP: Final = (56, 56)
@@ -168,7 +168,12 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         rounds = [{c.name: c.score for c in ranked.candidates} for ranked in record.ranked]
         truth = record.truth.name if record.truth else None
         scores = Markup(
-            score_chart(rounds, winner=answer.name if answer else None, truth=truth, min_score=record.min_score)
+            score_chart(
+                rounds,
+                winner=answer.name if answer else None,
+                truth=truth,
+                min_score=answer.min_score if answer else None,
+            )
         )
     return _Retrieval(
         number=number,

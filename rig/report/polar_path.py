@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from math import atan2, ceil, cos, hypot, sin
 from typing import Final, NamedTuple
 
+from rig.plans.words import azimuth_words, distinct
 from rig.report import svg
 from rig.report.compass import CENTRE, SIZE, polar, rim
 from rig.report.svg import Point
-from rig.report.words import azimuth_words, distinct
 
 _STOP_PX: Final = 10.0
 _ARROW_PX: Final = 9.0

@@ -121,17 +121,12 @@ class IdentificationRecord:
     ----------
     truth
         What really stands on the table; None where nobody knows.
-    min_score
-        The score per view below which an object is unknown (`identify.min_score`), to draw.
     region
         The part of the frames to show: x, y, width, height; as `view.roi` of the configuration. None shows all.
     """
 
-    def __init__(
-        self, *, truth: Truth | None = None, min_score: float | None = None, region: Region | None = None
-    ) -> None:
+    def __init__(self, *, truth: Truth | None = None, region: Region | None = None) -> None:
         self.truth = truth
-        self.min_score = min_score
         self.conditions: Mapping[str, Any] = {}
         self.ranked: list[Ranked] = []
         self.decided: list[Decided] = []

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from statistics import fmean, median
 from typing import NamedTuple
 
+from rig.plans.words import counted, listed
 from rig.report.records import EnrollmentRecord, IdentificationRecord
-from rig.report.words import counted, listed
 
 
 class Fact(NamedTuple):

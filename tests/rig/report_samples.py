@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hbr.angles import wrap360
 from rig.devices.camera import CameraLocks
+from rig.heading import Stillness
 from rig.plans.events import (
     Accepted,
     Candidate,
@@ -20,7 +21,7 @@ from rig.plans.events import (
     Started,
 )
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
-from rig.view import Stillness, ViewEvidence
+from rig.view import ViewEvidence
 
 NAMES = ("mug-white", "mug-star", "teapot", "vase-blue", "lamp")
 
@@ -58,6 +59,7 @@ def identifying(
     yaw_deg: float = 30.0,
     names: Sequence[str] = NAMES,
     shape: tuple[int, int] = (48, 64),
+    min_score: float = 0.75,
 ) -> Iterator[Event]:
     """The camera turns by ``rotations_deg``; the scores of all candidates are (0.9 - 0.1 rank) + 0.01 a view."""
     rng = np.random.default_rng(5)
@@ -78,7 +80,17 @@ def identifying(
             yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names))
     travelled_deg = sum(map(abs, rotations_deg))
     yield Identified(
-        answer, candidates, candidates[0].score, 0.1, pose_deg, yaw_deg, k + 1, travelled_deg, 9.5, "the lead passes"
+        answer,
+        candidates,
+        candidates[0].score,
+        0.1,
+        min_score,
+        pose_deg,
+        yaw_deg,
+        k + 1,
+        travelled_deg,
+        9.5,
+        "the lead passes",
     )
 
 
@@ -89,10 +101,8 @@ def enrolled(*args: object, **kwargs: object) -> EnrollmentRecord:
     return record
 
 
-def identified(
-    *args: object, truth: Truth | None = None, min_score: float | None = None, **kwargs: object
-) -> IdentificationRecord:
-    record = IdentificationRecord(truth=truth, min_score=min_score)
+def identified(*args: object, truth: Truth | None = None, **kwargs: object) -> IdentificationRecord:
+    record = IdentificationRecord(truth=truth)
     for event in identifying(*args, **kwargs):  # type: ignore[arg-type]
         record.add(event)
     return record

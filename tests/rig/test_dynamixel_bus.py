@@ -152,5 +152,3 @@ def test_the_watchdogs_register_holds_at_least_the_time_asked_for_and_never_swit
     units = watchdog_units(timeout_s)
     assert 1 <= units <= 127
     assert units * 0.02 >= min(timeout_s, 2.54) - 1e-9
-
-

@@ -69,9 +69,9 @@ class Page(HTMLParser):
 def demo(title: str = "Demo", names: tuple[str, ...] = NAMES) -> str:
     enrollments = [enrolled(name, retaken=(3,)) for name in names[:2]]
     identifications = [
-        identified(names[0], truth=Truth(names[0], 32.0), min_score=0.75, names=names),
-        identified(names[0], (90.0,), truth=Truth(names[1], 10.0), min_score=0.75, names=names),
-        identified(None, (90.0,), truth=Truth(None, description="globe"), min_score=0.75, names=names),
+        identified(names[0], truth=Truth(names[0], 32.0), names=names),
+        identified(names[0], (90.0,), truth=Truth(names[1], 10.0), names=names),
+        identified(None, (90.0,), truth=Truth(None, description="globe"), names=names),
         identified(names[0], (90.0,), truth=Truth(names[0], 30.0, 0.0), names=names),
     ]
     return render_report(title, "Two objects.", enrollments, identifications, meta=META)

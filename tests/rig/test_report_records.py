@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from report_samples import enrolled, enrolling, evidence, identified, identifying, moved
 
 from rig.plans.events import Accepted, Decided, Identified, Moved, Rejected, Started
+from rig.plans.words import answer_words, decision_words, distinct, move_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
 from rig.report.summary import enrollment_facts, totals
-from rig.report.words import answer_words, decision_words, distinct, move_words
 
 
 def facts(pairs: list) -> dict[str, str]:

@@ -19,7 +19,7 @@ def on_the_table(simulated):
 
 
 def test_a_good_frame_is_taken_at_once_with_its_evidence(on_the_table):
-    s, table, viewer = on_the_table
+    _, table, viewer = on_the_table
     settled_ns = table.hold().settled_ns
     (attempt,) = viewer.attempts(settled_ns, table.check_still)
     assert attempt.accepted

@@ -92,7 +92,7 @@ class DynamixelBus:
         self.port.closePort()
 
     def _transact(self, what: str, device_id: int, size: int, call: Callable[[], tuple[Any, int, int]]) -> Any:
-        """Run one SDK call (payload, result, error) until it succeeds or the retries are used up; return the payload."""
+        """Run an SDK call (payload, result, error) until it succeeds or the retries are used up; return the payload."""
         with self._lock:
             for attempt in range(self._retries + 1):
                 self.statistics.transactions += 1

@@ -27,8 +27,8 @@ _SIGNED = frozenset(
         "Position Trajectory",
     }
 )
-# One register carries its series' qualifier in its name there.
-_RENAMED = {"Secondary(Shadow) ID": "Secondary ID"}
+# Names that the .model files do not spell as the e-manual does.
+_RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdog"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What happened, in the words of the report."""
+"""What happened, in words: the same on the terminal and in the report."""
 
 from collections.abc import Iterable
 

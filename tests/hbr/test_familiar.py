@@ -1,0 +1,51 @@
+"""The score to expect of known objects."""
+
+import numpy as np
+import pytest
+
+import hbr
+
+
+def ring(seed: int, n: int, change: int) -> hbr.Views:
+    """Views of an object that changes by ``change`` bins from each view to the next."""
+    rng = np.random.default_rng(seed)
+    rows = [rng.integers(0, 8, 144).astype(np.uint8)]
+    for _ in range(n - 1):
+        row = rows[-1].copy()
+        row[rng.choice(144, change, replace=False)] = rng.integers(0, 8, change)
+        rows.append(row)
+    return hbr.Views.of_object(f"object {seed}", np.array(rows), np.arange(n) * 360 / n)
+
+
+def by_hand(views: hbr.Views) -> list[float]:
+    """Every average, literally; one object with views by rising azimuth, their number a multiple of four."""
+    n = len(views)
+    T = hbr.tanimoto(views.descriptors, views.descriptors)
+    best = [max(T[k, k - 1], T[k, (k + 1) % n]) for k in range(n)]
+    return [np.mean([best[(k + i * n // 4) % n] for i in range(4)]) for k in range(n)]
+
+
+def test_it_is_the_quantile_of_what_neighbouring_views_score():
+    views = ring(1, 24, 12)
+    assert hbr.familiar_score(views, quantile=0.0) == pytest.approx(min(by_hand(views)))
+    assert hbr.familiar_score(views, quantile=0.5) == pytest.approx(np.median(by_hand(views)))
+
+
+def test_the_order_of_the_views_does_not_matter_and_objects_are_kept_apart():
+    both = hbr.Views.concatenate([ring(1, 24, 12), ring(2, 16, 30)])
+    shuffled = both.select(np.random.default_rng(0).permutation(len(both)))
+    assert hbr.familiar_score(shuffled) == pytest.approx(hbr.familiar_score(both))
+    expected = np.quantile(by_hand(ring(1, 24, 12)) + by_hand(ring(2, 16, 30)), 0.05)
+    assert hbr.familiar_score(both) == pytest.approx(expected)
+
+
+def test_coarser_enrollment_expects_less():
+    fine = ring(3, 72, 8)
+    assert hbr.familiar_score(fine.select(np.arange(0, 72, 6))) < hbr.familiar_score(fine)
+
+
+def test_too_few_views_make_nothing_unknown_and_a_wrong_quantile_is_refused():
+    assert hbr.familiar_score(ring(4, 3, 5)) == 0.0
+    assert hbr.familiar_score(hbr.Views.empty()) == 0.0
+    with pytest.raises(ValueError, match="quantile is 5"):
+        hbr.familiar_score(ring(4, 8, 5), quantile=5)
