@@ -15,6 +15,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
+from rig.errors import UsageError
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 
 _LAYOUT = re.compile(r"obj(\d+)__(\d+(?:\.\d+)?)\.(?:png|jpe?g)", re.IGNORECASE)
@@ -54,21 +55,28 @@ def photographs(folder: str | Path) -> Mapping[str, Photographed]:
 
     Raises
     ------
-    ValueError
+    UsageError
         The folder does not exist, or holds no photograph in this layout, or shows an object twice at one angle.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ValueError(f"there is no folder {folder}: give one with photographs named obj1__0.png, obj1__5.png ...")
+        raise UsageError(
+            f"There is no folder {folder}.", next_step="Give one with photographs named obj1__0.png, obj1__5.png, ..."
+        )
     views: dict[int, dict[float, Path]] = defaultdict(dict)
     for path in sorted(folder.iterdir()):
         if match := _LAYOUT.fullmatch(path.name):
             number, azimuth = int(match[1]), float(match[2]) % 360
             if azimuth in views[number]:
-                raise ValueError(f"{views[number][azimuth]} and {path.name} show the same angle: remove one of them")
+                raise UsageError(
+                    f"{views[number][azimuth]} and {path.name} show the same angle.", next_step="Remove one of them."
+                )
             views[number][azimuth] = path
     if not views:
-        raise ValueError(f"no photograph in {folder} is named like obj1__0.png (object number, angle in degrees)")
+        raise UsageError(
+            f"No photograph in {folder} is named like obj1__0.png.",
+            next_step="Name them by object number and angle in degrees.",
+        )
     return MappingProxyType({f"obj{number}": _object(f"obj{number}", views[number]) for number in sorted(views)})
 
 
@@ -82,7 +90,7 @@ def _framed(path: Path) -> Image:
     """Return a photograph scaled to the frame's height, in the middle of a frame of its own border's colour."""
     photo = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if photo is None:
-        raise ValueError(f"{path} cannot be read as an image: replace or remove the file")
+        raise UsageError(f"{path} cannot be read as an image.", next_step="Replace or remove the file.")
     border = np.concatenate([photo[0], photo[-1], photo[:, 0], photo[:, -1]])
     frame = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
     frame[:] = np.median(border, axis=0).round()
