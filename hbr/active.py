@@ -4,7 +4,7 @@ Source: Czúni and Rashad, "Lightweight Active Object Retrieval with Weak Classi
 """
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,7 +51,13 @@ class Decision:
     detour_deg: float
 
 
-def next_view(ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit_deg: float = 10.0) -> Decision:
+def next_view(
+    ranking: Ranking,
+    *,
+    visited_deg: ArrayLike | None = None,
+    revisit_deg: float = 10.0,
+    side: Side | None = None,
+) -> Decision:
     """Decide to which side the candidates differ most, and turn to the next sector centre of the best candidate there.
 
     The views of an object fall into four sectors of 90 degrees; an average view stands for each (Eq. 5). The candidates
@@ -66,6 +72,8 @@ def next_view(ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit
     revisit_deg : float
         A turn that would end this close to a visited orientation, or closer, goes on for 90 degrees, and again until it
         is clear of all. If all four endings are visited, the first is taken.
+    side : {"left", "right"}, optional
+        Turn to this side whatever the likenesses say, by the same step: the control that a decision is measured by.
 
     Returns
     -------
@@ -75,7 +83,8 @@ def next_view(ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit
     Raises
     ------
     ValueError
-        The ranking is of a single query, `revisit_deg` is out of range, or a visited orientation is not finite.
+        The ranking is of a single query, `revisit_deg` is out of range, a visited orientation is not finite, or `side`
+        is unknown.
     """
     if len(ranking.orientation_deg) < 2:
         raise ValueError("a decision needs two queries; turn to the second view by a fixed step such as +90 degrees")
@@ -84,6 +93,8 @@ def next_view(ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit
         raise ValueError(f"visited_deg is {visited}; leave out orientations that are not known")
     if not 0 <= revisit_deg < _SECTOR_DEG / 2:
         raise ValueError(f"revisit_deg is {revisit_deg}; at least 0 and less than {_SECTOR_DEG / 2} is needed")
+    if side not in (None, *get_args(Side)):
+        raise ValueError(f"side {side!r} is unknown; use left or right, or None to decide by the candidates")
 
     candidates = np.unique(ranking.views.object_index[ranking.lists[-1]])
     if len(candidates) < 2:
@@ -93,7 +104,8 @@ def next_view(ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit
     s_left = _likeness(ranking.views, candidates, _next_sector(poses, +1)[0])
     s_right = _likeness(ranking.views, candidates, _next_sector(poses, -1)[0])
 
-    side: Side = "left" if s_left <= s_right else "right"
+    if side is None:
+        side = "left" if s_left <= s_right else "right"
     sign = 1 if side == "left" else -1
     step = float(_next_sector(ranking.pose_deg[:1], sign)[1][0])
     here = float(ranking.orientation_deg[-1])

@@ -143,3 +143,15 @@ def test_one_query_is_too_few() -> None:
 def test_what_does_not_fit_is_refused(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         next_view(pair(left_alike=True), **changed)
+
+
+def test_a_given_side_replaces_the_decision_and_keeps_the_step() -> None:
+    ranking = pair(left_alike=True, pose_deg=20.0)
+    decided, forced = next_view(ranking), next_view(ranking, side="left")
+    assert decided.side == "right" == next_view(ranking, side="right").side
+    assert next_view(ranking, side="right") == decided
+    assert forced.side == "left"
+    assert forced.rotation_deg > 0 > decided.rotation_deg
+    assert (forced.s_left, forced.s_right) == (decided.s_left, decided.s_right)
+    with pytest.raises(ValueError, match="left or right"):
+        next_view(ranking, side="up")  # type: ignore[arg-type]

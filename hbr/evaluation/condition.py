@@ -1,0 +1,103 @@
+"""How queries are photographed, compared with the enrolled views."""
+
+from dataclasses import dataclass, field
+from typing import Final, Literal, TypeVar, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.arrays import ImageArray
+from hbr.evaluation.noise import Noise
+
+Background = Literal["same", "uniform", "textured"]
+_T = TypeVar("_T", np.uint8, np.float32)
+
+#: COIL's black background has sensor noise and the glow of its surroundings up to about here.
+_DARK: Final = 24
+_TEXTURE_OCTAVES: Final = (4, 8, 16, 32)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """The differences between an enrolled view and a query.
+
+    Attributes
+    ----------
+    size_px : int or None
+        The longer side of all images, enrolled ones too; None leaves them as they are.
+    noise : Noise
+        Of the queries, applied at that size.
+    rotation_deg : float
+        Queries are turned in the image plane by a random angle up to this much to either side.
+    background : {"same", "uniform", "textured"}
+        What is behind a query's object instead of the dark surroundings.
+    """
+
+    size_px: int | None = None
+    noise: Noise = field(default_factory=Noise)
+    rotation_deg: float = 0.0
+    background: Background = "same"
+
+    def __post_init__(self) -> None:
+        if self.size_px is not None and self.size_px < 2:
+            raise ValueError(f"an image size of {self.size_px} pixels; at least 2 are needed, 480 is the paper's")
+        if not 0 <= self.rotation_deg <= 180:
+            raise ValueError(f"a rotation of {self.rotation_deg} degrees; 0 to 180 are possible")
+        if self.background not in get_args(Background):
+            raise ValueError(f"background {self.background!r} is unknown; use one of {', '.join(get_args(Background))}")
+
+    def enrolled(self, image_bgr: ImageArray) -> ImageArray:
+        """The image as it is enrolled."""
+        height, width = image_bgr.shape[:2]
+        if self.size_px is None or max(height, width) == self.size_px:
+            return image_bgr
+        scale = self.size_px / max(height, width)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        # bicubic, as MATLAB's imresize
+        method = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+        return cv2.resize(image_bgr, size, interpolation=method).astype(np.uint8, copy=False)
+
+    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> ImageArray:
+        """The image as a query sees it; the same draws for the same generator state."""
+        image = self.enrolled(image_bgr)
+        if self.rotation_deg or self.background != "same":
+            mask = object_mask(image).astype(np.float32)
+            if self.rotation_deg:
+                angle_deg = rng.uniform(-self.rotation_deg, self.rotation_deg)
+                image, mask = _turned(image, angle_deg), _turned(mask, angle_deg)
+            if self.background != "same":
+                behind = _uniform(image, rng) if self.background == "uniform" else _textured(image, rng)
+                share = mask[:, :, None]
+                image = np.rint(share * image + (1 - share) * behind).astype(np.uint8)
+        return self.noise.apply(image, rng)
+
+
+def object_mask(image_bgr: ImageArray) -> NDArray[np.bool_]:
+    """Where the object is, (H, W): all but the dark region that is connected with the border of the image."""
+    dark = (image_bgr.max(axis=2) <= _DARK).astype(np.uint8)
+    # a frame of dark pixels joins all regions that touch the border
+    labels = cv2.connectedComponents(cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1))[1]
+    outside: NDArray[np.bool_] = labels[1:-1, 1:-1] == labels[0, 0]
+    return ~outside
+
+
+def _turned(image: NDArray[_T], angle_deg: float) -> NDArray[_T]:
+    """Turned around its centre, counter-clockwise; what comes in from outside is black."""
+    height, width = image.shape[:2]
+    turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle_deg, 1.0)
+    return cv2.warpAffine(image, turn, (width, height), flags=cv2.INTER_LINEAR).astype(image.dtype, copy=False)
+
+
+def _uniform(image: ImageArray, rng: np.random.Generator) -> ImageArray:
+    return np.broadcast_to(rng.integers(0, 256, 3, dtype=np.uint8), image.shape)
+
+
+def _textured(image: ImageArray, rng: np.random.Generator) -> ImageArray:
+    """Coloured noise of several grain sizes, the coarse ones strongest, around a random colour."""
+    height, width = image.shape[:2]
+    texture = np.broadcast_to(rng.uniform(64, 192, 3), image.shape).astype(np.float32)
+    for cells in _TEXTURE_OCTAVES:
+        grain = rng.normal(0, 48 / np.sqrt(cells / _TEXTURE_OCTAVES[0]), (cells, cells, 3)).astype(np.float32)
+        texture = texture + cv2.resize(grain, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(texture, 0, 255).astype(np.uint8)

@@ -1,0 +1,169 @@
+"""Photographs of objects from known angles, in files."""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from hbr.angles import wrap360
+from hbr.arrays import FloatArray, ImageArray
+
+_SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
+_COIL_NAME: Final = re.compile(r"obj(?P<number>\d+)__(?P<angle>\d+(?:\.\d+)?)")
+#: The last bytes of a whole file. OpenCV returns what it could decode of one that was cut off.
+_ENDS: Final = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+
+
+class DatasetError(ValueError):
+    """A data set that cannot be evaluated; the message names the file or folder."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A file, and the orientation that it was taken from."""
+
+    path: Path
+    azimuth_deg: float
+
+
+@dataclass(frozen=True)
+class PhotographedObject:
+    """An object and its photographs, ascending by azimuth in [0, 360)."""
+
+    name: str
+    photographs: tuple[Photograph, ...]
+
+    @property
+    def azimuth_deg(self) -> FloatArray:
+        return np.array([photograph.azimuth_deg for photograph in self.photographs])
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Objects to enroll and to find again.
+
+    Attributes
+    ----------
+    name : str
+        For people.
+    objects : tuple of PhotographedObject
+        At least two, of different names.
+    ignored : int
+        Image files in the folder that are not named as views.
+    """
+
+    name: str
+    objects: tuple[PhotographedObject, ...]
+    ignored: int = 0
+
+    def __post_init__(self) -> None:
+        if len(self.objects) < 2:
+            raise DatasetError(f"{self.name}: {len(self.objects)} object; at least two are needed to tell apart")
+        for item in self.objects:
+            azimuth_deg = item.azimuth_deg
+            for i in np.flatnonzero(np.diff(azimuth_deg) <= 0):
+                first, second = item.photographs[i].path, item.photographs[i + 1].path
+                raise DatasetError(
+                    f"{first} and {second} are the same view of {item.name} ({azimuth_deg[i]:g}°); remove one of them"
+                )
+
+    @property
+    def views(self) -> int:
+        return sum(len(item.photographs) for item in self.objects)
+
+    @property
+    def spacing_deg(self) -> float:
+        """The usual step between neighbouring views: the median over all objects."""
+        gaps = [np.diff(item.azimuth_deg, append=item.azimuth_deg[0] + 360) for item in self.objects]
+        return float(np.median(np.concatenate(gaps)))
+
+    @property
+    def missing(self) -> int:
+        """How many views lack for every object to be seen all around at the usual step."""
+        whole = round(360 / self.spacing_deg)
+        return sum(max(0, whole - len(item.photographs)) for item in self.objects)
+
+    def subset(self, first: int, last: int) -> "Dataset":
+        """The objects at positions `first` to `last`, counted from 1, both included."""
+        if not 1 <= first <= last <= len(self.objects):
+            raise DatasetError(
+                f"objects {first}-{last} were asked for but {self.name} has {len(self.objects)}; count from 1"
+            )
+        return replace(self, objects=self.objects[first - 1 : last])
+
+
+def load_coil(folder: Path) -> Dataset:
+    """Find the views of a folder in the layout of COIL-100: ``obj{number}__{angle}.png`` or ``.jpg``.
+
+    Angles are degrees, fractions welcome. The angle in the name is taken as the azimuth; where it is the angle of the
+    table, left and right change their roles and nothing else. Objects are sorted by number.
+
+    Raises
+    ------
+    DatasetError
+        The folder is missing or holds no such file, or a view is there twice.
+    """
+    if not folder.is_dir():
+        raise DatasetError(
+            f"{folder} is not a folder; name the one with the images, obj1__0.png and so on "
+            "(COIL-100 is at https://cave.cs.columbia.edu/repository/COIL-100)"
+        )
+    found: dict[int, list[Photograph]] = {}
+    ignored = 0
+    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES):
+        name = _COIL_NAME.fullmatch(path.stem)
+        if name is None:
+            ignored += 1
+            continue
+        found.setdefault(int(name["number"]), []).append(Photograph(path, wrap360(float(name["angle"]))))
+    if not found:
+        raise DatasetError(
+            f"{folder} holds no view; files are expected to be named obj1__0.png, obj1__5.png, obj2__0.jpg"
+        )
+    objects = tuple(
+        PhotographedObject(f"obj{number}", tuple(sorted(found[number], key=lambda view: view.azimuth_deg)))
+        for number in sorted(found)
+    )
+    return Dataset(folder.name or str(folder), objects, ignored)
+
+
+def read_photograph(path: Path, size: tuple[int, int] | None = None) -> ImageArray:
+    """Read an image.
+
+    Parameters
+    ----------
+    path : Path
+        PNG or JPEG.
+    size : (int, int), optional
+        Width and height that it has to have.
+
+    Returns
+    -------
+    uint8 array (H, W, 3)
+        BGR.
+
+    Raises
+    ------
+    DatasetError
+        The file is missing or cut off, is no image, or has another size.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
+    # padding after the end is legal
+    if _ENDS.get(path.suffix.lower(), b"") not in data[-4096:]:
+        raise DatasetError(f"{path} is cut off or no image; fetch it again")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DatasetError(f"{path} is no image that OpenCV can read; fetch it again")
+    height, width = image.shape[:2]
+    if size is not None and (width, height) != size:
+        raise DatasetError(
+            f"{path} has {width} x {height} pixels, the first image {size[0]} x {size[1]}; "
+            "views of one data set must have one size"
+        )
+    return image.astype(np.uint8, copy=False)

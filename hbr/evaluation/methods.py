@@ -1,0 +1,88 @@
+"""The methods that are compared: how views are chosen, and how they are judged."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from hbr.hough import Extension
+
+Walk = Literal["random", "sweep-45", "sweep-90", "ahbr", "coin"]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A retrieval method.
+
+    Attributes
+    ----------
+    name : str
+        By which it is asked for.
+    label : str
+        For tables and figures.
+    walk : {"random", "sweep-45", "sweep-90", "ahbr", "coin"}
+        How the next view is chosen: at random, at fixed steps, by Eq. 5-7, or by a coin with the step of Eq. 5-7.
+    omega, list_length, extension
+        As for `hbr.retrieve`.
+    views : int or None
+        So many are looked at, whatever is allowed; None for no limit of its own.
+    """
+
+    name: str
+    label: str
+    walk: Walk = "random"
+    omega: float = 0.5
+    list_length: int = 10
+    extension: Extension = "orient_all"
+    views: int | None = None
+
+    @property
+    def active(self) -> bool:
+        return self.walk in ("ahbr", "coin")
+
+
+_LISTED: Final = (
+    Method("single", "single view", omega=0.0, extension="visual", views=1),
+    Method("hbr-visual", "HBR best visual match", omega=0.0, extension="visual"),
+    Method("hbr-0", "HBR ω = 0", omega=0.0),
+    Method("hbr-0-orient", "HBR ω = 0, orient", omega=0.0, extension="orient"),
+    Method("hbr", "HBR ω = 0.5 (random views)"),
+    Method("hbr-orient", "HBR ω = 0.5, orient", extension="orient"),
+    Method("ahbr", "AHBR ω = 0.5", walk="ahbr"),
+    Method("ahbr-orient", "AHBR ω = 0.5, orient", walk="ahbr", extension="orient"),
+    Method("coin", "coin flip, AHBR's step", walk="coin"),
+    Method("sweep-45", "sweep of 45°", walk="sweep-45"),
+    Method("sweep-90", "sweep of 90°", walk="sweep-90"),
+)
+_OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+_LENGTHS: Final = (1, 2, 5, 10, 20, 50, 100)
+_OMEGA_SWEEP: Final = tuple(Method(f"omega-{omega:g}", f"HBR ω = {omega:g}", omega=omega) for omega in _OMEGAS)
+_LIST_SWEEP: Final = tuple(Method(f"list-{n}", f"HBR lists of {n}", list_length=n) for n in _LENGTHS)
+
+METHODS: Final = {method.name: method for method in (*_LISTED, *_OMEGA_SWEEP, *_LIST_SWEEP)}
+GROUPS: Final[dict[str, tuple[Method, ...]]] = {
+    "all": _LISTED,
+    "omega-sweep": _OMEGA_SWEEP,
+    "list-sweep": _LIST_SWEEP,
+}
+
+
+def choose_methods(names: Iterable[str]) -> tuple[Method, ...]:
+    """The methods of these names and of the groups among them, each once.
+
+    Raises
+    ------
+    ValueError
+        No name, or one that is neither a method nor a group.
+    """
+    chosen: dict[str, Method] = {}
+    for name in names:
+        if name in GROUPS:
+            chosen |= {method.name: method for method in GROUPS[name]}
+        elif name in METHODS:
+            chosen[name] = METHODS[name]
+        else:
+            listed = ", ".join([*GROUPS, *(method.name for method in _LISTED)])
+            raise ValueError(f"method {name!r} is unknown; use some of {listed}")
+    if not chosen:
+        raise ValueError("no method was asked for; use all for the whole comparison")
+    return tuple(chosen.values())

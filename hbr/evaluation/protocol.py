@@ -1,0 +1,296 @@
+"""The trials: an object is looked at from up to eight sides, its views near those are taken out, and it is searched for.
+
+Everything that is drawn at random (first views, errors of the sensor, coins) is drawn once for each object and trial, so
+that all methods meet the same.
+"""
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.active import Side, next_view
+from hbr.angles import wrap180
+from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.evaluation.methods import Method
+from hbr.hough import Ranking, retrieve
+from hbr.index import ViewIndex
+from hbr.tanimoto import tanimoto
+from hbr.views import Views
+
+Removal = Literal["near", "paper79", "queries"]
+_STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0}
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What a trial is.
+
+    Attributes
+    ----------
+    trials : int
+        Of each object.
+    max_views : int
+        Queries of a trial; results are kept after each.
+    removal : {"near", "paper79", "queries"}
+        Which enrolled views of the object are taken out before it is searched for: those closer than `near_deg` to any
+        query so far; the queries and the next view of each (which leaves 79 % of 72 after 8 queries); the queries.
+    near_deg : float
+        For ``near``.
+    sigma_deg : float
+        Standard deviation of the error of each measured orientation.
+    drift_deg : float
+        What the measured orientation gains with each view.
+    seed : int
+        Of all that is random.
+    """
+
+    trials: int = 10
+    max_views: int = 8
+    removal: Removal = "near"
+    near_deg: float = 10.0
+    sigma_deg: float = 2.0
+    drift_deg: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.trials < 1 or self.max_views < 1:
+            raise ValueError(f"{self.trials} trials of {self.max_views} views; at least one of each is needed")
+        if self.removal not in get_args(Removal):
+            raise ValueError(f"removal {self.removal!r} is unknown; use one of {', '.join(get_args(Removal))}")
+        if not (0 < self.near_deg <= 180 and 0 <= self.sigma_deg < np.inf and np.isfinite(self.drift_deg)):
+            raise ValueError(
+                f"removal nearer than {self.near_deg}, orientation errors of {self.sigma_deg} and a drift of "
+                f"{self.drift_deg} degrees; above 0, at least 0 and finite are needed"
+            )
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}; a whole number of at least 0 is needed")
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """What came out, arrays of shape (methods, objects, trials, views).
+
+    Attributes
+    ----------
+    rank : int32
+        Place of the true object, 1 for found; 0 where it was no candidate, -1 where the method looks no more.
+    pose_error_deg : float64
+        Distance of the estimated from the true orientation of the true object, 0..180; nan where it was no candidate.
+    alike_error_deg : float64
+        The same to the nearest orientation from which the object looks as it does from the true one.
+    lead : float64
+        `hbr.lead` of the best object, a view.
+    travelled_deg : float64
+        Degrees turned since the first view, to either side.
+    step_ns : int64
+        Time of retrieval and decision, 0 where no timer was given.
+    """
+
+    rank: NDArray[np.int32]
+    pose_error_deg: FloatArray
+    alike_error_deg: FloatArray
+    lead: FloatArray
+    travelled_deg: FloatArray
+    step_ns: NDArray[np.int64]
+
+    @classmethod
+    def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
+        """Nothing looked at yet."""
+        shape = (methods, objects, trials, views)
+        return cls(np.full(shape, -1, np.int32), *(np.full(shape, np.nan) for _ in range(4)), np.zeros(shape, np.int64))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Runs"]) -> "Runs":
+        """The objects of all parts, in their order."""
+        return cls(*(np.concatenate([getattr(part, item.name) for part in parts], axis=1) for item in fields(cls)))
+
+
+@dataclass(frozen=True)
+class _Draws:
+    """What chance decides in one trial."""
+
+    order: IndexArray
+    error_deg: FloatArray
+    coins: NDArray[np.bool_]
+
+
+def run_object(
+    object_index: int,
+    queries: LevelArray,
+    views: Views,
+    methods: Sequence[Method],
+    protocol: Protocol,
+    *,
+    now_ns: Callable[[], int] = lambda: 0,
+) -> Runs:
+    """Search for one object by all methods, in all trials.
+
+    Parameters
+    ----------
+    object_index : int
+        The object.
+    queries : uint8 array (n, 144)
+        Its photographs as queries see them, one for each of its views, in the order of `views.of`.
+    views : Views
+        The whole model set, nothing taken out.
+    methods : sequence of Method
+        What to search by.
+    protocol : Protocol
+        The trials.
+    now_ns : callable
+        Monotonic time, for `Runs.step_ns`.
+
+    Returns
+    -------
+    Runs
+        Of this object alone.
+
+    Raises
+    ------
+    ValueError
+        The object has too few views, or other than there are queries.
+    """
+    trial = _Trials(object_index, queries, views, protocol, now_ns)
+    runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
+    for t in range(protocol.trials):
+        draws = trial.draw(t)
+        indices: dict[bytes, ViewIndex] = {}
+        for m, method in enumerate(methods):
+            trial.run(method, draws, indices, runs, (m, 0, t))
+    return runs
+
+
+class _Trials:
+    def __init__(
+        self, object_index: int, queries: LevelArray, views: Views, protocol: Protocol, now_ns: Callable[[], int]
+    ) -> None:
+        self._object, self._queries, self._views = object_index, queries, views
+        self._protocol, self._now_ns = protocol, now_ns
+        self._rows = views.of(object_index)
+        self._azimuth_deg = views.azimuth_deg[self._rows]
+        name = views.object_names[object_index]
+        if len(queries) != len(self._rows):
+            raise ValueError(f"{len(queries)} queries for the {len(self._rows)} views of {name}; one each is needed")
+        if len(self._rows) <= protocol.max_views:
+            raise ValueError(
+                f"{name} has {len(self._rows)} views; for {protocol.max_views} queries it needs more than that"
+            )
+        self._ring = np.argsort(self._azimuth_deg, kind="stable")
+        own = views.descriptors[self._rows]
+        self._alike = _looks_alike(own, self._ring)
+        self._own_similar = tanimoto(queries, own)
+        similar = tanimoto(queries, views.descriptors)
+        objects = range(len(views.object_names))
+        self._reach = np.stack([similar[:, views.of(j)].max(axis=1, initial=-np.inf) for j in objects])
+
+    def draw(self, trial: int) -> _Draws:
+        name = self._views.object_names[self._object].encode()
+        rng = np.random.default_rng([self._protocol.seed, zlib.crc32(name), trial])
+        count = self._protocol.max_views
+        return _Draws(
+            order=rng.permutation(len(self._rows))[:count],
+            error_deg=rng.normal(0, self._protocol.sigma_deg, count) + self._protocol.drift_deg * np.arange(count),
+            coins=rng.random(count) < 0.5,
+        )
+
+    def run(
+        self, method: Method, draws: _Draws, indices: dict[bytes, ViewIndex], runs: Runs, at: tuple[int, int, int]
+    ) -> None:
+        """Fill in the results of one trial by one method."""
+        seen = [int(draws.order[0])]
+        travelled_deg = 0.0
+        last = min(self._protocol.max_views, method.views or self._protocol.max_views)
+        for n in range(last):
+            keep = self._keep(np.array(seen))
+            key = keep.tobytes()
+            if key not in indices:
+                indices[key] = self._without(keep)
+            measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
+            start_ns = self._now_ns()
+            ranking = retrieve(
+                self._queries[seen],
+                measured_deg,
+                indices[key],
+                omega=method.omega,
+                list_length=method.list_length,
+                extension=method.extension,
+            )
+            following = self._next(method, draws, seen, ranking) if n + 1 < last else seen[-1]
+            runs.step_ns[*at, n] = self._now_ns() - start_ns
+            self._judge(ranking, seen, keep, runs, (*at, n))
+            runs.travelled_deg[*at, n] = travelled_deg
+            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
+            seen.append(following)
+
+    def _keep(self, seen: IndexArray) -> NDArray[np.bool_]:
+        """Which of the object's views stay enrolled after these queries."""
+        keep = np.ones(len(self._rows), np.bool_)
+        keep[seen] = False
+        match self._protocol.removal:
+            case "near":
+                away_deg = np.abs(wrap180(self._azimuth_deg[:, None] - self._azimuth_deg[seen]))
+                keep &= (away_deg >= self._protocol.near_deg).all(axis=1)
+            case "paper79":
+                place = np.argsort(self._ring)
+                keep[self._ring[(place[seen] + 1) % len(self._ring)]] = False
+            case "queries":
+                pass
+        if not keep.any():
+            name = self._views.object_names[self._object]
+            raise ValueError(
+                f"after {len(seen)} queries no view of {name} is left; use fewer views or removal 'queries'"
+            )
+        return keep
+
+    def _without(self, keep: NDArray[np.bool_]) -> ViewIndex:
+        mask = np.ones(len(self._views), np.bool_)
+        mask[self._rows] = keep
+        return ViewIndex(self._views.select(mask))
+
+    def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
+        """The photograph to look at next, of those not yet looked at."""
+        if method.walk == "random" or (method.active and len(seen) == 1):
+            return int(draws.order[len(seen)])
+        if method.active:
+            coin: Side = "left" if draws.coins[len(seen)] else "right"
+            turn_deg = next_view(ranking, side=None if method.walk == "ahbr" else coin).rotation_deg
+        else:
+            turn_deg = _STEP_DEG[method.walk]
+        away_deg = np.abs(wrap180(self._azimuth_deg - (self._azimuth_deg[seen[-1]] + turn_deg)))
+        away_deg[seen] = np.inf
+        return int(away_deg.argmin())
+
+    def _judge(
+        self,
+        ranking: Ranking,
+        seen: list[int],
+        keep: NDArray[np.bool_],
+        runs: Runs,
+        at: tuple[int, int, int, int],
+    ) -> None:
+        place = np.flatnonzero(ranking.object_index == self._object)
+        runs.rank[at] = place[0] + 1 if len(place) else 0
+        if len(place):
+            away_deg = np.abs(wrap180(ranking.pose_deg[place[0]] - self._azimuth_deg))
+            runs.pose_error_deg[at] = away_deg[seen[-1]]
+            runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
+        # hbr.lead, of similarities computed once for all trials
+        reach = self._reach[:, seen].sum(axis=1)
+        reach[self._object] = self._own_similar[np.ix_(seen, keep)].max(axis=1).sum()
+        reach[ranking.object_index[0]] = -np.inf
+        runs.lead[at] = (ranking.scores[0] - reach.max()) / len(seen)
+
+
+def _looks_alike(own: LevelArray, ring: IndexArray) -> NDArray[np.bool_]:
+    """Of each view, the views that are as similar to it as the less similar of its two neighbours on the ring, (n, n)."""
+    similar = tanimoto(own, own)
+    before, after = np.empty_like(ring), np.empty_like(ring)
+    before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)
+    rows = np.arange(len(ring))
+    alike: NDArray[np.bool_] = similar >= np.minimum(similar[rows, before], similar[rows, after])[:, None]
+    alike[rows, rows] = True  # also of a view without any texture or colour
+    return alike

@@ -1,0 +1,92 @@
+"""How sure a hit-rate is, and whether one method is better than another on the same trials."""
+
+from math import comb, isfinite, sqrt
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.arrays import FloatArray
+
+Hits = NDArray[np.bool_]
+
+
+def wilson(hits: int, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a proportion.
+
+    Parameters
+    ----------
+    hits, trials : int
+        0 <= hits <= trials, trials >= 1.
+    confidence : float
+        Coverage, between 0 and 1.
+
+    Returns
+    -------
+    low, high : float
+        Within 0..1, around ``hits / trials``.
+
+    Source: E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22 (1927) 209.
+    """
+    if trials < 1 or not 0 <= hits <= trials:
+        raise ValueError(f"{hits} hits of {trials} trials; at least one trial and no more hits than trials are needed")
+    if not (isfinite(confidence) and 0 < confidence < 1):
+        raise ValueError(f"confidence is {confidence}; a share between 0 and 1 is needed, 0.95 by default")
+    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    rate = hits / trials
+    shrink = 1 + z * z / trials
+    centre = (rate + z * z / (2 * trials)) / shrink
+    half = z / shrink * sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
+    # the limits at no hit and at all hits are exact; rounding must not leave them inside
+    return (0.0 if hits == 0 else centre - half), (1.0 if hits == trials else centre + half)
+
+
+def mcnemar_exact(only_first: int, only_second: int) -> float:
+    """Two-sided exact p-value of McNemar's test: are hits of only one method as often the first's as the second's?
+
+    Parameters
+    ----------
+    only_first, only_second : int
+        Trials that the one method hit and the other missed.
+
+    Returns
+    -------
+    float
+        1 where no trial tells the methods apart.
+    """
+    if only_first < 0 or only_second < 0:
+        raise ValueError(f"{only_first} and {only_second} discordant trials; counts cannot be negative")
+    trials = only_first + only_second
+    tail = sum(comb(trials, i) for i in range(min(only_first, only_second) + 1))
+    return min(1.0, 2 * tail / 2**trials)
+
+
+def bootstrap_difference(
+    first: Hits, second: Hits, rng: np.random.Generator, *, confidence: float = 0.95, resamples: int = 2000
+) -> tuple[float, float]:
+    """Percentile interval of the difference of two hit-rates, resampling whole objects.
+
+    The trials of one object are alike: an interval that takes them for independent is too narrow.
+
+    Parameters
+    ----------
+    first, second : bool array (objects, trials)
+        Hits on the same trials.
+    rng : numpy Generator
+        Draws the objects.
+    confidence : float
+        Coverage of the interval.
+    resamples : int
+        Draws of all objects with replacement.
+
+    Returns
+    -------
+    low, high : float
+        Of ``first.mean() - second.mean()``.
+    """
+    if first.shape != second.shape or first.ndim != 2 or not first.size:
+        raise ValueError(f"hits of shapes {first.shape} and {second.shape}; one (objects, trials) for both is needed")
+    by_object: FloatArray = first.mean(axis=1) - second.mean(axis=1)
+    drawn = by_object[rng.integers(len(by_object), size=(resamples, len(by_object)))].mean(axis=1)
+    low, high = np.quantile(drawn, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
