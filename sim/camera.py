@@ -30,7 +30,7 @@ _BUFFERS_RANGE = (1, 10)
 
 _METER_FRAMES = 5  # how often the automatics act
 _METER_TARGET = 70.0
-_EDGE_PX_PER_DEG = radians(80 * PX_PER_MM)  # how fast what stands 80 mm from the axis crosses the image
+_EDGE_PX_PER_DEG = radians(1.0) * 80 * PX_PER_MM  # how fast what stands 80 mm from the axis crosses the image
 _STILL_PX = 0.25
 _MAX_SUBFRAMES = 16
 

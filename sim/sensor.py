@@ -35,12 +35,12 @@ class Sensor:
 
     def __init__(self, noise: NoiseModel, rng: np.random.Generator) -> None:
         self._noise = noise
-        self._volts = 255 / (noise.full_well_e or NoiseModel().full_well_e)  # grey levels an electron
-        self._shot = self._volts if noise.full_well_e else 0.0
-        self._dark_variance = np.full((HEIGHT, WIDTH, 3), (self._volts * noise.read_noise_e) ** 2, dtype=np.float32)
-        self._noisy = noise.full_well_e > 0 or noise.read_noise_e > 0
+        levels_per_e = 255 / (noise.full_well_e or NoiseModel().full_well_e)
+        self._shot = levels_per_e if noise.full_well_e else 0.0
+        self._dark_variance = np.full((HEIGHT, WIDTH, 3), (levels_per_e * noise.read_noise_e) ** 2, dtype=np.float32)
+        noisy = noise.full_well_e > 0 or noise.read_noise_e > 0
         shape = (HEIGHT + _TILE_MARGIN, WIDTH + _TILE_MARGIN, 3)
-        self._tile = rng.standard_normal(shape, dtype=np.float32) if self._noisy else None
+        self._tile = rng.standard_normal(shape, dtype=np.float32) if noisy else None
         self._vignette = _vignette(noise.vignetting)
         self._light_key: Gains | None = None
         self._light_map = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
@@ -80,6 +80,7 @@ class Sensor:
         signal = cv2.multiply(scene, self._light_map, scale=max(flicker, 0.0) * exposure, dtype=cv2.CV_32F)
         if self._tile is not None:
             y, x = rng.integers(0, _TILE_MARGIN, 2, endpoint=True)
+            # var = levels_per_e · signal + (levels_per_e · read noise)²: EMVA 1288, in grey levels
             sigma = cv2.scaleAdd(signal, self._shot, self._dark_variance)
             cv2.sqrt(sigma, dst=sigma)
             cv2.multiply(sigma, self._tile[y : y + HEIGHT, x : x + WIDTH], dst=sigma)

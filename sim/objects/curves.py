@@ -4,12 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 Curve = tuple[tuple[float, ...], ...]
+_ROUNDS = 4
 
 
-def smooth(*corners: tuple[float, ...], rounds: int = 4) -> Curve:
+def smooth(*corners: tuple[float, ...]) -> Curve:
     """Return the curve through ``corners`` with its edges rounded (Chaikin's corner cutting); its ends stay."""
     points = np.array(corners, dtype=np.float64)
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         cut = np.stack([0.75 * points[:-1] + 0.25 * points[1:], 0.25 * points[:-1] + 0.75 * points[1:]], axis=1)
         points = np.concatenate([points[:1], cut.reshape(-1, points.shape[1]), points[-1:]])
     return tuple(tuple(float(x) for x in point) for point in points)

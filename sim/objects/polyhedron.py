@@ -28,14 +28,11 @@ class Face:
     paint: Paint | Colour
     frame: tuple[Floats, Floats, Floats]
 
-    @property
-    def colour(self) -> Colour:
-        return self.paint if isinstance(self.paint, tuple) else (0, 0, 0)
-
     @cached_property
-    def texture(self) -> Image | None:
+    def printed(self) -> Image | Colour:
+        """The face's texture, or its colour."""
         if isinstance(self.paint, tuple):
-            return None
+            return self.paint
         origin, right, down = self.frame
         rows = round(float(np.linalg.norm(down - origin)) * TEXELS_PER_MM)
         columns = round(float(np.linalg.norm(right - origin)) * TEXELS_PER_MM)
@@ -113,10 +110,10 @@ class Polyhedron:
         # The face seen best goes everywhere first, so that the smoothed seams show nothing but the solid itself.
         for n, i in enumerate(i for i in np.argsort(-facing).tolist() if facing[i] > _EDGE_ON):
             face, polygon = self.faces[i], None if n == 0 else corners[slices[i]]
-            if face.texture is None:
-                _paint_flat(solid, face.colour, polygon, lights[i])
+            if isinstance(face.printed, tuple):
+                _paint_flat(solid, face.printed, polygon, lights[i])
             else:
-                _paint_printed(solid, face.texture, frames[i], polygon, lights[i])
+                _paint_printed(solid, face.printed, frames[i], polygon, lights[i])
         cover = np.zeros((size[1], size[0]), dtype=np.uint8)
         hull = cv2.convexHull(corners.astype(np.float32)).reshape(-1, 2)
         _fill(cover, hull.astype(np.float64), (255,))

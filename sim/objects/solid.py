@@ -12,10 +12,12 @@ from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH
 
 
 class Part(Protocol):
-    """A piece of a solid: it knows how to be drawn and how far it reaches on the platter."""
+    """A piece of a solid."""
 
     @property
-    def reach_mm(self) -> float: ...
+    def reach_mm(self) -> float:
+        """How far from the axis it darkens the platter."""
+        ...
 
     def drawings(self, pose: Pose) -> list[Drawing]: ...
 
@@ -65,7 +67,7 @@ def empty_platter() -> Image:
     """Return what the camera sees without a thing: a plain backdrop and the platter, uint8 (480, 640, 3)."""
     image = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
     image[:] = (44, 40, 38)
-    x, y = (int(v) for v in CENTRE_PX)
+    x, y = CENTRE_PX
     axes = (int(105 * PX_PER_MM), int(105 * PX_PER_MM * SIN))
     thickness = int(6 * PX_PER_MM * COS)
     for down, colour in ((thickness, (58, 56, 54)), (0, (84, 82, 80))):

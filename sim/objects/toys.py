@@ -135,7 +135,8 @@ def _car() -> Solid:
 
 
 def _camera() -> Solid:
-    leather: Brush = lambda s: s.mottle(14.0, (0.012, 0.03), 81)  # noqa: E731
+    def leather(s: Sheet) -> None:
+        s.mottle(14.0, (0.012, 0.03), 81)
 
     def front(s: Sheet) -> None:
         leather(s)
