@@ -36,12 +36,14 @@ def move_words(moved: Moved) -> str:
 
 
 def answer_words(answer: Identified) -> str:
-    """Return the answer and why the search ended; an unknown object with its nearest three."""
+    """Return the answer, how sure it is and why the search ended; an unknown object with its nearest three."""
     if answer.name is None:
         nearest = ", ".join(f"{c.name} {c.score:.3f}" for c in answer.candidates[:3])
         found = f"Unknown: the nearest are {nearest}"
     else:
         found = f"{answer.name}, standing {answer.yaw_deg:.1f}° counter-clockwise of how it was enrolled"
+        if answer.margin <= 0 and len(answer.candidates) > 1:
+            found += f"; not sure, {answer.candidates[1].name} looks as likely"
     return f"{found}. {sentence(answer.reason)}"
 
 

@@ -78,7 +78,7 @@ def score_chart(
     parts.append(svg.text("views taken", ((_LEFT + _RIGHT) / 2, _BOTTOM + 38), "small"))
     if min_score is not None:
         y = at(0, min(max(min_score, low), high))[1]
-        words = f"unknown below {min_score:g}"
+        words = f"unknown below {round(min_score, 3):g}"
         if min_score < low:
             words += ", further down ↓"
         elif min_score > high:

@@ -188,6 +188,7 @@ class TestWords:
         assert answer_words(known) == (
             "mug-white, standing 30.0° counter-clockwise of how it was enrolled. The lead passes."
         )
+        assert "not sure, mug-star looks as likely" in answer_words(replace(known, margin=-0.01))
         assert answer_words(unknown).startswith(
             "Unknown: the nearest are mug-white 0.930, mug-star 0.830, teapot 0.730."
         )
