@@ -275,7 +275,8 @@ def test_a_network_stream_shows_the_present_after_a_pause(stream: tuple[str, lis
     url, level = stream
     clock = SystemClock()
     settings = CameraSettings(None, None, None, None, None, None)
-    camera = OpenCvCamera(open_capture(url), clock=clock, settings=settings, timeout_s=20.0)
+    # The latency leaves a busy machine time to drain what piled up before a stall can pass for waiting.
+    camera = OpenCvCamera(open_capture(url), clock=clock, settings=settings, timeout_s=20.0, latency_s=0.4)
     try:
         assert camera.time_base is TimeBase.PACED
         clock.sleep(0.5)  # frames pile up in the socket
