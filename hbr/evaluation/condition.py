@@ -32,35 +32,33 @@ class Condition:
         Queries are turned in the image plane by a random angle up to this much to either side.
     background : {"same", "uniform", "textured"}
         What is behind a query's object instead of the dark surroundings.
+    prefilter_px : float
+        Standard deviation of a Gaussian blur of all images, enrolled ones too, before they are described; 0 for none.
     """
 
     size_px: int | None = None
     noise: Noise = field(default_factory=Noise)
     rotation_deg: float = 0.0
     background: Background = "same"
+    prefilter_px: float = 0.0
 
     def __post_init__(self) -> None:
         if self.size_px is not None and self.size_px < 2:
             raise ValueError(f"an image size of {self.size_px} pixels; at least 2 are needed, 480 is the paper's")
         if not 0 <= self.rotation_deg <= 180:
             raise ValueError(f"a rotation of {self.rotation_deg} degrees; 0 to 180 are possible")
+        if not (np.isfinite(self.prefilter_px) and self.prefilter_px >= 0):
+            raise ValueError(f"a prefilter of {self.prefilter_px} pixels; at least 0 is needed")
         if self.background not in get_args(Background):
             raise ValueError(f"background {self.background!r} is unknown; use one of {', '.join(get_args(Background))}")
 
     def enrolled(self, image_bgr: ImageArray) -> ImageArray:
         """The image as it is enrolled."""
-        height, width = image_bgr.shape[:2]
-        if self.size_px is None or max(height, width) == self.size_px:
-            return image_bgr
-        scale = self.size_px / max(height, width)
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        # bicubic, as MATLAB's imresize
-        method = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
-        return cv2.resize(image_bgr, size, interpolation=method).astype(np.uint8, copy=False)
+        return self._prefiltered(self._sized(image_bgr))
 
     def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> ImageArray:
         """The image as a query sees it; the same draws for the same generator state."""
-        image = self.enrolled(image_bgr)
+        image = self._sized(image_bgr)
         if self.rotation_deg or self.background != "same":
             mask = object_mask(image).astype(np.float32)
             if self.rotation_deg:
@@ -70,7 +68,23 @@ class Condition:
                 behind = _uniform(image, rng) if self.background == "uniform" else _textured(image, rng)
                 share = mask[:, :, None]
                 image = np.rint(share * image + (1 - share) * behind).astype(np.uint8)
-        return self.noise.apply(image, rng)
+        return self._prefiltered(self.noise.apply(image, rng))
+
+    def _sized(self, image_bgr: ImageArray) -> ImageArray:
+        height, width = image_bgr.shape[:2]
+        if self.size_px is None or max(height, width) == self.size_px:
+            return image_bgr
+        scale = self.size_px / max(height, width)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        # bicubic, as MATLAB's imresize
+        method = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+        return cv2.resize(image_bgr, size, interpolation=method).astype(np.uint8, copy=False)
+
+    def _prefiltered(self, image_bgr: ImageArray) -> ImageArray:
+        if not self.prefilter_px:
+            return image_bgr
+        blurred = cv2.GaussianBlur(image_bgr, (0, 0), self.prefilter_px, borderType=cv2.BORDER_REPLICATE)
+        return blurred.astype(np.uint8, copy=False)
 
 
 def object_mask(image_bgr: ImageArray) -> NDArray[np.bool_]:

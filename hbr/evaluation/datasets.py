@@ -53,11 +53,14 @@ class Dataset:
         At least two, of different names.
     ignored : int
         Image files in the folder that are not named as views.
+    region : (int, int, int, int) or None
+        The part of every image to look at: x, y, width, height in pixels; None for all.
     """
 
     name: str
     objects: tuple[PhotographedObject, ...]
     ignored: int = 0
+    region: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
         if len(self.objects) < 2:

@@ -44,14 +44,14 @@ _LISTED: Final = (
     Method("single", "single view", omega=0.0, extension="visual", views=1),
     Method("hbr-visual", "HBR best visual match", omega=0.0, extension="visual"),
     Method("hbr-0", "HBR ω = 0", omega=0.0),
-    Method("hbr-0-orient", "HBR ω = 0, orient", omega=0.0, extension="orient"),
-    Method("hbr", "HBR ω = 0.5 (random views)"),
-    Method("hbr-orient", "HBR ω = 0.5, orient", extension="orient"),
+    Method("hbr-0-orient", "HBR ω = 0 (orient)", omega=0.0, extension="orient"),
+    Method("hbr", "HBR ω = 0.5"),
+    Method("hbr-orient", "HBR ω = 0.5 (orient)", extension="orient"),
     Method("ahbr", "AHBR ω = 0.5", walk="ahbr"),
-    Method("ahbr-orient", "AHBR ω = 0.5, orient", walk="ahbr", extension="orient"),
-    Method("coin", "coin flip, AHBR's step", walk="coin"),
-    Method("sweep-45", "sweep of 45°", walk="sweep-45"),
-    Method("sweep-90", "sweep of 90°", walk="sweep-90"),
+    Method("ahbr-orient", "AHBR ω = 0.5 (orient)", walk="ahbr", extension="orient"),
+    Method("coin", "coin flip", walk="coin"),
+    Method("sweep-45", "sweep 45°", walk="sweep-45"),
+    Method("sweep-90", "sweep 90°", walk="sweep-90"),
 )
 _OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _LENGTHS: Final = (1, 2, 5, 10, 20, 50, 100)

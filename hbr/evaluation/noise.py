@@ -130,4 +130,5 @@ def motion_kernel(length_px: float, angle_deg: float) -> FloatArray:
     beyond = np.hypot(right, up) >= half
     distance = np.where(beyond, np.hypot(across, np.abs(along) - half), np.abs(across))
     weights: FloatArray = np.maximum(0.0, 1.0 - distance)
-    return weights / weights.sum()
+    weights /= weights.sum()
+    return weights

@@ -1,10 +1,9 @@
-"""The trials: an object is looked at from up to eight sides, its views near those are taken out, and it is searched for.
+"""The trials: an object is looked at from several sides, its views near those are taken out, and it is searched for.
 
-Everything that is drawn at random (first views, errors of the sensor, coins) is drawn once for each object and trial, so
-that all methods meet the same.
+Everything that is drawn at random (first views, errors of the sensor, coins) is drawn once for each object and trial,
+so that all methods meet the same.
 """
 
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Final, Literal, get_args
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from hbr.active import Side, next_view
 from hbr.angles import wrap180
 from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
 from hbr.hough import Ranking, retrieve
 from hbr.index import ViewIndex
@@ -101,7 +101,8 @@ class Runs:
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
         """Nothing looked at yet."""
         shape = (methods, objects, trials, views)
-        return cls(np.full(shape, -1, np.int32), *(np.full(shape, np.nan) for _ in range(4)), np.zeros(shape, np.int64))
+        errors, alike, lead, travelled = np.full((4, *shape), np.nan)
+        return cls(np.full(shape, -1, np.int32), errors, alike, lead, travelled, np.zeros(shape, np.int64))
 
     @classmethod
     def concatenate(cls, parts: Sequence["Runs"]) -> "Runs":
@@ -188,8 +189,7 @@ class _Trials:
         self._reach = np.stack([similar[:, views.of(j)].max(axis=1, initial=-np.inf) for j in objects])
 
     def draw(self, trial: int) -> _Draws:
-        name = self._views.object_names[self._object].encode()
-        rng = np.random.default_rng([self._protocol.seed, zlib.crc32(name), trial])
+        rng = generator(self._protocol.seed, self._views.object_names[self._object], "trial", trial)
         count = self._protocol.max_views
         return _Draws(
             order=rng.permutation(len(self._rows))[:count],
@@ -280,13 +280,13 @@ class _Trials:
             runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
         # hbr.lead, of similarities computed once for all trials
         reach = self._reach[:, seen].sum(axis=1)
-        reach[self._object] = self._own_similar[np.ix_(seen, keep)].max(axis=1).sum()
+        reach[self._object] = self._own_similar[seen][:, keep].max(axis=1).sum()
         reach[ranking.object_index[0]] = -np.inf
         runs.lead[at] = (ranking.scores[0] - reach.max()) / len(seen)
 
 
 def _looks_alike(own: LevelArray, ring: IndexArray) -> NDArray[np.bool_]:
-    """Of each view, the views that are as similar to it as the less similar of its two neighbours on the ring, (n, n)."""
+    """Of each view, the views that are as similar to it as the less similar of its neighbours on the ring, (n, n)."""
     similar = tanimoto(own, own)
     before, after = np.empty_like(ring), np.empty_like(ring)
     before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)

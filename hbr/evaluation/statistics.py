@@ -42,7 +42,7 @@ def wilson(hits: int, trials: int, *, confidence: float = 0.95) -> tuple[float, 
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
-    """Two-sided exact p-value of McNemar's test: are hits of only one method as often the first's as the second's?
+    """Two-sided exact p-value of McNemar's test: hits of one method alone are as often the first's as the second's.
 
     Parameters
     ----------
@@ -58,7 +58,8 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
         raise ValueError(f"{only_first} and {only_second} discordant trials; counts cannot be negative")
     trials = only_first + only_second
     tail = sum(comb(trials, i) for i in range(min(only_first, only_second) + 1))
-    return min(1.0, 2 * tail / 2**trials)
+    p_value: float = 2 * tail / 2**trials
+    return min(1.0, p_value)
 
 
 def bootstrap_difference(

@@ -1,0 +1,42 @@
+"""Photographs to descriptors: as they are enrolled, and as queries see them."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hbr.arrays import ImageArray, LevelArray
+from hbr.cedd import describe
+from hbr.evaluation.condition import Condition
+from hbr.evaluation.datasets import Dataset, read_photograph
+from hbr.evaluation.draws import generator
+
+
+def enrolled_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int]) -> LevelArray:
+    """Descriptors of all views of object `j` as they are enrolled, uint8 (n, 144).
+
+    Raises
+    ------
+    DatasetError
+        A photograph cannot be used; `size` is the width and height that all must have.
+    """
+    return np.stack([describe(condition.enrolled(image)) for image in _images(dataset, j, size)])
+
+
+def query_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int) -> LevelArray:
+    """Descriptors of all views of object `j` as queries, uint8 (n, 144); each photograph has noise of its own."""
+    name = dataset.objects[j].name
+    return np.stack(
+        [
+            describe(condition.query(image, generator(seed, name, "photograph", i)))
+            for i, image in enumerate(_images(dataset, j, size))
+        ]
+    )
+
+
+def _images(dataset: Dataset, j: int, size: tuple[int, int]) -> Iterator[ImageArray]:
+    for photograph in dataset.objects[j].photographs:
+        image = read_photograph(photograph.path, size)
+        if dataset.region is not None:
+            x, y, width, height = dataset.region
+            image = image[y : y + height, x : x + width]
+        yield image

@@ -1,0 +1,226 @@
+"""From runs to rates: hit-rate against the number of views, decisions, pose errors, and methods compared."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.arrays import FloatArray
+from hbr.evaluation.methods import Method
+from hbr.evaluation.protocol import Runs
+from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
+
+_BEST: int = 10
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method after `views` queries; pose errors are of the trials in which the object was found, None if in none.
+
+    Intervals are Wilson's at 95 % and take trials for independent.
+    """
+
+    views: int
+    trials: int
+    hits: int
+    hit_rate: float
+    hit_rate_low: float
+    hit_rate_high: float
+    best10_hits: int
+    best10_rate: float
+    best10_low: float
+    best10_high: float
+    travelled_mean_deg: float
+    pose_error_median_deg: float | None
+    pose_error_rmse_deg: float | None
+    alike_error_median_deg: float | None
+    alike_error_rmse_deg: float | None
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """The search that ends as soon as the lead a view reaches the margin, or when all views are taken."""
+
+    margin: float
+    views_mean: float
+    views_p95: float
+    hit_rate: float
+    hit_rate_low: float
+    hit_rate_high: float
+    travelled_mean_deg: float
+    by_margin: float
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """All about one method."""
+
+    method: Method
+    curve: tuple[Point, ...]
+    stopping: Stopping
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Two methods after some views each, on the same trials; the difference is the first's less the second's.
+
+    The interval resamples objects; McNemar's exact test takes trials for independent.
+    """
+
+    first: str
+    first_views: int
+    second: str
+    second_views: int
+    trials: int
+    first_rate: float
+    second_rate: float
+    difference: float
+    difference_low: float
+    difference_high: float
+    only_first: int
+    only_second: int
+    p_value: float
+
+
+#: What is asked of the methods: first, its views, second, its views; None stands for all views.
+QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
+    ("ahbr", 4, "hbr", None),
+    ("ahbr", 4, "hbr", 4),
+    ("ahbr", None, "hbr", None),
+    ("hbr", None, "hbr-0", None),
+    ("hbr", 4, "hbr-0", 4),
+    ("hbr-orient", None, "hbr-0-orient", None),
+    ("hbr", None, "hbr-visual", None),
+    ("hbr", None, "hbr-orient", None),
+    ("ahbr", 4, "coin", 4),
+    ("ahbr", None, "coin", None),
+    ("ahbr", 4, "sweep-90", 4),
+    ("ahbr", 4, "sweep-45", 4),
+)
+
+
+def method_results(
+    runs: Runs, methods: Sequence[Method], margin: float, min_views: int = 2
+) -> tuple[MethodResult, ...]:
+    """Curve and stopping rule of every method.
+
+    Parameters
+    ----------
+    runs : Runs
+        Of these methods, in their order.
+    methods : sequence of Method
+        As they were run.
+    margin : float
+        Lead a view that ends a search.
+    min_views : int
+        Views before which no search ends.
+    """
+    return tuple(
+        MethodResult(method, tuple(_point(runs, m, n) for n in _looked(runs, m)), _stopping(runs, m, margin, min_views))
+        for m, method in enumerate(methods)
+    )
+
+
+def contests(runs: Runs, methods: Sequence[Method], rng: np.random.Generator) -> tuple[Contest, ...]:
+    """Answer those of `QUESTIONS` that the methods and views allow; `rng` resamples objects."""
+    place = {method.name: m for m, method in enumerate(methods)}
+    all_views = runs.rank.shape[-1]
+    answers = []
+    for first, first_views, second, second_views in QUESTIONS:
+        a, b = first_views or all_views, second_views or all_views
+        if first not in place or second not in place or max(a, b) > all_views:
+            continue
+        hits_a = runs.rank[place[first], ..., a - 1] == 1
+        hits_b = runs.rank[place[second], ..., b - 1] == 1
+        low, high = bootstrap_difference(hits_a, hits_b, rng)
+        only_a, only_b = int((hits_a & ~hits_b).sum()), int((hits_b & ~hits_a).sum())
+        answers.append(
+            Contest(
+                first=first,
+                first_views=a,
+                second=second,
+                second_views=b,
+                trials=hits_a.size,
+                first_rate=float(hits_a.mean()),
+                second_rate=float(hits_b.mean()),
+                difference=float(hits_a.mean() - hits_b.mean()),
+                difference_low=low,
+                difference_high=high,
+                only_first=only_a,
+                only_second=only_b,
+                p_value=mcnemar_exact(only_a, only_b),
+            )
+        )
+    return tuple(answers)
+
+
+def pose_rmse_by_object(runs: Runs, method: int, *, alike: bool) -> FloatArray:
+    """Root mean square pose error of each object after all views, over the trials that found it; nan if none did."""
+    last = _looked(runs, method)[-1]
+    errors = (runs.alike_error_deg if alike else runs.pose_error_deg)[method, ..., last]
+    hits = runs.rank[method, ..., last] == 1
+    total = np.where(hits, errors, 0.0) ** 2
+    count = hits.sum(axis=1)
+    mean: FloatArray = np.divide(total.sum(axis=1), count, out=np.full(len(count), np.nan), where=count > 0)
+    return np.sqrt(mean)
+
+
+def step_median_ms(runs: Runs, method: int) -> list[float]:
+    """Median time of a step after 1, 2, ... queries, in milliseconds."""
+    return [float(np.median(runs.step_ns[method, ..., n])) * 1e-6 for n in _looked(runs, method)]
+
+
+def _looked(runs: Runs, method: int) -> NDArray[np.intp]:
+    return np.flatnonzero((runs.rank[method] >= 0).all(axis=(0, 1)))
+
+
+def _point(runs: Runs, method: int, n: int) -> Point:
+    rank = runs.rank[method, ..., n]
+    found = rank == 1
+    hits, best10, trials = int(found.sum()), int(((rank >= 1) & (rank <= _BEST)).sum()), rank.size
+    errors = runs.pose_error_deg[method, ..., n][found]
+    alike = runs.alike_error_deg[method, ..., n][found]
+    return Point(
+        int(n) + 1,
+        trials,
+        hits,
+        hits / trials,
+        *wilson(hits, trials),
+        best10,
+        best10 / trials,
+        *wilson(best10, trials),
+        float(runs.travelled_deg[method, ..., n].mean()),
+        _median(errors),
+        _rms(errors),
+        _median(alike),
+        _rms(alike),
+    )
+
+
+def _stopping(runs: Runs, method: int, margin: float, min_views: int) -> Stopping:
+    looked = _looked(runs, method)
+    lead, rank, travelled_deg = (
+        part[method][..., looked].reshape(-1, len(looked)) for part in (runs.lead, runs.rank, runs.travelled_deg)
+    )
+    leads = (lead >= margin) & (looked + 1 >= min_views)
+    stops = np.where(leads.any(axis=1), leads.argmax(axis=1), len(looked) - 1)
+    trial = np.arange(len(stops))
+    hits = int((rank[trial, stops] == 1).sum())
+    return Stopping(
+        margin,
+        float(stops.mean()) + 1,
+        float(np.quantile(stops + 1, 0.95, method="higher")),
+        hits / len(trial),
+        *wilson(hits, len(trial)),
+        float(travelled_deg[trial, stops].mean()),
+        float(leads.any(axis=1).mean()),
+    )
+
+
+def _median(errors_deg: FloatArray) -> float | None:
+    return float(np.median(errors_deg)) if errors_deg.size else None
+
+
+def _rms(errors_deg: FloatArray) -> float | None:
+    return float(np.sqrt(np.mean(errors_deg**2))) if errors_deg.size else None

@@ -1,0 +1,131 @@
+"""`rig eval`."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.command import EXIT_INTERRUPTED, Settings, command
+
+if TYPE_CHECKING:
+    from hbr.evaluation.datasets import Dataset
+
+
+@command
+def evaluate(
+    settings: Settings,
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FOLDER]", help="Images obj{N}__{angle}.png or .jpg; the catalog where none is named."),
+    ] = None,
+    noise: Annotated[
+        str, typer.Option(help="Noise of the queries: none, gn, gn:VARIANCE, mb, mb:PIXELS:DEGREES, gn+mb.")
+    ] = "none",
+    methods: Annotated[
+        str, typer.Option(help="Methods or groups (all, omega-sweep, list-sweep), separated by commas.")
+    ] = "all",
+    trials: Annotated[int, typer.Option(min=1, help="Trials of each object.")] = 10,
+    views: Annotated[int, typer.Option(min=1, help="Queries of a trial.")] = 8,
+    removal: Annotated[
+        str, typer.Option(help="Views taken out of the model: near (closer than 10° to a query), paper79, queries.")
+    ] = "near",
+    size: Annotated[int | None, typer.Option(min=2, metavar="PIXELS", help="Longer side of all images.")] = None,
+    orientation_noise: Annotated[
+        float, typer.Option(min=0, metavar="DEGREES", help="Standard deviation of each measured orientation.")
+    ] = 2.0,
+    drift: Annotated[
+        float, typer.Option(metavar="DEGREES", help="What the measured orientation gains with each view.")
+    ] = 0.0,
+    rotate: Annotated[
+        float, typer.Option(min=0, max=180, metavar="DEGREES", help="Turn queries in their plane, by up to so much.")
+    ] = 0.0,
+    background: Annotated[str, typer.Option(help="Behind a query's object: same, uniform, textured.")] = "same",
+    prefilter: Annotated[
+        float, typer.Option(min=0, metavar="PIXELS", help="Blur all images by a Gaussian of this standard deviation.")
+    ] = 0.0,
+    objects: Annotated[
+        str | None, typer.Option(metavar="FIRST-LAST", help="These objects alone, counted from 1; e.g. 51-100.")
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option(min=0, help="Lead a view that ends a search; identify.margin otherwise.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the results are written.")] = Path("rig-eval"),
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with what the folder has.")] = False,
+) -> None:
+    """Measure retrieval on a folder of photographs in the layout of COIL-100, or on the catalog.
+
+    Example: rig eval coil-100 --noise mb --methods all --trials 10 --jobs 2
+    """
+    from hbr.evaluation.condition import Condition
+    from hbr.evaluation.methods import choose_methods
+    from hbr.evaluation.noise import Noise
+    from hbr.evaluation.protocol import Protocol
+    from rig.cli.present import Progress
+    from rig.errors import UsageError
+    from rig.evaluation.plan import Plan
+    from rig.evaluation.report import contest_sentences, curve_table, decision_table
+    from rig.evaluation.run import enrolled_views, run_plan
+    from rig.evaluation.store import Store
+    from rig.evaluation.write import write_results
+
+    try:
+        plan = Plan.of(
+            _dataset(settings, folder, objects),
+            Condition(size, Noise.parse(noise), rotate, background, prefilter),  # type: ignore[arg-type]
+            choose_methods(methods.split(",")),
+            Protocol(trials, views, removal, 10.0, orientation_noise, drift, settings.seed or 0),  # type: ignore[arg-type]
+        )
+        dataset = plan.dataset
+        note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
+        print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
+        store = Store(out / "runs", plan.settings(), resume=resume)
+        with Progress("describing") as progress:
+            progress.start(len(dataset.objects))
+            model = enrolled_views(plan, jobs, progress.advance)
+        with Progress("searching") as progress:
+            progress.start(len(dataset.objects))
+            runs = run_plan(plan, model, store, jobs, progress.advance)
+    except ValueError as error:
+        raise UsageError(
+            str(error), next_step="Correct the options or the data set and go on; --resume keeps what is done."
+        ) from error
+    except KeyboardInterrupt:
+        print(
+            f"\nInterrupted; what is done is kept in {out}. Go on with the same command and --resume.", file=sys.stderr
+        )
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+    rule = settings.load().identify
+    results = write_results(plan, runs, rule.margin if margin is None else margin, rule.min_views, out)
+    if settings.json:
+        settings.print_json(results)
+        return
+    from rich.console import Console
+
+    console = Console()
+    console.print(curve_table(results))
+    console.print()
+    console.print(decision_table(results))
+    console.print()
+    for sentence in contest_sentences(results):
+        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+    print(f"Written: {out / 'report.html'}, results.json, results.csv and the figures beside it.", file=sys.stderr)
+
+
+def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "Dataset":
+    from hbr.evaluation.datasets import DatasetError, load_coil
+    from rig.evaluation.plan import load_catalog
+
+    if folder is None:
+        with settings.open_catalog(read_only=True) as catalog:
+            dataset = load_catalog(catalog, settings.load().view.roi)
+    else:
+        dataset = load_coil(folder)
+    if objects is None:
+        return dataset
+    first, _, last = objects.partition("-")
+    if not (first.isdecimal() and last.isdecimal()):
+        raise DatasetError(f"objects {objects!r} is no range; give the first and the last, e.g. 51-100")
+    return dataset.subset(int(first), int(last))

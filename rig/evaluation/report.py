@@ -1,0 +1,129 @@
+"""Results of an evaluation as JSON values, as CSV and as a table."""
+
+import csv
+import io
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from hbr.evaluation.draws import generator
+from hbr.evaluation.protocol import Runs
+from hbr.evaluation.results import Contest, contests, method_results, pose_rmse_by_object, step_median_ms
+from hbr.packing import PACKED_BYTES
+from rig.evaluation.plan import Plan
+
+
+def evaluate(plan: Plan, runs: Runs, margin: float, min_views: int) -> dict[str, Any]:
+    """Return all results as JSON values, units in the keys; equal runs give equal values outside of ``wall_clock``.
+
+    Parameters
+    ----------
+    plan, runs
+        What was run, and what came of it.
+    margin
+        Lead a view that ends a search.
+    min_views
+        Views before which no search ends.
+    """
+    methods = method_results(runs, plan.methods, margin, min_views)
+    rng = generator(plan.protocol.seed, plan.dataset.name, "bootstrap", 0)
+    return {
+        "settings": plan.settings(),
+        "bytes_per_view": PACKED_BYTES,
+        "methods": [
+            {
+                "name": result.method.name,
+                "label": result.method.label,
+                "curve": [asdict(point) for point in result.curve],
+                "stopping": asdict(result.stopping),
+                "pose_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, alike=False)),
+                "alike_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, alike=True)),
+            }
+            for m, result in enumerate(methods)
+        ],
+        "contests": [asdict(contest) for contest in contests(runs, plan.methods, rng)],
+        "wall_clock": {
+            "step_median_ms": {method.name: step_median_ms(runs, m) for m, method in enumerate(plan.methods)}
+        },
+    }
+
+
+def csv_text(results: dict[str, Any]) -> str:
+    """Return one row for each method and number of views."""
+    rows = [
+        {"method": method["name"], **point, "step_median_ms": step_ms}
+        for method in results["methods"]
+        for point, step_ms in zip(method["curve"], results["wall_clock"]["step_median_ms"][method["name"]], strict=True)
+    ]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0].keys(), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def curve_table(results: dict[str, Any]) -> Table:
+    """Return hit-rates in percent by method and number of views, and the ten best."""
+    count = max(len(method["curve"]) for method in results["methods"])
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("hit-rate, %, at N =", no_wrap=True)
+    for heading in [*(f"{n}" for n in range(1, count + 1)), "best 10"]:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for method in results["methods"]:
+        cells = [f"{100 * point['hit_rate']:.1f}" for point in method["curve"]]
+        table.add_row(
+            method["label"], *cells, *[""] * (count - len(cells)), f"{100 * method['curve'][-1]['best10_rate']:.1f}"
+        )
+    return table
+
+
+def decision_table(results: dict[str, Any]) -> Table:
+    """Return what a decision costs, and how well the pose is known after all views."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("decision", no_wrap=True)
+    for heading in ("views", "p95", "hit-rate", "travelled", "pose error", "alike", "ms a step"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for method in results["methods"]:
+        last, stopping = method["curve"][-1], method["stopping"]
+        table.add_row(
+            method["label"],
+            f"{stopping['views_mean']:.1f}",
+            f"{stopping['views_p95']:.0f}",
+            f"{100 * stopping['hit_rate']:.1f} %",
+            f"{stopping['travelled_mean_deg']:.0f}°",
+            *(
+                "–" if error is None else f"{error:.0f}°"
+                for error in (last["pose_error_median_deg"], last["alike_error_median_deg"])
+            ),
+            f"{results['wall_clock']['step_median_ms'][method['name']][-1]:.1f}",
+        )
+    return table
+
+
+def contest_sentences(results: dict[str, Any]) -> list[str]:
+    """Return who is better, each with its interval and p-value, in words."""
+    labels = {method["name"]: method["label"] for method in results["methods"]}
+    return [_sentence(Contest(**contest), labels) for contest in results["contests"]]
+
+
+def _sentence(contest: Contest, labels: dict[str, str]) -> str:
+    first = f"{labels[contest.first]} at N = {contest.first_views}"
+    second = f"{labels[contest.second]} at N = {contest.second_views}"
+    if contest.difference_low > 0 and contest.p_value < 0.05:
+        verdict = "better"
+    elif contest.difference_high < 0 and contest.p_value < 0.05:
+        verdict = "worse"
+    else:
+        verdict = "no difference shown"
+    return (
+        f"{first} ({100 * contest.first_rate:.1f} %) against {second} ({100 * contest.second_rate:.1f} %): "
+        f"{100 * contest.difference:+.1f} points "
+        f"[{100 * contest.difference_low:+.1f}, {100 * contest.difference_high:+.1f}], "
+        f"McNemar p = {contest.p_value:.2g} ({contest.only_first} trials to {contest.only_second}); {verdict}"
+    )
+
+
+def _plain(values: Any) -> list[float | None]:
+    return [None if np.isnan(value) else round(float(value), 3) for value in values]
