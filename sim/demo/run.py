@@ -27,6 +27,7 @@ from rig.plans.events import Accepted
 from rig.plans.identify import identify
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
+from sim.demo.lines import MoveLines
 from sim.noise import NoiseModel
 from sim.objects.photographs import Photographed, photographs
 from sim.objects.shelf import shelf
@@ -211,8 +212,9 @@ def _identify(
     """Put a thing on the table anyhow, and let the bench find out which it is."""
     operator.next_object = thing.name
     record = IdentificationRecord(region=bench.config.view.roi)
+    moves = MoveLines()
     if say:
-        print(f"\nWhat stands on the table? (it is {thing.name})")
+        print(f"\nWhat stands on the table? (it is {thing.name})\n{MoveLines.HEADING}")
     for event in identify(bench, index):
         if isinstance(event, Accepted) and record.truth is None:
             record.truth = Truth(
@@ -222,7 +224,7 @@ def _identify(
                 description=thing.name,
             )
         record.add(event)
-        if say and (text := line(event)):
+        if say and (text := moves.add(event)):
             print(text, flush=True)
     return record
 

@@ -35,9 +35,17 @@ def test_it_enrolls_finds_and_recognises_strangers(small):
     done, _ = small
     assert done.exit_code in (0, 6)  # with so few views an answer may be wrong; that is said, and the exit code tells
     text = done.stdout
-    assert re.search(r"leading: .* \(sure lead [+-]\d", text)
-    assert re.search(r"S_left \d\.\d+ . S_right|S_right \d\.\d+ . S_left|first turn is fixed", text)
-    assert re.search(r"by the encoder, [+−]\d+\.\d+ ± \d+\.\d+° by the gyro", text)
+    moves = re.findall(
+        r"^ +\d  +[\d.]+°  +([+-][\d.]+)°  +([+-][\d.]+)°  +([+-][\d.]+) ± [\d.]+°.*  (\S+) (\d\.\d{3})",
+        text,
+        re.MULTILINE,
+    )
+    assert moves
+    for asked, encoder, imu, leader, score in moves:
+        assert float(encoder) == pytest.approx(float(asked), abs=0.5)
+        assert float(imu) == pytest.approx(float(encoder), abs=0.3 + 0.04 * abs(float(encoder)))
+        assert leader
+        assert 0 < float(score) <= 1
     assert text.count("(never enrolled)") + text.count("(never") >= 2
     assert "3 objects enrolled with 36 views" in text
 

@@ -1,0 +1,62 @@
+"""A retrieval as a table that grows: one line a move, with what was measured, thought and decided there."""
+
+from typing import ClassVar
+
+from rig.cli.present import line
+from rig.plans.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
+from rig.plans.words import azimuth_words, distinct
+
+
+class MoveLines:
+    """Turns the events of `rig.plans.identify` into lines, each complete when the next move is decided."""
+
+    HEADING: ClassVar = (
+        "      camera     the table's rotation                    how alike the candidates look\n"
+        "view  azimuth    asked    encoder               IMU      S_left  S_right  next        leading, score a view"
+    )
+
+    def __init__(self) -> None:
+        self._asked_deg: float | None = None
+        self._rest_deg = 0.0
+        self._move: Moved | None = None
+        self._azimuth_deg = 0.0
+        self._leading: tuple[Candidate, ...] = ()
+
+    def add(self, event: Event) -> str:
+        """Take an event; return the line that it completes, or nothing."""
+        match event:
+            case Moved():
+                self._move = event
+                self._rest_deg = event.encoder_deg
+            case Accepted():
+                self._azimuth_deg = event.azimuth_deg
+            case Ranked():
+                self._leading = event.candidates[:3]
+            case Decided():
+                text = self._line(event)
+                self._asked_deg = event.target_deg - self._rest_deg
+                return text
+            case Identified():
+                return f"{self._line(None)}\n{line(event)}"
+            case _:
+                return line(event)
+        return ""
+
+    def _line(self, decided: Decided | None) -> str:
+        assert self._move is not None  # a view follows a move
+        move = self._move
+        if self._asked_deg is None:
+            turned = f"{'–':>8}{'–':>11}{'–':>18}"
+        else:
+            imu = "no answer"
+            if move.rotation_imu_deg is not None and move.imu_sigma_deg is not None:
+                imu = f"{move.rotation_imu_deg:+.2f} ± {move.imu_sigma_deg:.2f}°"
+            turned = f"{self._asked_deg:+7.1f}°{move.rotation_encoder_deg:+10.2f}°{imu:>18}"
+        likeness = f"{'–':>12}{'–':>9}  "
+        if decided and decided.s_left is not None and decided.s_right is not None:
+            left, right = distinct(decided.s_left, decided.s_right)
+            likeness = f"{left:>12}{right:>9}  "
+        goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
+        leading = ", ".join(f"{c.name} {c.score:.3f}" for c in self._leading)
+        note = "" if move.agrees else "  ENCODER AND IMU DISAGREE"
+        return f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{turned}{likeness}{goes:<11} {leading}{note}"
