@@ -65,7 +65,7 @@ def evaluate(
     from rig.cli.present import Progress
     from rig.errors import UsageError
     from rig.evaluation.plan import Plan
-    from rig.evaluation.report import contest_sentences, curve_table, decision_table
+    from rig.evaluation.report import contest_sentences, curve_rows, decision_rows
     from rig.evaluation.run import enrolled_views, run_plan
     from rig.evaluation.store import Store
     from rig.evaluation.write import write_results
@@ -105,9 +105,9 @@ def evaluate(
     from rich.console import Console
 
     console = Console()
-    console.print(curve_table(results))
+    console.print(curve_rows(results).terminal())
     console.print()
-    console.print(decision_table(results))
+    console.print(decision_rows(results).terminal())
     console.print()
     for sentence in contest_sentences(results):
         console.print(sentence, markup=False, highlight=False, soft_wrap=True)

@@ -3,7 +3,7 @@
 import csv
 import io
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -64,42 +64,56 @@ def csv_text(results: dict[str, Any]) -> str:
     return text.getvalue()
 
 
-def curve_table(results: dict[str, Any]) -> Table:
-    """Return hit-rates in percent by method and number of views, and the ten best."""
+class Rows(NamedTuple):
+    """A table as text: its headings and its rows, the first column being names."""
+
+    columns: list[str]
+    rows: list[list[str]]
+
+    def terminal(self) -> Table:
+        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+        for i, heading in enumerate(self.columns):
+            table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*row)
+        return table
+
+
+def curve_rows(results: dict[str, Any], *, interval: bool = False) -> Rows:
+    """Return hit-rates in percent by method and number of views, with or without their intervals, and Best 10."""
     count = max(len(method["curve"]) for method in results["methods"])
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("hit-rate, %, at N =", no_wrap=True)
-    for heading in [*(f"{n}" for n in range(1, count + 1)), "best 10"]:
-        table.add_column(heading, justify="right", no_wrap=True)
+    rows = []
     for method in results["methods"]:
         cells = [f"{100 * point['hit_rate']:.1f}" for point in method["curve"]]
-        table.add_row(
-            method["label"], *cells, *[""] * (count - len(cells)), f"{100 * method['curve'][-1]['best10_rate']:.1f}"
-        )
-    return table
+        if interval:
+            cells = [
+                f"{cell} [{100 * point['hit_rate_low']:.1f}, {100 * point['hit_rate_high']:.1f}]"
+                for cell, point in zip(cells, method["curve"], strict=True)
+            ]
+        best10 = f"{100 * method['curve'][-1]['best10_rate']:.1f}"
+        rows.append([method["label"], *cells, *[""] * (count - len(cells)), best10])
+    return Rows(["hit-rate, %, at N =", *(str(n) for n in range(1, count + 1)), "best 10"], rows)
 
 
-def decision_table(results: dict[str, Any]) -> Table:
+def decision_rows(results: dict[str, Any]) -> Rows:
     """Return what a decision costs, and how well the pose is known after all views."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("decision", no_wrap=True)
-    for heading in ("views", "p95", "hit-rate", "travelled", "pose error", "alike", "ms a step"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    rows = []
     for method in results["methods"]:
         last, stopping = method["curve"][-1], method["stopping"]
-        table.add_row(
-            method["label"],
-            f"{stopping['views_mean']:.1f}",
-            f"{stopping['views_p95']:.0f}",
-            f"{100 * stopping['hit_rate']:.1f} %",
-            f"{stopping['travelled_mean_deg']:.0f}°",
-            *(
-                "–" if error is None else f"{error:.0f}°"
-                for error in (last["pose_error_median_deg"], last["alike_error_median_deg"])
-            ),
-            f"{results['wall_clock']['step_median_ms'][method['name']][-1]:.1f}",
+        poses = [last[f"{kind}_error_{measure}_deg"] for kind in ("pose", "alike") for measure in ("median", "rmse")]
+        rows.append(
+            [
+                method["label"],
+                f"{stopping['views_mean']:.2f}",
+                f"{stopping['views_p95']:.0f}",
+                f"{100 * stopping['hit_rate']:.1f}",
+                f"{stopping['travelled_mean_deg']:.0f}",
+                *("–" if error is None else f"{error:.0f}" for error in poses),
+                f"{results['wall_clock']['step_median_ms'][method['name']][-1]:.1f}",
+            ]
         )
-    return table
+    heads = ["decision", "views", "p95", "hits %", "turned°", "pose°", "RMSE°", "alike°", "RMSE°", "ms"]
+    return Rows(heads, rows)
 
 
 def contest_sentences(results: dict[str, Any]) -> list[str]:
