@@ -1,0 +1,28 @@
+"""The controller of a turntable rig: open a bench, enroll objects, identify them."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rig.bench import Bench, open_bench
+    from rig.catalog import Catalog
+    from rig.plans.enroll import enroll
+    from rig.plans.identify import identify
+
+__all__ = ["Bench", "Catalog", "enroll", "identify", "open_bench"]
+
+_HOMES = {
+    "Bench": "rig.bench",
+    "Catalog": "rig.catalog",
+    "enroll": "rig.plans.enroll",
+    "identify": "rig.plans.identify",
+    "open_bench": "rig.bench",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: `rig --help` must not load numpy, cv2 and sqlalchemy."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_HOMES[name]), name)

@@ -35,8 +35,8 @@ def line(event: Event) -> str:
             return f"{event.name}: {counted(event.views, 'view')} enrolled in {event.seconds:.0f} s{retakes}"
         case Identified():
             return (
-                f"{answer_words(event)} Score {event.score:.3f} (unknown below {event.min_score:.3f}), "
-                f"{counted(event.views, 'view')}, {event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s."
+                f"{answer_words(event)}\n  score {event.score:.3f} a view (unknown below {event.min_score:.3f}), "
+                f"{counted(event.views, 'view')}, {event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
             )
 
 
