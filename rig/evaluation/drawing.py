@@ -19,7 +19,7 @@ PNG_SCALE: Final = 2
 #: Fractional bits of the coordinates that OpenCV draws at.
 _BITS: Final = 4
 #: OpenCV's own letters are ASCII.
-_ASCII: Final = str.maketrans({"ω": "w", "°": " deg", "−": "-", "–": "-", "≤": "<=", "σ": "sigma", "’": "'"})
+_ASCII: Final = str.maketrans({"ω": "omega", "°": " deg", "−": "-", "–": "-", "≤": "<=", "σ": "sigma", "’": "'"})
 
 
 @dataclass(frozen=True)
@@ -154,13 +154,17 @@ def _fixed(points: Sequence[Point]) -> NDArray[np.int32]:
 
 
 def _dashes(points: Sequence[Point], on: float = 5.0, off: float = 4.0) -> list[list[Point]]:
-    """Return the parts of a polyline's segments that are drawn; each segment begins with a dash."""
+    """Return the drawn pieces of a polyline; the pattern runs on around its corners."""
     parts = []
+    passed = 0.0
     for (x0, y0), (x1, y1) in pairwise(points):
         length = float(np.hypot(x1 - x0, y1 - y0))
-        for start in np.arange(0.0, length, on + off):
-            a, b = start / length, min(start + on, length) / length
-            parts.append([(x0 + a * (x1 - x0), y0 + a * (y1 - y0)), (x0 + b * (x1 - x0), y0 + b * (y1 - y0))])
+        first = passed // (on + off) * (on + off) - passed
+        for start in np.arange(first, length, on + off).tolist():
+            begin, end = max(0.0, start), min(start + on, length)
+            if begin < end:
+                parts.append([(x0 + d / length * (x1 - x0), y0 + d / length * (y1 - y0)) for d in (begin, end)])
+        passed += length
     return parts
 
 

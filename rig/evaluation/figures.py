@@ -1,7 +1,7 @@
 """The figures of the paper, drawn from results: hit-rate against views (Fig. 6) and pose error by object (Fig. 5)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, floor
 from typing import Any, Final
 
@@ -30,6 +30,8 @@ _LOOKS: Final = {
 }
 _OTHERS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#1d2126", "#8a8f96", "#b08900")
 _BEST_10: Final = ("#b08900", False)
+#: More bands than these hide each other; the tables have all intervals.
+_BANDS: Final = ("hbr", "ahbr")
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ def hit_rate_figure(results: dict[str, Any]) -> Figure:
     for m, method in enumerate(results["methods"]):
         colour, dashed = _look(method["name"], m)
         curve = method["curve"]
-        series.append(_rates(method["label"], colour, dashed, [p["views"] for p in curve], curve))
+        drawn = _rates(method["label"], colour, dashed, [p["views"] for p in curve], curve)
+        series.append(drawn if method["name"] in _BANDS or len(curve) == 1 else replace(drawn, low=(), high=()))
         if method["name"] == "hbr":
             best10 = [{**p, "hit_rate": p["best10_rate"]} for p in curve]
             for point in best10:
@@ -82,7 +85,8 @@ def travel_figure(results: dict[str, Any]) -> Figure:
             continue  # they turn as HBR does
         colour, dashed = _look(method["name"], m)
         travelled = [p["travelled_mean_deg"] for p in method["curve"]]
-        series.append(_rates(method["label"], colour, dashed, travelled, method["curve"]))
+        drawn = _rates(method["label"], colour, dashed, travelled, method["curve"])
+        series.append(drawn if method["name"] in _BANDS else replace(drawn, low=(), high=()))
     farthest = max((x for s in series for x in s.x), default=0.0)
     ticks = [90 * i for i in range(max(2, ceil(farthest / 90) + 1))]
     return _chart(_title(results), "hit-rate, %", "degrees turned, mean", series, ticks)
@@ -107,7 +111,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> F
     ticks = [1, *range(step, count + 1, step)] if step > 1 else list(range(1, count + 1))
     return _chart(
         _title(results),
-        "RMSE of the orientation, °",
+        "RMSE of the orientation, degrees",
         "objects, each curve sorted by its error",
         series,
         ticks,

@@ -16,7 +16,10 @@ from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
 
 _HEADINGS = {
-    "hit-rate": ("Hit-rate", "Shaded: Wilson's 95 % intervals, which take trials for independent."),
+    "hit-rate": (
+        "Hit-rate",
+        "Shaded: Wilson's 95 % intervals of HBR, AHBR and Best 10, which take trials for independent.",
+    ),
     "travel": ("Hit-rate by degrees turned", "The same points over the way to them."),
     "pose": (
         "Pose",

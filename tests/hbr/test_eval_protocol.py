@@ -1,0 +1,196 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hbr
+from hbr import ViewIndex, Views
+from hbr.evaluation.methods import METHODS, Method, choose_methods
+from hbr.evaluation.protocol import Protocol, Removal, Runs, _Trials, run_object
+
+STEP = 15
+ALL = choose_methods(["all"])
+
+
+def world(seed: int = 0, objects: int = 6) -> tuple[Views, np.ndarray]:
+    """Objects whose levels change slowly around them, and all their views again with errors: the queries."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.arange(0, 360, STEP, dtype=float)
+    turn = np.radians(azimuth)[:, None]
+    parts = []
+    for j in range(objects):
+        used = rng.random(144) < 0.15
+        mean, swing, phase = rng.uniform(1, 5, 144), rng.uniform(0, 3, 144), rng.uniform(0, 7, 144)
+        levels = np.rint(np.clip(mean + swing * np.sin(turn + phase), 0, 7)) * used
+        parts.append(Views.of_object(f"object {j}", levels.astype(np.uint8), azimuth))
+    views = Views.concatenate(parts)
+    errors = rng.integers(-2, 3, views.descriptors.shape) * (rng.random(views.descriptors.shape) < 0.3)
+    return views, np.clip(views.descriptors + errors, 0, 7).astype(np.uint8)
+
+
+VIEWS, QUERIES = world()
+PROTOCOL = Protocol(trials=3, max_views=5, near_deg=20)
+
+
+def run(j: int, methods: tuple[Method, ...] = ALL, protocol: Protocol = PROTOCOL) -> Runs:
+    return run_object(j, QUERIES[VIEWS.of(j)], VIEWS, methods, protocol)
+
+
+@pytest.mark.parametrize("name", ["hbr", "hbr-visual", "hbr-0-orient", "ahbr", "coin", "sweep-90"])
+@pytest.mark.parametrize("removal", ["near", "paper79", "queries"])
+def test_a_trial_equals_the_protocol_written_out(name: str, removal: Removal) -> None:
+    """Every number once more from `retrieve`, `lead` and `next_view` on a model with the views taken out."""
+    method, protocol = METHODS[name], replace(PROTOCOL, removal=removal, drift_deg=1.0)
+    j = 2
+    own = VIEWS.of(j)
+    runs = run(j, (method,), protocol)
+    trials = _Trials(j, QUERIES[own], VIEWS, protocol, lambda: 0)
+    for t in range(protocol.trials):
+        draws = trials.draw(t)
+        seen, travelled = [int(draws.order[0])], 0.0
+        for n in range(protocol.max_views):
+            angles = np.array(seen) * STEP
+            gone = {
+                "near": [i for i in range(24) if min(abs((i * STEP - a + 180) % 360 - 180) for a in angles) < 20],
+                "paper79": [i for s in seen for i in (s, (s + 1) % 24)],
+                "queries": seen,
+            }[removal]
+            model = VIEWS.select(np.setdiff1d(np.arange(len(VIEWS)), own[gone]))
+            ranking = hbr.retrieve(
+                QUERIES[own[seen]],
+                angles + draws.error_deg[: n + 1],
+                ViewIndex(model),
+                omega=method.omega,
+                list_length=method.list_length,
+                extension=method.extension,
+            )
+            place = ranking.object_index.tolist().index(j) if j in ranking.object_index else -1
+            assert runs.rank[0, 0, t, n] == place + 1
+            assert runs.lead[0, 0, t, n] == pytest.approx(hbr.lead(ranking, QUERIES[own[seen]]) / (n + 1))
+            assert runs.travelled_deg[0, 0, t, n] == travelled
+            if place >= 0:
+                error = abs((ranking.pose_deg[place] - angles[-1] + 180) % 360 - 180)
+                assert runs.pose_error_deg[0, 0, t, n] == error
+                assert runs.alike_error_deg[0, 0, t, n] <= error
+            if name in ("ahbr", "coin") and n > 0:
+                side = None if name == "ahbr" else ("left" if draws.coins[n + 1 :][:1].any() else "right")
+                wanted = angles[-1] + hbr.next_view(ranking, side=side).rotation_deg  # type: ignore[arg-type]
+            elif name == "sweep-90":
+                wanted = angles[-1] + 90
+            else:
+                wanted = draws.order[(n + 1) % protocol.max_views] * STEP
+            left = [i for i in range(24) if i not in seen]
+            following = min(left, key=lambda i: abs((i * STEP - wanted + 180) % 360 - 180)) if n < 4 else seen[0]
+            travelled += abs((following * STEP - angles[-1] + 180) % 360 - 180)
+            seen.append(following)
+
+
+def test_methods_meet_the_same_trials_whatever_else_is_run() -> None:
+    together, alone = run(1), run(1, (METHODS["ahbr"],))
+    m = [method.name for method in ALL].index("ahbr")
+    np.testing.assert_array_equal(together.rank[m], alone.rank[0])
+    np.testing.assert_array_equal(together.pose_error_deg[m], alone.pose_error_deg[0])
+    by_name = {method.name: together.rank[i] for i, method in enumerate(ALL)}
+    for name in ("hbr", "ahbr", "sweep-45"):  # all begin with the same view
+        np.testing.assert_array_equal(by_name[name][..., 0], by_name["coin"][..., 0])
+    np.testing.assert_array_equal(by_name["hbr"][..., 1], by_name["ahbr"][..., 1])
+    np.testing.assert_array_equal(by_name["single"][..., 0], by_name["hbr-visual"][..., 0])
+    assert (by_name["single"][..., 1:] == -1).all()
+
+
+def test_trials_of_an_object_do_not_depend_on_the_other_objects() -> None:
+    order = np.concatenate([VIEWS.of(4), VIEWS.of(1)])
+    few = Views.concatenate([VIEWS.select(VIEWS.of(j)) for j in (4, 1)])
+    trials = _Trials(4, QUERIES[VIEWS.of(4)], VIEWS, PROTOCOL, lambda: 0)
+    again = _Trials(few.object_names.index("object 4"), QUERIES[order[:24]], few, PROTOCOL, lambda: 0)
+    for t in range(3):
+        np.testing.assert_array_equal(trials.draw(t).order, again.draw(t).order)
+        np.testing.assert_array_equal(trials.draw(t).error_deg, again.draw(t).error_deg)
+
+
+def test_seeds_and_trials_differ() -> None:
+    trials = _Trials(0, QUERIES[:24], VIEWS, PROTOCOL, lambda: 0)
+    other = _Trials(0, QUERIES[:24], VIEWS, replace(PROTOCOL, seed=1), lambda: 0)
+    orders = {tuple(draw.order.tolist()) for draw in (trials.draw(0), trials.draw(1), other.draw(0))}
+    assert len(orders) == 3
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sets(st.integers(0, 23), min_size=1, max_size=5), st.sampled_from([5.0, 15.0, 15.1, 31.0]))
+def test_near_views_are_taken_out_and_no_others(seen: set[int], near_deg: float) -> None:
+    trials = _Trials(0, QUERIES[:24], VIEWS, replace(PROTOCOL, near_deg=near_deg), lambda: 0)
+    keep = trials._keep(np.array(sorted(seen)))
+    for i in range(24):
+        nearest = min(abs(i - s) if abs(i - s) <= 12 else 24 - abs(i - s) for s in seen) * STEP
+        assert keep[i] == (nearest >= near_deg and i not in seen)
+
+
+def test_paper79_leaves_79_percent_of_72_views() -> None:
+    azimuth = np.arange(0, 360, 5.0)
+    views = Views.of_object("a", np.ones((72, 144), np.uint8), azimuth)
+    trials = _Trials(0, views.descriptors, views, Protocol(removal="paper79"), lambda: 0)
+    left = [trials._keep(trials.draw(t).order).mean() for t in range(400)]
+    assert np.mean(left) == pytest.approx(0.79, abs=0.005)
+
+
+def test_orientation_errors_are_normal_about_the_drift() -> None:
+    protocol = replace(PROTOCOL, sigma_deg=3.0, drift_deg=10.0)
+    trials = _Trials(0, QUERIES[:24], VIEWS, protocol, lambda: 0)
+    errors = np.array([trials.draw(t).error_deg for t in range(500)]) - 10.0 * np.arange(5)
+    assert errors.mean() == pytest.approx(0, abs=0.2)
+    assert errors.std() == pytest.approx(3, rel=0.05)
+
+
+def test_a_symmetric_object_has_a_plain_error_and_hardly_one_of_looks() -> None:
+    """An object that looks the same from four sides: poses are 0, 90, 180 or 270 degrees off."""
+    rng = np.random.default_rng(5)
+    quarter = rng.integers(0, 8, (6, 144)) * (rng.random((6, 144)) < 0.3)
+    box = Views.of_object("box", np.tile(quarter, (4, 1)).astype(np.uint8), np.arange(0, 360, 15.0))
+    views = Views.concatenate([box, *(VIEWS.select(VIEWS.of(j)) for j in range(3))])
+    runs = run_object(0, box.descriptors, views, (METHODS["hbr-visual"],), replace(PROTOCOL, trials=20, near_deg=10))
+    assert (runs.rank == 1).all()
+    assert np.median(runs.pose_error_deg) >= 90
+    assert (runs.alike_error_deg == 0).all()
+
+
+def test_the_time_of_a_step_comes_from_the_timer() -> None:
+    ticks = iter(range(0, 10**9, 7))
+    runs = run_object(0, QUERIES[:24], VIEWS, ALL[:2], PROTOCOL, now_ns=lambda: next(ticks))
+    assert (runs.step_ns[1] == 7).all()
+    assert (run(0, ALL[:1]).step_ns == 0).all()
+
+
+def test_runs_of_objects_are_joined_in_their_order() -> None:
+    joined = Runs.concatenate([run(3, ALL[:2]), run(0, ALL[:2])])
+    assert joined.rank.shape == (2, 2, 3, 5)
+    np.testing.assert_array_equal(joined.rank[:, 1:], run(0, ALL[:2]).rank)
+
+
+def test_what_cannot_be_run_is_refused() -> None:
+    with pytest.raises(ValueError, match="object 0 has 24 views; for 24 queries"):
+        run(0, ALL[:1], Protocol(max_views=24))
+    with pytest.raises(ValueError, match="no view of object 0 is left"):
+        run(0, ALL[4:5], Protocol(near_deg=180))
+    with pytest.raises(ValueError, match="23 queries for the 24 views"):
+        run_object(0, QUERIES[:23], VIEWS, ALL, PROTOCOL)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [{"trials": 0}, {"max_views": 0}, {"removal": "all"}, {"near_deg": 0}, {"sigma_deg": -1}, {"seed": -1}],
+)
+def test_what_is_no_protocol_is_refused(setting: dict) -> None:
+    with pytest.raises(ValueError, match=r"trials|removal|seed"):
+        Protocol(**setting)
+
+
+def test_methods_are_chosen_by_name_and_group() -> None:
+    assert [m.name for m in choose_methods(["ahbr", "hbr", "ahbr"])] == ["ahbr", "hbr"]
+    assert [m.omega for m in choose_methods(["omega-sweep"])][:3] == [0, 0.125, 0.25]
+    assert {m.list_length for m in choose_methods(["list-sweep", "hbr"])} >= {1, 10, 100}
+    with pytest.raises(ValueError, match="'best' is unknown; use some of all"):
+        choose_methods(["best"])
+    with pytest.raises(ValueError, match="no method"):
+        choose_methods([])
