@@ -1,0 +1,236 @@
+"""The gyro's scale: found with an honest uncertainty, or refused with the reason."""
+
+from datetime import UTC, datetime
+from math import sqrt
+
+import numpy as np
+import pytest
+
+from calibration.fact import Fact
+from calibration.gyro_scale import Leg, config_lines, from_data, live
+from rig.errors import DeviceSilent, LimitExceeded, UsageError
+from rig.plans.events import Moved
+from rig.turntable import Turntable
+from sim.imu.inertial import InertialModel
+from sim.world import World
+
+COUNT_DEG = 360 / 4096
+SLIP_DELAY_NS = 4_000_000_000
+"""After a move's end: beyond the rest, in the middle of the next leg."""
+
+
+def true_scale(seed: int) -> float:
+    """Return what the simulated part of this seed needs: its gain, and its tilt against the axis."""
+    part = InertialModel(World(seed=seed), "imu-68")
+    return 1 / float(part.gyro_gain[2] * part.up[2])
+
+
+def fit(legs: list[Leg]) -> Fact:
+    return from_data(legs, resolution_deg=COUNT_DEG, when_utc=datetime(2026, 3, 1, tzinfo=UTC), device={})
+
+
+def drawn(rng: np.random.Generator, scale: float, legs: int = 4, turn_deg: float = 720.0) -> list[Leg]:
+    """Return legs as a bench measures them that errs as stated: rests anywhere in a count, a gyro with noise."""
+    rests = np.arange(legs + 1) % 2 * turn_deg + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, legs + 1)
+    read = np.round(rests / COUNT_DEG) * COUNT_DEG
+    sigma = 0.03
+    turned = np.diff(rests) / scale + rng.normal(0.0, sigma, legs)
+    return [Leg(float(e), float(g), sigma) for e, g in zip(np.diff(read), turned, strict=True)]
+
+
+def run(s, *, turns: int = 4, during=None) -> Fact:
+    """Calibrate; ``during`` maps the index of a leg, from 1, to what happens to the world in the middle of it."""
+    events = live(s.bench, turns=turns)
+    for event in events:
+        if isinstance(event, Moved) and during and (happens := during.get(event.index + 1)):
+            s.world.clock.call_at(s.world.clock.now_ns() + SLIP_DELAY_NS, happens)
+    assert isinstance(event, Fact)
+    return event
+
+
+def torque(s) -> int:
+    return s.bench.servo._read("Torque Enable")
+
+
+def test_the_true_scale_is_found_within_the_stated_uncertainty(simulated):
+    """The simulated servo rests in the middle of its counts, a real one anywhere: the errors may be the smaller."""
+    z = []
+    for seed in range(20):
+        s = simulated(seed=seed)
+        fact = run(s)
+        assert fact.passed, fact.refusals
+        assert fact.value == pytest.approx(true_scale(seed), rel=0.001)
+        assert fact.residual < fact.limit
+        assert fact.uncertainty < 1.5e-4
+        z.append((fact.value - true_scale(seed)) / fact.uncertainty)
+    assert np.mean(np.abs(z) < 1.96) >= 0.85
+    assert 0.3 < sqrt(np.mean(np.square(z))) < 1.3
+
+
+@pytest.mark.parametrize("legs", [4, 12])
+def test_error_over_uncertainty_has_a_standard_deviation_of_one(legs):
+    rng = np.random.default_rng(1)
+    facts = [(scale, fit(drawn(rng, scale, legs))) for scale in rng.uniform(0.95, 1.05, 500)]
+    z = np.array([(fact.value - scale) / fact.uncertainty for scale, fact in facts])
+    assert 0.85 < z.std() < 1.1
+    assert abs(z.mean()) < 0.15
+    assert sum(fact.passed for _, fact in facts) == len(facts)
+
+
+def test_scatter_beyond_the_stated_noise_widens_the_uncertainty():
+    rng = np.random.default_rng(3)
+    modest = [
+        [Leg(leg.encoder_deg, leg.gyro_deg + rng.normal(0, 0.2), leg.sigma_deg) for leg in drawn(rng, 1.0, legs=12)]
+        for _ in range(200)
+    ]
+    z = [(fact.value - 1.0) / fact.uncertainty for fact in map(fit, modest)]
+    assert 0.8 < np.std(z) < 1.25
+
+
+def test_a_drifting_bias_cancels_between_the_ways_and_a_strong_one_is_refused():
+    rng = np.random.default_rng(2)
+
+    def drifting(by_deg: float) -> Fact:
+        return fit([Leg(leg.encoder_deg, leg.gyro_deg + by_deg, leg.sigma_deg) for leg in drawn(rng, 1.02)])
+
+    mild = drifting(0.08)
+    assert mild.passed
+    assert mild.value == pytest.approx(1.02, abs=3 * mild.uncertainty)
+    strong = drifting(0.3)
+    assert not strong.passed
+    assert any("bias drifts" in reason for reason in strong.refusals)
+
+
+@pytest.mark.parametrize(("slip_deg", "leg"), [(0.6, 1), (-0.6, 2), (6.0, 3)])
+def test_a_slipping_platter_is_refused(simulated, slip_deg, leg):
+    s = simulated(seed=3)
+    fact = run(s, during={leg: lambda: s.world.slip(slip_deg, 0.2)})
+    assert not fact.passed
+    assert f"Leg {leg} is off by" in fact.refusals[0]
+    assert fact.residual > fact.limit
+    with pytest.raises(UsageError, match="cannot be put in force"):
+        config_lines(fact)
+
+
+def test_a_saturated_gyro_is_refused_with_nothing_estimated(simulated):
+    s = simulated(seed=3)
+
+    def whirl():
+        s.world.slip(75.0, 0.2)
+        s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-75.0, 0.2))
+
+    fact = run(s, during=dict.fromkeys(range(1, 5), whirl))
+    assert fact.value is None
+    assert fact.uncertainty is None
+    assert "beyond the gyro's range" in fact.refusals[0]
+    assert "imu.range_dps" in fact.refusals[0]
+
+
+def test_one_lost_leg_is_left_out_and_too_few_are_refused():
+    legs = drawn(np.random.default_rng(4), 1.01, legs=6)
+    spoiled = [Leg(legs[0].encoder_deg, 17.0, 0.03, "the sensor lost 9 samples"), *legs[1:]]
+    assert fit(spoiled).passed
+    assert fit(spoiled).value == pytest.approx(1.01, abs=2e-4)
+    few = fit(spoiled[:4])
+    assert "1 upwards and 2 downwards" in few.refusals[0]
+    assert "lost 9 samples" in few.refusals[0]
+    assert not fit([]).passed
+
+
+@pytest.mark.parametrize("ratio", [0.0, -1.0, 0.5, 2.0])
+def test_a_gyro_of_another_axis_sign_range_or_gear_is_refused(ratio):
+    fact = fit([Leg(e, ratio * e, 0.03) for e in (360.0, -360.0) * 2])
+    assert fact.value is None
+    assert "imu.axis" in fact.refusals[0]
+
+
+def test_a_noisy_gyro_is_refused():
+    fact = fit([Leg(e, e, 1.0) for e in (360.0, -360.0) * 2])
+    assert "more than 0.1%" in fact.refusals[0]
+
+
+def test_a_cable_that_does_not_reach_around_is_said_before_anything_moves(simulated):
+    s = simulated("table.limits_deg=[-180, 181]")
+    with pytest.raises(LimitExceeded, match="358°"):
+        next(live(s.bench))
+    assert s.world.shaft()[0] == pytest.approx(0, abs=0.2)
+    with pytest.raises(UsageError, match="too few"):
+        next(live(s.bench, turns=3))
+
+
+def test_a_short_cable_is_enough_and_is_never_exceeded(simulated):
+    s = simulated("table.limits_deg=[-10, 354]", seed=5)
+    events, shaft_deg = zip(*((event, s.world.shaft()[0]) for event in live(s.bench, turns=4)), strict=True)
+    assert events[-1].passed
+    assert len(events[-1].evidence["legs"]) == 4
+    assert -10 <= min(shaft_deg) < max(shaft_deg) <= 354
+
+
+def test_the_table_returns_when_done_and_when_closed_between_turns(simulated):
+    for seed in (1, 2):
+        s = simulated(seed=seed)
+        with Turntable(s.bench) as table:
+            table.goto(40.0)
+        events = live(s.bench, turns=4)
+        if seed == 1:
+            assert list(events)[-1].passed
+        else:
+            next(events)
+            assert abs(s.world.shaft()[0] - 40.0) > 100
+            events.close()
+        assert s.world.shaft()[0] == pytest.approx(40.0, abs=0.3)
+        assert torque(s) == 0
+
+
+@pytest.mark.parametrize("after_s", [1.0, 4.0])  # during a rest, and in the middle of a leg
+def test_nothing_moves_by_itself_after_an_interruption(simulated, after_s):
+    s = simulated()
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    events = live(s.bench, turns=4)
+    next(events)
+    before = s.world.shaft()[0]
+    s.world.clock.call_at(s.world.clock.now_ns() + round(after_s * 1e9), interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        next(events)
+    assert torque(s) == 0
+    s.world.clock.sleep(1.0)
+    stopped = s.world.shaft()
+    assert stopped[1] == 0
+    assert abs(stopped[0] - before) == (pytest.approx(0, abs=0.2) if after_s < 2 else pytest.approx(180, abs=100))
+
+
+def test_a_servo_that_falls_silent_ends_it(simulated):
+    s = simulated()
+    events = live(s.bench, turns=4)
+    next(events)
+    s.bench.servo.bus.port.ser.unplug()
+    with pytest.raises(DeviceSilent):
+        next(events)
+    with pytest.raises(DeviceSilent):
+        s.bench.close()  # says that the torque could not be taken off
+
+
+def test_a_scale_in_force_does_not_change_what_is_found(simulated):
+    plain = run(simulated(seed=6))
+    scaled = run(simulated("imu.scale=1.05", "imu.scale_uncertainty=0.0", seed=6))
+    assert scaled.value == pytest.approx(plain.value, abs=plain.uncertainty)  # of 5 % nothing is left
+    assert scaled.uncertainty == pytest.approx(plain.uncertainty, rel=0.02)
+
+
+def test_the_calibrated_scale_narrows_what_a_move_may_differ_by(simulated):
+    fact = run(simulated(seed=6))
+    lines = config_lines(fact).splitlines()
+    assert lines[0] == "[imu]"
+    moves = []
+    for settings in ([], [f"imu.{line}" for line in lines[1:]]):
+        with Turntable(simulated(*settings, seed=6).bench) as table:
+            table.goto(5.0)
+            moves.append(table.goto(95.0))
+    before, after = (move.agreement for move in moves)
+    play_deg = 0.5
+    assert after.agrees
+    assert after.bound_deg - play_deg < 0.2 * (before.bound_deg - play_deg)
+    assert abs(after.difference_deg) < abs(before.difference_deg)
