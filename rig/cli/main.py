@@ -49,7 +49,11 @@ app.command("goto", context_settings={"ignore_unknown_options": True})(table.got
 app.command("status")(table.status)
 app.add_typer(catalog.app, name="catalog")
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
-    app.command(_point.name)(_point.load())
+    _plugin = _point.load()
+    if isinstance(_plugin, typer.Typer):
+        app.add_typer(_plugin, name=_point.name)
+    else:
+        app.command(_point.name)(_plugin)
 
 
 def main() -> None:
