@@ -1,6 +1,7 @@
 """`rig eval`."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -81,12 +82,21 @@ def evaluate(
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
         store = Store(out / "runs", plan.settings(), resume=resume)
+
+        def tell(progress: Progress, event: str) -> Callable[[str], None]:
+            progress.start(len(dataset.objects))
+
+            def advance(name: str) -> None:
+                progress.advance()
+                if settings.json:
+                    settings.print_json({"event": event, "object": name})
+
+            return advance
+
         with Progress("describing") as progress:
-            progress.start(len(dataset.objects))
-            model = enrolled_views(plan, jobs, progress.advance)
+            model = enrolled_views(plan, jobs, tell(progress, "described"))
         with Progress("searching") as progress:
-            progress.start(len(dataset.objects))
-            runs = run_plan(plan, model, store, jobs, progress.advance)
+            runs = run_plan(plan, model, store, jobs, tell(progress, "searched"))
     except ValueError as error:
         raise UsageError(
             str(error), next_step="Correct the options or the data set and go on; --resume keeps what is done."
@@ -100,7 +110,7 @@ def evaluate(
     rule = settings.load().identify
     results = write_results(plan, runs, rule.margin if margin is None else margin, rule.min_views, out)
     if settings.json:
-        settings.print_json(results)
+        settings.print_json({"event": "finished", **results})
         return
     from rich.console import Console
 

@@ -23,8 +23,8 @@ _T = TypeVar("_T")
 _work: Callable[[int], object]
 
 
-def enrolled_views(plan: Plan, jobs: int, advance: Callable[[], None]) -> Views:
-    """Describe every photograph as it is enrolled; `advance` is called after each object.
+def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Views:
+    """Describe every photograph as it is enrolled; `advance` is called with the name of each object.
 
     Raises
     ------
@@ -35,16 +35,17 @@ def enrolled_views(plan: Plan, jobs: int, advance: Callable[[], None]) -> Views:
     levels: dict[int, LevelArray] = {}
     for j, found in _over_processes(partial(_enroll, plan), range(len(objects)), jobs):
         levels[j] = found
-        advance()
+        advance(objects[j].name)
     return Views.concatenate(
         [Views.of_object(item.name, levels[j], item.azimuth_deg) for j, item in enumerate(objects)]
     )
 
 
-def run_plan(plan: Plan, views: Views, store: Store, jobs: int, advance: Callable[[], None]) -> Runs:
+def run_plan(plan: Plan, views: Views, store: Store, jobs: int, advance: Callable[[str], None]) -> Runs:
     """Search for every object that the store has no runs of, and return the runs of all.
 
-    The results do not depend on `jobs`. Whatever ends the call, the store keeps the objects that were done.
+    The results do not depend on `jobs`; `advance` is called with the name of each object. Whatever ends the call, the
+    store keeps the objects that were done.
 
     Raises
     ------
@@ -56,12 +57,12 @@ def run_plan(plan: Plan, views: Views, store: Store, jobs: int, advance: Callabl
     for j, name in enumerate(names):
         if (runs := store.load(name)) is not None:
             done[j] = runs
-            advance()
+            advance(name)
     missing = [j for j in range(len(names)) if j not in done]
     for j, runs in _over_processes(partial(_search, plan, views), missing, jobs):
         store.save(names[j], runs)
         done[j] = runs
-        advance()
+        advance(names[j])
     return Runs.concatenate([done[j] for j in range(len(names))])
 
 

@@ -66,7 +66,7 @@ class Store:
     def load(self, name: str) -> Runs | None:
         """Return the runs of an object; None where there are none, or the file was damaged."""
         try:
-            with np.load(self._path(name)) as arrays:
+            with self._path(name).open("rb") as file, np.load(file) as arrays:
                 return Runs(**arrays)
         except (OSError, ValueError, TypeError, BadZipFile, EOFError):
             return None
