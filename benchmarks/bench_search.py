@@ -1,15 +1,16 @@
-"""Exact Tanimoto search against a plain numpy scan and scipy's KD-tree, and a whole retrieval step."""
+"""Exact Tanimoto search and a whole retrieval step, against one float32 product of a query in the same run."""
 
 import argparse
 import statistics
 import timeit
-from collections.abc import Callable
+import tracemalloc
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hbr import ViewIndex, Views, next_view, retrieve
-from hbr.arrays import FloatArray, LevelArray
+from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.index import Method
 
 VIEWS_OF_AN_OBJECT = 72
 QUERIES = 12
@@ -37,62 +38,141 @@ def model(objects: int) -> Views:
     )
 
 
-def milliseconds(function: Callable[[int], object], repeats: int) -> tuple[float, float]:
-    """Minimum and median of a call, over different queries."""
-    times = [timeit.timeit(lambda i=i: function(i % QUERIES), number=1) for i in range(repeats)]  # type: ignore[misc]
-    return min(times) * 1e3, statistics.median(times) * 1e3
+def queries_of(views: Views, rows: IndexArray, seed: int) -> LevelArray:
+    """Views with some bins off by a level, as noise in the image makes them."""
+    rng = np.random.default_rng(seed)
+    shape = (len(rows), 144)
+    off = (rng.random(shape) < 0.1) * rng.integers(-1, 2, shape)
+    return np.clip(views.descriptors[rows] + off, 0, 7).astype(np.uint8)
 
 
-def bench(objects: int, repeats: int, with_tree: bool) -> None:
-    views = model(objects)
-    rng = np.random.default_rng(1)
-    rows = rng.integers(len(views), size=QUERIES)
-    # the queries are views with some bins off by a level, as noise in the image makes them
-    off = (rng.random((QUERIES, 144)) < 0.1) * rng.integers(-1, 2, (QUERIES, 144))
-    queries = np.clip(views.descriptors[rows] + off, 0, 7).astype(np.uint8)
+def milliseconds(function: Callable[[int], object], repeats: int) -> float:
+    """Median of a call, over different arguments."""
+    function(0)
+    return statistics.median(timeit.timeit(lambda i=i: function(i), number=1) for i in range(repeats)) * 1e3  # type: ignore[misc]
 
+
+def product_ms(views: Views, queries: LevelArray, repeats: int) -> tuple[float, float]:
+    """Time of one float32 product of a query with all views, alone and as a whole search for the best."""
     as_float = views.descriptors.astype(np.float32)
     lengths = np.einsum("ij,ij->i", as_float, as_float)
+    as_queries = queries.astype(np.float32)
 
     def scan(i: int) -> object:
-        query = queries[i].astype(np.float32)
+        query = as_queries[i % QUERIES]
         dots = as_float @ query
         similarities = dots / (lengths + query @ query - dots)
         best = np.argpartition(-similarities, K)[:K]
         return best[np.argsort(-similarities[best])]
 
-    results = {"numpy float32 product, argpartition": milliseconds(scan, repeats)}
-    if with_tree:
-        tree = cKDTree(as_float)
-        results["scipy cKDTree (Euclidean: not the same)"] = milliseconds(lambda i: tree.query(queries[i], K), repeats)
-    flat, bound = ViewIndex(views, "flat"), ViewIndex(views, "bound")
-    results["ViewIndex flat"] = milliseconds(lambda i: flat.search(queries[i], K), repeats)
-    results["ViewIndex bound"] = milliseconds(lambda i: bound.search(queries[i], K), repeats)
-    peer = results["numpy float32 product, argpartition"][1]
-    for name, (least, median) in results.items():
-        print(f"{len(views):>9} {name:<42} {least:8.3f} {median:9.3f} {median / peer:6.2f}")
+    return milliseconds(lambda i: as_float @ as_queries[i % QUERIES], repeats), milliseconds(scan, repeats)
 
+
+def bench_search(views: Views, methods: Sequence[Method], repeats: int) -> None:
+    """Search by every method: time, build, and the peak of memory beside the descriptors' own."""
+    queries = queries_of(views, np.random.default_rng(1).integers(len(views), size=QUERIES), 2)
+    alone, scanned = product_ms(views, queries, repeats)
+    print(f"{len(views):>9} {'numpy float32 product alone':<44} {alone:9.3f} {alone / scanned:6.2f}")
+    print(f"{len(views):>9} {'numpy float32 product, argpartition (= 1)':<44} {scanned:9.3f} {1:6.2f}")
+    for method in methods:
+        begun = timeit.default_timer()
+        index = ViewIndex(views, method)
+        build_s = timeit.default_timer() - begun
+
+        def search(i: int, index: ViewIndex = index) -> object:
+            index._remembered.clear()
+            return index.search(queries[i % QUERIES], K)
+
+        took = milliseconds(search, repeats)
+        print(
+            f"{len(views):>9} {f'ViewIndex {method}, built in {build_s:.1f} s':<44} {took:9.3f} {took / scanned:6.2f}"
+        )
+
+
+def bench_memory(views: Views) -> None:
+    """Peak of numpy's allocations while the default index is built and searched, the descriptors included."""
+    own = views.descriptors.nbytes
+    tracemalloc.start()
     index = ViewIndex(views)
-    mine = views.of(objects // 2)[[0, 18, 30, 45, 60, 66, 9, 51]]
-    turns_deg = views.azimuth_deg[mine]
-    for count in (2, 8):
-        seen = views.descriptors[mine[:count]]
+    index.search(views.descriptors[0], K)
+    peak = own + tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    print(f"{len(views):>9} {'peak memory, multiple of the descriptors':<44} {peak / 1e6:6.0f} MB {peak / own:6.2f}")
 
-        def step(_: int, seen: LevelArray = seen, turned_deg: FloatArray = turns_deg[:count]) -> object:
-            return next_view(retrieve(seen, turned_deg, index))
 
-        least, median = milliseconds(step, max(5, repeats // 2))
-        print(f"{len(views):>9} {f'retrieve and next_view, {count} queries':<42} {least:8.3f} {median:9.3f}")
+def bench_adding(views: Views) -> None:
+    """One more object, against building the index anew."""
+    more = Views.of_object("new", views.descriptors[:72], views.azimuth_deg[:72])
+    index = ViewIndex(views)
+    build = milliseconds(lambda _: ViewIndex(views), 1)
+    added = milliseconds(lambda _: index.extended(more), 3)
+    print(f"{len(views):>9} {'add 72 views, against building (= 1)':<44} {added:9.1f} {added / build:6.2f}")
+
+
+def step_ms(views: Views, index: ViewIndex, repeats: int) -> tuple[float, float]:
+    """Median time of a step with 8 queries: after the 7 steps before it, and with no list known."""
+    rng = np.random.default_rng(3)
+    after, at_once = [], []
+    for j in rng.integers(len(views.object_names), size=repeats).tolist():
+        rows = views.of(j)[[0, 18, 30, 45, 60, 66, 9, 51]]
+        seen, angles_deg = queries_of(views, rows, j), views.azimuth_deg[rows]
+
+        def step(seen: LevelArray = seen, angles_deg: FloatArray = angles_deg) -> object:
+            return next_view(retrieve(seen, angles_deg, index))
+
+        index._remembered.clear()
+        at_once.append(timeit.timeit(step, number=1))
+        index._remembered.clear()
+        retrieve(seen[:-1], angles_deg[:-1], index)
+        after.append(timeit.timeit(step, number=1))
+    return statistics.median(after) * 1e3, statistics.median(at_once) * 1e3
+
+
+def bench_step(views: Views, repeats: int) -> None:
+    """One step of an active search, against one product."""
+    alone, _ = product_ms(views, queries_of(views, np.arange(QUERIES), 2), repeats)
+    steps = zip(("the 8th step", "8 queries at once"), step_ms(views, ViewIndex(views), repeats), strict=True)
+    for name, took in steps:
+        print(f"{len(views):>9} {f'retrieve, next_view: {name} (product = 1)':<44} {took:9.3f} {took / alone:6.2f}")
+
+
+def growth(sizes: Sequence[int], times_ms: Sequence[float]) -> float:
+    """The exponent b of time = a * views**b, by least squares of the logarithms."""
+    return float(np.polyfit(np.log(sizes), np.log(times_ms), 1)[0])
+
+
+def bench_growth(objects: Sequence[int]) -> None:
+    """Time against the number of views, and the order of growth over the larger half."""
+    print(f"\n{'views':>9} {'search ms':>10} {'step ms':>10}")
+    sizes, searches, steps = [], [], []
+    for count in objects:
+        views = model(count)
+        index = ViewIndex(views)
+        queries = queries_of(views, np.random.default_rng(1).integers(len(views), size=61), 2)
+        searches.append(milliseconds(lambda i, index=index, queries=queries: index.search(queries[i + 1], K), 60))  # type: ignore[misc]
+        steps.append(step_ms(views, index, 30)[0])
+        sizes.append(len(views))
+        print(f"{sizes[-1]:>9} {searches[-1]:10.3f} {steps[-1]:10.3f}", flush=True)
+    half = len(sizes) // 2
+    print(
+        f"time grows as views to the power of {growth(sizes[half:], searches[half:]):.2f} (search), "
+        f"{growth(sizes[half:], steps[half:]):.2f} (step), from {sizes[half]} views on"
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--million", action="store_true", help="measure 1,000,000 views too (2 GB of memory)")
-    print(f"{'views':>9} {'call':<42} {'min ms':>8} {'median ms':>9} {'ratio':>6}")
-    bench(100, 200, with_tree=True)
-    bench(1_389, 40, with_tree=True)
-    if parser.parse_args().million:
-        bench(13_889, 20, with_tree=False)
+    parser.add_argument("--tree", action="store_true", help="the KD-tree at 1,000,000 views too (3 GB of memory)")
+    tree = parser.parse_args().tree
+    print(f"{'views':>9} {'call':<44} {'median ms':>9} {'ratio':>6}")
+    every: tuple[Method, ...] = ("flat", "bound", "kdtree")
+    for objects, repeats in ((100, 200), (1_389, 60), (10_000, 30), (13_889, 30)):
+        views = model(objects)
+        bench_search(views, every if objects < 10_000 or tree else every[:2], repeats)
+        bench_memory(views)
+        bench_adding(views)
+        bench_step(views, repeats)
+    bench_growth([100, 200, 400, 800, 1_600, 3_200, 6_400, 12_800])
 
 
 if __name__ == "__main__":

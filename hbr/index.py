@@ -1,6 +1,7 @@
 """Exact search for the views most similar to a query."""
 
-from typing import Final, Literal, TypeVar, get_args
+from copy import copy
+from typing import Final, Literal, Protocol, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from hbr.cedd import BINS
 from hbr.tanimoto import squares, tanimoto, tanimoto_of_dots
 from hbr.views import Views
 
-Method = Literal["auto", "flat", "bound"]
+Method = Literal["auto", "flat", "bound", "kdtree"]
 _T = TypeVar("_T", np.float32, np.float64)
 
 #: Below this many views one product over all 144 levels is as quick as the bound.
@@ -19,7 +20,10 @@ _SMALL: Final = 10_000
 _COMPONENTS: Final = 15
 #: Rows that share one maximum when the first candidates are looked for.
 _GROUP: Final = 64
-_CHUNK: Final = 65_536
+#: Searches whose answers are kept; then all are given up.
+_REMEMBERED: Final = 64
+#: Rows that are converted to float at a time.
+_CHUNK: Final = 8_192
 
 
 class ViewIndex:
@@ -29,22 +33,42 @@ class ViewIndex:
     ----------
     views : Views
         The model set; not copied.
-    method : {"auto", "flat", "bound"}
+    method : {"auto", "flat", "bound", "kdtree"}
         ``flat`` compares with every view. ``bound`` compares a few principal components with every view: with an
         orthonormal projection P, q·c <= Pq·Pc + |q - PᵀPq| |c - PᵀPc|, which bounds the similarity from above, and only
-        views whose bound reaches the k-th best similarity found so far are compared in full. ``auto`` takes ``flat``
-        for small sets. The answers are the same.
+        views whose bound reaches the k-th best similarity found so far are compared in full. ``kdtree`` looks up the
+        k nearest by Euclid in a KD-tree, then all in the ball that holds every view as similar as those; it takes eight
+        times the memory of the descriptors, and scipy. ``auto`` takes ``flat`` for small sets, ``bound`` for others.
+        The answers are the same.
     """
 
     def __init__(self, views: Views, method: Method = "auto") -> None:
         if method not in get_args(Method):
             raise ValueError(f"method {method!r} is unknown; use one of {', '.join(get_args(Method))}")
         self.views = views
-        use_flat = method == "flat" or (method == "auto" and len(views) < _SMALL)
-        self._search: _Flat | _Bound = _Flat(views.descriptors) if use_flat else _Bound(views.descriptors)
+        self._method = method
+        self._searcher: _Searcher = _searcher(views.descriptors, method)
+        self._remembered: dict[tuple[bytes, int], tuple[IndexArray, FloatArray]] = {}
 
     def __len__(self) -> int:
         return len(self.views)
+
+    def extended(self, more: Views) -> "ViewIndex":
+        """Return an index of these views and more, behind them; this one stays as it is.
+
+        What was computed of the views at hand is kept, except where their number has doubled since, and by ``kdtree``.
+
+        Parameters
+        ----------
+        more : Views
+            Objects of the same name become one (`Views.concatenate`).
+        """
+        views = Views.concatenate([self.views, more])
+        grown = copy(self)
+        grown.views = views
+        grown._searcher = _searcher(views.descriptors, self._method, self._searcher)
+        grown._remembered = {}
+        return grown
 
     def search(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
         """Find the `k` views with the largest Tanimoto similarity to the query.
@@ -74,7 +98,15 @@ class ViewIndex:
         k = min(k, len(self.views))
         if k == 0:
             return np.empty(0, np.intp), np.empty(0)
-        return self._search.top(query, k)
+        # an active search asks for the lists of its earlier queries again with every new one
+        key = np.asarray(query).tobytes(), k
+        found = self._remembered.get(key)
+        if found is None:
+            found = self._searcher.top(query, k)
+            if len(self._remembered) >= _REMEMBERED:
+                self._remembered.clear()
+            self._remembered[key] = found
+        return found[0].copy(), found[1].copy()
 
 
 def check_queries(queries: LevelArray) -> None:
@@ -87,12 +119,34 @@ def check_queries(queries: LevelArray) -> None:
         raise ValueError(f"the query has a level of {queries.max()}; CEDD levels are 0..7, unpack packed bytes first")
 
 
+class _Searcher(Protocol):
+    def extended(self, descriptors: LevelArray, /) -> Self | None:
+        """A searcher of these rows, which begin with its own; None where it had better be built anew."""
+        ...
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]: ...
+
+
+def _searcher(descriptors: LevelArray, method: Method, known: _Searcher | None = None) -> _Searcher:
+    if method == "auto":
+        method = "flat" if len(descriptors) < _SMALL else "bound"
+    kinds: dict[str, type[_Flat] | type[_Bound] | type[_Tree]] = {"flat": _Flat, "bound": _Bound, "kdtree": _Tree}
+    kind = kinds[method]
+    return (known.extended(descriptors) if isinstance(known, kind) else None) or kind(descriptors)
+
+
 class _Flat:
     """Products with every view; float32 holds them exactly (below 144 * 49)."""
 
     def __init__(self, descriptors: LevelArray) -> None:
         self._rows = descriptors.astype(np.float32)
         self._squares = squares(self._rows)
+
+    def extended(self, descriptors: LevelArray, /) -> "_Flat":
+        more = _Flat(descriptors[len(self._rows) :])
+        more._rows = np.concatenate([self._rows, more._rows])
+        more._squares = np.concatenate([self._squares, more._squares])
+        return more
 
     def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
         q = query.astype(np.float32)
@@ -104,19 +158,35 @@ class _Bound:
     """Bounds for every view, products for the few that can still be among the best."""
 
     def __init__(self, descriptors: LevelArray) -> None:
-        self._descriptors = descriptors
         moments = np.zeros((BINS, BINS))
         for start in range(0, len(descriptors), _CHUNK):
             rows = descriptors[start : start + _CHUNK].astype(np.float32)
             moments += rows.T @ rows
         # eigh sorts ascending: the last components carry most of the length
         self._axes = np.ascontiguousarray(np.linalg.eigh(moments)[1][:, -_COMPONENTS:])
+        self._fitted = len(descriptors)
+        self._columns, self._squares = np.empty((_COMPONENTS + 1, 0), np.float32), np.empty(0, np.float32)
+        self._take_in(descriptors)
+
+    def extended(self, descriptors: LevelArray, /) -> "_Bound | None":
+        if len(descriptors) > 2 * self._fitted:
+            return None  # the axes may no longer be those of most views
+        grown = copy(self)
+        grown._take_in(descriptors)
+        return grown
+
+    def _take_in(self, descriptors: LevelArray) -> None:
+        """Project the rows that are new, into arrays of their own."""
+        self._descriptors = descriptors
+        known = len(self._squares)
+        columns, lengths = self._columns, self._squares
+        self._columns = np.empty((len(columns), len(descriptors)), np.float32)
         self._squares = np.empty(len(descriptors), np.float32)
-        self._columns = np.empty((_COMPONENTS + 1, len(descriptors)), np.float32)
-        for start in range(0, len(descriptors), _CHUNK):
+        self._columns[:, :known], self._squares[:known] = columns, lengths
+        for start in range(known, len(descriptors), _CHUNK):
             chunk = slice(start, start + _CHUNK)
-            columns, self._squares[chunk] = self._project(descriptors[chunk])
-            self._columns[:, chunk] = columns.T
+            projected, self._squares[chunk] = self._project(descriptors[chunk])
+            self._columns[:, chunk] = projected.T
 
     def _project(self, rows: LevelArray) -> tuple[FloatArray, FloatArray]:
         """Components and length of the residual, (n, components + 1), and squared length of each row."""
@@ -142,6 +212,37 @@ class _Bound:
     def _similarities(self, query: LevelArray, rows: IndexArray) -> FloatArray:
         parts = (rows[start : start + _CHUNK] for start in range(0, len(rows), _CHUNK))
         return np.concatenate([tanimoto(query, self._descriptors[part])[0] for part in parts])
+
+
+class _Tree:
+    """A KD-tree by Euclid, and a ball that makes it exact by Tanimoto.
+
+    With α = (1 + t) / 2t, T(q, c) >= t is |c - αq| <= |q| √(α² - 1): multiply T's definition out, complete the square.
+    """
+
+    def __init__(self, descriptors: LevelArray) -> None:
+        from scipy.spatial import cKDTree
+
+        self._descriptors = descriptors
+        self._tree = cKDTree(descriptors.astype(np.float64)) if len(descriptors) else None
+
+    def extended(self, _descriptors: LevelArray, /) -> None:
+        return None
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        assert self._tree is not None
+        q = query.astype(np.float64)
+        nearest = np.atleast_1d(self._tree.query(q, k)[1])
+        reached = float(tanimoto(query, self._descriptors[nearest])[0].min())
+        if reached == 0:
+            rows = np.arange(len(self._descriptors))
+        else:
+            alpha = (1 + reached) / (2 * reached)
+            # a hair wider: a view on the rim may tie with the k-th
+            radius = np.sqrt(q @ q * (alpha * alpha - 1)) * (1 + 1e-9) + 1e-6
+            rows = np.sort(np.array(self._tree.query_ball_point(alpha * q, radius), np.intp))
+        best, similarities = _best(tanimoto(query, self._descriptors[rows])[0], k)
+        return rows[best], similarities
 
 
 def _best(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:

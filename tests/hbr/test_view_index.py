@@ -6,9 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hbr import ViewIndex, Views, tanimoto
-from hbr.index import Method, _best, _promising
+from hbr.index import Method, _best, _Bound, _Flat, _promising
 
 METHODS = get_args(Method)
+EXACT: tuple[Method, ...] = ("flat", "bound", "kdtree")
 
 
 def views_of(descriptors: np.ndarray) -> Views:
@@ -38,7 +39,7 @@ def test_equals_brute_force(seed: int, count: int, k: int) -> None:
     query = descriptors[rng.integers(count)] if rng.random() < 0.5 else adversarial(rng, 1)[0]
     similarities = tanimoto(query, descriptors)[0]
     expected = np.lexsort((np.arange(count), -similarities))[:k]
-    for method in ("flat", "bound"):
+    for method in EXACT:
         rows, values = ViewIndex(views_of(descriptors), method).search(query, k)
         assert rows.tolist() == expected.tolist(), method
         assert values.tolist() == similarities[expected].tolist(), method
@@ -55,6 +56,65 @@ def test_the_bound_refines_a_small_part_and_equals_brute_force_on_a_large_set() 
         expected, found = flat.search(query, 10), bound.search(query, 10)
         assert found[0].tolist() == expected[0].tolist()
         assert found[1].tolist() == expected[1].tolist()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 900), min_size=1, max_size=4), st.sampled_from(METHODS))
+def test_an_index_that_was_extended_equals_one_that_was_built(seed: int, sizes: list[int], method: Method) -> None:
+    rng = np.random.default_rng(seed)
+    parts = [views_of(adversarial(rng, size)) for size in sizes]
+    grown = ViewIndex(Views.empty(), method)
+    for part in parts:
+        before, count = grown, len(grown)
+        grown = grown.extended(part)
+        assert len(before) == count
+    whole = ViewIndex(Views.concatenate(parts), method)
+    query = adversarial(rng, 1)[0]
+    for found, expected in zip(grown.search(query, 12), whole.search(query, 12), strict=True):
+        assert found.tolist() == expected.tolist()
+
+
+def test_extending_projects_the_new_views_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = adversarial(np.random.default_rng(0), 3000)
+    index = ViewIndex(views_of(rows[:2000]), "bound")
+    projected = []
+    project = _Bound._project
+
+    def counted(self: _Bound, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        projected.append(len(rows))
+        return project(self, rows)
+
+    monkeypatch.setattr(_Bound, "_project", counted)
+    grown = index.extended(views_of(rows[2000:]))
+    assert projected == [1000]
+    assert index.search(rows[0], 5)[0].max() < 2000  # projects the query
+    grown.extended(views_of(rows[:1001]))  # twice the views the axes were fitted to: all anew
+    assert projected[2:] == [4001]
+
+
+def test_answers_are_remembered_for_a_while_and_belong_to_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = np.random.default_rng(0).integers(0, 8, (100, 144), dtype=np.uint8)
+    index = ViewIndex(views_of(rows))
+    searched = []
+    top = _Flat.top
+
+    def counted(self: _Flat, query: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        searched.append(k)
+        return top(self, query, k)
+
+    monkeypatch.setattr(_Flat, "top", counted)
+    expected = [part.tolist() for part in index.search(rows[3], 5)]
+    for part in index.search(rows[3], 5):
+        part[:] = 0
+    assert [part.tolist() for part in index.search(rows[3], 5)] == expected
+    assert searched == [5]
+    index.search(rows[3], 6)
+    assert searched == [5, 6]
+    for row in rows[10:80]:
+        index.search(row, 5)
+        assert len(index._remembered) <= 64
+    index.search(rows[3], 5)
+    assert len(searched) == 2 + 70 + 1
 
 
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=400), st.integers(1, 10))
@@ -103,5 +163,5 @@ def test_what_is_no_query_is_refused(query: np.ndarray, k: int, error: type[Exce
 
 
 def test_an_unknown_method_is_refused() -> None:
-    with pytest.raises(ValueError, match="auto, flat, bound"):
-        ViewIndex(Views.empty(), "kdtree")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="auto, flat, bound, kdtree"):
+        ViewIndex(Views.empty(), "hash")  # type: ignore[arg-type]
