@@ -1,5 +1,6 @@
 """`rig eval`."""
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -51,13 +52,13 @@ def evaluate(
     margin: Annotated[
         float | None, typer.Option(min=0, help="Lead a view that ends a search; identify.margin otherwise.")
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; one for each core otherwise.")] = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the results are written.")] = Path("rig-eval"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with what the folder has.")] = False,
 ) -> None:
     """Measure retrieval on a folder of photographs in the layout of COIL-100, or on the catalog.
 
-    Example: rig eval coil-100 --noise mb --methods all --trials 10 --jobs 2
+    Example: rig eval coil-100 --noise mb --methods all --trials 10
     """
     from hbr.evaluation.condition import Condition
     from hbr.evaluation.methods import choose_methods
@@ -71,6 +72,7 @@ def evaluate(
     from rig.evaluation.store import Store
     from rig.evaluation.write import write_results
 
+    jobs = jobs or os.cpu_count() or 1
     try:
         plan = Plan.of(
             _dataset(settings, folder, objects),

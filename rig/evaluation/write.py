@@ -42,7 +42,7 @@ def write_results(plan: Plan, runs: Runs, margin: float, min_views: int, folder:
     results = evaluate(plan, runs, margin, min_views)
     drawn = figures(results)
     files: dict[str, bytes] = {
-        "results.json": json.dumps(results, ensure_ascii=False, indent=1).encode() + b"\n",
+        "results.json": json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1).encode() + b"\n",
         "results.csv": csv_text(results).encode(),
         "report.html": _page(results, drawn).encode(),
     }

@@ -22,7 +22,7 @@ app = typer.Typer()
 app.command("eval")(evaluate)
 
 PROGRAM = "import typer; from rig.cli.evaluate import evaluate; typer.run(evaluate)"
-QUICK = ("--methods", "hbr,ahbr", "--trials", "2", "--views", "4")
+QUICK = ("--methods", "hbr,ahbr", "--trials", "2", "--views", "4", "--jobs", "1")
 
 
 def drawing(number: int, angle: float, size: int = 40) -> np.ndarray:
@@ -85,7 +85,8 @@ def test_an_evaluation_leaves_its_results_in_every_form(photographs: Path, tmp_p
 
 def test_equal_commands_give_equal_results_whatever_the_processes(photographs: Path, tmp_path: Path) -> None:
     for out, jobs in (("one", "1"), ("two", "2")):
-        assert run(photographs, *QUICK, "--noise", "mb:5", "--out", tmp_path / out, "--jobs", jobs).exit_code == 0
+        done = run(photographs, *QUICK, "--noise", "mb:5", "--out", tmp_path / out, "--jobs", jobs)
+        assert done.exit_code == 0, done.output
     assert results(tmp_path / "one") == results(tmp_path / "two")
     assert (tmp_path / "one/hit-rate.svg").read_bytes() == (tmp_path / "two/hit-rate.svg").read_bytes()
     assert run(photographs, *QUICK, "--noise", "mb:5", "--out", tmp_path / "three", "--seed", "1").exit_code == 0
