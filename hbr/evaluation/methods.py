@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 from hbr.hough import Extension
 
-Walk = Literal["random", "sweep-45", "sweep-90", "ahbr", "coin"]
+Walk = Literal["random", "sweep-45", "sweep-90", "ahbr", "ahbr-90", "coin"]
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,9 @@ class Method:
         By which it is asked for.
     label : str
         For tables and figures.
-    walk : {"random", "sweep-45", "sweep-90", "ahbr", "coin"}
+    walk : {"random", "sweep-45", "sweep-90", "ahbr", "ahbr-90", "coin"}
         How the next view is chosen: at random, at fixed steps, by Eq. 5-7, or by a coin with the step of Eq. 5-7.
+        These need two views: the second is a random one, or, of ``ahbr-90``, 90 degrees to the left as on the rig.
     omega, list_length, extension
         As for `hbr.retrieve`.
     views : int or None
@@ -37,7 +38,7 @@ class Method:
 
     @property
     def active(self) -> bool:
-        return self.walk in ("ahbr", "coin")
+        return self.walk in ("ahbr", "ahbr-90", "coin")
 
 
 _LISTED: Final = (
@@ -49,6 +50,7 @@ _LISTED: Final = (
     Method("hbr-orient", "HBR ω = 0.5 (orient)", extension="orient"),
     Method("ahbr", "AHBR ω = 0.5", walk="ahbr"),
     Method("ahbr-orient", "AHBR ω = 0.5 (orient)", walk="ahbr", extension="orient"),
+    Method("ahbr-90", "AHBR, first turn 90°", walk="ahbr-90"),
     Method("coin", "coin flip", walk="coin"),
     Method("sweep-45", "sweep 45°", walk="sweep-45"),
     Method("sweep-90", "sweep 90°", walk="sweep-90"),

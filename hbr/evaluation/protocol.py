@@ -22,7 +22,7 @@ from hbr.tanimoto import tanimoto
 from hbr.views import Views
 
 Removal = Literal["near", "paper79", "queries"]
-_STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0}
+_STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
 
 @dataclass(frozen=True)
@@ -253,13 +253,13 @@ class _Trials:
 
     def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
         """The photograph to look at next, of those not yet looked at."""
-        if method.walk == "random" or (method.active and len(seen) == 1):
-            return int(draws.order[len(seen)])
-        if method.active:
+        if method.active and len(seen) > 1:
             coin: Side = "left" if draws.coins[len(seen)] else "right"
-            turn_deg = next_view(ranking, side=None if method.walk == "ahbr" else coin).rotation_deg
-        else:
+            turn_deg = next_view(ranking, side=coin if method.walk == "coin" else None).rotation_deg
+        elif method.walk in _STEP_DEG:
             turn_deg = _STEP_DEG[method.walk]
+        else:
+            return int(draws.order[len(seen)])
         away_deg = np.abs(wrap180(self._azimuth_deg - (self._azimuth_deg[seen[-1]] + turn_deg)))
         away_deg[seen] = np.inf
         return int(away_deg.argmin())

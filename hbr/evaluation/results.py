@@ -97,6 +97,8 @@ QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
     ("ahbr", None, "coin", None),
     ("ahbr", 4, "sweep-90", 4),
     ("ahbr", 4, "sweep-45", 4),
+    ("ahbr-90", 4, "sweep-90", 4),
+    ("ahbr-90", 4, "sweep-45", 4),
 )
 
 

@@ -24,6 +24,7 @@ _LOOKS: Final = {
     "hbr-orient": ("#0072b2", True),
     "ahbr": ("#d55e00", False),
     "ahbr-orient": ("#d55e00", True),
+    "ahbr-90": ("#8c2d04", False),
     "coin": ("#cc79a7", False),
     "sweep-45": ("#1d2126", False),
     "sweep-90": ("#1d2126", True),

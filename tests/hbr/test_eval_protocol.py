@@ -38,7 +38,7 @@ def run(j: int, methods: tuple[Method, ...] = ALL, protocol: Protocol = PROTOCOL
     return run_object(j, QUERIES[VIEWS.of(j)], VIEWS, methods, protocol)
 
 
-@pytest.mark.parametrize("name", ["hbr", "hbr-visual", "hbr-0-orient", "ahbr", "coin", "sweep-90"])
+@pytest.mark.parametrize("name", ["hbr", "hbr-visual", "hbr-0-orient", "ahbr", "ahbr-90", "coin", "sweep-90"])
 @pytest.mark.parametrize("removal", ["near", "paper79", "queries"])
 def test_a_trial_equals_the_protocol_written_out(name: str, removal: Removal) -> None:
     """Every number once more from `retrieve`, `lead` and `next_view` on a model with the views taken out."""
@@ -74,10 +74,10 @@ def test_a_trial_equals_the_protocol_written_out(name: str, removal: Removal) ->
                 error = abs((ranking.pose_deg[place] - angles[-1] + 180) % 360 - 180)
                 assert runs.pose_error_deg[0, 0, t, n] == error
                 assert runs.alike_error_deg[0, 0, t, n] <= error
-            if name in ("ahbr", "coin") and n > 0:
-                side = None if name == "ahbr" else ("left" if draws.coins[n + 1 :][:1].any() else "right")
+            if name in ("ahbr", "ahbr-90", "coin") and n > 0:
+                side = None if name != "coin" else ("left" if draws.coins[n + 1 :][:1].any() else "right")
                 wanted = angles[-1] + hbr.next_view(ranking, side=side).rotation_deg  # type: ignore[arg-type]
-            elif name == "sweep-90":
+            elif name in ("sweep-90", "ahbr-90"):
                 wanted = angles[-1] + 90
             else:
                 wanted = draws.order[(n + 1) % protocol.max_views] * STEP
