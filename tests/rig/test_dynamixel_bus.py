@@ -1,5 +1,6 @@
 """The bus driver, through the unmodified SDK, on a line that misbehaves."""
 
+import os
 from dataclasses import replace
 
 import pytest
@@ -8,9 +9,11 @@ from dynamixel_sdk import Protocol2PacketHandler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.devices.dynamixel.bus import watchdog_units
+from rig.clock import SystemClock
+from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
+from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table
-from rig.errors import DeviceRefused, DeviceSilent
+from rig.errors import DeviceNotFound, DeviceRefused, DeviceSilent
 from sim.servo import Frame
 
 TABLE = control_table("xl430_w250")
@@ -152,3 +155,60 @@ def test_the_watchdogs_register_holds_at_least_the_time_asked_for_and_never_swit
     units = watchdog_units(timeout_s)
     assert 1 <= units <= 127
     assert units * 0.02 >= min(timeout_s, 2.54) - 1e-9
+
+
+def test_an_adapter_pulled_out_of_a_real_port_is_silent():
+    """pyserial itself, on a pseudo-terminal whose other end goes away: it then raises what is no OSError."""
+    far, near = os.openpty()
+    path = os.ttyname(near)
+    os.close(near)
+    bus = DynamixelBus(ClockedPort(open_serial(path, 57_600), SystemClock(), path), retries=0)
+    os.close(far)
+    with pytest.raises(DeviceSilent, match="does not answer") as caught:
+        bus.ping(1)
+    assert "port failed" in caught.value.evidence["reason"]
+
+
+def test_an_adapter_pulled_while_the_line_is_drained_is_silent(monkeypatch):
+    wires = servo_wires()
+    bus = open_bus(wires)
+    wires.bus.detach(wires.device)
+    drain = bus.port.drain
+
+    def pull_and_drain() -> None:
+        wires.serial.unplug()
+        drain()
+
+    monkeypatch.setattr(bus.port, "drain", pull_and_drain)
+    with pytest.raises(DeviceSilent, match="does not answer"):
+        bus.ping(1)
+
+
+def test_a_port_that_another_program_holds_is_told_as_busy():
+    far, near = os.openpty()
+    first = open_serial(os.ttyname(near), 57_600)
+    with pytest.raises(DeviceNotFound) as caught:
+        open_serial(os.ttyname(near), 57_600)
+    assert "Close the other program" in caught.value.next_step
+    first.close()
+    os.close(near)
+    os.close(far)
+
+
+def test_the_answer_to_a_question_that_was_cut_short_is_never_taken_for_the_next_one():
+    """Ctrl+C in the middle of a transaction, and then torque off with its own questions: Protocol 2.0 numbers none."""
+    wires = servo_wires()
+    bus = open_bus(wires)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    def late_and_interrupted(frame: Frame) -> Frame:
+        wires.bus.tampers.clear()
+        wires.world.clock.call_at(wires.world.clock.now_ns(), interrupt)
+        return replace(frame, start_ns=frame.start_ns + 1_000_000)
+
+    wires.bus.tampers.append(late_and_interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        bus.read(1, TABLE["Present Temperature"])
+    assert bus.read(1, TABLE["Torque Enable"]) == 0

@@ -54,6 +54,7 @@ class DynamixelBus:
         self._retries = retries
         self._lock = RLock()
         self._alerts: set[int] = set()
+        self._unanswered = False  # the last question, even when Ctrl+C cut it short: its answer may still be coming
 
     def alert(self, device_id: int) -> bool:
         """Return whether the device's last status packet carried the alert bit (its Hardware Error Status is not 0)."""
@@ -98,6 +99,9 @@ class DynamixelBus:
                 self.statistics.transactions += 1
                 self.statistics.retries += attempt > 0
                 try:
+                    if self._unanswered:
+                        self.port.drain()
+                    self._unanswered = True
                     payload, result, error = call()
                 except (serial.SerialException, OSError) as unplugged:
                     raise self._silent(what, device_id, f"the port failed: {unplugged}") from unplugged
@@ -106,15 +110,15 @@ class DynamixelBus:
                     payload, result, error = None, COMM_RX_CORRUPT, 0
                 finally:
                     self.port.is_using = False
-                if result == COMM_SUCCESS:
+                if result == COMM_SUCCESS and (error & ~_ALERT or size == 0 or len(payload) == size):
+                    self._unanswered = False
                     self._note_alert(device_id, error)
                     if error & ~_ALERT:
                         raise self._refused(what, device_id, error & ~_ALERT)
-                    if size == 0 or len(payload) == size:
-                        return payload
+                    return payload
+                if result == COMM_SUCCESS:
                     result = COMM_RX_CORRUPT
                 self._count(result)
-                self.port.drain()
             raise self._silent(what, device_id, self._packets.getTxRxResult(result).removeprefix("[TxRxResult] "))
 
     def _note_alert(self, device_id: int, error: int) -> None:

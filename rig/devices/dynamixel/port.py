@@ -1,6 +1,7 @@
 """The SDK's port on the bench's clock, around any object that reads and writes bytes as pyserial's does."""
 
 import errno
+import termios
 from typing import Protocol
 
 import serial
@@ -74,6 +75,12 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
     def getCurrentTime(self) -> float:  # noqa: N802 - the SDK's name
         """Return the time in milliseconds, as the SDK wants it."""
         return self._clock.now_ns() * 1e-6
+
+    def clearPort(self) -> None:  # noqa: N802
+        try:
+            self.ser.reset_input_buffer()
+        except termios.error as gone:  # a pulled adapter; pyserial lets this one through, and it is no OSError
+            raise serial.SerialException(*gone.args) from gone
 
     def writePort(self, packet: list[int]) -> int:  # noqa: N802
         return self.ser.write(bytes(packet)) or 0
