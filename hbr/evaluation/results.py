@@ -86,6 +86,7 @@ class Contest:
 #: What is asked of the methods: first, its views, second, its views; None stands for all views.
 QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
     ("ahbr", 4, "hbr", None),
+    ("hbr", 4, "hbr", None),
     ("ahbr", 4, "hbr", 4),
     ("ahbr", None, "hbr", None),
     ("hbr", None, "hbr-0", None),
