@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rig.config import RigConfig
 
 EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 143
+EXIT_BY_SIGNAL = 128  # plus the signal's number, as shells do
 
 BenchOption = Annotated[
     str | None, typer.Option("--bench", metavar="NAME", help="Bench to work on: hardware, sim, or a plug-in's.")
@@ -95,7 +95,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     """Make a command of a function whose first parameter is the `Settings`.
 
     The common options are added to its own; errors of the registry are printed with their next step and become the exit
-    code; Ctrl+C and SIGTERM unwind the stack, so that everything that is open is closed (torque off), and then end it.
+    code; Ctrl+C, SIGTERM and a lost terminal unwind the stack, so that everything that is open is closed (torque off),
+    and then end it.
     """
     signature = inspect.signature(function, eval_str=True)
     own = list(signature.parameters.values())[1:]
@@ -115,14 +116,16 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def run(ctx: typer.Context, **values: Any) -> None:
         given = [values.pop(name) for name in ("bench", "config", "overrides", "seed", "json_")]
         settings = (ctx.obj or Settings()).merged(*given)
-        signal.signal(signal.SIGTERM, _terminate)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup has a hang-up ignored; so be it
+                signal.signal(number, _terminate)
         try:
             function(settings, **values)
         except RigError as error:
             show_error(error, settings)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
-            print("Interrupted; the table is stopped and its torque off.", file=sys.stderr)
+            print("Interrupted; a table that was in use is let go, its torque off.", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
     run.__signature__ = inspect.Signature([context, *own, *shared])  # type: ignore[attr-defined]
@@ -144,5 +147,5 @@ def show_error(error: RigError, settings: Settings) -> None:
     print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
 
 
-def _terminate(_signal: int, _frame: object) -> None:
-    raise SystemExit(EXIT_TERMINATED)
+def _terminate(number: int, _frame: object) -> None:
+    raise SystemExit(EXIT_BY_SIGNAL + number)

@@ -32,6 +32,7 @@ def enroll(
 
     with settings.open_catalog(create=True) as catalog, settings.open_bench() as bench:
         events = plan(bench, catalog, name, views=views, label=label, note=note, resume=resume, replace=replace)
+        kept = 0
         try:
             with Progress(name) as progress:
                 for event in events:
@@ -41,6 +42,7 @@ def enroll(
                         case Started():
                             progress.start(event.views)
                         case Accepted():
+                            kept += 1
                             progress.advance()
                         case Rejected():
                             progress.note(line(event))
@@ -51,7 +53,10 @@ def enroll(
                         case _:
                             pass
         except BaseException:
-            print(f"The views taken so far are kept; go on with: rig enroll {name!r} --resume", file=sys.stderr)
+            if kept:
+                print(
+                    "The views taken so far are kept; the same command with --resume takes the others.", file=sys.stderr
+                )
             raise
         finally:
             events.close()

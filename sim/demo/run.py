@@ -21,6 +21,7 @@ from rig.catalog import Catalog
 from rig.cli.command import Settings
 from rig.cli.present import Progress, line
 from rig.clock import SystemClock, seconds_between
+from rig.config import validate
 from rig.errors import UsageError
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted
@@ -112,6 +113,8 @@ def run_demo(settings: Settings, *, objects: Path | None, count: int | None, out
     ------
     UsageError
         There are fewer objects than ``count``, or ``out`` cannot be written to.
+    ConfigError
+        The options of the simulated bench have mistakes.
     """
     if settings.bench not in (None, "sim"):
         raise UsageError(
@@ -121,13 +124,12 @@ def run_demo(settings: Settings, *, objects: Path | None, count: int | None, out
     system = SystemClock()
     wall_ns, begun = system.now_ns(), system.utc()
     config = settings.load()
-    options = SimOptions.model_validate(config.bench.get("sim", {}))
+    options = validate(SimOptions, config.bench.get("sim", {}), where="the configuration", prefix="bench.sim")
     enrolled, strangers = _choose(objects or options.objects, count)
     seed = settings.seed or 0
     world = World(noise=NoiseModel(**options.noise), seed=seed)
     operator = ShelfOperator(world, {**enrolled, **strangers})
-    _make_folder(out)
-    with tempfile.TemporaryDirectory(prefix=".catalog-", dir=out) as folder, open_sim_bench(config, operator) as bench:
+    with _folder_within(out) as folder, open_sim_bench(config, operator) as bench:
         with Catalog.open(folder, clock=bench.clock) as catalog:
             enrollments = _enroll_all(bench, catalog, list(enrolled), say=not settings.json)
             index = hbr.ViewIndex(catalog.views().views)
@@ -179,12 +181,14 @@ def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, Thing]
     )
 
 
-def _make_folder(out: Path) -> None:
+def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":
+    """Return a folder for the catalog inside ``out``, which is thereby known to take the report."""
     try:
         out.mkdir(parents=True, exist_ok=True)
+        return tempfile.TemporaryDirectory(prefix=".catalog-", dir=out)
     except OSError as error:
         raise UsageError(
-            f"The folder {out} cannot be made.",
+            f"The folder {out} cannot be written to.",
             next_step="Give another one with --out.",
             evidence={"reason": error.strerror or str(error)},
         ) from error

@@ -94,6 +94,7 @@ def test_a_second_enrollment_of_a_name_needs_a_decision(rig):
     again = rig("enroll", "dice", "--views", "4")
     assert again.exit_code == 7
     assert "--replace" in again.stderr
+    assert "--resume" not in again.stderr  # this command has stored nothing
     assert rig("enroll", "dice", "--views", "4", "--replace").exit_code == 0
 
 
@@ -148,7 +149,7 @@ def test_an_unknown_bench_and_an_unknown_command(rig):
     assert rig("fly").exit_code == 2
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_signals_end_an_enrollment_with_their_code_and_it_resumes(tmp_path, number, code):
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
