@@ -159,9 +159,9 @@ def run_object(
     runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
     for t in range(protocol.trials):
         draws = trial.draw(t)
-        indices: dict[bytes, ViewIndex] = {}
+        models: dict[bytes, Views] = {}
         for m, method in enumerate(methods):
-            trial.run(method, draws, indices, runs, (m, 0, t))
+            trial.run(method, draws, models, runs, (m, 0, t))
     return runs
 
 
@@ -198,7 +198,7 @@ class _Trials:
         )
 
     def run(
-        self, method: Method, draws: _Draws, indices: dict[bytes, ViewIndex], runs: Runs, at: tuple[int, int, int]
+        self, method: Method, draws: _Draws, models: dict[bytes, Views], runs: Runs, at: tuple[int, int, int]
     ) -> None:
         """Fill in the results of one trial by one method."""
         seen = [int(draws.order[0])]
@@ -207,14 +207,16 @@ class _Trials:
         for n in range(last):
             keep = self._keep(np.array(seen))
             key = keep.tobytes()
-            if key not in indices:
-                indices[key] = self._without(keep)
+            if key not in models:
+                models[key] = self._without(keep)
+            # each method its own: an index that remembers another's searches would flatter the time
+            index = ViewIndex(models[key])
             measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
             start_ns = self._now_ns()
             ranking = retrieve(
                 self._queries[seen],
                 measured_deg,
-                indices[key],
+                index,
                 omega=method.omega,
                 list_length=method.list_length,
                 extension=method.extension,
@@ -246,10 +248,10 @@ class _Trials:
             )
         return keep
 
-    def _without(self, keep: NDArray[np.bool_]) -> ViewIndex:
+    def _without(self, keep: NDArray[np.bool_]) -> Views:
         mask = np.ones(len(self._views), np.bool_)
         mask[self._rows] = keep
-        return ViewIndex(self._views.select(mask))
+        return self._views.select(mask)
 
     def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
         """The photograph to look at next, of those not yet looked at."""
