@@ -20,6 +20,7 @@ from rig.errors import RigError
 if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.catalog import Catalog
+    from rig.clock import Clock
     from rig.config import RigConfig
 
 EXIT_INTERRUPTED = 130
@@ -79,12 +80,13 @@ class Settings:
 
         return open_bench(self.bench_name, self.load(), seed=self.seed)
 
-    def open_catalog(self, *, create: bool = False, read_only: bool = False) -> "Catalog":
+    def open_catalog(self, *, clock: "Clock | None" = None, create: bool = False, read_only: bool = False) -> "Catalog":
+        """Open the bench's catalog; to add views to it takes the ``clock`` that they were captured by, the bench's."""
         from rig.catalog import Catalog
         from rig.clock import SystemClock
 
         path = self.load().catalog_path(self.bench_name)
-        return Catalog.open(path, clock=SystemClock(), create=create, read_only=read_only)
+        return Catalog.open(path, clock=clock or SystemClock(), create=create, read_only=read_only)
 
     def print_json(self, value: Any) -> None:
         """Print one line of JSON on stdout, at once."""

@@ -30,7 +30,7 @@ def enroll(
     from rig.plans.enroll import enroll as plan
     from rig.plans.events import Accepted, Enrolled, Moved, Rejected, Started, event_dict
 
-    with settings.open_catalog(create=True) as catalog, settings.open_bench() as bench:
+    with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
         events = plan(bench, catalog, name, views=views, label=label, note=note, resume=resume, replace=replace)
         kept = 0
         try:

@@ -76,6 +76,16 @@ def test_enroll_list_show_identify(rig):
     assert {e["event"] for e in events} >= {"moved", "accepted", "ranked", "decided"}
 
 
+def test_views_are_dated_by_the_clock_of_their_bench(rig):
+    assert rig("enroll", "dice", "--views", "4").exit_code == 0
+    told = json.loads(rig("catalog", "show", "dice", "--json").stdout)
+    (enrollment,) = told["enrollments"]
+    captured = [view["captured_utc"] for view in told["views"]]
+    assert enrollment["started_utc"] < captured[0]
+    assert captured == sorted(captured)
+    assert captured[-1] < enrollment["finished_utc"]
+
+
 def test_an_unknown_object_ends_with_exit_code_8(rig):
     rig("enroll", "mug-dots", "--views", "8")
     done = rig("identify", "--set", "bench.sim.object=clock", "--max-views", "3")
