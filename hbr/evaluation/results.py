@@ -130,13 +130,14 @@ def contests(runs: Runs, methods: Sequence[Method], rng: np.random.Generator) ->
     place = {method.name: m for m, method in enumerate(methods)}
     all_views = runs.rank.shape[-1]
     answers = []
-    for first, first_views, second, second_views in QUESTIONS:
+    # a stream for each question: its interval does not depend on the others
+    for (first, first_views, second, second_views), own in zip(QUESTIONS, rng.spawn(len(QUESTIONS)), strict=True):
         a, b = first_views or all_views, second_views or all_views
         if first not in place or second not in place or max(a, b) > all_views:
             continue
         hits_a = runs.rank[place[first], ..., a - 1] == 1
         hits_b = runs.rank[place[second], ..., b - 1] == 1
-        low, high = bootstrap_difference(hits_a, hits_b, rng)
+        low, high = bootstrap_difference(hits_a, hits_b, own)
         only_a, only_b = int((hits_a & ~hits_b).sum()), int((hits_b & ~hits_a).sum())
         answers.append(
             Contest(
