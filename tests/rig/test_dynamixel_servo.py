@@ -138,3 +138,16 @@ def test_registers_round_trip(name):
         assert register.decode(register.encode(value)) == value
     with pytest.raises(OverflowError):
         register.encode(high + 1)
+
+
+def test_torque_that_comes_on_with_a_goal_is_switched_off():
+    """After a dip of the supply such a servo would obey the next goal, as fast as it can and perhaps a turn away."""
+    wires = servo_wires()
+    wires.device.memory["Drive Mode"] = 0b1000
+    servo = open_servo(wires)
+    assert wires.device.memory["Drive Mode"] == 0
+    wires.device.power_cycle()
+    wires.world.clock.sleep(0.5)
+    servo.move_to(servo.read_state().position_deg + 90)
+    wires.world.clock.sleep(1.0)
+    assert abs(wires.world.shaft()[0]) < 0.1

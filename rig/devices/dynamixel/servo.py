@@ -13,7 +13,6 @@ DEG_PER_COUNT = 360.0 / COUNTS_PER_TURN
 DPS_PER_UNIT = 0.229 * 6.0  # Velocity registers: 0.229 rev/min
 DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # Profile Acceleration: 214.577 rev/min^2
 EXTENDED_POSITION_MODE = 4
-WATCHDOG_TRIPPED = 0xFF
 
 _HARDWARE_ERRORS = {
     0: "input voltage",
@@ -22,8 +21,9 @@ _HARDWARE_ERRORS = {
     4: "electrical shock",
     5: "overload",
 }
-_DRIVE_MODE_BITS = 0b101
-"""Drive Mode bits that must be 0: reverse direction (the table's direction is the rig's) and time-based profile."""
+_DRIVE_MODE_BITS = 0b1101
+"""Drive Mode bits that must be 0: reverse direction (the table's direction is the rig's), time-based profile, and
+torque on by goal update (after a dip of its supply the servo would obey the next goal, unprofiled)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,8 +147,7 @@ class DynamixelServo:
                 next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
                 evidence={"hardware_errors": list(errors)},
             )
-        if self._read("Bus Watchdog") == WATCHDOG_TRIPPED:
-            self._write("Bus Watchdog", 0)
+        self._write("Bus Watchdog", 0)  # tripped, or still armed by a host that was killed
         self._write("Goal Position", self._read("Present Position"))
         self._write("Torque Enable", 1)
 
