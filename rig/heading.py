@@ -8,7 +8,7 @@ before it gives the bias. The uncertainty of a rotation by φ in the time t (whi
 """
 
 from dataclasses import dataclass
-from math import hypot, inf, sqrt
+from math import hypot, inf, isfinite, sqrt
 from typing import Literal
 
 import numpy as np
@@ -65,10 +65,15 @@ class Agreement:
 
 @dataclass(frozen=True, slots=True)
 class Stillness:
-    """What encoder and gyro saw between settling and the end of the exposure."""
+    """What encoder and gyro saw between settling and the end of the exposure.
+
+    ``peak_rate_dps`` is infinite where the gyro's samples are not complete; ``platter_change_deg`` is the platter's own
+    turn, by the gyro, ``encoder_change_deg`` the shaft's.
+    """
 
     peak_rate_dps: float
     encoder_change_deg: float
+    platter_change_deg: float
     still: bool
 
 
@@ -92,11 +97,17 @@ def compare(
     return Agreement(encoder_deg - gyro.angle_deg, k * hypot(gyro.sigma_deg, encoder_sigma_deg) + backlash_deg)
 
 
+def finite(value: float) -> float | None:
+    """Return ``value`` as evidence, to three digits; None where it is unknown, as JSON has no infinity."""
+    return round(value, 3) if isfinite(value) else None
+
+
 class GyroHeading:
     """Rotations of the table by its gyro.
 
     Use: `rest` while the table stands, `begin`, move and call `update` every few hundredths of a second, and when
-    `peak_dps` says that it stands again, `end`.
+    `peak_dps` says that it stands again, `end`. A rotation counts from the `end` before it: a platter that is pushed
+    on its shaft while the table stands shows in the next one, unless samples were lost meanwhile.
 
     Parameters
     ----------
@@ -140,9 +151,7 @@ class GyroHeading:
         self._drained_ns = clock.now_ns()
         self._resting_ns = clock.now_ns()
         self._moving = False
-        self._sum_dps = 0.0
-        self._count = 0
-        self._trouble = ""
+        self._restart()
         self.bias: Bias | None = None
 
     def rest(self, duration_s: float = 0.5) -> Bias:
@@ -165,7 +174,9 @@ class GyroHeading:
                 f"a rest of {duration_s:g} s cannot be judged", next_step=f"Give up to {MEMORY_S / 2:g} s, above 0."
             )
         if self._moving:
+            self._drain()
             self._moving, self._resting_ns = False, self._clock.now_ns()
+            self._restart()
         rate = self._wait_for_rest(duration_s)
         mean = float(rate.mean())
         peak = float(np.abs(rate - mean).max())
@@ -176,6 +187,8 @@ class GyroHeading:
                 next_step="Wait until the table stands still; a standing table that shakes needs a steadier bench.",
                 evidence={"mean_dps": mean, "peak_dps": peak, "peak_limit_dps": REST_PEAK_DPS},
             )
+        if self.bias is None:
+            self._restart()
         self.bias = Bias(mean, self._noise(rate) / sqrt(rate.size / self._imu.rate_hz), peak, rate.size)
         return self.bias
 
@@ -190,7 +203,7 @@ class GyroHeading:
         if self.bias is None:
             raise NotReady("the gyro's bias is not known", next_step="Measure it at rest first.")
         self._drain()
-        self._moving, self._sum_dps, self._count, self._trouble = True, 0.0, 0, ""
+        self._moving = True
 
     def update(self) -> None:
         """Collect what the sensor has measured; cheap to call often."""
@@ -198,7 +211,7 @@ class GyroHeading:
             self._drain()
 
     def end(self) -> Rotation:
-        """Return the rotation since `begin`; the table stands again.
+        """Return the rotation since the last `end` (or first `rest`); the table stands again.
 
         Raises
         ------
@@ -208,8 +221,22 @@ class GyroHeading:
         if not self._moving or self.bias is None:
             raise NotReady("no rotation was begun", next_step="Call `begin` before the move.")
         self._drain()
+        rotation = self.since_rest()
         self._moving = False
         self._resting_ns = self._clock.now_ns()
+        self._restart()
+        return rotation
+
+    def since_rest(self) -> Rotation:
+        """Return the rotation since the last `end`, by the samples collected so far.
+
+        Raises
+        ------
+        NotReady
+            When no bias is known yet.
+        """
+        if self.bias is None:
+            raise NotReady("the gyro's bias is not known", next_step="Measure it at rest first.")
         duration_s = self._count / self._imu.rate_hz
         angle_deg = self._to_table * (self._sum_dps / self._imu.rate_hz - self.bias.rate_dps * duration_s)
         drift_deg = abs(self._to_table) * hypot(self._arw * sqrt(duration_s), self.bias.sigma_dps * duration_s)
@@ -241,13 +268,17 @@ class GyroHeading:
         self._rate_dps = np.concatenate([self._rate_dps, rate])
         kept = self._time_ns > self._drained_ns - MEMORY_S * 1e9
         self._time_ns, self._rate_dps = self._time_ns[kept], self._rate_dps[kept]
-        if self._moving:
-            self._sum_dps += float(rate.sum())
-            self._count += rate.size
-            if new.lost:
-                self._trouble = f"the sensor lost {new.lost} samples"
-            elif rate.size and np.abs(rate).max() >= self._saturated_dps:
-                self._trouble = f"the rate went beyond the gyro's range of {self._saturated_dps:g} °/s"
+        if new.lost and not self._moving:
+            self._restart()  # a table that stands is looked at seldom
+        elif new.lost:
+            self._trouble = f"the sensor lost {new.lost} samples"
+        self._sum_dps += float(rate.sum())
+        self._count += rate.size
+        if rate.size and np.abs(rate).max() >= self._saturated_dps:
+            self._trouble = f"the rate went beyond the gyro's range of {self._saturated_dps:g} °/s"
+
+    def _restart(self) -> None:
+        self._sum_dps, self._count, self._trouble = 0.0, 0, ""
 
     def _wait_for_rest(self, duration_s: float) -> NDArray[np.float64]:
         """Return the rates of at least ``duration_s`` since the rest began (or samples were lost)."""

@@ -3,7 +3,7 @@
 from collections import deque
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
-from math import ceil, floor, sqrt
+from math import ceil, floor, isfinite, sqrt
 from types import TracebackType
 from typing import Self
 
@@ -11,7 +11,7 @@ from rig.bench import Bench
 from rig.clock import seconds_between
 from rig.devices.servo import MotionProfile, ServoState
 from rig.errors import DeviceFault, LimitExceeded, MotionTimeout, NotReady, RigError
-from rig.heading import Agreement, GyroHeading, Rotation, Stillness, compare
+from rig.heading import Agreement, GyroHeading, Rotation, Stillness, compare, finite
 
 QUIET_COUNTS = 3
 """Encoder counts that readings at rest may differ by: one of quantisation, the rest of its noise."""
@@ -82,13 +82,14 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._play_taken_up = False
 
     def __enter__(self) -> Self:
-        self._profile = self._servo.set_profile(
-            MotionProfile(self._config.velocity_dps, self._config.acceleration_dps2)
-        )
-        self._servo.torque_on()
         try:
+            self._servo.torque_on()
+            # After torque on, which clears the watchdog: one that trips sets the profile back to unlimited.
+            self._profile = self._servo.set_profile(
+                MotionProfile(self._config.velocity_dps, self._config.acceleration_dps2)
+            )
             self._wait_for_rest(self.angle_deg(), self._config.quiet_s, SETTLE_ALLOWANCE_S)
-            self._heading.rest(FIRST_REST_S)
+            self._learn_bias(FIRST_REST_S)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -157,12 +158,22 @@ class Turntable(AbstractContextManager["Turntable"]):
         self.check_target(target_deg)
         return self._move(target_deg, self._waypoints(target_deg))
 
-    def check_still(self) -> Stillness:
-        """Look again at encoder and gyro, for the evidence of a view taken since the table came to rest."""
+    def check_still(self, since_ns: int | None = None) -> Stillness:
+        """Look again at encoder and gyro, for the evidence of a view taken since the table came to rest.
+
+        The rate is looked at from ``since_ns`` on, but never for less than ``table.quiet_s``; the angles of shaft and
+        platter are compared with those of the rest, however long ago.
+        """
         change = abs(self.angle_deg() - self._rest_deg)
-        peak = self._heading.peak_dps(self._config.quiet_s)
-        still = peak <= self._config.quiet_dps and change <= QUIET_COUNTS * self._servo.resolution_deg
-        return Stillness(peak, change, still)
+        now_ns = self._clock.now_ns()
+        window_s = max(self._config.quiet_s, seconds_between(now_ns if since_ns is None else since_ns, now_ns))
+        peak = self._heading.peak_dps(window_s)
+        if not isfinite(peak):
+            self._clock.sleep(self._config.quiet_s)  # somebody paused the plan for longer than the gyro remembers
+        turned = self._heading.since_rest()
+        slipped = abs(turned.angle_deg) > 4 * turned.sigma_deg + self._config.backlash_deg
+        still = peak <= self._config.quiet_dps and change <= QUIET_COUNTS * self._servo.resolution_deg and not slipped
+        return Stillness(peak, change, turned.angle_deg, still)
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
@@ -180,13 +191,25 @@ class Turntable(AbstractContextManager["Turntable"]):
             return (target_deg,)
         return (start, target_deg)
 
+    def _learn_bias(self, duration_s: float) -> None:
+        """Measure the gyro's bias; somebody who walks past costs a moment, a bench that goes on shaking the move."""
+        give_up_ns = self._clock.now_ns() + round(SETTLE_ALLOWANCE_S * 1e9)
+        while True:
+            try:
+                self._heading.rest(duration_s)
+            except NotReady:
+                if self._clock.now_ns() >= give_up_ns:
+                    raise
+            else:
+                return
+
     def _move(self, target_deg: float, waypoints: tuple[float, ...]) -> Move:
         if self._profile is None:
             raise NotReady(
                 "The table has no torque.", next_step="Use it in a with block: `with Turntable(bench) as table:`."
             )
         started_ns, start_deg = self._clock.now_ns(), self._rest_deg
-        self._heading.rest(self._config.quiet_s)  # the bias wanders: each rest measures it anew
+        self._learn_bias(self._config.quiet_s)  # it wanders: each rest measures it anew
         self._heading.begin()
         try:
             for waypoint in waypoints:
@@ -243,7 +266,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                         "encoder_deg": round(angle_deg, 2),
                         "in_position": state.in_position,
                         "moving": state.moving,
-                        "peak_rate_dps": round(self._heading.peak_dps(config.quiet_s), 3),
+                        "peak_rate_dps": finite(self._heading.peak_dps(config.quiet_s)),
                         "load_percent": round(state.load_percent, 1),
                         "voltage_v": round(state.voltage_v, 1),
                     },

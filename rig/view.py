@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from math import isfinite
 
 import cv2
 import numpy as np
@@ -59,7 +60,7 @@ class Viewer:
         self._locks = camera.read_locks()
         self._last: NDArray[np.uint8] | None = None
 
-    def attempts(self, settled_ns: int, check_still: Callable[[], Stillness]) -> Iterator[Attempt]:
+    def attempts(self, settled_ns: int, check_still: Callable[[int], Stillness]) -> Iterator[Attempt]:
         """Capture until a frame is accepted or the retakes are used up; the last attempt tells which.
 
         Parameters
@@ -67,12 +68,12 @@ class Viewer:
         settled_ns
             When the table came to rest: no older exposure counts.
         check_still
-            Looks at encoder and gyro again, after the exposure.
+            Looks at encoder and gyro again, after the exposure, from a given time on.
         """
         after_ns = settled_ns
         for number in range(1, 2 + self._config.retakes):
             frame = self._camera.capture(after_ns)
-            attempt = self._judge(number, frame, settled_ns, check_still())
+            attempt = self._judge(number, frame, settled_ns, check_still(after_ns))
             self._last = frame.image_bgr
             yield attempt
             if attempt.accepted:
@@ -108,8 +109,13 @@ class Viewer:
         reasons = []
         if frame.exposed_ns < settled_ns:
             reasons.append("exposed before the table was at rest")
-        if not stillness.still:
-            reasons.append(f"the table moved during the exposure ({stillness.peak_rate_dps:.2f} °/s)")
+        if not isfinite(stillness.peak_rate_dps):
+            reasons.append("the gyro's samples are not complete: whether the table stood still is unknown")
+        elif not stillness.still:
+            reasons.append(
+                f"the table moved ({stillness.peak_rate_dps:.2f} °/s, shaft {stillness.encoder_change_deg:.2f}°, "
+                f"platter {stillness.platter_change_deg:+.2f}°)"
+            )
         if evidence.repeated:
             reasons.append("the camera repeated its last frame")
         if not evidence.locks_hold:

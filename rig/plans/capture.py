@@ -3,6 +3,7 @@
 from collections.abc import Generator
 
 from rig.errors import ViewRejected
+from rig.heading import finite
 from rig.plans.events import Event, Moved, Rejected
 from rig.turntable import Move, Turntable
 from rig.view import Attempt, Viewer
@@ -46,6 +47,7 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
             "mean_level": round(evidence.mean_level, 1),
             "dark_share": round(evidence.dark_share, 3),
             "saturated_share": round(evidence.saturated_share, 3),
-            "peak_rate_dps": round(evidence.stillness.peak_rate_dps, 3),
+            "peak_rate_dps": finite(evidence.stillness.peak_rate_dps),
+            "platter_change_deg": finite(evidence.stillness.platter_change_deg),
         },
     )

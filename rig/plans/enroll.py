@@ -34,7 +34,8 @@ def enroll(
     ObjectExists, CatalogError, CatalogBusy
         See `Catalog.begin` and `Catalog.resume`.
     RotationDisagreement
-        Encoder and gyro differ by more than their uncertainty: no view is stored at an angle in doubt.
+        Encoder and gyro differ by more than their uncertainty, or the gyro lost the rotation: no view is stored at an
+        angle in doubt.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.view` and `rig.turntable`; views stored so far stay.
     """
@@ -65,7 +66,7 @@ def enroll(
         for index in missing:
             move = table.goto(index * 360.0 / views)
             yield moved(index, move)
-            if not move.agrees:
+            if move.agreement is None or not move.agreement.agrees:
                 raise _disagreement(move)
             imu.add(move)
             shot = yield from capture(index, viewer, table, move.settled_ns)
@@ -94,21 +95,28 @@ class _ImuAngle:
 
     def __init__(self) -> None:
         self.angle_deg: float | None = None
-        self.sigma_deg: float | None = None
+        self.sigma_deg = 0.0
 
     def add(self, move: Move) -> None:
-        if self.angle_deg is None or self.sigma_deg is None:
-            self.angle_deg, self.sigma_deg = move.encoder_deg, 0.0
-        elif move.gyro.valid:
+        if self.angle_deg is None:
+            self.angle_deg = move.encoder_deg
+        else:
             self.angle_deg += move.gyro.angle_deg
             self.sigma_deg += move.gyro.sigma_deg  # not in squares: bias and scale errors are common to all moves
 
 
 def _disagreement(move: Move) -> RotationDisagreement:
-    assert move.agreement is not None  # a move without one agrees
+    if move.agreement is None:
+        return RotationDisagreement(
+            f"Whether the platter turned {move.rotation_encoder_deg:.2f}° with the servo is unknown: "
+            f"{move.gyro.reason}.",
+            next_step="If nothing knocked the table, go on with --resume; else enroll the object anew with --replace.",
+            evidence={"table_deg": round(move.encoder_deg, 2)},
+        )
     return RotationDisagreement(
         f"The servo turned {move.rotation_encoder_deg:.2f}°, the platter {move.gyro.angle_deg:.2f}°.",
-        next_step="Tighten the platter, look for slip or a knocked table, then go on with --resume.",
+        next_step="Tighten the platter and enroll the object anew with --replace: "
+        "views from before and after a slip do not fit together.",
         evidence={
             "difference_deg": round(move.agreement.difference_deg, 3),
             "bound_deg": round(move.agreement.bound_deg, 3),

@@ -1,6 +1,7 @@
 """What a plan tells while it runs: small frozen events, the one stream that people, files and tests see."""
 
 from dataclasses import dataclass, field, fields, is_dataclass
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -139,11 +140,16 @@ def event_dict(event: Event) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Return dataclasses as dicts and tuples as lists, all the way down; fields marked ``json=False`` are left out."""
+    """Return ``value`` as JSON has it: dataclasses as dicts, tuples as lists, what is not finite (unknown) as None.
+
+    Fields marked ``json=False`` are left out.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value) if f.metadata.get("json", True)}
     if isinstance(value, tuple | list):
         return [plain(v) for v in value]
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, float) and not isfinite(value):
+        return None
     return value

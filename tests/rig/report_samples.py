@@ -28,7 +28,7 @@ NAMES = ("mug-white", "mug-star", "teapot", "vase-blue", "lamp")
 
 def evidence(sharpness: float = 100.0) -> ViewEvidence:
     locks = CameraLocks(8000.0, None, 5000.0, False, False)
-    return ViewEvidence(10, 20, sharpness, 90.0, 0.0, 0.0, False, locks, True, Stillness(0.05, 0.0, True))
+    return ViewEvidence(10, 20, sharpness, 90.0, 0.0, 0.0, False, locks, True, Stillness(0.05, 0.0, 0.0, True))
 
 
 def moved(index: int, commanded_deg: float, rotation_deg: float) -> Moved:

@@ -1,5 +1,7 @@
 """The table with real drivers on simulated wires: where it stops, when it is at rest, and what it refuses."""
 
+import json
+
 import pytest
 from bench_parts import motion_bench
 from hypothesis import given, settings
@@ -9,6 +11,7 @@ from rig.devices.servo import MotionProfile
 from rig.errors import DeviceFault, DeviceSilent, LimitExceeded, MotionTimeout, NotReady
 from rig.turntable import Turntable, motion_seconds
 from sim.noise import NoiseModel
+from sim.servo import Frame
 
 
 def test_it_goes_where_it_is_told_and_the_platter_agrees():
@@ -166,3 +169,79 @@ def test_the_expected_duration_is_the_trapezoids(distance, v, a):
 
     expected = to_position(0.0, 0.0, 0.0, distance, v, a).end_s
     assert motion_seconds(distance, MotionProfile(v, a)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_ctrl_c_while_the_torque_goes_on_takes_it_off_again():
+    with motion_bench() as (bench, wires):
+
+        def interrupt() -> None:
+            raise KeyboardInterrupt
+
+        def when_on(frame: Frame) -> Frame:
+            if wires.device.memory["Torque Enable"]:
+                wires.bus.tampers.clear()
+                wires.world.clock.call_at(wires.world.clock.now_ns(), interrupt)
+            return frame
+
+        wires.bus.tampers.append(when_on)
+        with pytest.raises(KeyboardInterrupt), Turntable(bench):
+            pass
+        assert not wires.bus.tampers
+        assert wires.device.memory["Torque Enable"] == 0
+
+
+def test_a_watchdog_that_a_killed_host_left_armed_does_not_stop_the_next_run():
+    with motion_bench() as (bench, wires):
+        bench.servo.torque_on()
+        bench.servo.arm_watchdog(0.2)  # and the host is killed: no torque off
+        wires.world.clock.sleep(0.1)
+        with Turntable(bench) as table:
+            assert wires.device.memory["Profile Velocity"] > 0  # 0 would be: as fast as it can
+            assert table.goto(20.0).encoder_deg == pytest.approx(20.0, abs=0.3)
+
+
+def test_somebody_who_walks_past_at_rest_costs_no_move():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        table.goto(20.0)
+        wires.world.slip(0.06, 0.05)
+        assert table.goto(40.0).agrees
+
+
+def test_a_platter_pushed_while_it_stands_shows_in_the_next_move():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        table.goto(20.0)
+        wires.world.slip(5.0, 0.2)
+        wires.world.clock.sleep(0.4)
+        move = table.goto(40.0)
+        assert not move.agrees
+        assert move.rotation_deg == pytest.approx(25.0, abs=0.6)
+
+
+def test_a_shake_in_the_beginning_of_a_long_exposure_is_seen():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        settled_ns = table.goto(20.0).settled_ns
+        wires.world.slip(0.06, 0.05)
+        wires.world.clock.sleep(0.6)
+        assert table.check_still().still  # it stands now
+        assert not table.check_still(settled_ns).still
+
+
+def test_a_push_of_the_platter_stays_visible_after_it_stands_again():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        table.goto(20.0)
+        wires.world.slip(2.0, 0.1)
+        wires.world.clock.sleep(0.5)
+        stillness = table.check_still()
+        assert not stillness.still
+        assert stillness.platter_change_deg == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_time_out_can_be_told_in_json_although_the_gyro_knows_nothing():
+    with motion_bench() as (bench, wires), pytest.raises(MotionTimeout) as caught:
+        wires.device.jam()
+        wires.device.memory["Shutdown"] = 0
+        with Turntable(bench) as table:
+            table._heading.bias = None
+            table._wait_for_rest(60.0, 0.1, 0.5)
+    told = json.loads(json.dumps(caught.value.as_dict(), allow_nan=False))
+    assert told["evidence"]["peak_rate_dps"] is None

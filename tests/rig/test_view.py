@@ -102,3 +102,23 @@ def test_the_region_of_interest_is_what_is_described(on_the_table):
     (attempt,) = look(s, table, viewer)
     x, y, width, height = s.bench.config.view.roi
     assert (viewer.describe(attempt.image_bgr) == hbr.describe(attempt.image_bgr[y : y + height, x : x + width])).all()
+
+
+def test_a_platter_pushed_after_settling_gives_no_view_however_often_it_is_retaken(on_the_table):
+    s, table, viewer = on_the_table
+    settled_ns = table.goto(40.0).settled_ns
+    s.world.slip(3.0, 0.02)
+    attempts = list(viewer.attempts(settled_ns, table.check_still))
+    assert not attempts[-1].accepted
+    assert "platter +" in attempts[-1].reasons[0]
+    assert attempts[-1].evidence.stillness.platter_change_deg == pytest.approx(3.0, abs=0.1)
+
+
+def test_after_a_pause_longer_than_the_gyros_memory_a_view_is_still_taken(on_the_table):
+    """Whoever consumes a plan's events may stop for a while; what the gyro missed meanwhile is not called a motion."""
+    s, table, viewer = on_the_table
+    settled_ns = table.goto(40.0).settled_ns
+    s.world.clock.sleep(30.0)
+    attempts = list(viewer.attempts(settled_ns, table.check_still))
+    assert "unknown" in attempts[0].reasons[0]
+    assert attempts[-1].accepted
