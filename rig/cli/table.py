@@ -57,12 +57,16 @@ def status(settings: Settings) -> None:
     for device in ("servo", "imu", "camera"):
         facts = report[device]
         assert isinstance(facts, dict)
-        print(f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in facts.items()))
+        print(f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in facts.items() if key != "time_ns"))
     for finding in bench.findings:
         print(f"note     {finding}")
 
 
 def _short(value: object) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, dict):
