@@ -66,9 +66,10 @@ class Bench(AbstractContextManager["Bench"]):
     ) -> None:
         try:
             self.close()
-        except (RigError, OSError):
+        except (RigError, OSError) as failure:
             if error is None:  # otherwise the first error is the one that people must see
                 raise
+            error.add_note(f"The bench could not be closed properly: {failure}")
 
     def close(self) -> None:
         """Torque off, then let go of the devices; a device that fails here does not keep the others open.

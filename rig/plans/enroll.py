@@ -43,7 +43,11 @@ def enroll(
     provenance = Provenance(
         bench=bench.name,
         devices=bench.devices(),
-        conditions={**bench.conditions, "view": bench.config.view.model_dump(mode="json")},
+        conditions={
+            **bench.conditions,
+            **bench.config.model_dump(mode="json", include={"table", "imu", "camera", "view"}),
+            "findings": list(bench.findings),
+        },
     )
     if resume:
         enrollment = catalog.resume(name, provenance=provenance)

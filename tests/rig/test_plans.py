@@ -102,6 +102,18 @@ def test_an_enrolled_object_is_replaced_only_on_request(simulated, catalog):
     assert catalog.object("dice").summary.views == 5
 
 
+def test_what_a_view_was_taken_under_is_kept_with_it(simulated, catalog):
+    """Also on a bench without a noise model: the calibration in force, the camera's settings, what opening it found."""
+    s = simulated("imu.scale=1.007")
+    list(enroll(s.bench, catalog, "dice", views=4))
+    provenance = catalog.object("dice").views[0].sitting.provenance
+    assert provenance.conditions["imu"]["scale"] == 1.007
+    assert provenance.conditions["table"]["zero_deg"] == s.bench.config.table.zero_deg
+    assert provenance.conditions["camera"]["exposure_us"] == s.bench.config.camera.exposure_us
+    assert "servo: Operating Mode was 3, is now 4" in provenance.conditions["findings"]
+    assert provenance.devices["servo"]["model"] == "xl430_w250"
+
+
 def test_a_dark_moment_costs_retakes_and_darkness_ends_the_enrollment_without_losing_views(simulated, catalog):
     s = simulated()
     events = []
@@ -135,6 +147,14 @@ def test_a_pulled_servo_cable_ends_the_plan_with_everything_kept(simulated, cata
     assert catalog.resumable("lamp").present == (0, 1, 2)
     with pytest.raises(DeviceSilent):
         s.bench.close()  # says that the torque could not be taken off, and lets go of the other devices
+
+
+def test_torque_that_could_not_be_taken_off_is_noted_on_the_first_error(simulated):
+    s = simulated()
+    with pytest.raises(KeyboardInterrupt) as caught, s.bench:
+        s.bench.servo.bus.port.ser.unplug()
+        raise KeyboardInterrupt
+    assert any("does not answer" in note for note in caught.value.__notes__)
 
 
 def servo_of(s):
