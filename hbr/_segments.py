@@ -12,8 +12,15 @@ def ranges(start: IndexArray, count: IndexArray) -> tuple[IndexArray, IndexArray
     return np.arange(end[-1] if len(end) else 0) + np.repeat(start - begin, count), begin
 
 
+def lengths(begin: IndexArray, total: int) -> IndexArray:
+    """Lengths of the segments that begin there and fill the total."""
+    end = np.empty_like(begin)
+    end[:-1], end[-1:] = begin[1:], total
+    return end - begin
+
+
 def first_maximum(values: FloatArray, begin: IndexArray) -> IndexArray:
     """Index of the maximum of each segment, the first of equals; no segment may be empty."""
     maxima = np.maximum.reduceat(values, begin)
-    reached = np.flatnonzero(values == np.repeat(maxima, np.diff(begin, append=len(values))))
+    reached = np.flatnonzero(values == np.repeat(maxima, lengths(begin, len(values))))
     return reached[np.searchsorted(reached, begin)]

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hbr._segments import first_maximum, ranges
+from hbr._segments import first_maximum, lengths, ranges
 from hbr.angles import turns_between
 from hbr.arrays import FloatArray, IndexArray, LevelArray
 from hbr.index import ViewIndex, check_queries
@@ -199,7 +199,7 @@ def _turned(anchors: IndexArray, turn_deg: FloatArray, views: Views) -> IndexArr
     if not len(anchors):
         return anchors
     rows, begin = views.of_each(views.object_index[anchors])
-    count = np.diff(begin, append=len(rows))
+    count = lengths(begin, len(rows))
     turned_deg = views.azimuth_deg[rows] - np.repeat(views.azimuth_deg[anchors], count)
     return rows[first_maximum(-turns_between(turned_deg, np.repeat(turn_deg, count)), begin)]
 
