@@ -5,10 +5,10 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import platformdirs
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from rig.errors import ConfigError
 
@@ -25,7 +25,6 @@ class Section(BaseModel):
 
 
 Degrees = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -70,12 +69,13 @@ class TableConfig(Section):
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
     watchdog_s: float = Field(0.5, ge=0.1, le=2.5, description="the servo stops by itself after this much silence")
 
-    @model_validator(mode="after")
-    def _limits_in_order(self) -> Self:
-        low, high = self.limits_deg
+    @field_validator("limits_deg")
+    @classmethod
+    def _limits_hold_a_turn(cls, limits_deg: tuple[float, float]) -> tuple[float, float]:
+        low, high = limits_deg
         if not (low <= 0 <= high and high - low >= 360):
-            raise ValueError("limits_deg must span at least one turn and hold 0, e.g. [-400, 400]")
-        return self
+            raise ValueError("must span at least one turn and hold 0, e.g. [-400, 400]")
+        return limits_deg
 
 
 class ImuConfig(Section):
@@ -137,7 +137,7 @@ class IdentifyConfig(Section):
     """How an object is found."""
 
     max_views: int = Field(8, ge=1, le=72, description="give the best answer after this many views")
-    min_views: int = Field(2, ge=1, le=72, description="never decide before")
+    min_views: int = Field(2, ge=1, le=72, validate_default=True, description="never decide before")
     first_step_deg: float = Field(
         90.0, ge=-180, le=180, description="rotation between the first two views, + to the left"
     )
@@ -154,11 +154,13 @@ class IdentifyConfig(Section):
         description="below this score a view the object is unknown; none: as the enrolled views suggest",
     )
 
-    @model_validator(mode="after")
-    def _views_in_order(self) -> Self:
-        if self.min_views > self.max_views:
-            raise ValueError(f"min_views ({self.min_views}) is above max_views ({self.max_views})")
-        return self
+    @field_validator("min_views")
+    @classmethod
+    def _views_in_order(cls, min_views: int, others: ValidationInfo) -> int:
+        max_views = others.data.get("max_views", min_views)
+        if min_views > max_views:
+            raise ValueError(f"must not be above max_views, which is {max_views}")
+        return min_views
 
 
 class RigConfig(Section):
@@ -169,13 +171,25 @@ class RigConfig(Section):
     table: TableConfig = TableConfig()
     imu: ImuConfig = ImuConfig()
     camera: CameraConfig = CameraConfig()
-    view: ViewConfig = ViewConfig()
+    view: ViewConfig = Field(ViewConfig(), validate_default=True)
     catalog: CatalogConfig = CatalogConfig()
     enroll: EnrollConfig = EnrollConfig()
     identify: IdentifyConfig = IdentifyConfig()
     bench: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="options of the benches, by name: [bench.sim]"
     )
+
+    @field_validator("view")
+    @classmethod
+    def _region_within_frame(cls, view: ViewConfig, others: ValidationInfo) -> ViewConfig:
+        camera = others.data.get("camera")
+        if camera is not None and view.roi is not None:
+            x, y, width, height = view.roi
+            if min(x, y) < 0 or min(width, height) < 1 or x + width > camera.width or y + height > camera.height:
+                raise ValueError(
+                    f"roi {list(view.roi)} does not lie within the camera's frame of {camera.width}x{camera.height}"
+                )
+        return view
 
     def catalog_path(self, bench_name: str) -> Path:
         """Return the catalog's folder: simulated views never mix with real ones unless the configuration says so."""
@@ -241,7 +255,7 @@ def _mistake(model: type[BaseModel], prefix: str, error: Any) -> str:
         near = difflib.get_close_matches(str(error["loc"][-1]), _siblings(model, error["loc"][:-1]), n=1)
         return f"{key}: unknown key" + (f"; did you mean {near[0]}?" if near else "")
     message = error["msg"].removeprefix("Value error, ")
-    found = "" if isinstance(error["input"], dict) else f" (found {error['input']!r})"
+    found = "" if isinstance(error["input"], dict | BaseModel) else f" (found {error['input']!r})"
     return f"{key}: {message}{found}" if key else f"{message}{found}"
 
 

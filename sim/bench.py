@@ -10,9 +10,9 @@ from pydantic import BaseModel, Field, field_validator
 
 from rig.bench import Bench, BenchKind
 from rig.clock import SystemClock
-from rig.config import RigConfig, Section
+from rig.config import RigConfig, Section, ServoConfig
 from rig.devices.dynamixel.port import READ_SLICE_S
-from rig.errors import ObjectNotFound
+from rig.errors import ConfigError, ObjectNotFound
 from rig.hardware import assemble
 from sim.camera import SimCapture
 from sim.clock import VirtualClock
@@ -86,11 +86,16 @@ def open_sim_bench(config: RigConfig, operator: ShelfOperator) -> Bench:
     """Put the real drivers on the simulated wires of the operator's world, by the lines that open a real bench.
 
     The simulated servo comes as from the factory and is set up over its wire.
+
+    Raises
+    ------
+    ConfigError
+        There is no simulated servo of that model, or it does not know the baud rate.
     """
     world = operator.world
     config = config.model_copy(update={"servo": config.servo.model_copy(update={"write_settings": True})})
     servo_bus = ServoBus(world.clock)
-    servo_bus.attach(XSeriesServo(world, config.servo.model, bus_id=config.servo.id, baudrate=config.servo.baud))
+    servo_bus.attach(_servo(world, config.servo))
     with ExitStack() as wires:
         i2c = wires.enter_context(SimI2cBus(world.clock))
         i2c.attach(config.imu.address, SimMpu6050(world, ad0=config.imu.address == 0x69))
@@ -106,6 +111,17 @@ def open_sim_bench(config: RigConfig, operator: ShelfOperator) -> Bench:
     bench.operator = operator
     bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
     return bench
+
+
+def _servo(world: World, config: ServoConfig) -> XSeriesServo:
+    try:
+        return XSeriesServo(world, config.model, bus_id=config.id, baudrate=config.baud)
+    except ValueError as error:
+        raise ConfigError(
+            "The simulated bench has no such servo.",
+            next_step="Mend servo.model or servo.baud.",
+            evidence={"reason": str(error)},
+        ) from error
 
 
 class SimBenchKind:

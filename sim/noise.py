@@ -20,7 +20,7 @@ class NoiseModel:
     structure_hz: float = 11.0
     """Natural frequency of platter and object on the shaft: they ring after each change of acceleration."""
     structure_damping: float = 0.15
-    """Damping ratio of that ringing."""
+    """Damping ratio of that ringing, below 1."""
     voltage_noise_v: float = 0.05
     """Standard deviation of the supply voltage."""
 
@@ -59,6 +59,12 @@ class NoiseModel:
             value = getattr(self, field.name)
             if not 0 <= value < float("inf"):
                 raise ValueError(f"{field.name} = {value!r}: give a finite number that is not negative")
+        if self.structure_damping >= 1:
+            raise ValueError(
+                f"structure_damping = {self.structure_damping!r}: give a ratio below 1 (no ringing: structure_hz = 0)"
+            )
+        if self.vignetting > 1:
+            raise ValueError(f"vignetting = {self.vignetting!r}: give a share of the light, at most 1")
 
     @classmethod
     def none(cls) -> Self:

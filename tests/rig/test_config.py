@@ -17,16 +17,20 @@ def test_the_defaults_are_valid_and_need_no_file(tmp_path, monkeypatch):
 def test_all_mistakes_are_told_at_once_with_range_and_suggestion(tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text(
-        '[servo]\nbaud = 3\nprot = "/dev/ttyUSB1"\n[table]\nlimits_deg = [0, 90]\n[identify]\nmax_view = 3\n',
+        '[servo]\nbaud = 3\nprot = "/dev/ttyUSB1"\n[table]\nlimits_deg = [0, 90]\nvelocity_dps = -1\n'
+        "[identify]\nmax_view = 3\nmax_views = 1\n[camera]\nwidth = 320\n",
         encoding="utf-8",
     )
     with pytest.raises(ConfigError) as caught:
         load_config(file)
     mistakes = "\n".join(caught.value.evidence["mistakes"])
-    assert len(caught.value.evidence["mistakes"]) == 4
+    assert len(caught.value.evidence["mistakes"]) == 7
     assert "servo.baud: Input should be greater than or equal to 9600 (found 3)" in mistakes
     assert "servo.prot: unknown key; did you mean port?" in mistakes
-    assert "table: limits_deg must span at least one turn" in mistakes
+    assert "table.limits_deg: must span at least one turn" in mistakes
+    assert "table.velocity_dps: Input should be greater than 0 (found -1)" in mistakes
+    assert "identify.min_views: must not be above max_views, which is 1 (found 2)" in mistakes
+    assert "view: roi [80, 0, 480, 480] does not lie within the camera's frame of 320x480" in mistakes
     assert "identify.max_view: unknown key; did you mean max_views?" in mistakes
     assert caught.value.exit_code == 3
 
@@ -39,6 +43,13 @@ def test_a_file_that_is_not_there_and_one_that_is_no_toml(tmp_path):
     with pytest.raises(ConfigError, match="not a TOML file") as caught:
         load_config(broken)
     assert "line 1" in caught.value.evidence["reason"]
+
+
+@pytest.mark.parametrize("roi", ["[-1, 0, 9, 9]", "[0, 0, 0, 9]", "[0, 0, 641, 480]", "[0, 1, 640, 480]"])
+def test_a_region_outside_the_frame_is_refused(roi):
+    with pytest.raises(ConfigError, match="1 mistake"):
+        load_config(None, [f"view.roi={roi}"])
+    assert load_config(None, ["view.roi=[0, 0, 640, 480]"]).view.roi == (0, 0, 640, 480)
 
 
 def test_overrides_win_over_the_file_and_bare_words_are_strings(tmp_path):

@@ -1,0 +1,43 @@
+"""The noise model: what it refuses, and that the bench behind it says so."""
+
+import pytest
+
+from rig.bench import open_bench
+from rig.config import load_config
+from rig.errors import ConfigError
+from sim.noise import NoiseModel
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("backlash_deg", -0.1),
+        ("read_noise_e", float("nan")),
+        ("gyro_bias_dps", float("inf")),
+        ("structure_damping", 1.0),
+        ("vignetting", 1.1),
+    ],
+)
+def test_what_no_bench_can_have_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} = "):
+        NoiseModel(**{name: value})
+
+
+def test_no_noise_is_none_at_all() -> None:
+    none = NoiseModel.none()
+    assert {getattr(none, name) for name in NoiseModel.__slots__} == {0.0}
+    assert none.with_values(backlash_deg=0.5) != none
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("servo.model=ax_12a", "xl430_w250"),
+        ("servo.baud=12345", "57600"),
+        ("bench.sim.noise.structure_damping=1.5", "below 1"),
+    ],
+)
+def test_a_simulated_bench_that_cannot_be_is_a_configuration_error(setting: str, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        open_bench("sim", load_config(None, [setting]))
+    assert words in str(caught.value.evidence)
