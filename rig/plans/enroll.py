@@ -27,7 +27,8 @@ def enroll(
     """Enroll the object ``name`` with views at even steps; yields events and returns the last of them.
 
     The table turns upwards from 0, so that its play is taken up; view k has the azimuth −k·360/views. An interrupted
-    enrollment keeps its views: ``resume`` takes the missing ones. Closing the generator takes the torque off.
+    enrollment keeps its views: ``resume`` takes the missing ones, of an object that nobody has moved since.
+    Closing the generator takes the torque off.
 
     Raises
     ------
