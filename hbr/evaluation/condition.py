@@ -14,7 +14,7 @@ Background = Literal["same", "uniform", "textured"]
 _T = TypeVar("_T", np.uint8, np.float32)
 
 #: COIL's black background has sensor noise and the glow of its surroundings up to about here.
-_DARK: Final = 24
+_DARK: Final = 45
 _TEXTURE_OCTAVES: Final = (4, 8, 16, 32)
 
 

@@ -1,3 +1,6 @@
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -125,3 +128,14 @@ def test_sizes_and_prefilter_are_of_both_sides_and_noise_of_queries_alone() -> N
 def test_what_is_no_condition_is_refused(setting: dict) -> None:
     with pytest.raises(ValueError, match=r"pixels|rotation|background"):
         Condition(**setting)
+
+
+@pytest.mark.parametrize(("number", "low", "high"), [(1, 0.3, 0.4), (3, 0.25, 0.35), (8, 0.2, 0.3), (26, 0.1, 0.9)])
+def test_the_dark_surroundings_of_a_photograph_are_left_out(
+    rig_test_data: Path, number: int, low: float, high: float
+) -> None:
+    image = cv2.imread(str(rig_test_data / f"coil-100/obj{number}__0.png"))
+    assert image is not None
+    mask = object_mask(image)  # type: ignore[arg-type]
+    assert low < mask.mean() < high
+    assert not mask[[2, 2, -3, -3], [2, -3, 2, -3]].any()  # the outermost pixel of some is bright
