@@ -11,13 +11,14 @@ _QUERIES: Final = 4
 """Views that a typical retrieval takes, spread evenly around the object."""
 
 
-def familiar_score(views: Views, *, quantile: float = 0.05) -> float:
+def familiar_score(views: Views, *, quantile: float = 0.05, repeatability: float = 0.97) -> float:
     """Return the score a view below which an object is probably none of those enrolled.
 
     Every enrolled view is taken for a query and compared with its two neighbours in azimuth, as if it were not enrolled
     itself; the better one counts, averaged over four views a quarter of a turn apart. A real query lies at most half as
-    far from an enrolled view, so fewer known objects than ``quantile`` fall below. Light that has changed since the
-    enrollment is not in it.
+    far from an enrolled view, so fewer known objects than ``quantile`` fall below. What a second sitting costs (placed
+    by hand, other light) is not in the enrolled views; ``repeatability`` allows for it, which matters where all views
+    of all objects are nearly alike.
 
     Parameters
     ----------
@@ -25,6 +26,8 @@ def familiar_score(views: Views, *, quantile: float = 0.05) -> float:
         The model set.
     quantile : float
         Share of these averages, over all objects and starting points, that lie below the result.
+    repeatability : float
+        The result is never above this similarity, which the same view of two sittings surely keeps.
 
     Returns
     -------
@@ -34,10 +37,11 @@ def familiar_score(views: Views, *, quantile: float = 0.05) -> float:
     Raises
     ------
     ValueError
-        `quantile` is outside [0, 1].
+        `quantile` or `repeatability` is outside [0, 1].
     """
-    if not 0 <= quantile <= 1:
-        raise ValueError(f"quantile is {quantile}; a share between 0 and 1 is needed")
+    for name, share in (("quantile", quantile), ("repeatability", repeatability)):
+        if not 0 <= share <= 1:
+            raise ValueError(f"{name} is {share}; a value between 0 and 1 is needed")
     order = np.lexsort((views.azimuth_deg, views.object_index))
     _, begin, count = np.unique(views.object_index[order], return_index=True, return_counts=True)
     averages = [
@@ -45,7 +49,7 @@ def familiar_score(views: Views, *, quantile: float = 0.05) -> float:
         for start, n in zip(begin, count, strict=True)
         if n >= _QUERIES
     ]
-    return float(np.quantile(np.concatenate(averages), quantile)) if averages else 0.0
+    return min(float(np.quantile(np.concatenate(averages), quantile)), repeatability) if averages else 0.0
 
 
 def _averages(ring: FloatArray) -> FloatArray:

@@ -16,6 +16,8 @@ M = TypeVar("M", bound=BaseModel)
 
 APP = "hbr-rig"
 FILE_NAME = "rig.toml"
+MAX_LIMIT_DEG = 90_000.0
+"""250 turns: extended position mode reaches 256 either way (e-manual, Operating Mode)."""
 
 
 class Section(BaseModel):
@@ -75,7 +77,17 @@ class TableConfig(Section):
         low, high = limits_deg
         if not (low <= 0 <= high and high - low >= 360):
             raise ValueError("must span at least one turn and hold 0, e.g. [-400, 400]")
+        if max(-low, high) > MAX_LIMIT_DEG:
+            raise ValueError(f"must stay within ±{MAX_LIMIT_DEG:g}, which a servo in extended position mode reaches")
         return limits_deg
+
+    @field_validator("watchdog_s")
+    @classmethod
+    def _watchdog_outlasts_the_loop(cls, watchdog_s: float, others: ValidationInfo) -> float:
+        poll_s = others.data.get("poll_s", 0.0)
+        if watchdog_s < 2 * poll_s:
+            raise ValueError(f"must be at least twice poll_s, which is {poll_s:g}: the control loop feeds the watchdog")
+        return watchdog_s
 
 
 class ImuConfig(Section):

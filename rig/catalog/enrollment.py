@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, and_, select, update
+from sqlalchemy import Connection, and_, delete, select, update
 
 import hbr
 from rig.catalog import images
 from rig.catalog.database import Database, insert_row
 from rig.catalog.records import EnrollmentStatus, Sitting, StoredView, ViewRecord
-from rig.catalog.schema import DESCRIPTOR_KIND, DESCRIPTOR_VERSION, enrollments, views
+from rig.catalog.schema import DESCRIPTOR_KIND, DESCRIPTOR_VERSION, enrollments, objects, sittings, views
 from rig.clock import Clock
 from rig.errors import CatalogError, UsageError
 
@@ -162,6 +162,27 @@ class Enrollment:
         with self._database.write() as connection:
             self._check_in_progress(connection)
             self._close(connection, EnrollmentStatus.ABANDONED)
+
+    def discard(self) -> None:
+        """Take back an enrollment that holds no view yet, and its object if it has no other enrollment.
+
+        Raises
+        ------
+        CatalogError
+            It holds views, which nobody throws away like that, or is no longer in progress.
+        """
+        with self._database.write() as connection:
+            self._check_in_progress(connection)
+            if len(self._missing(connection)) < len(self.planned_azimuth_deg):
+                raise CatalogError(
+                    f"the enrollment of {self.object_name!r} holds views",
+                    next_step="abandon it, which keeps them",
+                )
+            connection.execute(delete(sittings).where(sittings.c.enrollment_id == self.id))
+            connection.execute(delete(enrollments).where(enrollments.c.id == self.id))
+            others = select(enrollments.c.id).where(enrollments.c.object_id == self.object_id)
+            if connection.scalar(others) is None:
+                connection.execute(delete(objects).where(objects.c.id == self.object_id))
 
     def _close(self, connection: Connection, status: EnrollmentStatus) -> None:
         connection.execute(

@@ -146,6 +146,7 @@ def show_error(error: RigError, settings: Settings) -> None:
             lines += [f"  {key}:", *(f"    {item}" for item in value)]
         else:
             lines.append(f"  {key}: {value}")
+    lines += [f"  {note}" for note in getattr(error, "__notes__", ())]
     print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
 
 

@@ -1,5 +1,6 @@
 """The command `rig`."""
 
+import sys
 from importlib.metadata import entry_points, version
 from typing import Annotated
 
@@ -49,7 +50,11 @@ app.command("goto", context_settings={"ignore_unknown_options": True})(table.got
 app.command("status")(table.status)
 app.add_typer(catalog.app, name="catalog")
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
-    _plugin = _point.load()
+    try:
+        _plugin = _point.load()
+    except (ImportError, AttributeError) as _broken:  # somebody's broken plug-in must not take the rig's commands along
+        print(f"The command {_point.name} of {_point.value} is left out: {_broken}", file=sys.stderr)
+        continue
     if isinstance(_plugin, typer.Typer):
         app.add_typer(_plugin, name=_point.name)
     else:

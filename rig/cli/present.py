@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as RichProgress
 
 from rig.plans.events import Accepted, Decided, Enrolled, Event, Identified, Moved, Ranked, Rejected, Started
-from rig.plans.words import answer_words, azimuth_words, counted, decision_words, move_words
+from rig.plans.words import answer_words, azimuth_words, counted, decision_words, move_words, signed
 
 SHOWN = 3
 
@@ -27,7 +27,7 @@ def line(event: Event) -> str:
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():
             leaders = ", ".join(f"{c.name} {c.score:.3f}" for c in event.candidates[:SHOWN])
-            return f"  leading: {leaders} (sure lead {event.margin:+.3f})"
+            return f"  leading: {leaders} (sure lead {signed(event.margin, 3)})"
         case Decided():
             return f"  {decision_words(event)} The table goes to {event.target_deg:.1f}°."
         case Enrolled():

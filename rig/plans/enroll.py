@@ -4,9 +4,9 @@ from collections.abc import Generator
 
 from hbr.angles import wrap360
 from rig.bench import Bench
-from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.clock import seconds_between
-from rig.errors import CatalogError, RotationDisagreement
+from rig.errors import RigError, RotationDisagreement
 from rig.plans.capture import capture, moved
 from rig.plans.events import Accepted, Enrolled, Event, Started, plain
 from rig.turntable import Move, Turntable
@@ -59,17 +59,31 @@ def enroll(
             name, planned_azimuth_deg=planned_deg, provenance=provenance, label=label, note=note, replace=replace
         )
     missing = enrollment.missing()
-    if not missing:
-        raise CatalogError(f"No view of {name!r} is missing.", next_step="Nothing is to be done.")
     yield Started("enroll", enrollment.object_name, len(missing), dict(provenance.conditions))
-    bench.operator.place(enrollment.object_name)
     started_ns = bench.clock.now_ns()
+    retakes = 0
+    if missing:
+        try:
+            bench.operator.place(enrollment.object_name)
+        except RigError:
+            if not resume:
+                enrollment.discard()  # a mistyped name leaves nothing behind
+            raise
+        retakes = yield from _take_views(bench, enrollment, missing)
+    enrollment.finish()
+    done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
+    yield done
+    return done
+
+
+def _take_views(bench: Bench, enrollment: Enrollment, missing: tuple[int, ...]) -> Generator[Event, None, int]:
+    """Take and store the missing views, turn back to 0, and return how many frames were taken again."""
     viewer = Viewer(bench.camera, bench.config.view)
     retakes = 0
     imu = _ImuAngle()
     with Turntable(bench) as table:
         for index in missing:
-            move = table.goto(index * 360.0 / views)
+            move = table.goto(index * 360.0 / len(enrollment.planned_azimuth_deg))
             yield moved(index, move)
             if move.agreement is None or not move.agreement.agrees:
                 raise _disagreement(move)
@@ -89,10 +103,9 @@ def enroll(
             )
             enrollment.add(record, shot.image_bgr)
             yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr)
-    enrollment.finish()
-    done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
-    yield done
-    return done
+        # The servo forgets whole turns without its supply; a cable left wound up would be wound further the next time.
+        table.goto(0.0)
+    return retakes
 
 
 class _ImuAngle:

@@ -11,7 +11,9 @@ def decision_words(decided: Decided) -> str:
     if decided.s_left is None or decided.s_right is None:
         return f"{decided.side}: the first turn is fixed; {turning}."
     left, right = distinct(decided.s_left, decided.s_right)
-    if decided.s_left == decided.s_right:
+    if len(decided.rivals) < 2:
+        why = "no second candidate is in sight to be told apart"
+    elif decided.s_left == decided.s_right:
         why = f"the leading candidates look as much alike on both sides: S_left {left} = S_right {right}"
     elif decided.side == "left":
         why = f"the leading candidates look less alike there: S_left {left} < S_right {right}"
@@ -24,11 +26,11 @@ def decision_words(decided: Decided) -> str:
 
 def move_words(moved: Moved) -> str:
     """Return how far the table turned by encoder and gyro, and whether they agree."""
-    words = f"table {_signed(moved.rotation_encoder_deg)}° by the encoder"
+    words = f"table {signed(moved.rotation_encoder_deg, 2)}° by the encoder"
     if moved.rotation_imu_deg is None:
         return f"{words}, the gyro has no answer"
     sigma = "" if moved.imu_sigma_deg is None else f" ± {moved.imu_sigma_deg:.2f}"
-    words += f", {_signed(moved.rotation_imu_deg)}{sigma}° by the gyro"
+    words += f", {signed(moved.rotation_imu_deg, 2)}{sigma}° by the gyro"
     if moved.agrees:
         return words
     bound = "" if moved.bound_deg is None else f" by more than {moved.bound_deg:.2f}°"
@@ -67,11 +69,12 @@ def listed(items: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(items))
 
 
-def distinct(a: float, b: float) -> tuple[str, str]:
-    """Return two numbers with as many decimals as tell them apart: two at least, five at most."""
-    decimals = next((d for d in range(2, 5) if f"{a:.{d}f}" != f"{b:.{d}f}"), 5) if a != b else 2
-    return f"{a:.{decimals}f}", f"{b:.{decimals}f}"
+def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:
+    """Return two numbers with as many decimals as tell them apart: ``decimals`` at least, five at most."""
+    enough = next((d for d in range(decimals, 5) if f"{a:.{d}f}" != f"{b:.{d}f}"), 5) if a != b else decimals
+    return f"{a:.{enough}f}", f"{b:.{enough}f}"
 
 
-def _signed(value: float) -> str:
-    return f"{value:+.2f}".replace("-", "−")
+def signed(value: float, decimals: int) -> str:
+    """Return a number with its sign, a real minus."""
+    return f"{value:+.{decimals}f}".replace("-", "−")

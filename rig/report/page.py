@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from hbr.angles import wrap360
 from rig.errors import UsageError
-from rig.plans.words import answer_words, azimuth_words, counted, decision_words, listed, move_words, sentence
+from rig.plans.words import answer_words, azimuth_words, counted, decision_words, listed, move_words, sentence, signed
 from rig.report.azimuth_ring import RingView, azimuth_ring
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.polar_path import polar_path
@@ -185,7 +185,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         travelled=f"{answer.travelled_deg:.0f}°" if answer else "–",
         pose_error="–" if error_deg is None else f"{error_deg:.1f}°",
         score=f"{answer.score:.3f}" if answer else "–",
-        margin=f"{answer.margin:.3f}" if answer else "–",
+        margin=signed(answer.margin, 3) if answer else "–",
         words=answer_words(answer) if answer else "The search ended before an answer.",
         path=path,
         compared=any(event.s_left is not None for event in record.decided),
@@ -222,7 +222,7 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
                 where=f"{azimuth_words(_as_drawn(record, view.azimuth_deg))}°",
                 refused=listed(view.refused),
                 leading=[(c.name, f"{c.score:.3f}") for c in thought.candidates[:3]] if thought else [],
-                margin=f"{thought.margin:.3f}" if thought else "",
+                margin=signed(thought.margin, 3) if thought else "",
                 moved=sentence(move_words(view.move)) if view.move and view.index else "",
                 decision=decision_words(decision) if decision else "",
             )

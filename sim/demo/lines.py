@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from rig.cli.present import line
 from rig.plans.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
-from rig.plans.words import azimuth_words, distinct
+from rig.plans.words import azimuth_words, distinct, signed
 
 
 class MoveLines:
@@ -50,11 +50,11 @@ class MoveLines:
         else:
             imu = "no answer"
             if move.rotation_imu_deg is not None and move.imu_sigma_deg is not None:
-                imu = f"{move.rotation_imu_deg:+.2f} ± {move.imu_sigma_deg:.2f}°"
-            turned = f"{self._asked_deg:+7.1f}°{move.rotation_encoder_deg:+10.2f}°{imu:>18}"
+                imu = f"{signed(move.rotation_imu_deg, 2)} ± {move.imu_sigma_deg:.2f}°"
+            turned = f"{signed(self._asked_deg, 1):>7}°{signed(move.rotation_encoder_deg, 2):>10}°{imu:>18}"
         likeness = f"{'–':>12}{'–':>9}  "
         if decided and decided.s_left is not None and decided.s_right is not None:
-            left, right = distinct(decided.s_left, decided.s_right)
+            left, right = distinct(decided.s_left, decided.s_right, decimals=3)
             likeness = f"{left:>12}{right:>9}  "
         goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
         leading = ", ".join(f"{c.name} {c.score:.3f}" for c in self._leading)

@@ -26,6 +26,7 @@ from rig.errors import UsageError
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted
 from rig.plans.identify import identify
+from rig.plans.words import signed
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
 from sim.demo.lines import MoveLines
@@ -264,7 +265,7 @@ def _print_totals(result: DemoResult) -> None:
             f"{trial['travelled_deg']:.0f}°",
             "–" if error is None else f"{error:.1f}°",
             f"{trial['score']:.3f}",
-            f"{trial['margin']:.3f}",
+            signed(trial["margin"], 3),
         )
     print()
     Console(file=sys.stdout).print(table)

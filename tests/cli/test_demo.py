@@ -36,8 +36,8 @@ def test_it_enrolls_finds_and_recognises_strangers(small):
     assert done.exit_code in (0, 6)  # with so few views an answer may be wrong; that is said, and the exit code tells
     text = done.stdout
     moves = re.findall(
-        r"^ +\d  +[\d.]+°  +([+-][\d.]+)°  +([+-][\d.]+)°  +([+-][\d.]+) ± [\d.]+°.*  (\S+) (\d\.\d{3})",
-        text,
+        r"^ +\d +[\d.]+° +([+-][\d.]+)° +([+-][\d.]+)° +([+-][\d.]+) ± [\d.]+°.* (\S+) (\d\.\d{3})",
+        text.replace("−", "-"),
         re.MULTILINE,
     )
     assert moves

@@ -27,8 +27,8 @@ def by_hand(views: hbr.Views) -> list[float]:
 
 def test_it_is_the_quantile_of_what_neighbouring_views_score():
     views = ring(1, 24, 12)
-    assert hbr.familiar_score(views, quantile=0.0) == pytest.approx(min(by_hand(views)))
-    assert hbr.familiar_score(views, quantile=0.5) == pytest.approx(np.median(by_hand(views)))
+    assert hbr.familiar_score(views, quantile=0.0, repeatability=1.0) == pytest.approx(min(by_hand(views)))
+    assert hbr.familiar_score(views, quantile=0.5, repeatability=1.0) == pytest.approx(np.median(by_hand(views)))
 
 
 def test_the_order_of_the_views_does_not_matter_and_objects_are_kept_apart():
@@ -49,3 +49,12 @@ def test_too_few_views_make_nothing_unknown_and_a_wrong_quantile_is_refused():
     assert hbr.familiar_score(hbr.Views.empty()) == 0.0
     with pytest.raises(ValueError, match="quantile is 5"):
         hbr.familiar_score(ring(4, 8, 5), quantile=5)
+
+
+def test_no_more_is_asked_of_a_round_object_than_two_sittings_keep():
+    face = np.random.default_rng(5).integers(0, 8, 144).astype(np.uint8)
+    views = hbr.Views.of_object("vase", np.tile(face, (36, 1)), np.arange(36) * 10.0)
+    assert hbr.familiar_score(views) == 0.97
+    assert hbr.familiar_score(views, repeatability=0.9) == 0.9
+    with pytest.raises(ValueError, match="repeatability is 2"):
+        hbr.familiar_score(views, repeatability=2)

@@ -427,3 +427,15 @@ class CatalogMachine(RuleBasedStateMachine):
 
 TestCatalogMachine = CatalogMachine.TestCase
 TestCatalogMachine.settings = settings(max_examples=20, stateful_step_count=20, deadline=None)
+
+
+def test_only_an_enrollment_without_views_can_be_taken_back(catalog: Catalog) -> None:
+    begin(catalog, "typo").discard()
+    assert catalog.objects() == []
+    fill(catalog, "mug", 3)
+    begin(catalog, "mug", replace=True).discard()
+    assert catalog.object("mug").summary.views == 3
+    again = begin(catalog, "mug", replace=True)
+    again.add(record(0), image(0))
+    with pytest.raises(CatalogError, match="holds views"):
+        again.discard()

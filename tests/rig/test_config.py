@@ -96,3 +96,16 @@ def test_a_real_bench_without_its_servo_says_what_to_check(setting):
     with pytest.raises(DeviceNotFound, match="servo") as caught:
         open_bench("hardware", load_config(None, [setting]))
     assert caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("table.watchdog_s=0.1", "twice poll_s"),
+        ("table.limits_deg=[-1e9, 1e9]", "within ±90000"),
+    ],
+)
+def test_settings_that_would_stop_or_overrun_the_servo_are_refused(setting, words):
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [setting, "table.poll_s=0.06"])
+    assert words in caught.value.evidence["mistakes"][0]

@@ -15,6 +15,7 @@ from rig.errors import (
     DeviceFault,
     DeviceSilent,
     ObjectExists,
+    ObjectNotFound,
     RigError,
     RotationDisagreement,
     ViewRejected,
@@ -355,3 +356,34 @@ def test_equal_seeds_give_equal_events_and_other_seeds_do_not(simulated, tmp_pat
 
     assert run(5, "a") == run(5, "b")
     assert run(5, "c") != run(6, "d")
+
+
+def test_a_mistyped_name_leaves_nothing_in_the_catalog(simulated, catalog):
+    s = simulated()
+    plan = enroll(s.bench, catalog, "nonsense", views=6)
+    with pytest.raises(ObjectNotFound):
+        list(plan)
+    assert catalog.objects() == []
+    list(enroll(s.bench, catalog, "dice", views=4))
+    with pytest.raises(ObjectNotFound):
+        list(enroll(s.bench, catalog, "nonsense", views=6, label="x"))
+    assert [o.name for o in catalog.objects()] == ["dice"]
+
+
+def test_the_cable_is_left_unwound(simulated, catalog):
+    s = simulated()
+    list(enroll(s.bench, catalog, "dice", views=6))
+    assert s.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
+
+
+def test_an_enrollment_killed_between_its_last_view_and_its_end_is_finished_by_resume(simulated, catalog):
+    s = simulated()
+    plan = enroll(s.bench, catalog, "dice", views=4)
+    for event in plan:
+        if isinstance(event, Accepted) and event.index == 3:
+            break
+    plan.close()
+    assert catalog.object("dice").summary.views == 0
+    events = list(enroll(s.bench, catalog, "dice", resume=True))
+    assert [type(event) for event in events] == [Started, Enrolled]
+    assert catalog.object("dice").summary.views == 4

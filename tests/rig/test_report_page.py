@@ -84,10 +84,10 @@ def test_the_page_says_what_the_records_say() -> None:
         "#", "on the table", "found as", "verdict", "views", "travelled", "pose error", "score", "margin"
     ]  # fmt: skip
     assert results[1:] == [
-        ["1", "mug-white", "mug-white", "✓ right", "4", "258°", "2.0°", "0.930", "0.100"],
-        ["2", "mug-star", "mug-white", "✗ wrong", "2", "90°", "–", "0.910", "0.100"],
-        ["3", "globe (never enrolled)", "unknown", "✓ right", "2", "90°", "–", "0.910", "0.100"],
-        ["4", "mug-white", "mug-white", "✓ right", "2", "90°", "–", "0.910", "0.100"],
+        ["1", "mug-white", "mug-white", "✓ right", "4", "258°", "2.0°", "0.930", "+0.100"],
+        ["2", "mug-star", "mug-white", "✗ wrong", "2", "90°", "–", "0.910", "+0.100"],
+        ["3", "globe (never enrolled)", "unknown", "✓ right", "2", "90°", "–", "0.910", "+0.100"],
+        ["4", "mug-white", "mug-white", "✓ right", "2", "90°", "–", "0.910", "+0.100"],
     ]
     assert "found 2/3" in page.text
     assert "unknown recognised 1/1" in page.text

@@ -181,6 +181,10 @@ class TestWords:
         assert move_words(slipped).endswith("they disagree by more than 0.60°, the gyro is believed")
         assert move_words(replace(move, rotation_imu_deg=None)).endswith("the gyro has no answer")
 
+    def test_a_lone_candidate_is_not_compared(self) -> None:
+        decided = Decided(2, "left", 90.0, -90.0, 0.0, 0.0, ("mug",))
+        assert decision_words(decided) == "left: no second candidate is in sight to be told apart; turning 90.0°."
+
     def test_answers(self) -> None:
         known, unknown = identified("mug-white").answer, identified(None).answer
         assert isinstance(known, Identified)
