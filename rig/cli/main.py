@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import catalog, enroll, identify, table
+from rig.cli import catalog, enroll, evaluate, identify, table
 from rig.cli.command import BenchOption, ConfigOption, JsonOption, SeedOption, SetOption, Settings
 
 GROUP = "rig.commands"
@@ -46,6 +46,7 @@ common.__doc__ = None  # the help of the program is the app's
 
 app.command("enroll")(enroll.enroll)
 app.command("identify")(identify.identify)
+app.command("eval")(evaluate.evaluate)
 app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)
 app.command("status")(table.status)
 app.add_typer(catalog.app, name="catalog")

@@ -44,11 +44,14 @@ def test_help_is_light():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "HEAVY []" in done.stdout
-    for name in ("enroll", "identify", "demo", "catalog", "goto", "status"):
+    for name in ("enroll", "identify", "demo", "eval", "calibrate", "catalog", "goto", "status"):
         assert name in done.stdout
 
 
-@pytest.mark.parametrize("name", ["enroll", "identify", "demo", "goto", "status", "catalog list", "catalog show"])
+@pytest.mark.parametrize(
+    "name",
+    ["enroll", "identify", "demo", "eval", "goto", "status", "calibrate imu", "catalog list", "catalog show"],
+)
 def test_every_command_has_an_example_in_its_help(rig, name):
     done = rig(*name.split(), "--help")
     assert done.exit_code == 0
