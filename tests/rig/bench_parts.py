@@ -26,7 +26,6 @@ class Wires:
     bus: ServoBus
     device: XSeriesServo
     serial: SimSerial
-    i2c: SimI2cBus
     sent: list[Frame] = field(default_factory=list)
 
     @property
@@ -40,7 +39,7 @@ def servo_wires(noise: NoiseModel | None = None, seed: int = 0, **servo: Any) ->
     bus = ServoBus(world.clock)
     device = XSeriesServo(world, **servo)
     bus.attach(device)
-    wires = Wires(world, bus, device, SimSerial(bus, device.baudrate, READ_SLICE_S), SimI2cBus(world.clock))
+    wires = Wires(world, bus, device, SimSerial(bus, device.baudrate, READ_SLICE_S))
     bus.taps.append(wires.sent.append)
     return wires
 
@@ -59,10 +58,10 @@ def open_servo(wires: Wires, **options: Any) -> DynamixelServo:
 def motion_bench(*settings: str, noise: NoiseModel | None = None, seed: int = 0) -> Iterator[tuple[Bench, Wires]]:
     """Yield a bench of servo and IMU, and its wires."""
     wires = servo_wires(noise, seed)
-    with wires.i2c:
-        wires.i2c.attach(0x68, SimMpu6050(wires.world))
+    with SimI2cBus(wires.world.clock) as i2c:
+        i2c.attach(0x68, SimMpu6050(wires.world))
         servo = open_servo(wires)
-        imu = Mpu6050(wires.i2c.path, clock=wires.world.clock)
+        imu = Mpu6050(i2c.path, clock=wires.world.clock)
         config = load_config(overrides=settings)
         yield Bench("test", config, wires.world.clock, servo, imu, camera=None), wires  # type: ignore[arg-type]
         imu.close()
