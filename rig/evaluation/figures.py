@@ -103,7 +103,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> F
         colour, _ = _look(method["name"], m)
         for key, dashed, words in (
             ("pose_rmse_deg_by_object", True, "plain"),
-            ("alike_rmse_deg_by_object", False, "symmetry-aware"),
+            ("alike_rmse_deg_by_object", False, "alike"),
         ):
             errors = sorted(error for error in method[key] if error is not None)
             series.append(_Series(f"{method['label']}, {words}", colour, dashed, range(1, len(errors) + 1), errors))
