@@ -80,6 +80,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._profile: MotionProfile | None = None
         self._rest_deg = 0.0
         self._play_taken_up = False
+        self._broken_off = False
 
     def __enter__(self) -> Self:
         try:
@@ -93,6 +94,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         except BaseException:
             self.__exit__(None, None, None)
             raise
+        self._broken_off = False
         return self
 
     def __exit__(
@@ -208,6 +210,11 @@ class Turntable(AbstractContextManager["Turntable"]):
             raise NotReady(
                 "The table has no torque.", next_step="Use it in a with block: `with Turntable(bench) as table:`."
             )
+        if self._broken_off:
+            raise NotReady(
+                "The last motion was broken off: where the table rests is in doubt.",
+                next_step="Find the cause, then leave the with block and enter it anew.",
+            )
         started_ns, start_deg = self._clock.now_ns(), self._rest_deg
         self._learn_bias(self._config.quiet_s)  # it wanders: each rest measures it anew
         self._heading.begin()
@@ -223,6 +230,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
             self._servo.disarm_watchdog()
         except BaseException:
+            self._broken_off = True
             self._stop()
             raise
         self._play_taken_up = self._play_taken_up or bool(waypoints)

@@ -245,3 +245,22 @@ def test_a_time_out_can_be_told_in_json_although_the_gyro_knows_nothing():
             table._wait_for_rest(60.0, 0.1, 0.5)
     told = json.loads(json.dumps(caught.value.as_dict(), allow_nan=False))
     assert told["evidence"]["peak_rate_dps"] is None
+
+
+def test_no_motion_follows_one_that_was_broken_off_until_the_table_is_taken_anew():
+    with motion_bench() as (bench, wires):
+        table = Turntable(bench)
+        with table:
+            table.goto(10.0)
+            wires.device.jam()
+            with pytest.raises((MotionTimeout, DeviceFault)):
+                table.goto(60.0)
+            sent = len(wires.instructions)
+            with pytest.raises(NotReady, match="broken off"):
+                table.goto(10.0)
+            assert len(wires.instructions) == sent
+        wires.device.free()
+        wires.device.power_cycle()
+        wires.world.clock.sleep(1.0)
+        with table:
+            assert table.goto(20.0).agrees
