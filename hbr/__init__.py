@@ -6,7 +6,7 @@ from hbr.familiar import familiar_score
 from hbr.hough import Extension, Ranking, retrieve
 from hbr.index import ViewIndex
 from hbr.lead import lead
-from hbr.packing import pack, unpack
+from hbr.packing import pack, unpack, unpack_rows
 from hbr.tanimoto import tanimoto
 from hbr.views import Views
 
@@ -26,4 +26,5 @@ __all__ = [
     "retrieve",
     "tanimoto",
     "unpack",
+    "unpack_rows",
 ]

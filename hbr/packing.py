@@ -3,7 +3,6 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hbr.arrays import LevelArray
 from hbr.cedd import BINS
@@ -58,5 +57,28 @@ def unpack(packed: bytes) -> LevelArray:
     """
     if len(packed) != PACKED_BYTES:
         raise ValueError(f"{len(packed)} bytes; a packed descriptor has {PACKED_BYTES}, check how it was stored")
-    bits: NDArray[np.uint8] = np.unpackbits(np.frombuffer(packed, np.uint8)).reshape(BINS, BITS)
-    return np.packbits(bits, axis=1)[:, 0] >> np.uint8(8 - BITS)
+    levels: LevelArray = unpack_rows(packed)[0]
+    return levels
+
+
+def unpack_rows(packed: bytes) -> LevelArray:
+    """Restore a table of descriptors, packed and joined, at once.
+
+    Returns
+    -------
+    uint8 array (n, 144)
+        Levels 0..7.
+
+    Raises
+    ------
+    ValueError
+        The bytes are no multiple of 54.
+    """
+    if len(packed) % PACKED_BYTES:
+        raise ValueError(f"{len(packed)} bytes are no multiple of {PACKED_BYTES}, check how they were stored")
+    threes = np.frombuffer(packed, np.uint8).reshape(-1, BINS // 8, BITS).astype(np.uint32)  # 3 bytes are 8 levels
+    bits = threes[..., 0] << 16 | threes[..., 1] << 8 | threes[..., 2]
+    levels = np.empty((*bits.shape, 8), np.uint8)
+    for place in range(8):
+        levels[..., place] = bits >> (21 - BITS * place) & 7
+    return levels.reshape(-1, BINS)

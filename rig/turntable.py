@@ -108,10 +108,6 @@ class Turntable(AbstractContextManager["Turntable"]):
                 raise
 
     @property
-    def clock_ns(self) -> int:
-        return self._clock.now_ns()
-
-    @property
     def rest_deg(self) -> float:
         """Angle by the encoder at the last rest."""
         return self._rest_deg

@@ -87,9 +87,6 @@ class SimCapture:
     def isOpened(self) -> bool:  # noqa: N802
         return self._open
 
-    def getBackendName(self) -> str:  # noqa: N802
-        return "SIM"
-
     def release(self) -> None:
         self._open = False
 

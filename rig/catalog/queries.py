@@ -151,22 +151,12 @@ def model_set(connection: Connection) -> tuple[hbr.Views, NDArray[np.int64]]:
     known_ids, object_index = np.unique(np.array(object_ids, np.int64), return_inverse=True)
     names = {row.id: row.name for row in connection.execute(select(objects.c.id, objects.c.name))}
     loaded = hbr.Views(
-        descriptors=unpack_rows(b"".join(packed)),
+        descriptors=hbr.unpack_rows(b"".join(packed)),
         azimuth_deg=np.array(azimuths_deg, np.float64),
         object_index=object_index,
         object_names=tuple(names[int(object_id)] for object_id in known_ids),
     )
     return loaded, np.array(view_ids, np.int64)
-
-
-def unpack_rows(packed: bytes) -> NDArray[np.uint8]:
-    """Unpack joined descriptors, 54 bytes each, to levels, uint8 (n, 144): `hbr.unpack` for all of them at once."""
-    eights = np.frombuffer(packed, np.uint8).reshape(-1, 18, 3).astype(np.uint32)  # 3 bytes are 8 levels of 3 bits
-    bits = eights[..., 0] << 16 | eights[..., 1] << 8 | eights[..., 2]
-    levels = np.empty((*bits.shape, 8), np.uint8)
-    for place in range(8):
-        levels[..., place] = bits >> (21 - 3 * place) & 7
-    return levels.reshape(-1, 144)
 
 
 def _sitting(row: Row[Any]) -> Sitting:

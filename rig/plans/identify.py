@@ -73,9 +73,7 @@ def identify(bench: Bench, index: hbr.ViewIndex) -> Generator[Event, None, Ident
             yield decided
             move = table.goto(decided.target_deg)
             travelled_deg += abs(move.rotation_deg)
-            orientation_deg -= (
-                move.rotation_deg
-            )  # the camera goes around the object as the table turns under it, backwards
+            orientation_deg -= move.rotation_deg  # as the table turns, the camera goes around the object backwards
     best = ranked.candidates[0]
     answer = Identified(
         name=best.name if best.score >= min_score else None,

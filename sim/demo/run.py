@@ -54,7 +54,7 @@ ENROLLED = (
     "toy-car",
     "nutcracker",
 )
-"""What is enrolled first: two pairs of twins, a round vase, a bowl that looks the same at every sixth of a turn."""
+"""What is enrolled first: two pairs of twins, a round vase, a bowl that looks the same at every eighth of a turn."""
 
 STRANGERS = ("radio", "clock")
 """What is shown to the bench without having been enrolled."""

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hbr import pack, unpack
+from hbr import pack, unpack, unpack_rows
 
 
 @given(arrays(np.uint8, 144, elements=st.integers(0, 7)))
@@ -49,3 +49,13 @@ def test_what_is_no_descriptor_is_refused(levels: np.ndarray, error: type[Except
 def test_a_wrong_number_of_bytes_is_refused(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count} bytes; a packed descriptor has 54"):
         unpack(bytes(count))
+
+
+@given(arrays(np.uint8, st.tuples(st.integers(0, 5), st.just(144)), elements=st.integers(0, 7)))
+def test_joined_descriptors_unpack_as_single_ones(levels: np.ndarray) -> None:
+    assert np.array_equal(unpack_rows(b"".join(pack(row) for row in levels)), levels)
+
+
+def test_a_table_that_ends_within_a_row_is_refused() -> None:
+    with pytest.raises(ValueError, match="109 bytes are no multiple of 54"):
+        unpack_rows(bytes(109))

@@ -14,9 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-import hbr
 from rig.catalog import Catalog, Enrollment, EnrollmentStatus, Provenance, ViewRecord, clean_name
-from rig.catalog.queries import unpack_rows
 from rig.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
 from sim.clock import EPOCH, VirtualClock
 
@@ -102,12 +100,6 @@ def test_a_view_comes_back_as_it_was_stored(
     assert np.array_equal(model.descriptors, descriptor[None])
     assert model.azimuth_deg.tolist() == [azimuth_deg]
     assert view_ids.tolist() == [stored.id]
-
-
-@settings(max_examples=20)
-@given(hnp.arrays(np.uint8, st.tuples(st.integers(1, 5), st.just(144)), elements=st.integers(0, 7)))
-def test_joined_descriptors_unpack_as_single_ones(levels: np.ndarray) -> None:
-    assert np.array_equal(unpack_rows(b"".join(hbr.pack(row) for row in levels)), levels)
 
 
 def test_models_are_ordered_by_object_and_index(catalog: Catalog) -> None:
