@@ -19,7 +19,7 @@ demo: $(READY)
 	@$(BIN)/rig demo
 
 test: $(READY)
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -n auto
 
 lint: $(READY)
 	@$(BIN)/ruff format --check .
