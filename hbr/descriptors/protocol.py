@@ -1,0 +1,75 @@
+"""What retrieval asks of a descriptor."""
+
+from typing import Protocol
+
+from hbr.arrays import FloatArray, ImageArray, LevelArray
+
+
+class Descriptor(Protocol):
+    """A way to put a view into a few bytes, and to compare such bytes.
+
+    Attributes
+    ----------
+    name : str
+        By which it is asked for, and stored with every view.
+    version : int
+        Rises when the same image gives other levels; levels of different versions must not be compared.
+    size_bytes : int
+        Of a packed view.
+    length : int
+        Levels of a view.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def version(self) -> int: ...
+    @property
+    def size_bytes(self) -> int: ...
+    @property
+    def length(self) -> int: ...
+
+    def describe(self, image_bgr: ImageArray) -> LevelArray:
+        """Describe an image, uint8 (H, W, 3) in BGR, by levels, uint8 (length,).
+
+        Raises
+        ------
+        TypeError, ValueError
+            It is no such image.
+        """
+        ...
+
+    def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
+        """Similarity of every row of `a`, (n, length), to every row of `b`, (m, length).
+
+        Returns
+        -------
+        float64 array (n, m)
+            0..1; 1 for equal rows that show anything.
+
+        Raises
+        ------
+        ValueError
+            The rows are not of this descriptor's length.
+        """
+        ...
+
+    def pack(self, levels: LevelArray) -> bytes:
+        """Pack the levels of one view, (length,), into `size_bytes` bytes.
+
+        Raises
+        ------
+        TypeError, ValueError
+            They are no levels of this descriptor.
+        """
+        ...
+
+    def unpack(self, packed: bytes) -> LevelArray:
+        """Restore the levels of one view, uint8 (length,), the inverse of `pack`.
+
+        Raises
+        ------
+        ValueError
+            There are not exactly `size_bytes` bytes.
+        """
+        ...
