@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Self
 
 from pydantic import AwareDatetime, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
 
-from rig.catalog.images import write
 from rig.errors import ConfigError, UsageError
+from rig.files import write
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

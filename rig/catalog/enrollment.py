@@ -14,6 +14,7 @@ from rig.catalog.records import EnrollmentStatus, Sitting, StoredView, ViewRecor
 from rig.catalog.schema import DESCRIPTOR_KIND, DESCRIPTOR_VERSION, enrollments, objects, sittings, views
 from rig.clock import Clock
 from rig.errors import CatalogError, UsageError
+from rig.files import write
 
 
 class Enrollment:
@@ -97,7 +98,7 @@ class Enrollment:
                     f"view {index} of {self.object_name!r} is stored already",
                     next_step="go on with the missing views; check that no other process enrolls this object",
                 )
-            images.write(self._database.root / image, png)
+            write(self._database.root / image, png)
             view_id = insert_row(
                 connection,
                 views,

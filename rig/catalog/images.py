@@ -1,10 +1,8 @@
-"""Images of views: encoding, file names, and writes that survive a power cut."""
+"""Images of views: encoding and file names."""
 
 import hashlib
-import os
 import re
 import unicodedata
-from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.errors import CatalogError, UsageError
+from rig.files import sync_folder
 
 IMAGE_FOLDER: Final = "images"
 MAX_SLUG_LENGTH: Final = 40
@@ -82,30 +81,6 @@ def make_folder(path: Path, *, within: Path) -> None:
     """Create ``path`` and the folders between it and ``within``, each durably known to the one above it."""
     path.mkdir(parents=True, exist_ok=True)
     for above in path.parents:
-        _sync_folder(above)
+        sync_folder(above)
         if above == within:
             return
-
-
-def write(path: Path, content: bytes) -> None:
-    """Write a file so that under its name there is all of it or nothing, and all of it once this returns."""
-    temporary = path.with_name(f"{path.name}.part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink()
-        raise
-    _sync_folder(path.parent)
-
-
-def _sync_folder(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
