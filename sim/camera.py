@@ -1,8 +1,10 @@
 """The simulated camera: a UVC device at the seam of `cv2.VideoCapture`, looking at the world's platter."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, cos, radians, sin
+from typing import Any
 from zlib import crc32
 
 import cv2
@@ -12,13 +14,15 @@ from numpy.typing import NDArray
 from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
 from sim.sensor import Gains, Sensor, white_balance
-from sim.world import HISTORY_S, Scene, World
+from sim.world import HISTORY_S, Happening, Scene, World
 
 FPS = 30
 NOMINAL_EXPOSURE = 100
 """Exposure at which a scene's grey levels are the frame's, in V4L2's unit of 100 µs."""
 READOUT_NS = 15_000_000
 """From the end of the exposure until the computer has the frame."""
+SELECT_S = 10.0
+"""How long OpenCV's V4L2 backend waits for a frame (OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT)."""
 V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY = 1, 3
 
 _EXPOSURE_RANGE = (1, 10_000 // FPS)
@@ -62,9 +66,27 @@ class SimCapture:
     fetches are kept, the oldest; then new ones are lost until there is room, as V4L2 does. A frame is drawn when it is
     retrieved, from the world's past at its own exposure, so frames that are dropped cost nothing and change nothing.
     Properties follow OpenCV's V4L2 backend: its units, False from `set` and 0 from `get` for what the camera lacks.
+
+    Attributes
+    ----------
+    every
+        Of how many frames one is exposed: a camera that has become slow.
+    latency_ns
+        How much later than `READOUT_NS` a frame arrives.
+    hangs
+        Whether no frame arrives although the camera is there: `grab` gives up after `SELECT_S`.
+    blur_px
+        Width of the blur of a lens that was knocked; the camera does not know.
+    tampers
+        Called with each frame that is fetched and its number, one after the other; returns the one that goes on.
     """
 
     def __init__(self, world: World) -> None:
+        self.every = 1
+        self.latency_ns = 0
+        self.hangs = False
+        self.blur_px = 0.0
+        self.tampers: list[Callable[[Image, int], Image]] = []
         self._world = world
         self._clock = world.clock
         self._sensor = Sensor(world.noise, world.rng("camera"))
@@ -82,6 +104,16 @@ class SimCapture:
         """Pull the cable: from now on no frame arrives."""
         self._open = False
 
+    def replug(self) -> None:
+        """Put it in again: the stream begins anew, with the settings that the camera kept."""
+        self._queue.clear()
+        self._next = self._exposed_from(_frame_after(self._clock.now_ns()))
+        self._open = True
+
+    def drift(self, **values: Any) -> None:
+        """Change settings (fields of `Controls`) from inside, as a camera does that forgets its locks."""
+        self._change(self._clock.now_ns(), replace(self._controls[-1][1], **values))
+
     # -- the side of cv2.VideoCapture ---------------------------------------------------------------------------------
 
     def isOpened(self) -> bool:  # noqa: N802
@@ -98,6 +130,9 @@ class SimCapture:
         if not self._open:
             return False
         self._receive()
+        if self.hangs and not self._queue:
+            self._clock.sleep(SELECT_S)
+            return False
         while not self._queue:
             self._clock.advance_to(self._arrival_ns(self._next))
             self._receive()
@@ -108,7 +143,11 @@ class SimCapture:
         """Return the frame that was grabbed last, uint8 (480, 640, 3)."""
         if self._grabbed is None or not self._open:
             return False, None
-        return True, self._frame(self._grabbed)
+        self._world.tell(Happening.SEEN)
+        image = self._frame(self._grabbed)
+        for tamper in self.tampers:
+            image = tamper(image, self._grabbed)
+        return True, image
 
     def get(self, prop: int) -> float:
         self._meter()
@@ -167,17 +206,23 @@ class SimCapture:
         self._meter()
         now_ns = self._clock.now_ns()
         room = self._controls[-1][1].buffers
+        if self.hangs:
+            self._next = max(self._next, self._exposed_from(_frame_after(now_ns)))
         while len(self._queue) < room and self._arrival_ns(self._next) <= now_ns:
             self._queue.append(self._next)
-            self._next += 1
+            self._next = self._exposed_from(self._next + 1)
         if len(self._queue) == room:
-            self._next = max(self._next, _frame_after(now_ns) - 2)
+            self._next = max(self._next, self._exposed_from(_frame_after(now_ns - self.latency_ns) - 2))
             while self._arrival_ns(self._next) <= now_ns:
-                self._next += 1
+                self._next = self._exposed_from(self._next + 1)
+
+    def _exposed_from(self, frame: int) -> int:
+        """Return the first frame from ``frame`` on that is exposed at all."""
+        return -(-frame // self.every) * self.every
 
     def _arrival_ns(self, frame: int) -> int:
         start = start_ns(frame)
-        return start + _exposure_ns(self._controls_at(start)) + READOUT_NS
+        return start + _exposure_ns(self._controls_at(start)) + READOUT_NS + self.latency_ns
 
     def _controls_at(self, time_ns: int) -> Controls:
         return next((c for since, c in reversed(self._controls) if since <= time_ns), self._controls[0][1])
@@ -203,7 +248,7 @@ class SimCapture:
             for angle in angles:
                 cv2.accumulate(self._picture(scene, float(angle)), total)
             seen = total * np.float32(1 / len(angles))
-        blur = abs(controls.focus - _SHARP_AT) * 0.04
+        blur = max(abs(controls.focus - _SHARP_AT) * 0.04, self.blur_px)
         if blur > 0.1:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
         return self._sensor.expose(

@@ -52,6 +52,10 @@ class VirtualClock:
         if seconds > 0:
             self.advance_to(self._now_ns + round(seconds * 1e9))
 
+    def set_civil(self, seconds: float) -> None:
+        """Set the civil time forward or back, as a time server or a person does; `now_ns` goes on undisturbed."""
+        self._start_utc += timedelta(seconds=seconds)
+
     def call_at(self, at_ns: int, callback: Callable[[], None]) -> Timer:
         """Schedule ``callback`` for ``at_ns``; a time that has passed means as soon as time moves on."""
         timer = Timer(max(at_ns, self._now_ns), callback)

@@ -62,8 +62,8 @@ class Message:
 class SimI2cBus:
     """A bus with a path that ``smbus2.SMBus(path)`` opens.
 
-    Bus side: `path`. World side: `attach`, `detach` (a pulled cable), `nack`, `cut_read`, `stuck`, and `wire`, the last
-    messages that were acknowledged.
+    Bus side: `path`. World side: `attach`, `detach` (a pulled cable), `nack`, `refusals` (asked, with the address,
+    whether nobody acknowledges it now), `cut_read`, `stuck`, and `wire`, the last messages that were acknowledged.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
@@ -73,6 +73,7 @@ class SimI2cBus:
         self._nacks = 0
         self._cut: int | None = None
         self.stuck = False
+        self.refusals: list[Callable[[int], bool]] = []
         self.wire: deque[Message] = deque(maxlen=1000)
         handle, self.path = tempfile.mkstemp(prefix="sim-i2c-")
         self._key = _file_key(handle)
@@ -209,7 +210,7 @@ class SimI2cBus:
     def _start(self, address: int, reading: bool) -> I2cDevice:
         self._pass(1)
         device = self._devices.get(address)
-        if device is None or self._nacks:
+        if device is None or self._nacks or any(refuses(address) for refuses in self.refusals):
             self._nacks = max(self._nacks - 1, 0)
             raise _os_error(ENXIO)
         device.start(reading)

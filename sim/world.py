@@ -3,9 +3,10 @@
 The emulators have two sides: the bus, on which unchanged drivers talk to them, and this world, which tests set.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any, Protocol
 from zlib import crc32
 
@@ -41,18 +42,26 @@ class Scene:
     light: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
+class Happening(Enum):
+    """What a fault may wait for."""
+
+    SET_OFF = "the shaft begins to turn"
+    SEEN = "a frame is fetched from the camera"
+
+
 class World:
     """True state of the simulated bench on its virtual clock.
 
     Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. With ``noise`` and ``seed`` the
     whole run is determined: each emulator draws from its own stream (`rng`), so one more reading of one device does not
-    change what another one sees.
+    change what another one sees. Whoever is in ``watchers`` is told what happens.
     """
 
     def __init__(self, *, noise: NoiseModel | None = None, seed: int = 0, clock: VirtualClock | None = None) -> None:
         self.clock = clock or VirtualClock()
         self.noise = noise or NoiseModel()
         self.seed = seed
+        self.watchers: list[Callable[[Happening], None]] = []
         self._scenes: list[tuple[int, Scene]] = [(0, Scene())]
         first = self._platter()
         first.follow(rest(0.0, 0.0), None)
@@ -68,10 +77,18 @@ class World:
     def drive(self, shaft: Trajectory) -> None:
         """Let the servo's shaft follow ``shaft`` from now on."""
         now_ns = self.clock.now_ns()
+        standing = self.shaft()[1] == 0
         platter = self._platter()
         platter.follow(shaft, self._motions[-1][1])
         self._motions.append((now_ns, platter))
         self._forget(self._motions, now_ns)
+        if standing and shaft.end_s > shaft.start_s[0]:
+            self.tell(Happening.SET_OFF)
+
+    def tell(self, happening: Happening) -> None:
+        """Tell the watchers."""
+        for watcher in tuple(self.watchers):
+            watcher(happening)
 
     def slip(self, angle_deg: float, seconds: float = 0.001) -> None:
         """Turn the platter by ``angle_deg`` against the shaft, evenly from now on: a loose platter, a bumped table."""

@@ -9,6 +9,8 @@ pin, the signal paths' reset, the motion processor, and start-up times. The low-
 accelerometer follows the gyro's rate and bandwidth.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from sim.imu.inertial import InertialModel
@@ -47,11 +49,15 @@ _SAMPLING = {SMPLRT_DIV, CONFIG, PWR_MGMT_1}
 _FIFO_BITS = (0x08, 0x08, 0x08, 0x80, 0x40, 0x20, 0x10)
 
 
+Words = np.ndarray[tuple[int, int], np.dtype[np.int16]]
+
+
 class SimMpu6050:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
     World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `clock_error` (how much too fast its
-    clock runs, relatively; set before it wakes), `who_am_i` (a clone answers otherwise) and `power_cycle`.
+    clock runs, relatively; set before it wakes), `who_am_i` (a clone answers otherwise), `power_cycle`, and
+    `distortions`, each of which is given the samples' words, int16 (n, 7), and returns those that are kept.
     """
 
     def __init__(self, world: World, *, ad0: bool = False, who_am_i: int = 0x68) -> None:
@@ -60,6 +66,7 @@ class SimMpu6050:
         self.temperature_c = 25.0
         self.clock_error = 0.0
         self.who_am_i = who_am_i
+        self.distortions: list[Callable[[Words], Words]] = []
         self._clock = world.clock
         self.power_cycle()
 
@@ -162,6 +169,8 @@ class SimMpu6050:
         ticks = np.arange(first * decimation + 1, due * decimation + 1)
         gyro, accel = self.inertial.sample(self._epoch_ns + tick_ns * ticks, internal_hz, BANDWIDTH_HZ[filter_setting])
         words = self._quantised(gyro[decimation - 1 :: decimation], accel[decimation - 1 :: decimation])
+        for distort in self.distortions:
+            words = distort(words)
         registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = words[-1].tobytes()
         registers[INT_STATUS] |= DATA_RDY
         chosen = [i for i, bit in enumerate(_FIFO_BITS) if registers[FIFO_EN] & bit]
@@ -171,11 +180,11 @@ class SimMpu6050:
                 del self._fifo[:-FIFO_SIZE]
                 registers[INT_STATUS] |= FIFO_OFLOW
 
-    def _quantised(self, gyro: Floats, accel: Floats) -> np.ndarray[tuple[int, int], np.dtype[np.int16]]:
+    def _quantised(self, gyro: Floats, accel: Floats) -> Words:
         """Return the samples (n, 7) as the big-endian words of the data registers, saturated."""
         values = np.empty((len(gyro), 7))
         values[:, :3] = accel * LSB_PER_G[self._registers[ACCEL_CONFIG] >> 3 & 3]
         values[:, 3] = (self.temperature_c - 36.53) * 340
         values[:, 4:] = gyro * LSB_PER_DPS[self._registers[GYRO_CONFIG] >> 3 & 3]
-        words: np.ndarray[tuple[int, int], np.dtype[np.int16]] = np.clip(np.rint(values), -32768, 32767).astype(">i2")
+        words: Words = np.clip(np.rint(values), -32768, 32767).astype(">i2")
         return words

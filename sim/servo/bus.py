@@ -94,12 +94,18 @@ class ServoBus:
     tampers
         Called with each frame of a device on its way to the host, one after the other; a tamper returns the frame that
         goes on in its place (other bytes, another time), or None to lose it.
+    echo
+        Whether the adapter hears itself, as a half-duplex one without a switched receiver does.
+    deaf
+        Whether what the host sends gets lost on its way.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
         self.taps: list[Callable[[Frame], None]] = []
         self.tampers: list[Callable[[Frame], Frame | None]] = []
+        self.echo = False
+        self.deaf = False
         self._devices: list[Device] = []
         self._deliver: Callable[[Frame], None] | None = None
         self._sent_until_ns = 0
@@ -130,8 +136,16 @@ class ServoBus:
         self._sent_until_ns = frame.end_ns
         for tap in self.taps:
             tap(frame)
-        self.clock.call_at(frame.end_ns, lambda: self._hear(frame))
+        if self.echo and self._deliver is not None:
+            self._deliver(frame)
+        if not self.deaf:
+            self.clock.call_at(frame.end_ns, lambda: self._hear(frame))
         return frame.end_ns
+
+    def disturb(self, data: bytes, baudrate: int) -> None:
+        """Put bytes of nobody on the line, for the host to hear."""
+        if self._deliver is not None:
+            self._deliver(Frame(Source.DEVICE, self.clock.now_ns(), baudrate, data))
 
     def _hear(self, frame: Frame) -> None:
         if frame.baudrate != self._heard.baudrate or frame.start_ns - self._heard.end_ns > ABANDON_S * 1e9:

@@ -146,6 +146,12 @@ class Controller:
         self._turns_counts = present - present % COUNTS_PER_TURN
         self._memory["Goal Position"] = self._present_position()
 
+    def slip_encoder(self, angle_deg: float) -> None:
+        """Read ``angle_deg`` more than before, and go to the goal as the encoder now sees it."""
+        self._center += round(angle_deg / DEG_PER_COUNT)
+        if self._motor.driven:
+            self.pursue_position()
+
     # -- reports --------------------------------------------------------------------------------------------------
 
     def refresh(self) -> None:

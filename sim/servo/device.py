@@ -53,6 +53,12 @@ class XSeriesServo:
     ------
     ValueError
         No such model, id or baud rate.
+
+    Attributes
+    ----------
+    distortions
+        Called with the memory each time its live registers have been filled in, before they are read: a tired servo
+        reports something else.
     """
 
     def __init__(
@@ -78,6 +84,7 @@ class XSeriesServo:
         self.motor = Motor(world, self.model)
         self._clock = world.clock
         self._controller = Controller(world, self.memory, self.motor, self.model, center_counts)
+        self.distortions: list[Callable[[Memory], None]] = []
         self._registered: tuple[int, bytes] | None = None
         self._heard_ns = 0
         self._watchdog: Timer | None = None
@@ -179,6 +186,8 @@ class XSeriesServo:
     def _read(self, address: int, size: int) -> bytes:
         if address + size > _FIRST_LIVE_REGISTER:
             self._controller.refresh()
+            for distort in self.distortions:
+                distort(self.memory)
         return self.memory.read(address, size)
 
     def _write(self, address: int, data: bytes, in_group: bool) -> None:
@@ -253,6 +262,16 @@ class XSeriesServo:
         if error & self.memory["Shutdown"] and self.memory["Torque Enable"]:
             self.memory["Torque Enable"] = 0
             self.motor.release()
+
+    def trip_watchdog(self) -> None:
+        """Let the Bus Watchdog expire now, if it is armed: as after a silence of the host."""
+        if self.memory["Torque Enable"] and 0 < self.memory["Bus Watchdog"] < WATCHDOG_TRIPPED:
+            self._trip()
+
+    def slip_encoder(self, angle_deg: float) -> None:
+        """Let the encoder's magnet slip on the shaft by ``angle_deg``; the shaft follows what the encoder now reads."""
+        self._controller.slip_encoder(angle_deg)
+        self._supervise()
 
     def power_off(self) -> None:
         """Cut the supply."""
@@ -355,5 +374,8 @@ class XSeriesServo:
         if self._clock.now_ns() < self._heard_ns + self.memory["Bus Watchdog"] * WATCHDOG_UNIT_NS:
             self._arm_watchdog()
         elif self.memory["Torque Enable"]:
-            self.memory["Bus Watchdog"] = WATCHDOG_TRIPPED
-            self._controller.stop()
+            self._trip()
+
+    def _trip(self) -> None:
+        self.memory["Bus Watchdog"] = WATCHDOG_TRIPPED
+        self._controller.stop()

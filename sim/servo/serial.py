@@ -61,6 +61,10 @@ class SimSerial:
         self.close()
         self._unplugged = True
 
+    def replug(self) -> None:
+        """Plug the adapter in again; the port must be opened anew."""
+        self._unplugged = False
+
     @property
     def in_waiting(self) -> int:
         if self._unplugged:
