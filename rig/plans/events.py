@@ -9,17 +9,26 @@ from numpy.typing import NDArray
 
 from rig.view import ViewEvidence
 
+SCHEMA = 1
+"""Version of the JSON form (docs/events.md): raised when a field goes or changes its meaning, not when one comes."""
+
 _OUTSIDE = {"json": False}
 
 
 @dataclass(frozen=True, slots=True)
 class Started:
-    """A plan begins: ``plan`` is "enroll" or "identify", ``views`` how many views it takes at most."""
+    """A plan begins: ``plan`` is "enroll" or "identify", ``views`` how many views it takes at most.
+
+    ``strategy`` and ``seed`` decide where an identification looks.
+    """
 
     plan: str
     name: str | None
     views: int
     conditions: dict[str, Any]
+    strategy: str | None = None
+    seed: int | None = None
+    schema: int = SCHEMA
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +93,10 @@ class Ranked:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """Where to look next (Eq. 6-7): the side on which the ``rivals`` look less alike.
+    """Where to look next, and ``why`` in words: of AHBR, the side on which the ``rivals`` look less alike (Eq. 6-7).
 
     ``rotation_deg`` is the camera's around the object, positive to the left; the table turns the other way, to
-    ``target_deg``. ``s_left`` and ``s_right`` are None for the first move, which is fixed.
+    ``target_deg``. ``s_left`` and ``s_right`` are None where the sides were not compared.
     """
 
     index: int
@@ -97,6 +106,7 @@ class Decided:
     s_left: float | None
     s_right: float | None
     rivals: tuple[str, ...]
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,27 +1,30 @@
 """What happened, in words: the same on the terminal and in the report."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from rig.plans.events import Decided, Identified, Moved
 
 
 def decision_words(decided: Decided) -> str:
-    """Return why the camera goes to a side, and how far: "left: the rivals look less alike there …; turning 47.3°"."""
+    """Return why the camera goes to a side, and how far: "left: the rivals look less alike there …; turning 47.3°."."""
     turning = f"turning {abs(decided.rotation_deg):.1f}°"
-    if decided.s_left is None or decided.s_right is None:
-        return f"{decided.side}: the first turn is fixed; {turning}."
-    left, right = distinct(decided.s_left, decided.s_right)
-    if len(decided.rivals) < 2:
-        why = "no second candidate is in sight to be told apart"
-    elif decided.s_left == decided.s_right:
-        why = f"the leading candidates look as much alike on both sides: S_left {left} = S_right {right}"
-    elif decided.side == "left":
-        why = f"the leading candidates look less alike there: S_left {left} < S_right {right}"
-    else:
-        why = f"the leading candidates look less alike there: S_right {right} < S_left {left}"
-    # The step itself is at most 90°; what exceeds it leads past views that were taken before (`hbr.next_view`).
-    past = " past what was seen already" if round(abs(decided.rotation_deg), 1) > 90 else ""
-    return f"{decided.side}: {why}; {turning}{past}."
+    # A step of AHBR is at most 90°; what exceeds it leads past views that were taken before (`hbr.next_view`).
+    compared = decided.s_left is not None
+    past = " past what was seen already" if compared and round(abs(decided.rotation_deg), 1) > 90 else ""
+    return f"{decided.side}: {decided.why}; {turning}{past}."
+
+
+def likeness_words(side: str, s_left: float, s_right: float, rivals: Sequence[str]) -> str:
+    """Return why a side was chosen: how alike the rivals look from the left and from the right (Eq. 6)."""
+    if len(rivals) < 2:
+        return "no second candidate is in sight to be told apart"
+    left, right = distinct(s_left, s_right)
+    leading = "the two leading candidates" if len(rivals) == 2 else "the leading candidates"
+    if s_left == s_right:
+        return f"{leading} look as much alike on both sides: S_left {left} = S_right {right}"
+    if side == "left":
+        return f"{leading} look less alike there: S_left {left} < S_right {right}"
+    return f"{leading} look less alike there: S_right {right} < S_left {left}"
 
 
 def move_words(moved: Moved) -> str:

@@ -20,6 +20,7 @@ from rig.plans.events import (
     Rejected,
     Started,
 )
+from rig.plans.words import likeness_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.view import ViewEvidence
 
@@ -77,7 +78,8 @@ def identifying(
             step_deg = rotations_deg[k]
             s_left, s_right = (None, None) if k == 0 else (0.41, 0.66) if step_deg >= 0 else (0.66, 0.41)
             side = "left" if step_deg >= 0 else "right"
-            yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names))
+            why = "the first turn is fixed" if s_left is None else likeness_words(side, s_left, s_right, names)
+            yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names), why)
     travelled_deg = sum(map(abs, rotations_deg))
     yield Identified(
         answer,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from report_samples import enrolled, enrolling, evidence, identified, identifying, moved
 
 from rig.plans.events import Accepted, Decided, Identified, Moved, Rejected, Started
-from rig.plans.words import answer_words, decision_words, distinct, move_words
+from rig.plans.words import answer_words, decision_words, distinct, likeness_words, move_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
 from rig.report.summary import enrollment_facts, totals
@@ -152,21 +152,26 @@ class TestIdentification:
         assert found["views"] == "4"
 
 
+def decided(side: str, rotation_deg: float, s_left: float, s_right: float, *rivals: str) -> Decided:
+    why = likeness_words(side, s_left, s_right, rivals)
+    return Decided(1, side, rotation_deg, -rotation_deg, s_left, s_right, rivals, why)
+
+
 class TestWords:
     def test_decisions(self) -> None:
-        first = Decided(0, "left", 90.0, -90.0, None, None, ())
+        first = Decided(0, "left", 90.0, -90.0, None, None, (), "the first turn is fixed")
         assert decision_words(first) == "left: the first turn is fixed; turning 90.0°."
-        left = Decided(1, "left", 47.3, -137.3, 0.41, 0.66, ("a", "b"))
-        assert decision_words(left) == (
-            "left: the leading candidates look less alike there: S_left 0.41 < S_right 0.66; turning 47.3°."
+        assert decision_words(decided("left", 47.3, 0.41, 0.66, "a", "b")) == (
+            "left: the two leading candidates look less alike there: S_left 0.41 < S_right 0.66; turning 47.3°."
         )
-        right = Decided(1, "right", -137.3, 47.3, 0.66, 0.41, ("a", "b"))
-        assert decision_words(right) == (
+        assert decision_words(decided("right", -137.3, 0.66, 0.41, "a", "b", "c")) == (
             "right: the leading candidates look less alike there: S_right 0.41 < S_left 0.66; "
             "turning 137.3° past what was seen already."
         )
-        tie = Decided(1, "left", 90.0, 0.0, 0.5, 0.5, ("a", "b"))
+        tie = decided("left", 90.0, 0.5, 0.5, "a", "b")
         assert "as much alike on both sides: S_left 0.50 = S_right 0.50" in decision_words(tie)
+        drawn = Decided(1, "right", -170.0, 170.0, None, None, (), "a turn drawn at random")
+        assert decision_words(drawn) == "right: a turn drawn at random; turning 170.0°."
 
     @given(a=st.floats(0, 45), b=st.floats(0, 45))
     def test_numbers_that_differ_read_differently(self, a: float, b: float) -> None:
@@ -182,8 +187,8 @@ class TestWords:
         assert move_words(replace(move, rotation_imu_deg=None)).endswith("the gyro has no answer")
 
     def test_a_lone_candidate_is_not_compared(self) -> None:
-        decided = Decided(2, "left", 90.0, -90.0, 0.0, 0.0, ("mug",))
-        assert decision_words(decided) == "left: no second candidate is in sight to be told apart; turning 90.0°."
+        alone = decided("left", 90.0, 0.0, 0.0, "mug")
+        assert decision_words(alone) == "left: no second candidate is in sight to be told apart; turning 90.0°."
 
     def test_answers(self) -> None:
         known, unknown = identified("mug-white").answer, identified(None).answer
