@@ -1,42 +1,62 @@
-"""Registers by name on a Dynamixel bus, through the unmodified SDK."""
+"""Registers by name on a Dynamixel bus: every answer belongs to its question, or is none."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from threading import RLock
-from typing import Any
 
 import serial
-from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS, Protocol2PacketHandler
+from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
+from rig.clock import seconds_between
+from rig.devices.dynamixel.packets import (
+    BROADCAST_ID,
+    PING,
+    READ,
+    REBOOT,
+    SYNC_READ,
+    WRITE,
+    Packets,
+    Packets1,
+    Packets2,
+    Reply,
+)
 from rig.devices.dynamixel.port import ClockedPort, LineBabble
 from rig.devices.dynamixel.registers import Register
-from rig.errors import DeviceRefused, DeviceSilent
+from rig.errors import DeviceRefused, DeviceSilent, UsageError
 
-_ALERT = 0x80
-_STATUS_ERRORS = {
-    1: "result fail",
-    2: "instruction error",
-    3: "CRC error",
-    4: "data range error",
-    5: "data length error",
-    6: "data limit error",
-    7: "access error",
-}
+OWED_S = 2.0
+"""How long an answer that never came may still come: longer than any buffer on the way keeps it."""
+
+_ECHO_SIZE = 2
+"""An instruction of Protocol 1.0 that reads so many bytes is, echoed, a valid answer to itself."""
+
+Answers = tuple[dict[int, Reply], int]
+"""Replies by id, and the SDK's result for those that did not come."""
 
 
 @dataclass(slots=True)
 class BusStatistics:
-    """What the line was like since it was opened."""
+    """What the line was like since it was opened.
+
+    ``late`` counts answers to another question than the one asked, ``foreign`` those of devices that nobody asked.
+    """
 
     transactions: int = 0
     retries: int = 0
     timeouts: int = 0
     corrupt: int = 0
+    late: int = 0
+    foreign: int = 0
+    refused: int = 0
 
 
 class DynamixelBus:
     """Reads and writes registers; retries what the line spoiled, and never takes a failed read for a value.
+
+    The protocols number neither questions nor answers, so that an answer that comes after its time-out would pass for
+    the next one. Here the length tells: as long as an answer is owed, no other read asks for as many bytes (it asks for
+    some more, below its address), and a write is read back, because all writes are answered alike.
 
     Parameters
     ----------
@@ -45,16 +65,25 @@ class DynamixelBus:
     retries
         How often a transaction is repeated before the device counts as silent. All instructions used here are absolute
         (a read, or a write of a value), so that repeating one does no harm.
+    protocol
+        2 (X, MX with firmware for it), or 1 (AX-12A).
     """
 
-    def __init__(self, port: ClockedPort, retries: int = 3) -> None:
+    def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
         self.port = port
         self.statistics = BusStatistics()
-        self._packets = Protocol2PacketHandler()
+        self._packets: Packets = Packets1() if protocol == 1 else Packets2()
         self._retries = retries
         self._lock = RLock()
         self._alerts: set[int] = set()
         self._unanswered = False  # the last question, even when Ctrl+C cut it short: its answer may still be coming
+        self._owed: list[
+            tuple[int, int]
+        ] = []  # answers that may still come: their parameters, when they were asked for
+
+    @property
+    def protocol(self) -> int:
+        return self._packets.version
 
     def alert(self, device_id: int) -> bool:
         """Return whether the device's last status packet carried the alert bit (its Hardware Error Status is not 0)."""
@@ -62,70 +91,164 @@ class DynamixelBus:
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
-        return int(self._transact("ping", device_id, 0, lambda: self._packets.ping(self.port, device_id)))
+        if self.protocol == 1 or self._owes(3):  # an echoed ping of Protocol 1.0 is a valid answer to itself
+            return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
+        answer = self._transact("ping", (device_id,), lambda: self._ask((device_id,), PING, b"", 3))[device_id]
+        return int.from_bytes(answer.data[:2], "little")
 
     def read(self, device_id: int, register: Register) -> int:
         return register.decode(self.read_block(device_id, register.address, register.size))
 
     def read_block(self, device_id: int, address: int, size: int) -> bytes:
         """Return ``size`` bytes from ``address``, all of one moment."""
-        data = self._transact(
-            f"read of {size} bytes at {address}",
-            device_id,
-            size,
-            lambda: self._packets.readTxRx(self.port, device_id, address, size),
-        )
-        return bytes(data)
+        skipped = 0
+
+        def attempt() -> Answers:
+            nonlocal skipped
+            start, asked = self._unmistakable(address, size)
+            skipped = address - start
+            return self._ask((device_id,), READ, self._packets.read_parameters(start, asked), asked)
+
+        reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
+        return reply.data[skipped : skipped + size]
+
+    def sync_read(self, device_ids: Sequence[int], address: int, size: int) -> dict[int, bytes]:
+        """Return ``size`` bytes from ``address`` of several devices, by id, in one transaction (Protocol 2.0 only)."""
+        if self.protocol == 1:
+            return {device_id: self.read_block(device_id, address, size) for device_id in device_ids}
+
+        skipped = 0
+
+        def attempt() -> Answers:
+            nonlocal skipped
+            start, asked = self._unmistakable(address, size)
+            skipped = address - start
+            parameters = self._packets.read_parameters(start, asked) + bytes(device_ids)
+            return self._ask(device_ids, SYNC_READ, parameters, asked)
+
+        replies = self._transact(f"sync read of {size} bytes at {address}", device_ids, attempt)
+        return {device_id: replies[device_id].data[skipped : skipped + size] for device_id in device_ids}
 
     def write(self, device_id: int, register: Register, value: int) -> None:
-        data = list(register.encode(value))
-        self._transact(
-            f"write of {register.name} = {value}",
-            device_id,
-            0,
-            lambda: (None, *self._packets.writeTxRx(self.port, device_id, register.address, register.size, data)),
-        )
+        data = register.encode(value)
+
+        def attempt() -> Answers:
+            doubtful = self._owes(0)  # somebody else's answer may pass for this one's
+            answers = self._ask((device_id,), WRITE, self._packets.write_parameters(register.address, data), 0)
+            reply = answers[0].get(device_id)
+            if reply is None or reply.error or not doubtful:
+                return answers
+            start, asked = self._unmistakable(register.address, register.size)
+            replies, result = self._ask((device_id,), READ, self._packets.read_parameters(start, asked), asked)
+            skipped = register.address - start
+            if result == COMM_SUCCESS and replies[device_id].data[skipped : skipped + register.size] == data:
+                return answers
+            return {}, COMM_RX_CORRUPT if result == COMM_SUCCESS else result
+
+        self._transact(f"write of {register.name} = {value}", (device_id,), attempt)
 
     def reboot(self, device_id: int) -> None:
-        self._transact("reboot", device_id, 0, lambda: (None, *self._packets.reboot(self.port, device_id)))
+        """Restart a device; it is silent for some tenths of a second.
+
+        Raises
+        ------
+        UsageError
+            Protocol 1.0 has no such instruction.
+        """
+        if self.protocol == 1:
+            raise UsageError(
+                "A servo with Protocol 1.0 cannot be restarted over its bus.",
+                next_step="Switch its supply off and on.",
+            )
+        self._transact("reboot", (device_id,), lambda: self._ask((device_id,), REBOOT, b"", 0))
 
     def close(self) -> None:
         self.port.closePort()
 
-    def _transact(self, what: str, device_id: int, size: int, call: Callable[[], tuple[Any, int, int]]) -> Any:
-        """Run an SDK call (payload, result, error) until it succeeds or the retries are used up; return the payload."""
+    # -- questions and answers ------------------------------------------------------------------------------------
+
+    def _transact(self, what: str, device_ids: Sequence[int], attempt: Callable[[], Answers]) -> dict[int, Reply]:
+        """Make attempts until all devices have answered or the retries are used up; return their replies."""
         with self._lock:
-            for attempt in range(self._retries + 1):
+            for number in range(self._retries + 1):
                 self.statistics.transactions += 1
-                self.statistics.retries += attempt > 0
+                self.statistics.retries += number > 0
                 try:
                     if self._unanswered:
                         self.port.drain()
                     self._unanswered = True
-                    payload, result, error = call()
+                    replies, result = attempt()
                 except (serial.SerialException, OSError) as unplugged:
-                    raise self._silent(what, device_id, f"the port failed: {unplugged}") from unplugged
+                    raise self._silent(what, device_ids, f"the port failed: {unplugged}") from unplugged
                 except (LineBabble, IndexError):
-                    # The SDK indexes into status packets that are shorter than it expects.
-                    payload, result, error = None, COMM_RX_CORRUPT, 0
+                    # Of some noise the SDK makes a packet that is shorter than the bytes it then looks at.
+                    replies, result = {}, COMM_RX_CORRUPT
                 finally:
                     self.port.is_using = False
-                if result == COMM_SUCCESS and (error & ~_ALERT or size == 0 or len(payload) == size):
-                    self._unanswered = False
-                    self._note_alert(device_id, error)
-                    if error & ~_ALERT:
-                        raise self._refused(what, device_id, error & ~_ALERT)
-                    return payload
                 if result == COMM_SUCCESS:
-                    result = COMM_RX_CORRUPT
+                    self._unanswered = False
+                    for reply in replies.values():
+                        self._note_alert(reply)
+                    refused = next((reply for reply in replies.values() if reply.error), None)
+                    if refused:
+                        self.statistics.refused += 1
+                        raise self._refused(what, refused)
+                    return replies
                 self._count(result)
-            raise self._silent(what, device_id, self._packets.getTxRxResult(result).removeprefix("[TxRxResult] "))
+            missing = [device_id for device_id in device_ids if device_id not in replies]
+            raise self._silent(what, missing or device_ids, self._packets.reason(result))
 
-    def _note_alert(self, device_id: int, error: int) -> None:
-        if error & _ALERT:
-            self._alerts.add(device_id)
+    def _ask(self, device_ids: Sequence[int], instruction: int, parameters: bytes, size: int) -> Answers:
+        """Send an instruction to ``device_ids`` and wait for their answers with ``size`` parameters each.
+
+        An answer of another length is not this question's. A refusal has no parameters; while an answer without
+        parameters is owed it is taken only when nothing better comes.
+        """
+        ambiguous = size > 0 and self._owes(0)
+        self._owed += [(size, self.port.clock.now_ns())] * len(device_ids)
+        target = device_ids[0] if instruction != SYNC_READ else BROADCAST_ID
+        result = self._packets.send(self.port, target, instruction, parameters)
+        if result != COMM_SUCCESS:
+            return {}, result
+        self.port.setPacketTimeout(self._packets.reply_size(size) * len(device_ids))
+        replies: dict[int, Reply] = {}
+        doubtful: dict[int, Reply] = {}
+        while len(replies) < len(device_ids):
+            reply, result = self._packets.receive(self.port)
+            if reply is None:
+                replies = doubtful | replies
+                return replies, COMM_SUCCESS if len(replies) == len(device_ids) else result
+            if reply.bus_id not in device_ids:
+                self.statistics.foreign += 1
+            elif reply.error and not reply.data and ambiguous:
+                doubtful[reply.bus_id] = reply
+            elif len(reply.data) != size and not (reply.error and not reply.data):
+                self.statistics.late += 1
+            else:
+                replies[reply.bus_id] = reply
+                del self._owed[[owed for owed, _ in self._owed].index(size)]
+        return replies, COMM_SUCCESS
+
+    def _owes(self, size: int) -> bool:
+        """Return whether an answer with ``size`` parameters may still come."""
+        if not self._owed:
+            return False
+        now_ns = self.port.clock.now_ns()
+        self._owed = [owed for owed in self._owed if seconds_between(owed[1], now_ns) <= OWED_S]
+        return any(owed == size for owed, _ in self._owed)
+
+    def _unmistakable(self, address: int, size: int) -> tuple[int, int]:
+        """Return start and size of a read that holds ``size`` bytes at ``address`` and whose answer is its own."""
+        asked = size
+        while self._owes(asked) or (self.protocol == 1 and asked == _ECHO_SIZE):
+            asked += 1
+        return max(address - (asked - size), 0), asked
+
+    def _note_alert(self, reply: Reply) -> None:
+        if reply.alert:
+            self._alerts.add(reply.bus_id)
         else:
-            self._alerts.discard(device_id)
+            self._alerts.discard(reply.bus_id)
 
     def _count(self, result: int) -> None:
         if result == COMM_RX_CORRUPT:
@@ -133,18 +256,20 @@ class DynamixelBus:
         else:
             self.statistics.timeouts += 1
 
-    def _silent(self, what: str, device_id: int, reason: str) -> DeviceSilent:
+    def _silent(self, what: str, device_ids: Sequence[int], reason: str) -> DeviceSilent:
+        ids = ", ".join(map(str, device_ids))
         return DeviceSilent(
-            f"Servo {device_id} does not answer ({what}).",
+            f"Servo {ids} does not answer ({what}).",
             next_step="Check the servo's cable and its supply (its LED blinks at power-up), then start again.",
             evidence={"reason": reason, "attempts": self._retries + 1, "baud": self.port.baudrate},
         )
 
-    def _refused(self, what: str, device_id: int, error: int) -> DeviceRefused:
+    def _refused(self, what: str, reply: Reply) -> DeviceRefused:
+        reason = self._packets.refusals.get(reply.error, f"error {reply.error}")
         return DeviceRefused(
-            f"Servo {device_id} refused the {what}: {_STATUS_ERRORS.get(error, f'error {error}')}.",
+            f"Servo {reply.bus_id} refused the {what}: {reason}.",
             next_step="Run `rig status` to see the servo's state; a tripped watchdog or hardware error forbids motion.",
-            evidence={"status_error": error, "alert": self.alert(device_id)},
+            evidence={"status_error": reply.error, "alert": reply.alert},
         )
 
 

@@ -70,11 +70,24 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
         self.baudrate = wire.baudrate
         self.is_open = True
         self.tx_time_per_byte = 10_000.0 / self.baudrate
-        self._clock = clock
+        self.clock = clock
 
-    def getCurrentTime(self) -> float:  # noqa: N802 - the SDK's name
+    def setBaudRate(self, baudrate: int) -> bool:  # noqa: N802 - the SDK's names
+        """Change the baud rate to any that the adapter takes: the SDK's own list lacks 250,000 and 4,500,000.
+
+        Raises
+        ------
+        serial.SerialException, OSError, ValueError
+            The adapter does not take it.
+        """
+        self.ser.baudrate = baudrate
+        self.baudrate = baudrate
+        self.tx_time_per_byte = 10_000.0 / baudrate
+        return True
+
+    def getCurrentTime(self) -> float:  # noqa: N802
         """Return the time in milliseconds, as the SDK wants it."""
-        return self._clock.now_ns() * 1e-6
+        return self.clock.now_ns() * 1e-6
 
     def clearPort(self) -> None:  # noqa: N802
         try:
@@ -86,6 +99,9 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
         return self.ser.write(bytes(packet)) or 0
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Return up to ``length`` bytes; the SDK asks for fewer than none when it drops what was no header."""
+        if length <= 0:
+            return b""
         data: bytes = self.ser.read(length)
         if data and self.getTimeSinceStart() > self.packet_timeout + BABBLE_GRACE_MS:
             raise LineBabble
@@ -97,7 +113,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
         A reply that comes after its timeout would otherwise be taken for the answer to the next request: Protocol 2.0
         has no sequence numbers.
         """
-        start_ns = last_ns = self._clock.now_ns()
-        while (now_ns := self._clock.now_ns()) - last_ns < quiet_s * 1e9 and now_ns - start_ns < limit_s * 1e9:
+        start_ns = last_ns = self.clock.now_ns()
+        while (now_ns := self.clock.now_ns()) - last_ns < quiet_s * 1e9 and now_ns - start_ns < limit_s * 1e9:
             if self.ser.read(256):
-                last_ns = self._clock.now_ns()
+                last_ns = self.clock.now_ns()

@@ -1,0 +1,165 @@
+"""Instructions and replies of both Dynamixel protocols, through the SDK's packet handlers.
+
+The SDK finds packets in the stream and checks their sums; here its byte stuffing is set right, and a reply is kept
+whole, with its length, which the SDK's own read functions do not look at.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler, Protocol2PacketHandler
+
+from rig.devices.dynamixel.port import ClockedPort
+
+PING, READ, WRITE, REBOOT, SYNC_READ = 0x01, 0x02, 0x03, 0x08, 0x82
+BROADCAST_ID = 0xFE
+
+_HEADER = b"\xff\xff\xfd"
+_STUFFED = _HEADER + b"\xfd"
+_MALFORMED = -1
+"""Id of a reply that contradicts itself: nobody's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """A status packet: the device's id, why it refused (0: it did not), whether it raises the alert, its parameters."""
+
+    bus_id: int
+    error: int
+    alert: bool
+    data: bytes
+
+
+class Packets(Protocol):
+    """One of the two protocols, on a port."""
+
+    version: ClassVar[int]
+
+    refusals: ClassVar[dict[int, str]]
+    """What the error of a `Reply` means."""
+
+    def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
+        """Send an instruction, after throwing away what lies in the port; return the SDK's result."""
+        ...
+
+    def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
+        """Wait for the next intact status packet; return it, or None and the SDK's result."""
+        ...
+
+    def reply_size(self, size: int) -> int:
+        """Return how many bytes a status packet with ``size`` parameters has."""
+        ...
+
+    def read_parameters(self, address: int, size: int) -> bytes: ...
+
+    def write_parameters(self, address: int, data: bytes) -> bytes: ...
+
+    def reason(self, result: int) -> str:
+        """Return the SDK's words for a result."""
+        ...
+
+
+class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
+    """Protocol 2.0."""
+
+    version: ClassVar[int] = 2
+    refusals: ClassVar[dict[int, str]] = {
+        1: "result fail",
+        2: "instruction error",
+        3: "CRC error",
+        4: "data range error",
+        5: "data length error",
+        6: "data limit error",
+        7: "access error",
+    }
+
+    def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
+        length = len(parameters) + 3
+        packet = [0, 0, 0, 0, bus_id, length & 0xFF, length >> 8, instruction, *parameters, 0, 0]
+        return int(self.txPacket(port, packet))
+
+    def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
+        packet, result = self.rxPacket(port, False)
+        if result != COMM_SUCCESS:
+            return None, result
+        body = packet[8:-2]
+        if not body:
+            return Reply(_MALFORMED, 0, False, b""), result
+        return Reply(packet[4], body[0] & 0x7F, bool(body[0] & 0x80), bytes(body[1:])), result
+
+    def reply_size(self, size: int) -> int:
+        return 11 + size
+
+    def read_parameters(self, address: int, size: int) -> bytes:
+        return address.to_bytes(2, "little") + size.to_bytes(2, "little")
+
+    def write_parameters(self, address: int, data: bytes) -> bytes:
+        return address.to_bytes(2, "little") + data
+
+    def reason(self, result: int) -> str:
+        return _words(self, result)
+
+    def addStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802 - the SDK's names
+        """Stuff ``packet`` in place: the SDK's own makes a new list, which its `txPacket` drops."""
+        return _restuff(packet, bytes(packet[7:-2]).replace(_HEADER, _STUFFED))
+
+    def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
+        """Return ``packet`` without stuffing, exactly as long as it says.
+
+        The SDK's own looks back into bytes that it has already moved, and after one stuffed byte takes FF FD FD for
+        another one: it loses a byte of the value, and passes a byte of the CRC for its last.
+        """
+        end = 7 + (packet[5] | packet[6] << 8)
+        return _restuff(packet[:end], bytes(packet[7 : end - 2]).replace(_STUFFED, _HEADER))
+
+
+class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
+    """Protocol 1.0, whose error byte mixes refusals with the state of the hardware.
+
+    Its sum has 8 bits: of replies that a bad line spoils in several places, one in 256 passes for good. A line that
+    echoes plays back an instruction that reads two bytes as a valid status packet; `DynamixelBus` never sends one.
+    """
+
+    version: ClassVar[int] = 1
+    refusals: ClassVar[dict[int, str]] = {
+        0x02: "outside the angle limits",
+        0x08: "value out of range",
+        0x10: "checksum error",
+        0x40: "instruction error",
+    }
+
+    def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
+        return int(self.txPacket(port, [0, 0, bus_id, len(parameters) + 2, instruction, *parameters, 0]))
+
+    def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
+        packet, result = self.rxPacket(port)
+        if result != COMM_SUCCESS:
+            return None, result
+        end = 4 + packet[3]
+        if packet[3] < 2 or len(packet) < end:
+            return Reply(_MALFORMED, 0, False, b""), result
+        refused = next((bit for bit in self.refusals if packet[4] & bit), 0)
+        return Reply(packet[2], refused, bool(packet[4] & 0x25), bytes(packet[5 : end - 1])), result
+
+    def reply_size(self, size: int) -> int:
+        return 6 + size
+
+    def read_parameters(self, address: int, size: int) -> bytes:
+        return bytes((address, size))
+
+    def write_parameters(self, address: int, data: bytes) -> bytes:
+        return bytes((address,)) + data
+
+    def reason(self, result: int) -> str:
+        return _words(self, result)
+
+
+def _restuff(packet: list[int], body: Sequence[int] | bytes) -> list[int]:
+    length = len(body) + 2
+    packet[5:-2] = [length & 0xFF, length >> 8, *body]
+    return packet
+
+
+def _words(handler: Protocol1PacketHandler | Protocol2PacketHandler, result: int) -> str:
+    return str(handler.getTxRxResult(result)).removeprefix("[TxRxResult] ")
