@@ -5,15 +5,18 @@ import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
-from sqlalchemy import Connection, QueuePool, Table, create_engine, event, insert
+from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, event, insert
 from sqlalchemy.exc import DBAPIError
 
 from rig.catalog import images
 from rig.catalog.schema import APPLICATION_ID, METADATA, SCHEMA_VERSION
 from rig.errors import CatalogBusy, CatalogError, RigError
+from rig.files import sync_folder
 
 DATABASE_NAME: Final = "catalog.sqlite"
 
@@ -98,17 +101,11 @@ class Database:
         absent = CatalogError(
             f"there is no catalog in {self.root}", next_step="check the path, or enroll an object to create it"
         )
-        if not self._file.exists():
+        if not self._file.exists() or not self._file.stat().st_size:
             if not create:
                 raise absent
             images.make_folder(self.root, within=next(above for above in self.root.parents if above.exists()))
-            self._file.touch()
-        with self.read() as connection:
-            fresh = _is_empty(connection)
-        if fresh:
-            if not create:
-                raise absent
-            self._create_tables()
+            self._create()
         with self.read() as connection:
             self._check_identity(connection)
 
@@ -136,14 +133,31 @@ class Database:
         # the catalog rests (an archive, a read-only disk) and SQLite must be told that nobody will write.
         return os.access(self.root, os.W_OK) or self._file.with_name(f"{DATABASE_NAME}-wal").exists()
 
-    def _create_tables(self) -> None:
-        with closing(self._connect()) as connection:  # the journal mode is set outside of transactions
-            connection.execute("PRAGMA journal_mode = WAL")
-        with self.write() as transaction:
-            if _is_empty(transaction):  # nobody else was faster
-                METADATA.create_all(transaction)
-                transaction.exec_driver_sql(f"PRAGMA application_id = {APPLICATION_ID}")
-                transaction.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
+    def _create(self) -> None:
+        """Make the database aside and give it its name when it is whole: nobody ever opens one that is half made.
+
+        Changing the journal mode of a file that others open already would fail now and then, whatever the timeout.
+        """
+        with TemporaryDirectory(prefix=".new-", dir=self.root) as aside:
+            made = Path(aside, DATABASE_NAME)
+            engine = create_engine("sqlite://", creator=partial(sqlite3.connect, made), poolclass=NullPool)
+            with engine.connect() as connection:
+                connection.exec_driver_sql("PRAGMA journal_mode = WAL")
+                METADATA.create_all(connection)
+                connection.exec_driver_sql(f"PRAGMA application_id = {APPLICATION_ID}")
+                connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
+                connection.commit()
+            try:
+                self._file.hardlink_to(made)
+            except FileExistsError:  # somebody was faster, or a program was cut off when it had made an empty file
+                self._replace_empty(made)
+        sync_folder(self.root)
+
+    def _replace_empty(self, made: Path) -> None:
+        with closing(self._connect()) as lock:
+            lock.execute("BEGIN EXCLUSIVE")  # of those who find the same empty file one goes first
+            if not self._file.stat().st_size:
+                made.replace(self._file)
 
     def _check_identity(self, connection: Connection) -> None:
         application_id, version = _identity(connection)
@@ -162,7 +176,7 @@ class Database:
     def _of_sqlite(self, error: BaseException | None) -> RigError | None:
         evidence = {"sqlite": str(error)}
         match getattr(error, "sqlite_errorcode", 0) & 0xFF:
-            case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED:
+            case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED | sqlite3.SQLITE_PROTOCOL:
                 return CatalogBusy(
                     f"another process is writing to the catalog {self.root} "
                     f"and was not done after {self._busy_timeout_s:g} s; nothing was changed",
@@ -222,8 +236,3 @@ def _identity(connection: Connection) -> tuple[int, int]:
     application_id: int = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
     version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
     return application_id, version
-
-
-def _is_empty(connection: Connection) -> bool:
-    tables: int = connection.exec_driver_sql("SELECT count(*) FROM sqlite_master").scalar_one()
-    return tables == 0 and _identity(connection) == (0, 0)

@@ -175,7 +175,8 @@ def test_processes_create_enroll_and_read_one_catalog_together(tmp_path: Path) -
     children = {name: spawn(path, name) for name in ("mug", "tin")}
     for child in children.values():
         assert child.stdout is not None
-        assert child.stdout.readline() == "0\n"
+        first = child.stdout.readline()
+        assert first == "0\n", child.communicate()
     seen = [0]
     with Catalog.open(path, clock=VirtualClock(), read_only=True) as catalog:
         while any(child.poll() is None for child in children.values()):
