@@ -27,7 +27,8 @@ class ServoState:
     """One reading of the servo's status registers, all from one transaction.
 
     ``time_ns`` is the middle of the transaction on the bench's clock, ``hardware_errors`` the names of the bits set in
-    Hardware Error Status (a status alert), empty when the servo is well.
+    Hardware Error Status (a status alert), empty when the servo is well. ``trajectory_deg`` is where the servo's own
+    profile wants the shaft to be now; None where the model does not tell.
     """
 
     time_ns: int
@@ -39,6 +40,30 @@ class ServoState:
     moving: bool
     in_position: bool
     hardware_errors: tuple[str, ...]
+    trajectory_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ServoCondition:
+    """What a servo was left in; read before anything is written to it.
+
+    ``power_lost`` says that its volatile registers are as after power-up: since the rig last set a profile it was
+    without supply, and with it the count of its turns was lost.
+    """
+
+    torque: bool
+    watchdog_armed: bool
+    watchdog_tripped: bool
+    power_lost: bool
+    hardware_errors: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ServoLimits:
+    """Where the servo shuts down by itself."""
+
+    temperature_c: float
+    voltage_v: tuple[float, float]
 
 
 class Servo(Protocol):
@@ -52,7 +77,23 @@ class Servo(Protocol):
         """Angle of one encoder count."""
         ...
 
+    @property
+    def limits(self) -> ServoLimits: ...
+
     def read_state(self) -> ServoState: ...
+
+    def read_condition(self) -> ServoCondition: ...
+
+    def verify(self) -> None:
+        """Raise `DeviceMismatch` unless the servo that answers is the one that was opened, set up as the rig needs it.
+
+        For what may have happened meanwhile: a pulled cable, a reboot, a servo that was replaced.
+        """
+        ...
+
+    def reboot(self) -> None:
+        """Restart the servo, which clears its hardware errors, its torque and the count of its turns; then `verify`."""
+        ...
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
         """Set the profile and return the one that the servo's units allow."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from rig.clock import Clock
 from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
 from rig.devices.dynamixel.registers import ControlTable, control_table, model_numbers
-from rig.devices.servo import MotionProfile, ServoIdentity, ServoState
+from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
 from rig.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceRefused, DeviceSilent
 
 COUNTS_PER_TURN = 4096
@@ -13,6 +13,9 @@ DEG_PER_COUNT = 360.0 / COUNTS_PER_TURN
 DPS_PER_UNIT = 0.229 * 6.0  # Velocity registers: 0.229 rev/min
 DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # Profile Acceleration: 214.577 rev/min^2
 EXTENDED_POSITION_MODE = 4
+WATCHDOG_TRIPPED = 0xFF
+BOOT_ALLOWANCE_S = 3.0
+"""How long a servo may be silent after a reboot; the e-manual gives no number, they take some tenths of a second."""
 
 _HARDWARE_ERRORS = {
     0: "input voltage",
@@ -75,10 +78,18 @@ class DynamixelServo:
         self._status_size = last.address + last.size - first.address
         # Present Current shares the unit of Current Limit, so that their ratio needs no unit of the model.
         self._current_limit = self._read("Current Limit") if "Present Current" in self._table else None
+        self._limits = ServoLimits(
+            temperature_c=float(self._read("Temperature Limit")),
+            voltage_v=(self._read("Min Voltage Limit") * 0.1, self._read("Max Voltage Limit") * 0.1),
+        )
 
     @property
     def identity(self) -> ServoIdentity:
         return self._identity
+
+    @property
+    def limits(self) -> ServoLimits:
+        return self._limits
 
     @property
     def resolution_deg(self) -> float:
@@ -130,7 +141,46 @@ class DynamixelServo:
             moving=bool(self._field(block, "Moving")),
             in_position=bool(self._field(block, "Moving Status") & 1),
             hardware_errors=self._hardware_errors() if self._bus.alert(self._id) else (),
+            trajectory_deg=self._field(block, "Position Trajectory") * DEG_PER_COUNT,
         )
+
+    def read_condition(self) -> ServoCondition:
+        watchdog = self._read("Bus Watchdog")
+        tripped = watchdog == WATCHDOG_TRIPPED
+        return ServoCondition(
+            torque=bool(self._read("Torque Enable")),
+            watchdog_armed=0 < watchdog < WATCHDOG_TRIPPED,
+            watchdog_tripped=tripped,
+            # The rig's profile is never 0, power-up's is; a watchdog that trips sets it to 0 as well.
+            power_lost=not tripped and self._read("Profile Acceleration") == 0,
+            hardware_errors=self._hardware_errors(),
+        )
+
+    def verify(self) -> None:
+        number, firmware = self._bus.ping(self._id), self._read("Firmware Version")
+        if (number, firmware) != (self._identity.model_number, self._identity.firmware):
+            raise DeviceMismatch(
+                f"Another servo answers at id {self._id} than the one that was there.",
+                next_step="Connect the servo that belongs to this bench, or start again with the other one.",
+                evidence={
+                    "expected": f"{self._identity.model}, firmware {self._identity.firmware}",
+                    "got": f"{model_numbers().get(number, f'unknown model {number}')}, firmware {firmware}",
+                },
+            )
+        prepare_servo(self, write=False)
+
+    def reboot(self) -> None:
+        self._bus.reboot(self._id)
+        give_up_ns = self._clock.now_ns() + round(BOOT_ALLOWANCE_S * 1e9)
+        while True:
+            self._clock.sleep(0.1)
+            try:
+                self.verify()
+            except DeviceSilent:
+                if self._clock.now_ns() > give_up_ns:
+                    raise
+            else:
+                return
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
         velocity = max(round(profile.velocity_dps / DPS_PER_UNIT), 1)  # 0 would mean: as fast as it can
