@@ -124,6 +124,90 @@ class NotReady(RigError):
     title = "not ready"
 
 
+class FollowingError(RigError):
+    """The shaft is not where the servo's own profile wants it, or left the way to its goal."""
+
+    code = 504
+    title = "following error"
+
+
+class Stalled(RigError):
+    """The servo pushes and the shaft stands: something blocks the table."""
+
+    code = 505
+    title = "stalled"
+
+
+class Overloaded(RigError):
+    """The table turns, but takes more load than it should, for longer than a start takes."""
+
+    code = 506
+    title = "overloaded"
+
+
+class Overheated(RigError):
+    """The servo is close to the temperature at which it shuts down by itself."""
+
+    code = 507
+    title = "overheated"
+
+
+class SupplyOutOfRange(RigError):
+    """The servo's supply is close to the voltage at which it shuts down by itself."""
+
+    code = 508
+    title = "supply voltage"
+
+
+class NoProgress(RigError):
+    """A goal was set and nothing turns, nor pushes."""
+
+    code = 509
+    title = "no progress"
+
+
+class WatchdogTripped(RigError):
+    """The servo heard nothing from the computer for too long, and stopped by itself."""
+
+    code = 510
+    title = "watchdog"
+
+
+class SupplyLost(RigError):
+    """The servo was without supply in the middle of a motion, and forgot its turns."""
+
+    code = 511
+    title = "supply lost"
+
+
+class MotionStopped(RigError):
+    """Somebody asked for a stop (`rig stop`)."""
+
+    code = 512
+    title = "stopped"
+
+
+class Unreferenced(NotReady):
+    """How far the cable is wound up is in doubt; only a person who looks at it can tell."""
+
+    code = 513
+    title = "not referenced"
+
+
+class FaultLatched(NotReady):
+    """A fault was found, and nobody has acknowledged it yet."""
+
+    code = 514
+    title = "fault latched"
+
+
+class StateNotKept(RigError):
+    """What the next program must know about the bench (its turns, its faults) cannot be written to the disk."""
+
+    code = 515
+    title = "bench state"
+
+
 class ViewRejected(RigError):
     """No acceptable view within the allowed retakes."""
 
@@ -157,3 +241,10 @@ class CatalogBusy(RigError):
 
     code = 900
     title = "busy"
+
+
+class BenchBusy(RigError):
+    """Another process holds the bench."""
+
+    code = 901
+    title = "bench in use"
