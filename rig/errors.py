@@ -215,6 +215,13 @@ class ViewRejected(RigError):
     title = "view rejected"
 
 
+class ReplayMismatch(RigError):
+    """A saved run gives other decisions when it is computed again."""
+
+    code = 602
+    title = "replay mismatch"
+
+
 class CatalogError(RigError):
     """The catalog cannot do what was asked."""
 

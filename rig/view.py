@@ -51,6 +51,19 @@ class Attempt:
         return not self.reasons
 
 
+def region(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8]:
+    """Return the region of interest of a frame, uint8 (H, W, 3); a view into it."""
+    if config.roi is None:
+        return image_bgr
+    x, y, width, height = config.roi
+    return image_bgr[y : y + height, x : x + width]
+
+
+def describe(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8]:
+    """Return the CEDD levels, uint8 (144,), of a frame's region of interest."""
+    return hbr.describe(region(image_bgr, config))
+
+
 class Viewer:
     """Takes views with one camera, whose locks must stay as they were when the viewer was made."""
 
@@ -82,17 +95,11 @@ class Viewer:
 
     def describe(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the CEDD levels, uint8 (144,), of the frame's region of interest."""
-        return hbr.describe(self._region(image_bgr))
-
-    def _region(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        if self._config.roi is None:
-            return image_bgr
-        x, y, width, height = self._config.roi
-        return image_bgr[y : y + height, x : x + width]
+        return describe(image_bgr, self._config)
 
     def _judge(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:
         config = self._config
-        grey = cv2.cvtColor(self._region(frame.image_bgr), cv2.COLOR_BGR2GRAY)
+        grey = cv2.cvtColor(region(frame.image_bgr, config), cv2.COLOR_BGR2GRAY)
         locks = self._camera.read_locks()
         evidence = ViewEvidence(
             settled_ns=settled_ns,
