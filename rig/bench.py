@@ -14,7 +14,7 @@ from typing import Any, Protocol, Self
 from pydantic import BaseModel
 
 from rig.clock import Clock
-from rig.config import RigConfig, validate
+from rig.config import RigConfig, Values, mistaken, validate
 from rig.devices.camera import Camera
 from rig.devices.imu import Imu
 from rig.devices.servo import Servo
@@ -136,19 +136,62 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
     """
     config = config or RigConfig()
     name = name or config.default_bench
-    points = {point.name: point for point in entry_points(group=GROUP)}
-    unknown = sorted(set(config.bench) - set(points))
-    if name not in points or unknown:
-        wrong = name if name not in points else unknown[0]
-        near = get_close_matches(wrong, points, n=1)
-        raise ConfigError(
-            f"There is no bench {wrong!r}.",
-            next_step=f"Did you mean {near[0]}?" if near else "Choose one of the benches listed.",
-            evidence={"benches": sorted(points)},
-        )
-    kind: BenchKind = points[name].load()
+    for wrong in sorted(set(config.bench) - set(bench_names())):
+        bench_kind(wrong)  # a misspelt section is told before anything is opened
+    kind = bench_kind(name)
     options = validate(kind.options, config.bench.get(name, {}), where="the configuration", prefix=f"bench.{name}")
     return kind.open(config, options, seed)
+
+
+def bench_kind(name: str) -> BenchKind:
+    """Return the plug-in of that name.
+
+    Raises
+    ------
+    ConfigError
+        There is no such bench.
+    """
+    points = {point.name: point for point in entry_points(group=GROUP)}
+    if name in points:
+        kind: BenchKind = points[name].load()
+        return kind
+    near = get_close_matches(name, points, n=1)
+    raise ConfigError(
+        f"There is no bench {name!r}.",
+        next_step=f"Did you mean {near[0]}?" if near else "Choose one of the benches listed.",
+        evidence={"benches": sorted(points)},
+    )
+
+
+def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
+    """Return the configuration and the options of every bench that is installed.
+
+    Raises
+    ------
+    ConfigError
+        All mistakes at once, those in the benches' own sections included.
+    """
+    found: list[str] = []
+    config, options = RigConfig(), {}
+    where = str(read.path) if read.path else "the command line"
+    try:
+        config = validate(RigConfig, read.values, where=where, places=read.places)
+    except ConfigError as error:
+        found += error.evidence["mistakes"]
+    sections = read.values.get("bench", {})
+    if not isinstance(sections, dict) or not all(isinstance(section, dict) for section in sections.values()):
+        sections = {}  # told above
+    for name in sorted({*bench_names(), *sections}):
+        try:
+            kind = bench_kind(name)
+            options[name] = validate(
+                kind.options, sections.get(name, {}), where=where, prefix=f"bench.{name}", places=read.places
+            )
+        except ConfigError as error:
+            found += error.evidence.get("mistakes") or [f"bench.{name}: {error.what} {error.next_step}"]
+    if found:
+        raise mistaken(found, where)
+    return config, options
 
 
 def _plain(identity: Any) -> dict[str, Any]:

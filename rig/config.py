@@ -1,15 +1,18 @@
 """The configuration `rig.toml`: every key with its unit, range and default; every mistake reported at once."""
 
-import difflib
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import platformdirs
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
+from rig.config_file import Key, line_numbers, read_text
+from rig.config_words import mistakes
 from rig.errors import ConfigError
 
 M = TypeVar("M", bound=BaseModel)
@@ -88,6 +91,25 @@ class TableConfig(Section):
         if watchdog_s < 2 * poll_s:
             raise ValueError(f"must be at least twice poll_s, which is {poll_s:g}: the control loop feeds the watchdog")
         return watchdog_s
+
+
+class SafetyConfig(Section):
+    """When a motion is broken off: before the servo would shut down by itself, and long before something breaks."""
+
+    following_error_deg: float = Field(
+        12.0, gt=0, le=90, description="largest distance of the shaft from the servo's profile, and from its way"
+    )
+    max_load_percent: float = Field(
+        70.0, gt=0, le=100, description="largest share of the servo's torque (or current limit) that is no overload"
+    )
+    stall_s: float = Field(0.25, ge=0.05, le=1, description="how long the servo may push without turning")
+    overload_s: float = Field(0.8, ge=0.1, le=5, description="how long it may turn overloaded, or lag behind")
+    no_progress_s: float = Field(1.0, ge=0.3, le=5, description="how long nothing may happen on the way to a goal")
+    temperature_margin_c: float = Field(5.0, ge=0, le=40, description="distance kept from the servo's own limit")
+    voltage_margin_v: float = Field(0.2, ge=0, le=2, description="distance kept from the servo's own limits")
+    slip_deg: float = Field(
+        10.0, gt=0, le=90, description="difference of encoder and gyro (beyond 4 sigma) that breaks a motion off"
+    )
 
 
 class ImuConfig(Section):
@@ -179,8 +201,12 @@ class RigConfig(Section):
     """Everything in `rig.toml`."""
 
     default_bench: str = Field("hardware", description="bench that is opened where --bench does not say")
+    state_dir: Path | None = Field(
+        None, description="folder of what a bench must not forget, one folder in it a bench; none: the user's"
+    )
     servo: ServoConfig = ServoConfig()
     table: TableConfig = TableConfig()
+    safety: SafetyConfig = SafetyConfig()
     imu: ImuConfig = ImuConfig()
     camera: CameraConfig = CameraConfig()
     view: ViewConfig = Field(ViewConfig(), validate_default=True)
@@ -207,13 +233,68 @@ class RigConfig(Section):
         """Return the catalog's folder: simulated views never mix with real ones unless the configuration says so."""
         return self.catalog.path or Path(platformdirs.user_data_dir(APP)) / bench_name
 
+    def state_path(self, bench_name: str) -> Path:
+        """Return the folder of the bench's turns, its latched fault, and who holds it."""
+        return (self.state_dir or Path(platformdirs.user_state_dir(APP))) / bench_name
+
 
 def default_path() -> Path | None:
     """Return the configuration in force without `--config`: ./rig.toml, else the user's; None where neither exists."""
-    for path in (Path(FILE_NAME), Path(platformdirs.user_config_dir(APP)) / FILE_NAME):
-        if path.is_file():
-            return path
-    return None
+    return next((path for path in search_paths() if path.is_file()), None)
+
+
+def search_paths() -> list[Path]:
+    """Return where a configuration is looked for without `--config`, first the one that wins."""
+    return [Path(FILE_NAME), Path(platformdirs.user_config_dir(APP)) / FILE_NAME]
+
+
+@dataclass(frozen=True, slots=True)
+class Values:
+    """What a file and the command line say, not yet judged, and where each of it stands."""
+
+    path: Path | None
+    values: dict[str, Any]
+    places: dict[Key, str]
+
+    def origin(self, key: Key) -> str:
+        """Return where a key's value comes from: ``rig.toml line 3``, ``--set``, or ``default``."""
+        place = next((self.places[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.places), None)
+        if place is None or not _holds(self.values, key):
+            return "default"
+        return f"{self.path.name} {place}" if self.path and place.startswith("line") else place
+
+
+def read_values(path: Path | None = None, overrides: Iterable[str] = ()) -> Values:
+    """Read a configuration file (None: the one in force, if any) and apply ``overrides``, without judging the values.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing or is no TOML, or an override is none.
+    """
+    values: dict[str, Any] = {}
+    places: dict[Key, str] = {}
+    source = path or default_path()
+    if source is not None:
+        text = read_text(source)
+        try:
+            values = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(
+                f"{source} is not a TOML file.",
+                next_step="Mend the line named.",
+                evidence={"reason": str(error), **_line_named(text, str(error))},
+            ) from error
+        places = {key: f"line {line}" for key, line in line_numbers(text).items()}
+        # Paths in a file are relative to that file, not to where the command happens to be run.
+        catalog = values.get("catalog")
+        if isinstance(catalog, dict) and isinstance(catalog.get("path"), str):
+            catalog["path"] = os.path.normpath(source.resolve().parent / Path(catalog["path"]).expanduser())
+        if isinstance(values.get("state_dir"), str):
+            values["state_dir"] = os.path.normpath(source.resolve().parent / Path(values["state_dir"]).expanduser())
+    for override in overrides:
+        places[_apply(values, override)] = "--set"
+    return Values(source, values, places)
 
 
 def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> RigConfig:
@@ -224,64 +305,60 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> RigC
     ConfigError
         The file is missing, is no TOML, or holds mistakes: all of them at once, each with its key.
     """
-    values: dict[str, Any] = {}
-    source = path or default_path()
-    if source is not None:
-        try:
-            values = tomllib.loads(source.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ConfigError(
-                f"Cannot read the configuration {source}.",
-                next_step="Give an existing file with --config, or leave the option out for the defaults.",
-                evidence={"reason": error.strerror or str(error)},
-            ) from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ConfigError(
-                f"{source} is not a TOML file.", next_step="Mend the line named.", evidence={"reason": str(error)}
-            ) from error
-        # Paths in a file are relative to that file, not to where the command happens to be run.
-        catalog = values.get("catalog")
-        if isinstance(catalog, dict) and isinstance(catalog.get("path"), str):
-            catalog["path"] = os.path.normpath(source.resolve().parent / Path(catalog["path"]).expanduser())
-    for override in overrides:
-        _apply(values, override)
-    return validate(RigConfig, values, where=str(source) if source else "the command line")
+    read = read_values(path, overrides)
+    where = str(read.path) if read.path else "the command line"
+    return validate(RigConfig, read.values, where=where, places=read.places)
 
 
-def validate(model: type[M], values: Mapping[str, Any], *, where: str, prefix: str = "") -> M:
-    """Return ``values`` as ``model``; every mistake at once in one `ConfigError`."""
+def validate(
+    model: type[M],
+    values: Mapping[str, Any],
+    *,
+    where: str,
+    prefix: str = "",
+    places: Mapping[Key, str] | None = None,
+) -> M:
+    """Return ``values`` as ``model``; every mistake at once in one `ConfigError`.
+
+    ``prefix`` is the model's path in the configuration, ``places`` says where in a file each key stands.
+    """
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        mistakes = [_mistake(model, prefix, e) for e in error.errors(include_url=False)]
-    raise ConfigError(
-        f"{len(mistakes)} mistake{'s' if len(mistakes) > 1 else ''} in {where}.",
-        next_step="Mend the keys listed.",
-        evidence={"mistakes": mistakes},
+        above = tuple(prefix.split(".")) if prefix else ()
+        found = mistakes(model, values, error.errors(include_url=False), above, places or {})
+    raise mistaken(found, where)
+
+
+def mistaken(found: list[str], where: str) -> ConfigError:
+    """Return the error of a configuration with the mistakes that were found."""
+    return ConfigError(
+        f"{len(found)} mistake{'s' if len(found) > 1 else ''} in {where}.",
+        next_step="Mend the keys listed; `rig config check` looks again.",
+        evidence={"mistakes": found},
     )
 
 
-def _mistake(model: type[BaseModel], prefix: str, error: Any) -> str:
-    key = ".".join([*([prefix] if prefix else []), *(str(part) for part in error["loc"])])
-    if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(str(error["loc"][-1]), _siblings(model, error["loc"][:-1]), n=1)
-        return f"{key}: unknown key" + (f"; did you mean {near[0]}?" if near else "")
-    message = error["msg"].removeprefix("Value error, ")
-    found = "" if isinstance(error["input"], dict | BaseModel) else f" (found {error['input']!r})"
-    return f"{key}: {message}{found}" if key else f"{message}{found}"
+def _holds(values: Mapping[str, Any], key: Key) -> bool:
+    here: Any = values
+    for part in key:
+        if not isinstance(here, Mapping) or part not in here:
+            return False
+        here = here[part]
+    return True
 
 
-def _siblings(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
-    for part in path:
-        field = model.model_fields.get(str(part))
-        inner = field.annotation if field else None
-        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-            return []
-        model = inner
-    return list(model.model_fields)
+def _line_named(text: str, reason: str) -> dict[str, str]:
+    """Return the line that a message of `tomllib` names, as evidence."""
+    named = re.search(r"at line (\d+)", reason)
+    lines = text.splitlines()
+    if named is None or not 0 < int(named[1]) <= len(lines):
+        return {}
+    return {f"line {named[1]}": lines[int(named[1]) - 1].strip()}
 
 
-def _apply(values: dict[str, Any], override: str) -> None:
+def _apply(values: dict[str, Any], override: str) -> Key:
+    """Set what an override says, and return its key."""
     key, sign, text = override.partition("=")
     parts = key.strip().split(".")
     if not sign or not all(parts):
@@ -289,14 +366,19 @@ def _apply(values: dict[str, Any], override: str) -> None:
             f"Cannot read the setting {override!r}.",
             next_step="Write SECTION.KEY=VALUE, e.g. --set identify.max_views=4.",
         )
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text.strip()  # a bare word is a string
     here = values
     for part in parts[:-1]:
         inner = here.setdefault(part, {})
         if not isinstance(inner, dict):
             raise ConfigError(f"{part} in {override!r} is not a section.", next_step="Write SECTION.KEY=VALUE.")
         here = inner
-    here[parts[-1]] = value
+    here[parts[-1]] = parsed(text)
+    return tuple(parts)
+
+
+def parsed(text: str) -> Any:
+    """Return a value as a person types it: TOML, or else a bare word."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text.strip()

@@ -1,0 +1,119 @@
+"""`rig config ...` as its users call it."""
+
+import json
+import tomllib
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+from rig.config import RigConfig, load_config
+
+
+@pytest.fixture
+def rig(tmp_path, monkeypatch):
+    """Return a function that runs `rig ...` in an empty folder, with no configuration of the user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "home"))
+
+    def run(*arguments: str):
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+def test_check_tells_all_mistakes_of_all_sections_at_once_each_with_its_line(rig, tmp_path):
+    (tmp_path / "rig.toml").write_text(
+        "[bench.sim]\nobjekt = 1\n[bench.sin]\nx = 1\n[imu]\nbus = [1]\nrange_dps = 300\n"
+        '[table]\nlimits_deg = ["a", 3]\n[camera]\nexposure_us = -1\nheigth = 3\n',
+        encoding="utf-8",
+    )
+    done = rig("config", "check", "--set", "identify.omega=-1")
+    assert done.exit_code == 3
+    for line in (
+        "line 2: bench.sim.objekt: unknown key; did you mean object?",
+        "bench.sin: There is no bench 'sin'. Did you mean sim?",
+        'line 6: imu.bus: must be a whole number or a text in "quotes" (found [1])',
+        "line 7: imu.range_dps: must be one of 250, 500, 1000, 2000 °/s (found 300)",
+        "line 9: table.limits_deg: must be [a number, a number] ° (found ['a', 3])",
+        "line 11: camera.exposure_us: must be a number above 0, up to 1000000 µs (found -1)",
+        "line 12: camera.heigth: unknown key; did you mean height?",
+        "--set: identify.omega: must be a number from 0 to 100 (found -1)",
+    ):
+        assert line in done.stderr
+    assert "8 mistakes in rig.toml" in done.stderr
+
+
+def test_a_slip_of_the_pen_is_shown_with_its_line(rig, tmp_path):
+    (tmp_path / "rig.toml").write_text('[servo]\nport = "x\n', encoding="utf-8")
+    done = rig("config", "check")
+    assert done.exit_code == 3
+    assert 'line 2: port = "x' in done.stderr
+
+
+def test_a_new_file_changes_nothing_explains_everything_and_is_never_overwritten(rig, tmp_path):
+    assert rig("config", "init").exit_code == 0
+    file = tmp_path / "rig.toml"
+    assert load_config(file) == RigConfig()
+    text = file.read_text(encoding="utf-8")
+    assert "# bits per second; the servo's factory setting is 57600 (a whole number from 9600 to 4500000 bit/s)" in text
+    uncommented = "\n".join(
+        line[1:] if line.startswith("#") and line[1:2].isalpha() else line for line in text.splitlines()
+    )
+    given = [line for line in uncommented.splitlines() if not line.endswith("=")]
+    assert load_config_text("\n".join(given), tmp_path) == RigConfig()  # the comments hold the defaults
+    file.write_text("# mine\n", encoding="utf-8")
+    assert rig("config", "init").exit_code == 3
+    assert file.read_text(encoding="utf-8") == "# mine\n"
+
+
+def load_config_text(text, folder):
+    path = folder / "uncommented.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_config(path)
+
+
+def test_show_is_toml_and_says_where_each_value_comes_from(rig, tmp_path):
+    (tmp_path / "rig.toml").write_text('[servo]\nid = 4\n[bench.sim]\nobject = "dice"\n', encoding="utf-8")
+    done = rig("config", "show", "--set", "servo.baud=115200")
+    assert done.exit_code == 0
+    shown = tomllib.loads(done.stdout)
+    assert (shown["servo"]["id"], shown["servo"]["baud"], shown["bench"]["sim"]["object"]) == (4, 115200, "dice")
+    told = json.loads(rig("config", "show", "servo", "--set", "servo.baud=115200", "--json").stdout)["keys"]
+    assert {key: told[key]["origin"] for key in ("servo.id", "servo.baud", "servo.port")} == {
+        "servo.id": "rig.toml line 2",
+        "servo.baud": "--set",
+        "servo.port": "default",
+    }
+    assert told["servo.baud"]["unit"] == "bit/s"
+    assert "table.zero_deg" not in told
+    changed = rig("config", "show", "--changed").stdout
+    assert "id = 4" in changed
+    assert "baud" not in changed
+    assert "Did you mean servo.port?" in rig("config", "show", "servo.prot").stderr
+
+
+def test_path_says_which_file_is_in_force(rig, tmp_path):
+    assert "defaults are in force" in rig("config", "path").stdout
+    (tmp_path / "home" / "hbr-rig").mkdir(parents=True)
+    (tmp_path / "home" / "hbr-rig" / "rig.toml").write_text("")
+    assert rig("config", "path").stdout.strip() == str(tmp_path / "home" / "hbr-rig" / "rig.toml")
+    (tmp_path / "rig.toml").write_text("")
+    assert json.loads(rig("config", "path", "--json").stdout)["path"] == "rig.toml"
+
+
+def test_set_changes_one_line_or_nothing(rig, tmp_path):
+    file = tmp_path / "rig.toml"
+    file.write_text("[servo] # the red one\nid = 4 # sticker\n", encoding="utf-8")
+    assert rig("config", "set", "servo.port", "/dev/ttyACM0").exit_code == 0
+    assert file.read_text(encoding="utf-8") == '[servo] # the red one\nid = 4 # sticker\nport = "/dev/ttyACM0"\n'
+    before = file.read_bytes()
+    refused = rig("config", "set", "servo.id", "900")
+    assert refused.exit_code == 3
+    assert "from 0 to 252" in refused.stderr
+    assert rig("config", "set", "servo.prot", "x").exit_code == 3
+    assert rig("config", "set", "servo", "x").exit_code == 2
+    assert file.read_bytes() == before
+    assert rig("config", "set", "table.limits_deg", "[-720, 720]").exit_code == 0
+    assert rig("config", "set", "table.zero_deg", "-3").exit_code == 0
+    assert load_config(file).table.zero_deg == -3
