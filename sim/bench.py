@@ -1,6 +1,6 @@
 """The simulated bench: one world, and the real drivers on simulated wires."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -10,18 +10,15 @@ from pydantic import BaseModel, Field, field_validator
 
 from rig.bench import Bench, BenchKind
 from rig.clock import SystemClock
-from rig.config import RigConfig, Section, ServoConfig
-from rig.devices.dynamixel.port import READ_SLICE_S
-from rig.errors import ConfigError, ObjectNotFound
+from rig.config import RigConfig, Section
+from rig.errors import ObjectNotFound
 from rig.hardware import assemble
-from sim.camera import SimCapture
 from sim.clock import VirtualClock
-from sim.i2c import SimI2cBus
-from sim.imu.mpu6050 import SimMpu6050
+from sim.faults import Fault, Faults
 from sim.noise import NoiseModel
 from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
-from sim.servo import ServoBus, SimSerial, XSeriesServo
+from sim.parts import SimParts
 from sim.world import Thing, World
 
 
@@ -47,7 +44,8 @@ class SimOptions(Section):
 class ShelfOperator:
     """The hand that takes things from the shelf: to be enrolled they stand by the platter's mark, to be found anyhow.
 
-    Every placement misses the table's axis by a little, as hands do.
+    Every placement misses the table's axis by a little, as hands do. Once a bench is open, ``parts`` is what it is made
+    of, and ``faults`` what goes wrong with that.
     """
 
     def __init__(
@@ -57,6 +55,8 @@ class ShelfOperator:
         self.things = things
         self.next_object = next_object
         self.yaw_deg = yaw_deg
+        self.parts: SimParts | None = None
+        self.faults: Faults | None = None
         self._rng = world.rng("operator")
 
     def place(self, name: str | None) -> None:
@@ -82,46 +82,46 @@ class ShelfOperator:
         self.world.put(self.things[name], yaw_deg, (dx_mm, dy_mm))
 
 
-def open_sim_bench(config: RigConfig, operator: ShelfOperator) -> Bench:
+def open_sim_bench(
+    config: RigConfig, operator: ShelfOperator, *, faults: Iterable[Fault] = (), parts: SimParts | None = None
+) -> Bench:
     """Put the real drivers on the simulated wires of the operator's world, by the lines that open a real bench.
 
-    The simulated servo comes as from the factory and is set up over its wire.
+    Parameters
+    ----------
+    config
+        The configuration. Where it is given no ``parts``, the simulated servo comes as from the factory and is set up
+        over its wire.
+    operator
+        The hands; they get hold of the ``parts``.
+    faults
+        What will go wrong, and when.
+    parts
+        The devices that an earlier bench in this world was opened with; whoever made them takes them away.
 
     Raises
     ------
     ConfigError
         There is no simulated servo of that model, or it does not know the baud rate.
+    DeviceNotFound, DeviceMismatch, DeviceSilent
+        A device was made to fail from the start.
     """
     world = operator.world
     config = config.model_copy(update={"servo": config.servo.model_copy(update={"write_settings": True})})
-    servo_bus = ServoBus(world.clock)
-    servo_bus.attach(_servo(world, config.servo))
     with ExitStack() as wires:
-        i2c = wires.enter_context(SimI2cBus(world.clock))
-        i2c.attach(config.imu.address, SimMpu6050(world, ad0=config.imu.address == 0x69))
-        bench = assemble(
-            "sim",
-            config,
-            world.clock,
-            wire=SimSerial(servo_bus, config.servo.baud, READ_SLICE_S),
-            i2c_bus=i2c.path,
-            capture=SimCapture(world),
-        )
+        owned = parts is None
+        if parts is None:
+            parts = wires.enter_context(SimParts.connected(config, world))
+        operator.parts, operator.faults = parts, Faults(parts)
+        if owned:
+            wires.callback(operator.faults.clear)
+        parts.open_wires()
+        operator.faults.schedule(*faults)
+        bench = assemble("sim", config, world.clock, wire=parts.adapter, i2c_bus=parts.i2c.path, capture=parts.camera)
         bench.wires = wires.pop_all()
     bench.operator = operator
     bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
     return bench
-
-
-def _servo(world: World, config: ServoConfig) -> XSeriesServo:
-    try:
-        return XSeriesServo(world, config.model, bus_id=config.id, baudrate=config.baud)
-    except ValueError as error:
-        raise ConfigError(
-            "The simulated bench has no such servo.",
-            next_step="Mend servo.model or servo.baud.",
-            evidence={"reason": str(error)},
-        ) from error
 
 
 class SimBenchKind:

@@ -73,6 +73,8 @@ class SimCapture:
         Of how many frames one is exposed: a camera that has become slow.
     latency_ns
         How much later than `READOUT_NS` a frame arrives.
+    falters
+        Asked at each `grab` whether it fails.
     hangs
         Whether no frame arrives although the camera is there: `grab` gives up after `SELECT_S`.
     blur_px
@@ -84,6 +86,7 @@ class SimCapture:
     def __init__(self, world: World) -> None:
         self.every = 1
         self.latency_ns = 0
+        self.falters: list[Callable[[], bool]] = []
         self.hangs = False
         self.blur_px = 0.0
         self.tampers: list[Callable[[Image, int], Image]] = []
@@ -91,7 +94,7 @@ class SimCapture:
         self._clock = world.clock
         self._sensor = Sensor(world.noise, world.rng("camera"))
         self._backdrop = empty_platter()
-        self._open = True
+        self._open = self._plugged = True
         self._queue: deque[int] = deque()
         self._next = _frame_after(self._clock.now_ns())
         self._grabbed: int | None = None
@@ -102,13 +105,27 @@ class SimCapture:
 
     def unplug(self) -> None:
         """Pull the cable: from now on no frame arrives."""
-        self._open = False
+        self._open, self._plugged = False, False
 
     def replug(self) -> None:
-        """Put it in again: the stream begins anew, with the settings that the camera kept."""
-        self._queue.clear()
-        self._next = self._exposed_from(_frame_after(self._clock.now_ns()))
-        self._open = True
+        """Put the cable in again; the camera must be opened anew."""
+        self._plugged = True
+
+    def reopen(self) -> bool:
+        """Open the stream anew, as another `cv2.VideoCapture` does; return whether the camera is there.
+
+        The camera has kept its settings.
+        """
+        if self._plugged and not self._open:
+            self._queue.clear()
+            self._next = self._exposed_from(_frame_after(self._clock.now_ns()))
+            self._open = True
+        return self._open
+
+    @property
+    def exposure(self) -> float:
+        """The exposure in force, in V4L2's unit."""
+        return self._controls[-1][1].exposure
 
     def drift(self, **values: Any) -> None:
         """Change settings (fields of `Controls`) from inside, as a camera does that forgets its locks."""
@@ -127,7 +144,7 @@ class SimCapture:
 
     def grab(self) -> bool:
         """Take the oldest waiting frame, or wait for the next one."""
-        if not self._open:
+        if not self._open or any(fails() for fails in self.falters):
             return False
         self._receive()
         if self.hangs and not self._queue:

@@ -56,8 +56,9 @@ class SimMpu6050:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
     World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `clock_error` (how much too fast its
-    clock runs, relatively; set before it wakes), `who_am_i` (a clone answers otherwise), `power_cycle`, and
-    `distortions`, each of which is given the samples' words, int16 (n, 7), and returns those that are kept.
+    clock runs, relatively; set before it wakes, or by `run_clock`), `who_am_i` (a clone answers otherwise),
+    `power_cycle`, and `distortions`, each of which is given the samples' words, int16 (n, 7), and returns those that
+    are kept.
     """
 
     def __init__(self, world: World, *, ad0: bool = False, who_am_i: int = 0x68) -> None:
@@ -69,6 +70,19 @@ class SimMpu6050:
         self.distortions: list[Callable[[Words], Words]] = []
         self._clock = world.clock
         self.power_cycle()
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples a second, by a true clock."""
+        registers = self._registers
+        internal_hz = 8000 if registers[CONFIG] & 0x07 in (0, 7) else 1000
+        return internal_hz / (1 + registers[SMPLRT_DIV]) * (1 + self.clock_error)
+
+    def run_clock(self, error: float) -> None:
+        """Let its clock run wrong by ``error``, relatively, from now on."""
+        self._take_samples()
+        self.clock_error = error
+        self._begin_sampling()
 
     def power_cycle(self) -> None:
         """Lose everything: what a brown-out or DEVICE_RESET leaves behind."""

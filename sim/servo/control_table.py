@@ -8,6 +8,8 @@ from sim.servo.protocol2 import StatusError
 
 RAM_START = 64
 """Addresses below it are EEPROM: kept without power, locked while torque is on."""
+FIRST_LIVE_REGISTER = 120
+"""From Realtime Tick on, registers follow the world."""
 
 _READ_ONLY = frozenset(
     {
@@ -61,6 +63,8 @@ class Memory:
         self._at = {register.address: register for register in self._registers.values()}
         self._size = max(register.address + register.size for register in self._registers.values())
         self._image = bytearray(self._size)
+        last = self._registers["Present Temperature"]
+        self._live_end = last.address + last.size
         identity = {"Firmware Version": firmware, "Model Number": _model_number(model.name)}
         self._defaults = {**model.initial, **identity}
         for address, pointer in self._indirect.items():
@@ -78,6 +82,14 @@ class Memory:
         """Set a register from inside, without any check of access; OverflowError where the value does not fit."""
         register = self._registers[name]
         self._image[register.address : register.address + register.size] = register.encode(value)
+
+    def live(self) -> bytes:
+        """Return the registers that follow the world, as one block."""
+        return bytes(self._image[FIRST_LIVE_REGISTER : self._live_end])
+
+    def set_live(self, block: bytes) -> None:
+        """Set them, in the order of `live`."""
+        self._image[FIRST_LIVE_REGISTER : self._live_end] = block
 
     def forget_ram(self) -> None:
         """Set the RAM area to its initial values, as at power-up."""

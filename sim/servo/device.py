@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from rig.devices.dynamixel.registers import Register
 from sim.clock import Timer
-from sim.servo.control_table import RAM_START, Memory, Refusal
+from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, Memory, Refusal
 from sim.servo.controller import Controller
 from sim.servo.models import BAUD_RATES, COUNTS_PER_TURN, MODELS, POSITION_MODE
 from sim.servo.motor import Motor
@@ -27,7 +27,6 @@ VOLTAGE_ERROR, OVERHEATING_ERROR, ENCODER_ERROR, ELECTRICAL_ERROR, OVERLOAD_ERRO
 _TORQUE_BY_GOAL = 0x08  # bit of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 _CLEAR_MULTI_TURN = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
-_FIRST_LIVE_REGISTER = 120  # from Realtime Tick on, registers follow the world
 
 
 class XSeriesServo:
@@ -184,7 +183,7 @@ class XSeriesServo:
         return Status(error | (ALERT if self.memory["Hardware Error Status"] else 0), data)
 
     def _read(self, address: int, size: int) -> bytes:
-        if address + size > _FIRST_LIVE_REGISTER:
+        if address + size > FIRST_LIVE_REGISTER:
             self._controller.refresh()
             for distort in self.distortions:
                 distort(self.memory)

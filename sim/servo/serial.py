@@ -42,6 +42,8 @@ class SimSerial:
     def open(self) -> None:
         if self.is_open:
             raise serial.SerialException("Port is already open.")
+        if self._unplugged:
+            raise serial.SerialException(errno.ENOENT, f"could not open port {self.port}: No such file or directory")
         if not self._bus.connect(self._deliver):
             raise serial.SerialException(
                 errno.EBUSY, f"Could not exclusively lock port {self.port}: another host is on this bus"

@@ -1,0 +1,175 @@
+"""When a fault happens: in short words (``jam@move3+2s``), or in a TOML file."""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, Self
+
+from rig.errors import UsageError
+from sim.faults.kind import Kind, find_kind
+
+NOTATION = "NAME[:PARAMETER=VALUE...][@TIME], TIME being 12s, move3 or view10, with +2s behind it for how long"
+
+_SHORT = re.compile(r"(?P<name>[a-z0-9_.]+)(?P<values>(?::[^:@]*)*)(?:@(?P<when>.*))?")
+_WHEN = re.compile(r"(?:(?P<at>[\d.]+)s|move(?P<move>\d+)|view(?P<view>\d+))(?:\+(?P<length>[\d.]+)s)?")
+_KEYS = ("name", "at_s", "during_move", "after_view", "for_s")
+
+
+class Trigger(Enum):
+    """What a fault waits for."""
+
+    AT = "at_s"
+    MOVE = "during_move"
+    VIEW = "after_view"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault with its time.
+
+    Attributes
+    ----------
+    kind
+        What happens.
+    values
+        Its parameters, all of them.
+    trigger, mark
+        It begins at ``mark`` seconds of the bench's clock, or during the move or after the view with that number,
+        counted from 0 since the faults were scheduled: `sim.faults.injector.Faults`.
+    for_s
+        How long it lasts; None: until somebody ends it.
+    """
+
+    kind: Kind
+    values: Mapping[str, float] = field(default_factory=dict)
+    trigger: Trigger = Trigger.AT
+    mark: float = 0.0
+    for_s: float | None = None
+
+    def __str__(self) -> str:
+        given = "".join(
+            f":{name}={value:g}" for name, value in self.values.items() if value != self.kind.parameters[name].default
+        )
+        when = {Trigger.AT: f"{self.mark:g}s", Trigger.MOVE: f"move{self.mark:g}", Trigger.VIEW: f"view{self.mark:g}"}
+        length = "" if self.for_s is None else f"+{self.for_s:g}s"
+        return f"{self.kind.name}{given}@{when[self.trigger]}{length}"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return what the short notation says.
+
+        Raises
+        ------
+        UsageError
+            It cannot be read, or there is no such fault or parameter.
+        """
+        match = _SHORT.fullmatch(text.strip())
+        if not match:
+            raise _unreadable(text)
+        given: dict[str, Any] = {"name": match["name"]}
+        for entry in match["values"].split(":")[1:]:
+            name, sign, value = entry.partition("=")
+            if not sign or name in _KEYS:
+                raise _unreadable(text)
+            given[name] = value
+        if match["when"] is not None:
+            when = _WHEN.fullmatch(match["when"])
+            if not when:
+                raise _unreadable(text)
+            keys = {"at_s": "at", "during_move": "move", "after_view": "view", "for_s": "length"}
+            given |= {key: when[group] for key, group in keys.items() if when[group] is not None}
+        return cls.from_table(given)
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Self:
+        """Return what a table says: ``name``, one of ``at_s``, ``during_move``, ``after_view``, ``for_s``, parameters.
+
+        Raises
+        ------
+        UsageError
+            There is no such fault or parameter, or a value is none.
+        """
+        name = table.get("name")
+        if not isinstance(name, str):
+            raise UsageError("A fault has no name.", next_step='Write name = "jam", or another: rig faults lists them.')
+        kind = find_kind(name)
+        triggers = [trigger for trigger in Trigger if trigger.value in table]
+        if len(triggers) > 1:
+            raise UsageError(
+                f"The fault {name} has more than one time.",
+                next_step=f"Give one of {' and '.join(trigger.value for trigger in triggers)}.",
+            )
+        numbers = {key: _number(name, key, value) for key, value in table.items() if key != "name"}
+        for_s = numbers.pop("for_s", None)
+        trigger = triggers[0] if triggers else Trigger.AT
+        mark = numbers.pop(trigger.value, 0.0)
+        if mark < 0 or (for_s is not None and for_s <= 0):
+            raise UsageError(f"The time of the fault {name} is negative.", next_step="Give a time from 0 on.")
+        if trigger is not Trigger.AT and mark != int(mark):
+            raise UsageError(f"{trigger.value} = {mark:g} of the fault {name}.", next_step="Give a whole number.")
+        return cls(kind, kind.values(numbers), trigger, mark, for_s)
+
+
+def load_faults(path: Path) -> list[Fault]:
+    """Return the faults of a TOML file: ``faults = ["jam@move3+2s", ...]``, or tables ``[[faults]]``.
+
+    Raises
+    ------
+    UsageError
+        The file cannot be read, or one of its faults is none; the message says which.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(
+            f"Cannot read the faults in {path}.",
+            next_step="Give an existing file.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(
+            f"{path} is not a TOML file.", next_step="Mend the line named.", evidence={"reason": str(error)}
+        ) from error
+    entries = content.pop("faults", None)
+    if content or not isinstance(entries, list):
+        raise UsageError(
+            f"{path} is not a list of faults.",
+            next_step='Write faults = ["jam@move3+2s"], or a table [[faults]] for each, and nothing else.',
+            evidence={"keys": list(content)} if content else None,
+        )
+    return [_entry(entry, f"Fault {number} in {path}: ") for number, entry in enumerate(entries, 1)]
+
+
+def read_faults(entries: list[Any]) -> list[Fault]:
+    """Return the faults of a configuration's list of texts and tables; raises UsageError as `load_faults` does."""
+    return [_entry(entry, f"Fault {number}: ") for number, entry in enumerate(entries, 1)]
+
+
+def _entry(entry: Any, where: str) -> Fault:
+    try:
+        if isinstance(entry, str):
+            return Fault.parse(entry)
+        if isinstance(entry, dict):
+            return Fault.from_table(entry)
+        raise _unreadable(str(entry))
+    except UsageError as error:
+        raise UsageError(where + error.what, next_step=error.next_step, evidence=error.evidence) from error
+
+
+def _number(name: str, key: str, value: Any) -> float:
+    try:
+        if isinstance(value, bool):
+            raise ValueError
+        number = float(value)
+        if number != number:
+            raise ValueError
+    except (TypeError, ValueError):
+        raise UsageError(f"{key} = {value!r} of the fault {name}.", next_step="Give a number.") from None
+    return number
+
+
+def _unreadable(text: str) -> UsageError:
+    return UsageError(f"Cannot read the fault {text!r}.", next_step=f"Write {NOTATION}.")
