@@ -10,7 +10,8 @@ from rig.clock import Clock, SystemClock
 from rig.config import RigConfig, Section
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, Wire, open_serial
-from rig.devices.dynamixel.servo import DynamixelServo, prepare_servo
+from rig.devices.dynamixel.register_servo import prepare_servo
+from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
 from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
 

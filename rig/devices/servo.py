@@ -1,5 +1,9 @@
-"""What the rig asks of a servo; angles are the encoder's own, unwrapped, before any zero or direction of the table."""
+"""What the rig asks of a servo.
 
+Angles are the encoder's own, unwrapped, on the table's side of a gear, before any zero or direction of the table.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -79,6 +83,16 @@ class Servo(Protocol):
 
     @property
     def limits(self) -> ServoLimits: ...
+
+    @property
+    def reach_deg(self) -> tuple[float, float]:
+        """Lowest and highest position that it can go to, in the mode it is used in."""
+        ...
+
+    @property
+    def line(self) -> Mapping[str, int]:
+        """What the line was like since it was opened: transactions, retries and what they were for."""
+        ...
 
     def read_state(self) -> ServoState: ...
 

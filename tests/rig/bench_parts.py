@@ -9,7 +9,8 @@ from rig.bench import Bench
 from rig.config import load_config
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
-from rig.devices.dynamixel.servo import DynamixelServo, prepare_servo
+from rig.devices.dynamixel.register_servo import prepare_servo
+from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050

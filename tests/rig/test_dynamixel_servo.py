@@ -5,8 +5,9 @@ from bench_parts import open_bus, open_servo, servo_wires
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.dynamixel.registers import control_table, model_numbers
-from rig.devices.dynamixel.servo import DEG_PER_COUNT, DynamixelServo, prepare_servo
+from rig.devices.dynamixel.servo import DEG_PER_COUNT, DynamixelServo
 from rig.devices.servo import MotionProfile
 from rig.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
 from sim.noise import NoiseModel
@@ -17,7 +18,9 @@ def test_a_factory_fresh_servo_is_refused_with_a_list_of_what_differs():
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
     with pytest.raises(DeviceMismatch) as caught:
         prepare_servo(servo, write=False)
-    assert caught.value.evidence == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
+    told = {register: text.partition(":")[0] for register, text in caught.value.evidence.items()}
+    assert told == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
+    assert all(text.partition(": ")[2] for text in caught.value.evidence.values())  # each with its reason
     assert "write_settings" in caught.value.next_step
 
 

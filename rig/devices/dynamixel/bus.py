@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from threading import RLock
 
 import serial
@@ -50,6 +50,9 @@ class BusStatistics:
     foreign: int = 0
     refused: int = 0
 
+    def as_dict(self) -> dict[str, int]:
+        return asdict(self)
+
 
 class DynamixelBus:
     """Reads and writes registers; retries what the line spoiled, and never takes a failed read for a value.
@@ -75,7 +78,7 @@ class DynamixelBus:
         self._packets: Packets = Packets1() if protocol == 1 else Packets2()
         self._retries = retries
         self._lock = RLock()
-        self._alerts: set[int] = set()
+        self._alerts: dict[int, int] = {}
         self._unanswered = False  # the last question, even when Ctrl+C cut it short: its answer may still be coming
         self._owed: list[
             tuple[int, int]
@@ -85,15 +88,15 @@ class DynamixelBus:
     def protocol(self) -> int:
         return self._packets.version
 
-    def alert(self, device_id: int) -> bool:
-        """Return whether the device's last status packet carried the alert bit (its Hardware Error Status is not 0)."""
-        return device_id in self._alerts
+    def alert(self, device_id: int) -> int:
+        """Return the alert of the device's last status packet, 0 where its hardware is well: see `Reply`."""
+        return self._alerts.get(device_id, 0)
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
         if self.protocol == 1 or self._owes(3):  # an echoed ping of Protocol 1.0 is a valid answer to itself
             return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
-        answer = self._transact("ping", (device_id,), lambda: self._ask((device_id,), PING, b"", 3))[device_id]
+        answer = self._transact("ping", (device_id,), lambda: self._ask(device_id, PING, b"", 3))[device_id]
         return int.from_bytes(answer.data[:2], "little")
 
     def read(self, device_id: int, register: Register) -> int:
@@ -107,7 +110,7 @@ class DynamixelBus:
             nonlocal skipped
             start, asked = self._unmistakable(address, size)
             skipped = address - start
-            return self._ask((device_id,), READ, self._packets.read_parameters(start, asked), asked)
+            return self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
 
         reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
         return reply.data[skipped : skipped + size]
@@ -124,22 +127,24 @@ class DynamixelBus:
             start, asked = self._unmistakable(address, size)
             skipped = address - start
             parameters = self._packets.read_parameters(start, asked) + bytes(device_ids)
-            return self._ask(device_ids, SYNC_READ, parameters, asked)
+            return self._ask(BROADCAST_ID, SYNC_READ, parameters, asked, device_ids)
 
         replies = self._transact(f"sync read of {size} bytes at {address}", device_ids, attempt)
         return {device_id: replies[device_id].data[skipped : skipped + size] for device_id in device_ids}
 
-    def write(self, device_id: int, register: Register, value: int) -> None:
+    def write(self, device_id: int, register: Register, value: int, *, answered: bool = True) -> None:
+        """Write a register; with ``answered`` False nobody waits for the answer that a servo was told not to give."""
         data = register.encode(value)
 
         def attempt() -> Answers:
             doubtful = self._owes(0)  # somebody else's answer may pass for this one's
-            answers = self._ask((device_id,), WRITE, self._packets.write_parameters(register.address, data), 0)
+            parameters = self._packets.write_parameters(register.address, data)
+            answers = self._ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
             reply = answers[0].get(device_id)
             if reply is None or reply.error or not doubtful:
                 return answers
             start, asked = self._unmistakable(register.address, register.size)
-            replies, result = self._ask((device_id,), READ, self._packets.read_parameters(start, asked), asked)
+            replies, result = self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
             skipped = register.address - start
             if result == COMM_SUCCESS and replies[device_id].data[skipped : skipped + register.size] == data:
                 return answers
@@ -160,7 +165,7 @@ class DynamixelBus:
                 "A servo with Protocol 1.0 cannot be restarted over its bus.",
                 next_step="Switch its supply off and on.",
             )
-        self._transact("reboot", (device_id,), lambda: self._ask((device_id,), REBOOT, b"", 0))
+        self._transact("reboot", (device_id,), lambda: self._ask(device_id, REBOOT, b"", 0))
 
     def close(self) -> None:
         self.port.closePort()
@@ -187,8 +192,7 @@ class DynamixelBus:
                     self.port.is_using = False
                 if result == COMM_SUCCESS:
                     self._unanswered = False
-                    for reply in replies.values():
-                        self._note_alert(reply)
+                    self._alerts |= {reply.bus_id: reply.alert for reply in replies.values()}
                     refused = next((reply for reply in replies.values() if reply.error), None)
                     if refused:
                         self.statistics.refused += 1
@@ -198,27 +202,29 @@ class DynamixelBus:
             missing = [device_id for device_id in device_ids if device_id not in replies]
             raise self._silent(what, missing or device_ids, self._packets.reason(result))
 
-    def _ask(self, device_ids: Sequence[int], instruction: int, parameters: bytes, size: int) -> Answers:
-        """Send an instruction to ``device_ids`` and wait for their answers with ``size`` parameters each.
+    def _ask(
+        self, target: int, instruction: int, parameters: bytes, size: int, answering: Sequence[int] | None = None
+    ) -> Answers:
+        """Send an instruction to ``target`` and wait for answers with ``size`` parameters, from it or ``answering``.
 
         An answer of another length is not this question's. A refusal has no parameters; while an answer without
         parameters is owed it is taken only when nothing better comes.
         """
+        answering = (target,) if answering is None else answering
         ambiguous = size > 0 and self._owes(0)
-        self._owed += [(size, self.port.clock.now_ns())] * len(device_ids)
-        target = device_ids[0] if instruction != SYNC_READ else BROADCAST_ID
+        self._owed += [(size, self.port.clock.now_ns())] * max(len(answering), 1)
         result = self._packets.send(self.port, target, instruction, parameters)
         if result != COMM_SUCCESS:
             return {}, result
-        self.port.setPacketTimeout(self._packets.reply_size(size) * len(device_ids))
+        self.port.setPacketTimeout(self._packets.reply_size(size) * len(answering))
         replies: dict[int, Reply] = {}
         doubtful: dict[int, Reply] = {}
-        while len(replies) < len(device_ids):
+        while len(replies) < len(answering):
             reply, result = self._packets.receive(self.port)
             if reply is None:
                 replies = doubtful | replies
-                return replies, COMM_SUCCESS if len(replies) == len(device_ids) else result
-            if reply.bus_id not in device_ids:
+                return replies, COMM_SUCCESS if len(replies) == len(answering) else result
+            if reply.bus_id not in answering:
                 self.statistics.foreign += 1
             elif reply.error and not reply.data and ambiguous:
                 doubtful[reply.bus_id] = reply
@@ -244,12 +250,6 @@ class DynamixelBus:
             asked += 1
         return max(address - (asked - size), 0), asked
 
-    def _note_alert(self, reply: Reply) -> None:
-        if reply.alert:
-            self._alerts.add(reply.bus_id)
-        else:
-            self._alerts.discard(reply.bus_id)
-
     def _count(self, result: int) -> None:
         if result == COMM_RX_CORRUPT:
             self.statistics.corrupt += 1
@@ -269,7 +269,7 @@ class DynamixelBus:
         return DeviceRefused(
             f"Servo {reply.bus_id} refused the {what}: {reason}.",
             next_step="Run `rig status` to see the servo's state; a tripped watchdog or hardware error forbids motion.",
-            evidence={"status_error": reply.error, "alert": reply.alert},
+            evidence={"status_error": reply.error, "alert": bool(reply.alert)},
         )
 
 

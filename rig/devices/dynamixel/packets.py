@@ -23,11 +23,15 @@ _MALFORMED = -1
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A status packet: the device's id, why it refused (0: it did not), whether it raises the alert, its parameters."""
+    """A status packet: the device's id, why it refused (0: it did not), its parameters.
+
+    ``alert`` is not 0 where the hardware is in trouble: the alert bit of Protocol 2.0, of which Hardware Error Status
+    knows more; the bits of the trouble itself in Protocol 1.0, as Hardware Error Status has them.
+    """
 
     bus_id: int
     error: int
-    alert: bool
+    alert: int
     data: bytes
 
 
@@ -85,8 +89,8 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
             return None, result
         body = packet[8:-2]
         if not body:
-            return Reply(_MALFORMED, 0, False, b""), result
-        return Reply(packet[4], body[0] & 0x7F, bool(body[0] & 0x80), bytes(body[1:])), result
+            return Reply(_MALFORMED, 0, 0, b""), result
+        return Reply(packet[4], body[0] & 0x7F, body[0] & 0x80, bytes(body[1:])), result
 
     def reply_size(self, size: int) -> int:
         return 11 + size
@@ -138,9 +142,9 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
             return None, result
         end = 4 + packet[3]
         if packet[3] < 2 or len(packet) < end:
-            return Reply(_MALFORMED, 0, False, b""), result
+            return Reply(_MALFORMED, 0, 0, b""), result
         refused = next((bit for bit in self.refusals if packet[4] & bit), 0)
-        return Reply(packet[2], refused, bool(packet[4] & 0x25), bytes(packet[5 : end - 1])), result
+        return Reply(packet[2], refused, packet[4] & 0x25, bytes(packet[5 : end - 1])), result
 
     def reply_size(self, size: int) -> int:
         return 6 + size

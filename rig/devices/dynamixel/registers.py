@@ -1,4 +1,7 @@
-"""Control tables of Dynamixel models, from the `.model` files that the SDK ships: registers by name, values signed."""
+"""Control tables of Dynamixel models: registers by name, values signed.
+
+Those of Protocol 2.0 come from the `.model` files that the SDK ships, that of the AX-12A from its e-manual page.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -29,6 +32,46 @@ _SIGNED = frozenset(
 )
 # Names that the .model files do not spell as the e-manual does.
 _RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdog"}
+# Registers that the .model files lack: (address, size, name), from which firmware on, and in which models.
+_STARTUP = (60, 1, "Startup Configuration")
+_STARTUP_FIRMWARE = {"xl330": 46, "xc330": 46, "x": 45}
+
+_AX_12A_NUMBER, _AX_12A = 12, "ax_12a"
+_AX_12A_TABLE = (
+    (0, 2, "Model Number"),
+    (2, 1, "Firmware Version"),
+    (3, 1, "ID"),
+    (4, 1, "Baud Rate"),
+    (5, 1, "Return Delay Time"),
+    (6, 2, "CW Angle Limit"),
+    (8, 2, "CCW Angle Limit"),
+    (11, 1, "Temperature Limit"),
+    (12, 1, "Min Voltage Limit"),
+    (13, 1, "Max Voltage Limit"),
+    (14, 2, "Max Torque"),
+    (16, 1, "Status Return Level"),
+    (17, 1, "Alarm LED"),
+    (18, 1, "Shutdown"),
+    (24, 1, "Torque Enable"),
+    (25, 1, "LED"),
+    (26, 1, "CW Compliance Margin"),
+    (27, 1, "CCW Compliance Margin"),
+    (28, 1, "CW Compliance Slope"),
+    (29, 1, "CCW Compliance Slope"),
+    (30, 2, "Goal Position"),
+    (32, 2, "Moving Speed"),
+    (34, 2, "Torque Limit"),
+    (36, 2, "Present Position"),
+    (38, 2, "Present Speed"),
+    (40, 2, "Present Load"),
+    (42, 1, "Present Voltage"),
+    (43, 1, "Present Temperature"),
+    (44, 1, "Registered"),
+    (46, 1, "Moving"),
+    (47, 1, "Lock"),
+    (48, 2, "Punch"),
+)
+"""No value of it is signed: speed and load carry their direction in bit 10."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +93,14 @@ class Register:
 
 
 class ControlTable(Mapping[str, Register]):
-    """The registers of one model by their e-manual names."""
+    """The registers of one model by their e-manual names.
 
-    def __init__(self, model: str, registers: Mapping[str, Register]) -> None:
+    Below ``ram_start`` they are EEPROM: kept without supply, and locked while torque is on.
+    """
+
+    def __init__(self, model: str, registers: Mapping[str, Register], ram_start: int = 64) -> None:
         self.model = model
+        self.ram_start = ram_start
         self._registers = dict(registers)
 
     def __getitem__(self, name: str) -> Register:
@@ -76,8 +123,14 @@ def _rows(file_name: str, section: str) -> list[list[str]]:
 
 @cache
 def model_numbers() -> Mapping[int, str]:
-    """Return the models that the SDK has a table for, by their Model Number."""
-    return {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel.model", "")}
+    """Return the models that there is a table for, by their Model Number."""
+    known = {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel.model", "")}
+    return {**known, _AX_12A_NUMBER: _AX_12A}
+
+
+def protocol_of(model: str) -> int:
+    """Return the version of the protocol that ``model`` speaks: 1 or 2."""
+    return 1 if model == _AX_12A else 2
 
 
 @cache
@@ -87,8 +140,11 @@ def control_table(model: str, firmware: int | None = None) -> ControlTable:
     Raises
     ------
     ConfigError
-        The SDK knows no such model.
+        There is no such model.
     """
+    if model == _AX_12A:
+        rows = (Register(name, address, size, signed=False) for address, size, name in _AX_12A_TABLE)
+        return ControlTable(model, {register.name: register for register in rows}, ram_start=24)
     known = sorted(model_numbers().values())
     if model not in known:
         raise ConfigError(
@@ -100,7 +156,11 @@ def control_table(model: str, firmware: int | None = None) -> ControlTable:
     if firmware is not None and firmware >= 52 and files(_PACKAGE).joinpath(_FOLDER, f"{model}_fw52.model").is_file():
         name = f"{model}_fw52"
     registers = {}
-    for address, size, label in _rows(f"{name}.model", "control table"):
+    for place, width, label in _rows(f"{name}.model", "control table"):
         label = _RENAMED.get(label, label)
-        registers[label] = Register(label, int(address), int(size), label in _SIGNED)
+        registers[label] = Register(label, int(place), int(width), label in _SIGNED)
+    since = next((version for prefix, version in _STARTUP_FIRMWARE.items() if model.startswith(prefix)), None)
+    if firmware is not None and since is not None and firmware >= since:
+        address, size, label = _STARTUP
+        registers[label] = Register(label, address, size, signed=False)
     return ControlTable(model, registers)

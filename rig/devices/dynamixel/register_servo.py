@@ -1,0 +1,243 @@
+"""What all Dynamixel servos of the rig share: identity, permanent settings, and the gear between servo and table."""
+
+from abc import ABC, abstractmethod
+
+from rig.clock import Clock
+from rig.devices.dynamixel import settings
+from rig.devices.dynamixel.bus import DynamixelBus
+from rig.devices.dynamixel.registers import ControlTable, Register, control_table, model_numbers
+from rig.devices.dynamixel.settings import ServoMode, SettingDifference
+from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
+from rig.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
+
+BOOT_ALLOWANCE_S = 3.0
+"""How long a servo may be silent after a reboot; the e-manual gives no number, they take some tenths of a second."""
+
+_HARDWARE_ERRORS = {
+    0: "input voltage",
+    2: "overheating",
+    3: "motor encoder",
+    4: "electrical shock",
+    5: "overload",
+}
+
+
+class RegisterServo(ABC):
+    """A servo on a `DynamixelBus`; implements `rig.devices.servo.Servo`.
+
+    Opening only reads: the model is compared with the configured one. Nothing moves, torque stays as it is.
+
+    Parameters
+    ----------
+    bus
+        The bus that it is on.
+    bus_id, model
+        Its id, and its model by the name of `model_numbers`.
+    clock
+        The bench's clock.
+    mode
+        What it is used for.
+    gear_ratio
+        Turns of the servo for one turn of the table. All angles and rates of this class are the table's side of the
+        gear; a pair of gears that turns the direction around is told to `table.direction`.
+
+    Raises
+    ------
+    DeviceNotFound
+        Nothing answers at ``bus_id``.
+    DeviceMismatch
+        Another model answers.
+    """
+
+    deg_per_count: float
+    """Of the servo's own shaft."""
+
+    def __init__(
+        self,
+        bus: DynamixelBus,
+        *,
+        bus_id: int,
+        model: str,
+        clock: Clock,
+        mode: ServoMode = ServoMode.TURNTABLE,
+        gear_ratio: float = 1.0,
+    ) -> None:
+        self._bus = bus
+        self._clock = clock
+        self._id = bus_id
+        self._mode = mode
+        self._gear_ratio = gear_ratio
+        self._blocks: dict[tuple[int, int], list[Register]] = {}
+        try:
+            number = bus.ping(bus_id)
+        except DeviceSilent as silent:
+            raise DeviceNotFound(
+                f"No servo answers at id {bus_id}.",
+                next_step="Check the servo's power and cable, and servo.id, servo.baud and servo.model in the "
+                "configuration: an AX-12A speaks another protocol than the others.",
+                evidence=silent.evidence,
+            ) from silent
+        found = model_numbers().get(number, f"unknown model {number}")
+        if found != model:
+            raise DeviceMismatch(
+                f"The servo at id {bus_id} is another model than configured.",
+                next_step=f'Set servo.model = "{found}" if this is the right servo, else connect the right one.',
+                evidence={"expected": model, "got": found, "model_number": number},
+            )
+        try:
+            firmware = bus.read(bus_id, control_table(model)["Firmware Version"])
+        except DeviceSilent as silent:
+            silent.add_note("It answers a ping but no read: its Status Return Level is 0, or the line is bad.")
+            raise
+        self._table: ControlTable = control_table(model, firmware)
+        self._identity = ServoIdentity(model, number, bus_id, firmware)
+        self._limits = ServoLimits(
+            temperature_c=float(self._read("Temperature Limit")),
+            voltage_v=(self._read("Min Voltage Limit") * 0.1, self._read("Max Voltage Limit") * 0.1),
+        )
+
+    @property
+    def identity(self) -> ServoIdentity:
+        return self._identity
+
+    @property
+    def limits(self) -> ServoLimits:
+        return self._limits
+
+    @property
+    def resolution_deg(self) -> float:
+        return self.deg_per_count / self._gear_ratio
+
+    @property
+    def bus(self) -> DynamixelBus:
+        return self._bus
+
+    @property
+    def line(self) -> dict[str, int]:
+        return self._bus.statistics.as_dict()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a person should know about this model on a rig."""
+        return ()
+
+    def close(self) -> None:
+        self._bus.close()
+
+    # -- what the models do differently ---------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def reach_deg(self) -> tuple[float, float]: ...
+
+    @abstractmethod
+    def read_state(self) -> ServoState: ...
+
+    @abstractmethod
+    def read_condition(self) -> ServoCondition: ...
+
+    @abstractmethod
+    def set_profile(self, profile: MotionProfile) -> MotionProfile: ...
+
+    @abstractmethod
+    def torque_on(self) -> None: ...
+
+    @abstractmethod
+    def arm_watchdog(self, timeout_s: float) -> None: ...
+
+    @abstractmethod
+    def disarm_watchdog(self) -> None: ...
+
+    def torque_off(self) -> None:
+        self._write("Torque Enable", 0)
+
+    def move_to(self, position_deg: float) -> None:
+        self._write("Goal Position", round(position_deg / self.resolution_deg))
+
+    # -- settings -------------------------------------------------------------------------------------------------
+
+    def setting_differences(self) -> list[SettingDifference]:
+        """Return the EEPROM settings that stand in the rig's way."""
+        return settings.compare(self._bus, self._id, self._table, self._mode)
+
+    def write_settings(self, differences: list[SettingDifference]) -> None:
+        """Write EEPROM settings, with torque off, and read them back."""
+        settings.write(self._bus, self._id, self._table, differences)
+
+    def verify(self) -> None:
+        number, firmware = self._bus.ping(self._id), self._read("Firmware Version")
+        if (number, firmware) != (self._identity.model_number, self._identity.firmware):
+            raise DeviceMismatch(
+                f"Another servo answers at id {self._id} than the one that was there.",
+                next_step="Connect the servo that belongs to this bench, or start again with the other one.",
+                evidence={
+                    "expected": f"{self._identity.model}, firmware {self._identity.firmware}",
+                    "got": f"{model_numbers().get(number, f'unknown model {number}')}, firmware {firmware}",
+                },
+            )
+        prepare_servo(self, write=False)
+
+    def reboot(self) -> None:
+        self._bus.reboot(self._id)
+        give_up_ns = self._clock.now_ns() + round(BOOT_ALLOWANCE_S * 1e9)
+        while True:
+            self._clock.sleep(0.1)
+            try:
+                self.verify()
+            except DeviceSilent:
+                if self._clock.now_ns() > give_up_ns:
+                    raise
+            else:
+                return
+
+    # -- for the models -------------------------------------------------------------------------------------------
+
+    def _read(self, name: str) -> int:
+        return self._bus.read(self._id, self._table[name])
+
+    def _write(self, name: str, value: int) -> None:
+        self._bus.write(self._id, self._table[name], value)
+
+    def _read_registers(self, first: str, last: str) -> tuple[int, dict[str, int]]:
+        """Read all registers from ``first`` to ``last`` in one transaction; return when, and their values by name."""
+        start, end = self._table[first].address, self._table[last].address + self._table[last].size
+        begun_ns = self._clock.now_ns()
+        image = self._bus.read_block(self._id, start, end - start)
+        time_ns = (begun_ns + self._clock.now_ns()) // 2
+        block = self._blocks.get((start, end))
+        if block is None:
+            block = [r for r in self._table.values() if start <= r.address and r.address + r.size <= end]
+            self._blocks[start, end] = block
+        return time_ns, {r.name: r.decode(image[r.address - start : r.address - start + r.size]) for r in block}
+
+
+def hardware_errors(bits: int) -> tuple[str, ...]:
+    """Return the names of the bits of Hardware Error Status."""
+    return tuple(name for bit, name in _HARDWARE_ERRORS.items() if bits >> bit & 1)
+
+
+def prepare_servo(servo: RegisterServo, *, write: bool) -> tuple[str, ...]:
+    """Compare the servo's EEPROM with what the rig needs; write the differences where that is allowed.
+
+    Raises
+    ------
+    DeviceMismatch
+        Settings differ and writing is not allowed.
+    """
+    differences = servo.setting_differences()
+    if not differences:
+        return ()
+    if not write:
+        raise DeviceMismatch(
+            f"{len(differences)} EEPROM settings of the servo are not as the rig needs them.",
+            next_step="Set servo.write_settings = true once (--set servo.write_settings=true): "
+            "the rig then writes these values, with torque off.",
+            evidence={d.register: _found_wanted(d) for d in differences},
+        )
+    servo.write_settings(differences)
+    return tuple(f"servo: {d.register} was {d.found}, is now {d.wanted}" for d in differences)
+
+
+def _found_wanted(difference: SettingDifference) -> str:
+    because = f": {difference.reason}" if difference.reason else ""
+    return f"found {difference.found}, wanted {difference.wanted}{because}"
