@@ -204,6 +204,9 @@ class RigConfig(Section):
     state_dir: Path | None = Field(
         None, description="folder of what a bench must not forget, one folder in it a bench; none: the user's"
     )
+    calibration_dir: Path | None = Field(
+        None, description="folder of the calibrations, one folder in it a bench; none: the user's data folder"
+    )
     servo: ServoConfig = ServoConfig()
     table: TableConfig = TableConfig()
     safety: SafetyConfig = SafetyConfig()
@@ -232,6 +235,10 @@ class RigConfig(Section):
     def catalog_path(self, bench_name: str) -> Path:
         """Return the catalog's folder: simulated views never mix with real ones unless the configuration says so."""
         return self.catalog.path or Path(platformdirs.user_data_dir(APP)) / bench_name
+
+    def calibration_path(self, bench_name: str) -> Path:
+        """Return the folder of the bench's calibrations."""
+        return (self.calibration_dir or Path(platformdirs.user_data_dir(APP)) / "calibration") / bench_name
 
     def state_path(self, bench_name: str) -> Path:
         """Return the folder of the bench's turns, its latched fault, and who holds it."""
