@@ -1,6 +1,6 @@
 """The simulated bench: one world, and the real drivers on simulated wires."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -11,10 +11,12 @@ from pydantic import BaseModel, Field, field_validator
 from rig.bench import Bench, BenchKind
 from rig.clock import SystemClock
 from rig.config import RigConfig, Section
-from rig.errors import ObjectNotFound
+from rig.errors import ObjectNotFound, UsageError
 from rig.hardware import assemble
 from sim.clock import VirtualClock
 from sim.faults import Fault, Faults
+from sim.faults.injector import Occurrence
+from sim.faults.schedule import read_faults
 from sim.noise import NoiseModel
 from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
@@ -29,6 +31,19 @@ class SimOptions(Section):
     object: str | None = Field(None, description="what stands on the table to be identified; none: drawn by the seed")
     yaw_deg: float | None = Field(None, ge=-360, le=360, description="how it stands; none: drawn by the seed")
     noise: dict[str, float] = Field(default_factory=dict, description="values of the noise model that differ")
+
+    faults: list[Any] = Field(
+        default_factory=list, description='what goes wrong, e.g. ["jam@move3+2s"]; rig faults lists what can'
+    )
+
+    @field_validator("faults")
+    @classmethod
+    def _readable(cls, entries: list[Any]) -> list[Any]:
+        try:
+            read_faults(entries)
+        except UsageError as error:
+            raise ValueError(f"{error.what} {error.next_step}") from error
+        return entries
 
     @field_validator("noise")
     @classmethod
@@ -83,7 +98,12 @@ class ShelfOperator:
 
 
 def open_sim_bench(
-    config: RigConfig, operator: ShelfOperator, *, faults: Iterable[Fault] = (), parts: SimParts | None = None
+    config: RigConfig,
+    operator: ShelfOperator,
+    *,
+    faults: Iterable[Fault] = (),
+    heard: Callable[[Occurrence], None] | None = None,
+    parts: SimParts | None = None,
 ) -> Bench:
     """Put the real drivers on the simulated wires of the operator's world, by the lines that open a real bench.
 
@@ -96,6 +116,8 @@ def open_sim_bench(
         The hands; they get hold of the ``parts``.
     faults
         What will go wrong, and when.
+    heard
+        Called when one of them begins or ends.
     parts
         The devices that an earlier bench in this world was opened with; whoever made them takes them away.
 
@@ -113,6 +135,8 @@ def open_sim_bench(
         if parts is None:
             parts = wires.enter_context(SimParts.connected(config, world))
         operator.parts, operator.faults = parts, Faults(parts)
+        if heard:
+            operator.faults.listeners.append(heard)
         if owned:
             wires.callback(operator.faults.clear)
         parts.open_wires()
@@ -135,7 +159,7 @@ class SimBenchKind:
         clock = VirtualClock(start_utc=SystemClock().utc())
         world = World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock)
         operator = ShelfOperator(world, things, next_object=options.object, yaw_deg=options.yaw_deg)
-        return open_sim_bench(config, operator)
+        return open_sim_bench(config, operator, faults=read_faults(options.faults))
 
 
 SIM: BenchKind = SimBenchKind()

@@ -17,6 +17,13 @@ def demo(
         Path | None, typer.Option(metavar="FOLDER", help="Photographs obj{N}__{A}.png instead of the built-in objects.")
     ] = None,
     count: Annotated[int | None, typer.Option(min=2, help="Objects to enroll: 16, or the folder's first 20.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="NAME[@TIME]", help="Let a fault happen, e.g. jam@move3+2s. See rig faults."),
+    ] = None,
+    faults: Annotated[
+        Path | None, typer.Option("--faults", metavar="FILE", help="Faults from a TOML file.", show_default=False)
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html is written.")] = Path("rig-demo"),
 ) -> None:
     """Enroll objects on the simulated bench, then find each of them again, and two that were never enrolled.
@@ -24,8 +31,10 @@ def demo(
     Example: rig demo --seed 7 --out /tmp/demo
     """
     from sim.demo.run import run_demo
+    from sim.faults import Fault, load_faults
 
-    result = run_demo(settings, objects=objects, count=count, out=out)
+    planned = [*(load_faults(faults) if faults else ()), *(Fault.parse(text) for text in fault or ())]
+    result = run_demo(settings, objects=objects, count=count, out=out, faults=planned)
     if settings.json:
         settings.print_json(result.as_dict())
     if not result.good:

@@ -30,6 +30,8 @@ from rig.plans.words import signed
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
 from sim.demo.lines import MoveLines
+from sim.faults.injector import Occurrence
+from sim.faults.schedule import Fault, read_faults
 from sim.noise import NoiseModel
 from sim.objects.photographs import Photographed, photographs
 from sim.objects.shelf import shelf
@@ -107,8 +109,12 @@ class DemoResult:
         }
 
 
-def run_demo(settings: Settings, *, objects: Path | None, count: int | None, out: Path) -> DemoResult:
+def run_demo(
+    settings: Settings, *, objects: Path | None, count: int | None, out: Path, faults: Sequence[Fault] = ()
+) -> DemoResult:
     """Enroll a shelf, find each object again and two strangers, print what happens, and write ``out/report.html``.
+
+    The ``faults``, and those of the configuration, happen meanwhile.
 
     Raises
     ------
@@ -130,7 +136,11 @@ def run_demo(settings: Settings, *, objects: Path | None, count: int | None, out
     seed = settings.seed or 0
     world = World(noise=NoiseModel(**options.noise), seed=seed)
     operator = ShelfOperator(world, {**enrolled, **strangers})
-    with _folder_within(out) as folder, open_sim_bench(config, operator) as bench:
+    heard = None if settings.json else _say_fault
+    with (
+        _folder_within(out) as folder,
+        open_sim_bench(config, operator, faults=[*read_faults(options.faults), *faults], heard=heard) as bench,
+    ):
         with Catalog.open(folder, clock=bench.clock) as catalog:
             enrollments = _enroll_all(bench, catalog, list(enrolled), say=not settings.json)
             index = hbr.ViewIndex(catalog.views().views)
@@ -162,6 +172,11 @@ def run_demo(settings: Settings, *, objects: Path | None, count: int | None, out
     if not settings.json:
         _print_totals(result)
     return result
+
+
+def _say_fault(occurrence: Occurrence) -> None:
+    begins = "begins" if occurrence.began else "ends"
+    print(f"{occurrence.time_ns * 1e-9:8.2f} s  fault {begins}: {occurrence.fault.kind.name}", file=sys.stderr)
 
 
 def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, Thing], Mapping[str, Thing]]:

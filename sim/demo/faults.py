@@ -1,0 +1,35 @@
+"""`rig faults`: the vocabulary."""
+
+import typer
+
+from rig.cli.command import Settings, command
+
+
+@command
+def faults(settings: Settings) -> None:
+    """List what can go wrong on the simulated bench, with parameters, defaults and units.
+
+    Example: rig faults; then rig demo --fault jam@move3+2s --fault crc_flip:rate=0.2
+    """
+    from sim.faults import kinds
+    from sim.faults.schedule import NOTATION
+
+    if settings.json:
+        for kind in kinds().values():
+            settings.print_json(
+                {
+                    "fault": kind.name,
+                    "what": kind.what,
+                    "parameters": {n: {"default": p.default, "meaning": p.meaning} for n, p in kind.parameters.items()},
+                }
+            )
+        return
+    width = max(map(len, kinds()))
+    for kind in kinds().values():
+        typer.echo(f"{kind.name:<{width}}  {kind.what}")
+        for name, parameter in kind.parameters.items():
+            typer.echo(f"{'':<{width}}    {name}={parameter.default:g}  {parameter.meaning}")
+    typer.echo(f"\nrig demo --fault {NOTATION}.")
+    typer.echo(
+        'In a file (rig demo --faults FILE) or rig.toml ([bench.sim]): faults = ["jam@move3+2s", "babble@20s+5s"]'
+    )
