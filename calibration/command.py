@@ -1,11 +1,15 @@
 """`rig calibrate ...`."""
 
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rig.cli.command import Settings, command
+
+if TYPE_CHECKING:
+    from rig.bench import Bench
+    from rig.facts import Fact
 
 EXIT_QUALITY = 6
 
@@ -17,21 +21,31 @@ app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 def imu(
     settings: Settings,
     turns: Annotated[int, typer.Option(min=4, help="Whole turns at least, both ways together.")] = 8,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Where the result is written (JSON) when it passes.")
-    ] = None,
 ) -> None:
     """Calibrate the gyro's scale by whole turns of the table; takes about a minute, exit code 6 if it fails.
 
-    Example: rig calibrate imu --bench sim --turns 12 --out imu-scale.json
+    Example: rig calibrate imu --bench sim --turns 12
     """
-    from calibration.fact import Fact
-    from calibration.gyro_scale import config_lines, live
+    from calibration.gyro_scale import live
+
+    run(settings, lambda bench: live(bench, turns=turns))
+
+
+def run(settings: Settings, procedure: "Callable[[Bench], Generator[Any, None, Fact]]") -> None:
+    """Run one calibration on the bench, keep its fact, passed or not, and say how it went.
+
+    Raises
+    ------
+    typer.Exit
+        With code 6 when the calibration did not pass.
+    """
     from rig.cli.present import line
+    from rig.facts import Fact, FactStore
     from rig.plans.events import event_dict, plain
 
     with settings.open_bench() as bench:
-        events = live(bench, turns=turns)
+        store = FactStore(bench.config.calibration_path(bench.name))
+        events = procedure(bench)
         try:
             for event in events:
                 if isinstance(event, Fact):
@@ -42,15 +56,22 @@ def imu(
                     print(line(event), flush=True)
         finally:
             events.close()
-    if out and fact.passed:
-        fact.to_file(out)
+    path = store.keep(fact)
     if settings.json:
-        settings.print_json({"event": "calibrated", "passed": fact.passed, **plain(fact)})
-    elif fact.passed:
-        print(f"PASS {fact.name} = {fact.value:.6f} ± {fact.uncertainty:.6f}", end="")
-        print(f" (worst residual {fact.residual:.3f}°, limit {fact.limit:.3f}°)")
-        print(f"Put these lines into rig.toml:\n{config_lines(fact)}")
+        settings.print_json({"event": "calibrated", "passed": fact.passed, "file": str(path), **plain(fact)})
     else:
-        print("\n".join([f"FAIL {fact.name}", *(f"  {reason}" for reason in fact.refusals)]))
+        print(verdict(fact))
+        print(f"Kept in {path}" + (", in force from now on." if fact.passed else "; what was in force stays so."))
     if not fact.passed:
         raise typer.Exit(EXIT_QUALITY)
+
+
+def verdict(fact: "Fact") -> str:
+    """Return in words what a calibration found, or why it was refused and what to do."""
+    judged = ""
+    if fact.residual is not None and fact.limit is not None:
+        unit = fact.residual_unit
+        judged = f" (worst residual {fact.residual:.3g} {unit}, limit {fact.limit:.3g} {unit})"
+    lines = [f"{'PASS' if fact.passed else 'FAIL'} {fact.name}{judged}"]
+    lines += [f"  {name} = {estimate}" for name, estimate in fact.estimates.items()]
+    return "\n".join([*lines, *(f"  {reason}" for reason in fact.refusals)])

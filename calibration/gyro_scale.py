@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.fact import Fact
 from rig.bench import Bench
 from rig.config import ImuConfig
 from rig.errors import LimitExceeded, UsageError
+from rig.facts import Estimate, Fact
 from rig.heading import DRAIN_S, MEMORY_S
 from rig.plans.capture import moved
 from rig.plans.events import Moved, plain
@@ -38,6 +38,8 @@ COVERAGE = 4.0
 """Residuals and differences beyond this many standard uncertainties are no chance (1 in 16 000)."""
 PLAUSIBLE = (0.9, 1.1)
 """±3 % from part to part, ±2 % over temperature (PS-MPU-6000A, 6.1), a mounting tilted by up to 15°."""
+VALID_DAYS = 180
+"""The scale ages by mounting and temperature, not by use; half a year finds a sensor that came loose."""
 MAX_UNCERTAINTY = 0.001
 """What a rotation by 90° needs to be known to a tenth of a degree."""
 
@@ -101,16 +103,8 @@ def live(bench: Bench, *, turns: int = 8) -> Generator[Moved | Fact, None, Fact]
         finally:
             if may_return:
                 table.goto(start_deg)
-    devices = bench.devices()
     fact = from_data(
-        legs,
-        resolution_deg=bench.servo.resolution_deg,
-        when_utc=when_utc,
-        device={
-            "bench": bench.name,
-            "imu": {**devices["imu"], **imu_config.model_dump(include={"axis", "sign", "range_dps"})},
-            "servo": devices["servo"],
-        },
+        legs, resolution_deg=bench.servo.resolution_deg, when_utc=when_utc, device=bench.apparatus("servo", "imu")
     )
     yield fact
     return fact
@@ -136,6 +130,7 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
     sigma = np.hypot([leg.sigma_deg for leg in used], resolution_deg / sqrt(3))
     up = encoder > 0
     evidence: dict[str, Any] = {"legs": plain(list(legs))}
+    estimates = {}
     value = uncertainty = residual = limit = None
     refusals = []
     if min(int(up.sum()), int((~up).sum())) < MIN_LEGS:
@@ -157,6 +152,7 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
         residual, limit = float(residuals[worst]), COVERAGE * float(sigma[worst])
         # Scatter beyond the stated noise counts (the Birge ratio); less of it is luck.
         uncertainty = sigma_fit * sqrt(max(float(((residuals / sigma) ** 2).sum()) / (len(used) - 1), 1.0))
+        estimates["scale"] = Estimate(value, uncertainty, "true °/s per °/s read")
         (value_up, sigma_up), (value_down, sigma_down) = (
             _ratio(encoder[way], gyro[way], sigma[way]) for way in (up, ~up)
         )
@@ -176,36 +172,20 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
                 f"The scale is uncertain by {uncertainty:.2%}, more than {MAX_UNCERTAINTY:.1%}: the gyro is noisy. "
                 "Keep vibration off the bench, or give more --turns."
             )
+    settings = {NAME: value, f"{NAME}_uncertainty": uncertainty}
     return Fact(
         name=NAME,
-        value=value,
-        unit="true °/s per °/s read",
-        uncertainty=uncertainty,
+        estimates=estimates,
         residual=residual,
         limit=limit,
         residual_unit="°",
         refusals=tuple(refusals),
+        settings={} if refusals else settings,
+        valid_days=VALID_DAYS,
         when_utc=when_utc,
         device=device,
         evidence=evidence,
     )
-
-
-def config_lines(fact: Fact) -> str:
-    """Return the lines of `rig.toml` that put a calibrated scale in force.
-
-    Raises
-    ------
-    UsageError
-        The fact is not one of the gyro's scale, or was refused.
-    """
-    if fact.name != NAME or not fact.passed:
-        raise UsageError(
-            f"This calibration of {fact.name} cannot be put in force as {NAME}.",
-            next_step="Calibrate with `rig calibrate imu` until it passes.",
-            evidence={"refusals": list(fact.refusals)},
-        )
-    return f"[imu]\nscale = {fact.value:.6f}\nscale_uncertainty = {fact.uncertainty:.6f}"
 
 
 def _ends(low_deg: float, high_deg: float, turns: int) -> tuple[float, float]:

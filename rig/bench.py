@@ -19,6 +19,8 @@ from rig.devices.camera import Camera
 from rig.devices.imu import Imu
 from rig.devices.servo import Servo
 from rig.errors import ConfigError, RigError
+from rig.facts import FactStore, State, apparatus, put_in_force
+from rig.facts.store import CALIBRATIONS
 
 GROUP = "rig.benches"
 
@@ -97,6 +99,12 @@ class Bench(AbstractContextManager["Bench"]):
         }
 
 
+    def apparatus(self, *parts: str) -> dict[str, Any]:
+        """Return what a calibration of some of the devices (all of them by default) is bound to."""
+        whole = apparatus(self.name, self.devices(), self.config, self.conditions)
+        return {key: value for key, value in whole.items() if not parts or key in ("bench", "conditions", *parts)}
+
+
 class BenchKind(Protocol):
     """A plug-in: its options, checked with the rest of the configuration, and how it is opened."""
 
@@ -140,7 +148,33 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
         bench_kind(wrong)  # a misspelt section is told before anything is opened
     kind = bench_kind(name)
     options = validate(kind.options, config.bench.get(name, {}), where="the configuration", prefix=f"bench.{name}")
-    return kind.open(config, options, seed)
+    bench = kind.open(config, options, seed)
+    try:
+        calibrate(bench, FactStore(config.calibration_path(bench.name)))
+    except BaseException:
+        bench.close()
+        raise
+    return bench
+
+
+def calibrate(bench: Bench, store: FactStore) -> None:
+    """Put the bench's calibrations in force; what has expired or belongs to other devices becomes a finding.
+
+    Raises
+    ------
+    ConfigError
+        A calibration sets what the configuration does not take.
+    """
+    standings = store.standings(bench.apparatus(), bench.clock.utc())
+    facts = [standing.fact for standing in standings if standing.state is State.IN_FORCE]
+    bench.config, told = put_in_force(bench.config, facts)
+    bench.conditions = {**bench.conditions, CALIBRATIONS: [fact.id for fact in facts]}
+    bench.findings += told + tuple(error.what for error in store.unreadable)
+    bench.findings += tuple(
+        f"{standing.words}; calibrate again with `{standing.command}`"
+        for standing in standings
+        if standing.state is not State.IN_FORCE
+    )
 
 
 def bench_kind(name: str) -> BenchKind:

@@ -21,6 +21,16 @@ settings.register_profile("nightly", deadline=None)
 settings.load_profile("rig")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the tests and the catalogs, calibrations and benches of whoever runs them apart."""
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        for folder in ("CONFIG", "DATA", "STATE", "CACHE"):
+            patch.setenv(f"XDG_{folder}_HOME", str(home / folder.lower()))
+        yield
+
+
 @dataclass(frozen=True)
 class SimulatedBench:
     """A bench, and the hands and the world behind it."""

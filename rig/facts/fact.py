@@ -2,50 +2,64 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import UTC
+from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from pydantic import AwareDatetime, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import AwareDatetime, ConfigDict, FiniteFloat, PositiveFloat, TypeAdapter, ValidationError
 
 from rig.errors import ConfigError, UsageError
 from rig.files import write
 
 
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A quantity with its standard uncertainty, both in ``unit``."""
+
+    value: FiniteFloat
+    uncertainty: FiniteFloat
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.value:.6g} ± {self.uncertainty:.2g} {self.unit}".rstrip()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fact:
-    """A calibrated quantity.
+    """The result of one calibration.
 
     Attributes
     ----------
     name
-        The quantity, by its key in the configuration where it has one.
-    value, uncertainty
-        Best estimate and standard uncertainty, in ``unit``; None where nothing could be estimated.
+        What was calibrated: ``imu.scale``, ``camera.intrinsics``.
+    estimates
+        The quantities by name; empty where nothing could be estimated.
     residual, limit
         The worst residual of the fit and what it may be, in ``residual_unit``.
     refusals
-        Why the value must not be used, each with what to do about it; empty when the calibration passed.
+        Why the estimates must not be used, each with what to do about it; empty when the calibration passed.
+    settings
+        What it puts in force, by key of the configuration.
+    valid_days
+        How long it holds; None: until the device changes.
     when_utc
         By the bench's clock.
     device
-        What was calibrated, against what, and on which bench: a fact holds for no other.
+        What was calibrated, against what, and on which bench (`rig.facts.apparatus`): a fact holds for no other.
     evidence
         What was measured, enough to fit it again.
 
     Raises
     ------
     ValueError
-        When a fact without refusals has no value or no uncertainty, or ``when_utc`` no time zone.
+        When a fact without refusals has no estimate, one with refusals has settings, or ``when_utc`` no time zone.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     name: str
-    value: FiniteFloat | None
-    unit: str
-    uncertainty: FiniteFloat | None
+    estimates: Mapping[str, Estimate]
     residual: FiniteFloat | None
     limit: FiniteFloat | None
     residual_unit: str
@@ -53,11 +67,15 @@ class Fact:
     when_utc: AwareDatetime
     device: Mapping[str, Any]
     evidence: Mapping[str, Any]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    valid_days: PositiveFloat | None = None
     software: str = field(default_factory=lambda: f"hbr-rig {version('hbr-rig')}")
 
     def __post_init__(self) -> None:
-        if self.passed and (self.value is None or self.uncertainty is None):
+        if self.passed and not self.estimates:
             raise ValueError(f"{self.name}: what passed has a value and an uncertainty")
+        if self.settings and not self.passed:
+            raise ValueError(f"{self.name}: what was refused puts nothing in force")
         if self.when_utc.tzinfo is None:
             raise ValueError(f"{self.name}: when_utc needs a time zone")
         object.__setattr__(self, "when_utc", self.when_utc.astimezone(UTC))
@@ -65,6 +83,14 @@ class Fact:
     @property
     def passed(self) -> bool:
         return not self.refusals
+
+    @property
+    def id(self) -> str:
+        """Name by which a stored view refers to the fact."""
+        return f"{self.name}@{self.when_utc:%Y%m%dT%H%M%S.%fZ}"
+
+    def expired(self, now_utc: datetime) -> bool:
+        return self.valid_days is not None and now_utc - self.when_utc > timedelta(days=self.valid_days)
 
     def to_file(self, path: Path) -> None:
         """Write the fact as JSON: all of it or, when that fails, nothing.
@@ -103,7 +129,7 @@ class Fact:
             return fact
         raise ConfigError(
             f"Cannot read the calibration {path}.",
-            next_step="Give a file that `rig calibrate ... --out FILE` wrote, or calibrate again.",
+            next_step="Give a file that `rig calibrate ...` wrote, or remove it and calibrate again.",
             evidence={"mistakes": mistakes},
         )
 
