@@ -243,6 +243,41 @@ class ObjectNotFound(CatalogError):
     title = "object not found"
 
 
+class DescriptorOutdated(CatalogError):
+    """Views are not described by the descriptor, or the version of it, that this program compares."""
+
+    code = 703
+    title = "descriptor outdated"
+
+
+class CatalogOutdated(CatalogError):
+    """The catalog is of an earlier version and is to be migrated first."""
+
+    code = 704
+    title = "catalog outdated"
+
+
+class ImportRefused(CatalogError):
+    """What was to be imported cannot be used; nothing of it is in the catalog."""
+
+    code = 705
+    title = "import refused"
+
+
+class ExportFailed(CatalogError):
+    """The catalog cannot be exported in this way."""
+
+    code = 706
+    title = "export"
+
+
+class CatalogDamaged(CatalogError):
+    """The catalog was checked and something in it is not as it was stored."""
+
+    code = 707
+    title = "catalog damaged"
+
+
 class CatalogBusy(RigError):
     """Another process holds the catalog or the bench."""
 

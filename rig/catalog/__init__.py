@@ -1,7 +1,9 @@
 """The catalog of enrolled objects: an SQLite file, and the images as plain files beside it."""
 
+from rig.catalog.audit import AuditEntry
 from rig.catalog.catalog import Catalog, ModelSet
 from rig.catalog.enrollment import Enrollment
+from rig.catalog.migrate import Migration, migrate
 from rig.catalog.records import (
     EnrollmentStatus,
     EnrollmentSummary,
@@ -15,10 +17,12 @@ from rig.catalog.records import (
 )
 
 __all__ = [
+    "AuditEntry",
     "Catalog",
     "Enrollment",
     "EnrollmentStatus",
     "EnrollmentSummary",
+    "Migration",
     "ModelSet",
     "ObjectDetails",
     "ObjectSummary",
@@ -27,4 +31,5 @@ __all__ = [
     "StoredView",
     "ViewRecord",
     "clean_name",
+    "migrate",
 ]

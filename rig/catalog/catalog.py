@@ -1,21 +1,31 @@
 """The catalog: objects, their enrollments and views."""
 
 from collections.abc import Sequence
-from difflib import get_close_matches
+from datetime import datetime
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, and_, select, true, update
+from sqlalchemy import ColumnElement, Connection, and_, select, update
 
 import hbr
-from rig.catalog import images
+from rig.catalog import audit, images
+from rig.catalog.audit import AuditEntry
 from rig.catalog.database import Database, insert_row
+from rig.catalog.describing import known_descriptor
 from rig.catalog.enrollment import Enrollment
-from rig.catalog.queries import enrollment_summaries, model_set, object_summaries, stored_views
+from rig.catalog.queries import (
+    check_free,
+    enrollment_summaries,
+    find,
+    in_use,
+    model_set,
+    object_summaries,
+    stored_views,
+)
 from rig.catalog.records import (
     EnrollmentStatus,
     EnrollmentSummary,
@@ -28,9 +38,9 @@ from rig.catalog.records import (
     check_text,
     clean_name,
 )
-from rig.catalog.schema import enrollments, objects, sittings, views
+from rig.catalog.schema import DESCRIPTOR, enrollments, objects, sittings, views
 from rig.clock import Clock
-from rig.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
+from rig.errors import CatalogError, ObjectExists, UsageError
 
 
 class ModelSet(NamedTuple):
@@ -97,6 +107,16 @@ class Catalog:
         self._database.close()
 
     @property
+    def database(self) -> Database:
+        """For the other rooms of this package: everybody else asks the catalog."""
+        return self._database
+
+    @property
+    def clock(self) -> Clock:
+        """Gives the civil time of what is stored."""
+        return self._clock
+
+    @property
     def path(self) -> Path:
         """The catalog's folder."""
         return self._database.root
@@ -144,12 +164,10 @@ class Catalog:
             raise UsageError("an enrollment with no views is planned", next_step="plan at least one view")
         for azimuth_deg in plan:
             check_azimuth(azimuth_deg)
-        given = {key: text for key, text in (("label", label), ("note", note)) if text is not None}
-        for key, text in given.items():
-            check_text(text, key)
+        given = _texts(label, note)
         now = self._clock.utc()
         with self._database.write() as connection:
-            object_id = connection.scalar(select(objects.c.id).where(objects.c.name == name))
+            object_id = connection.scalar(select(objects.c.id).where(in_use(name)))
             if object_id is None:
                 texts = {"label": "", "note": ""} | given
                 object_id = insert_row(connection, objects, name=name, created_utc=now, **texts)
@@ -171,6 +189,15 @@ class Catalog:
                 started_utc=now,
                 planned_azimuth_deg=plan,
             )
+            audit.append(
+                connection,
+                self._clock,
+                "began to enroll",
+                name,
+                enrollment_id=enrollment_id,
+                views=len(plan),
+                replace=replace,
+            )
             return self._sit_down(connection, enrollment_id, object_id, name, plan, provenance)
 
     def resumable(self, name: str) -> EnrollmentSummary | None:
@@ -182,7 +209,7 @@ class Catalog:
             No object of that name is in the catalog.
         """
         with self._database.read() as connection:
-            object_id, _ = _find(connection, name)
+            object_id, _ = find(connection, name)
             return next(iter(enrollment_summaries(connection, _current(object_id, EnrollmentStatus.IN_PROGRESS))), None)
 
     def resume(self, name: str, *, provenance: Provenance) -> Enrollment:
@@ -198,19 +225,25 @@ class Catalog:
             Another process is writing for longer than the timeout.
         """
         with self._database.write() as connection:
-            object_id, name = _find(connection, name)
+            object_id, name = find(connection, name)
             unfinished = connection.execute(
                 select(enrollments).where(_current(object_id, EnrollmentStatus.IN_PROGRESS))
             ).first()
             if unfinished is None:
                 raise CatalogError(f"{name!r} has no unfinished enrollment", next_step="enroll it without --resume")
             plan = tuple(unfinished.planned_azimuth_deg)
+            audit.append(connection, self._clock, "resumed", name, enrollment_id=unfinished.id)
             return self._sit_down(connection, unfinished.id, object_id, name, plan, provenance)
 
     def objects(self) -> list[ObjectSummary]:
-        """Return all objects, in the order in which they came into the catalog."""
+        """Return all objects, in the order in which they came into the catalog; those deleted are left out."""
         with self._database.read() as connection:
-            return object_summaries(connection, true())
+            return object_summaries(connection, objects.c.deleted_utc.is_(None))
+
+    def deleted(self) -> list[ObjectSummary]:
+        """Return the objects that were deleted and can be taken back."""
+        with self._database.read() as connection:
+            return object_summaries(connection, objects.c.deleted_utc.is_not(None))
 
     def object(self, name: str) -> ObjectDetails:
         """Return an object with its enrollments and views.
@@ -221,7 +254,7 @@ class Catalog:
             No object of that name is in the catalog.
         """
         with self._database.read() as connection:
-            object_id, _ = _find(connection, name)
+            object_id, _ = find(connection, name)
             (summary,) = object_summaries(connection, objects.c.id == object_id)
             return ObjectDetails(
                 summary=summary,
@@ -229,16 +262,98 @@ class Catalog:
                 views=tuple(stored_views(connection, _current(object_id, EnrollmentStatus.COMPLETE))),
             )
 
-    def views(self) -> ModelSet:
-        """Return the views of every object's complete enrollment, by object and index.
+    def views(self, descriptor: str = DESCRIPTOR) -> ModelSet:
+        """Return the views of every object's complete enrollment, by object and index, as a descriptor has them.
 
         Raises
         ------
-        CatalogError
-            Some were described by another version of the descriptor and cannot be compared.
+        UsageError
+            There is no such descriptor.
+        DescriptorOutdated
+            Some are not described by this version of it and cannot be compared.
         """
+        kind = known_descriptor(descriptor)
         with self._database.read() as connection:
-            return ModelSet(*model_set(connection))
+            return ModelSet(*model_set(connection, kind))
+
+    def rename(self, name: str, new_name: str) -> None:
+        """Give an object another name; its images stay where they are.
+
+        Raises
+        ------
+        UsageError
+            The new name cannot be used.
+        ObjectNotFound
+            No object of that name is in the catalog.
+        ObjectExists
+            Another object has the new name.
+        """
+        new_name = clean_name(new_name)
+        with self._database.write() as connection:
+            object_id, name = find(connection, name)
+            if new_name == name:
+                return
+            check_free(connection, new_name)
+            connection.execute(update(objects).where(objects.c.id == object_id).values(name=new_name))
+            audit.append(connection, self._clock, "renamed", new_name, before=name)
+
+    def describe(self, name: str, *, label: str | None = None, note: str | None = None) -> None:
+        """Change the label or the note of an object; None leaves them.
+
+        Raises
+        ------
+        UsageError
+            They are no text.
+        ObjectNotFound
+            No object of that name is in the catalog.
+        """
+        given = _texts(label, note)
+        with self._database.write() as connection:
+            object_id, name = find(connection, name)
+            if given:
+                connection.execute(update(objects).where(objects.c.id == object_id).values(given))
+                audit.append(connection, self._clock, "labelled", name, **given)
+
+    def delete(self, *names: str) -> None:
+        """Take objects out of use, all or none; they can be taken back (`undelete`) until `collect_garbage`.
+
+        Raises
+        ------
+        ObjectNotFound
+            No object of one of these names is in the catalog.
+        """
+        with self._database.write() as connection:
+            for object_id, name in [find(connection, name) for name in dict.fromkeys(names)]:
+                connection.execute(
+                    update(objects).where(objects.c.id == object_id).values(deleted_utc=self._clock.utc())
+                )
+                audit.append(connection, self._clock, "deleted", name)
+
+    def undelete(self, name: str) -> None:
+        """Take an object back into use, the last one that was deleted under this name.
+
+        Raises
+        ------
+        ObjectNotFound
+            No such object can be taken back.
+        ObjectExists
+            An object of this name is in use.
+        """
+        with self._database.write() as connection:
+            object_id, name = find(connection, name, deleted=True)
+            check_free(connection, name)
+            connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=None))
+            audit.append(connection, self._clock, "undeleted", name)
+
+    def note(self, action: str, object_name: str | None = None, **details: Any) -> None:
+        """Write into the audit log what was done with the bench, such as "moved"; details are JSON values."""
+        with self._database.write() as connection:
+            audit.append(connection, self._clock, action, object_name, **details)
+
+    def log(self, *, since: datetime | None = None, object_name: str | None = None) -> list[AuditEntry]:
+        """Return what was done with this catalog, by whom and when, oldest first."""
+        with self._database.read() as connection:
+            return audit.entries(connection, since, object_name)
 
     def view(self, view_id: int) -> StoredView:
         """Return one view.
@@ -308,18 +423,11 @@ def _current(object_id: int, status: EnrollmentStatus) -> ColumnElement[bool]:
     return and_(enrollments.c.object_id == object_id, enrollments.c.status == status)
 
 
-def _find(connection: Connection, name: str) -> tuple[int, str]:
-    name = clean_name(name)
-    object_id = connection.scalar(select(objects.c.id).where(objects.c.name == name))
-    if object_id is not None:
-        return object_id, name
-    by_folded = {known.casefold(): known for known in connection.scalars(select(objects.c.name))}
-    near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
-    raise ObjectNotFound(
-        f"there is no object {name!r} in the catalog",
-        next_step=f"did you mean {' or '.join(map(repr, near))}?" if near else "list the objects: rig catalog list",
-        evidence={"near": near},
-    )
+def _texts(label: str | None, note: str | None) -> dict[str, str]:
+    given = {key: text for key, text in (("label", label), ("note", note)) if text is not None}
+    for key, text in given.items():
+        check_text(text, key)
+    return given
 
 
 def _check_not_enrolled(connection: Connection, object_id: int, name: str) -> None:

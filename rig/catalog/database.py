@@ -1,24 +1,20 @@
 """The SQLite file of a catalog: how it is opened, its transactions, and what goes wrong in words."""
 
-import errno
 import os
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
 
 from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, event, insert
-from sqlalchemy.exc import DBAPIError
 
 from rig.catalog import images
+from rig.catalog.failures import DATABASE_NAME, absent, in_words
 from rig.catalog.schema import APPLICATION_ID, METADATA, SCHEMA_VERSION
-from rig.errors import CatalogBusy, CatalogError, RigError
+from rig.errors import CatalogError, CatalogOutdated
 from rig.files import sync_folder
-
-DATABASE_NAME: Final = "catalog.sqlite"
 
 
 class Database:
@@ -80,34 +76,18 @@ class Database:
         with self.in_words(), self._writing.begin() as connection:
             yield connection
 
-    @contextmanager
-    def in_words(self) -> Iterator[None]:
+    def in_words(self) -> AbstractContextManager[None]:
         """Turn the errors of SQLite and of the file system into the catalog's."""
-        try:
-            yield
-        except (DBAPIError, sqlite3.Error) as error:
-            told = self._of_sqlite(error.orig if isinstance(error, DBAPIError) else error)
-            if told is None:
-                raise
-            raise told from error
-        except OSError as error:
-            raise self._of_system(error) from error
+        return in_words(self.root, self._busy_timeout_s)
 
     def _open(self, *, create: bool) -> None:
-        if self.root.exists() and not self.root.is_dir():
-            raise CatalogError(
-                f"{self.root} is a file, not the folder of a catalog", next_step="give the folder of the catalog"
-            )
-        absent = CatalogError(
-            f"there is no catalog in {self.root}", next_step="check the path, or enroll an object to create it"
-        )
-        if not self._file.exists() or not self._file.stat().st_size:
+        if not is_there(self.root):
             if not create:
-                raise absent
+                raise absent(self.root)
             images.make_folder(self.root, within=next(above for above in self.root.parents if above.exists()))
             self._create()
         with self.read() as connection:
-            self._check_identity(connection)
+            _check_up_to_date(connection, self.root)
 
     def _connect(self) -> sqlite3.Connection:
         mode = "rw"
@@ -159,66 +139,47 @@ class Database:
             if not self._file.stat().st_size:
                 made.replace(self._file)
 
-    def _check_identity(self, connection: Connection) -> None:
-        application_id, version = _identity(connection)
-        if application_id != APPLICATION_ID:
-            raise CatalogError(
-                f"{self._file} is the database of another program", next_step="give the folder of a catalog"
-            )
-        if version > SCHEMA_VERSION:
-            raise CatalogError(
-                f"the catalog {self.root} was written by a newer program: its schema has version {version}, "
-                f"this program knows {SCHEMA_VERSION}",
-                next_step="update hbr-rig on this computer",
-                evidence={"found": version, "known": SCHEMA_VERSION},
-            )
 
-    def _of_sqlite(self, error: BaseException | None) -> RigError | None:
-        evidence = {"sqlite": str(error)}
-        match getattr(error, "sqlite_errorcode", 0) & 0xFF:
-            case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED | sqlite3.SQLITE_PROTOCOL:
-                return CatalogBusy(
-                    f"another process is writing to the catalog {self.root} "
-                    f"and was not done after {self._busy_timeout_s:g} s; nothing was changed",
-                    next_step="wait until it is done and try again",
-                    evidence=evidence,
-                )
-            case sqlite3.SQLITE_NOTADB:
-                return CatalogError(
-                    f"{self._file} is not a catalog", next_step="give the folder of a catalog", evidence=evidence
-                )
-            case sqlite3.SQLITE_CORRUPT:
-                return CatalogError(
-                    f"the catalog {self._file} is damaged",
-                    next_step="copy the folder as it is, then restore the database from a backup",
-                    evidence=evidence,
-                )
-            case sqlite3.SQLITE_FULL:
-                return self._of_system(OSError(errno.ENOSPC, str(error)))
-            case sqlite3.SQLITE_CANTOPEN | sqlite3.SQLITE_READONLY | sqlite3.SQLITE_PERM:
-                return self._of_system(OSError(errno.EACCES, str(error)))
-            case sqlite3.SQLITE_IOERR:
-                return self._of_system(OSError(errno.EIO, str(error)))
-        return None
+def is_there(root: Path) -> bool:
+    """Tell whether a folder has a database; an empty file is one that some program was cut off at."""
+    if root.exists() and not root.is_dir():
+        raise absent(root)
+    file = root / DATABASE_NAME
+    return file.exists() and file.stat().st_size > 0
 
-    def _of_system(self, error: OSError) -> CatalogError:
-        evidence = {"errno": errno.errorcode.get(error.errno or 0, "unknown"), "system": str(error)}
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return CatalogError(
-                f"the disk of the catalog {self.root} is full; this change was not stored, all earlier ones are safe",
-                next_step="free some space, then go on with the enrollment",
-                evidence=evidence,
-            )
-        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            return CatalogError(
-                f"no permission to use the catalog {self.root}",
-                next_step="have the folder and its files made writable for this user, or give another folder",
-                evidence=evidence,
-            )
-        return CatalogError(
-            f"the catalog {self.root} cannot be used: {error}",
-            next_step="check the folder and its disk; a catalog belongs on a local disk",
-            evidence=evidence,
+
+def version_of(connection: Connection, root: Path) -> int:
+    """Return the version of a catalog's tables, this program's or an earlier one.
+
+    Raises
+    ------
+    CatalogError
+        It is the database of another program, or of a newer version.
+    """
+    application_id = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
+    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+    if application_id != APPLICATION_ID:
+        raise CatalogError(
+            f"{root / DATABASE_NAME} is the database of another program", next_step="give the folder of a catalog"
+        )
+    if version > SCHEMA_VERSION:
+        raise CatalogError(
+            f"the catalog {root} was written by a newer program: its schema has version {version}, "
+            f"this program knows {SCHEMA_VERSION}",
+            next_step="update hbr-rig on this computer",
+            evidence={"found": version, "known": SCHEMA_VERSION},
+        )
+    return version
+
+
+def _check_up_to_date(connection: Connection, root: Path) -> None:
+    version = version_of(connection, root)
+    if version < SCHEMA_VERSION:
+        raise CatalogOutdated(
+            f"the catalog {root} was written by an earlier program: its schema has version {version}, "
+            f"this program works with {SCHEMA_VERSION}",
+            next_step="bring it up to date, which keeps a backup beside it: rig catalog migrate",
+            evidence={"found": version, "known": SCHEMA_VERSION},
         )
 
 
@@ -230,9 +191,3 @@ def insert_row(connection: Connection, table: Table, **values: object) -> int:
 
 def _begin(connection: Connection) -> None:
     connection.exec_driver_sql(connection.get_execution_options().get("begin", "BEGIN"))
-
-
-def _identity(connection: Connection) -> tuple[int, int]:
-    application_id: int = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
-    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-    return application_id, version

@@ -1,17 +1,18 @@
 """The writing side of an enrollment."""
 
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, and_, delete, select, update
+from sqlalchemy import Connection, and_, delete, insert, select, update
 
-import hbr
-from rig.catalog import images
+from rig.catalog import audit, images
 from rig.catalog.database import Database, insert_row
+from rig.catalog.describing import packed_rows
 from rig.catalog.records import EnrollmentStatus, Sitting, StoredView, ViewRecord
-from rig.catalog.schema import DESCRIPTOR_KIND, DESCRIPTOR_VERSION, enrollments, objects, sittings, views
+from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
 from rig.clock import Clock
 from rig.errors import CatalogError, UsageError
 from rig.files import write
@@ -72,7 +73,7 @@ class Enrollment:
         UsageError
             The view is not in the plan, or the image is none.
         TypeError, ValueError
-            The descriptor is none (`hbr.pack`).
+            A descriptor is none (`hbr.pack`).
         CatalogError
             The view is stored already, the enrollment is no longer in progress, or the disk is full or fails.
         CatalogBusy
@@ -84,12 +85,16 @@ class Enrollment:
                 f"view {index} is not one of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r}",
                 next_step="begin a new enrollment with the larger plan",
             )
-        packed = hbr.pack(record.descriptor)
+        if record.descriptor is None:
+            raise UsageError(f"view {index} is not described", next_step="describe it: hbr.describe")
+        packed = list(packed_rows(record.descriptor, record.further, DESCRIPTOR, record.region))
         png = images.encode(image_bgr)
         image = self.folder / f"{index:03d}.png"
         sha256 = images.digest(png)
-        age_ns = self._clock.now_ns() - record.captured_ns
-        captured_utc = self._clock.utc() - timedelta(microseconds=age_ns // 1000)
+        captured_utc = None
+        if record.captured_ns is not None:
+            age_ns = self._clock.now_ns() - record.captured_ns
+            captured_utc = self._clock.utc() - timedelta(microseconds=age_ns // 1000)
         # The image is written under the write lock: two processes at one enrollment cannot change each other's images.
         with self._database.write() as connection:
             self._check_in_progress(connection)
@@ -110,16 +115,15 @@ class Enrollment:
                 imu_deg=record.imu_deg,
                 imu_sigma_deg=record.imu_sigma_deg,
                 azimuth_deg=record.azimuth_deg,
-                descriptor_kind=DESCRIPTOR_KIND,
-                descriptor_version=DESCRIPTOR_VERSION,
-                descriptor=packed,
                 captured_utc=captured_utc,
                 captured_ns=record.captured_ns,
                 image=image.as_posix(),
                 image_sha256=sha256,
                 image_bytes=len(png),
                 evidence=record.evidence,
+                front_end=record.front_end,
             )
+            connection.execute(insert(descriptors), [{"view_id": view_id, **row} for row in packed])
         return StoredView(
             id=view_id,
             object_name=self.object_name,
@@ -157,12 +161,21 @@ class Enrollment:
                 .values(status=EnrollmentStatus.SUPERSEDED)
             )
             self._close(connection, EnrollmentStatus.COMPLETE)
+            audit.append(
+                connection,
+                self._clock,
+                "enrolled",
+                self.object_name,
+                enrollment_id=self.id,
+                views=len(self.planned_azimuth_deg),
+            )
 
     def abandon(self) -> None:
         """Give the enrollment up; its images stay, and the complete enrollment before it stays in use."""
         with self._database.write() as connection:
             self._check_in_progress(connection)
             self._close(connection, EnrollmentStatus.ABANDONED)
+            audit.append(connection, self._clock, "abandoned", self.object_name, enrollment_id=self.id)
 
     def discard(self) -> None:
         """Take back an enrollment that holds no view yet, and its object if it has no other enrollment.
@@ -184,6 +197,7 @@ class Enrollment:
             others = select(enrollments.c.id).where(enrollments.c.object_id == self.object_id)
             if connection.scalar(others) is None:
                 connection.execute(delete(objects).where(objects.c.id == self.object_id))
+            audit.append(connection, self._clock, "discarded", self.object_name, enrollment_id=self.id)
 
     def _close(self, connection: Connection, status: EnrollmentStatus) -> None:
         connection.execute(
@@ -194,8 +208,39 @@ class Enrollment:
         present = set(connection.scalars(select(views.c.view_index).where(views.c.enrollment_id == self.id)))
         return tuple(index for index in range(len(self.planned_azimuth_deg)) if index not in present)
 
+    def set_reference_image(self, image_bgr: NDArray[np.uint8]) -> None:
+        """Keep what this sitting's camera saw of the empty table, uint8 (H, W, 3) BGR; durable when this returns.
+
+        Raises
+        ------
+        UsageError, CatalogError, CatalogBusy
+            As for `add`.
+        """
+        png = images.encode(image_bgr)
+        image = self.folder / f"empty-{self.sitting.id:06d}.png"
+        with self._database.write() as connection:
+            self._check_in_progress(connection)
+            write(self._database.root / image, png)
+            connection.execute(
+                update(sittings)
+                .where(sittings.c.id == self.sitting.id)
+                .values(
+                    reference_image=image.as_posix(),
+                    reference_image_sha256=images.digest(png),
+                    reference_image_bytes=len(png),
+                )
+            )
+        self.sitting = replace(self.sitting, reference_image=image.as_posix())
+
     def _check_in_progress(self, connection: Connection) -> None:
-        status = connection.scalar(select(enrollments.c.status).where(enrollments.c.id == self.id))
+        status, deleted_utc = connection.execute(
+            select(enrollments.c.status, objects.c.deleted_utc).join(objects).where(enrollments.c.id == self.id)
+        ).first() or ("gone", None)
+        if deleted_utc is not None:
+            raise CatalogError(
+                f"{self.object_name!r} was deleted while it was being enrolled",
+                next_step=f"take the deletion back and go on: rig catalog undelete {self.object_name}",
+            )
         if status != EnrollmentStatus.IN_PROGRESS:
             raise CatalogError(
                 f"the enrollment of {self.object_name!r} is {status}, not in progress", next_step="begin a new one"

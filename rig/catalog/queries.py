@@ -1,6 +1,8 @@
 """Reading a catalog: from rows to records."""
 
 from collections import defaultdict
+from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -8,6 +10,8 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Row, and_, func, select
 
 import hbr
+from hbr.descriptors import Descriptor, descriptor
+from rig.catalog.describing import region_of
 from rig.catalog.records import (
     EnrollmentStatus,
     EnrollmentSummary,
@@ -16,9 +20,51 @@ from rig.catalog.records import (
     Sitting,
     StoredView,
     ViewRecord,
+    clean_name,
 )
-from rig.catalog.schema import DESCRIPTOR_KIND, DESCRIPTOR_VERSION, enrollments, objects, sittings, views
-from rig.errors import CatalogError
+from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
+from rig.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
+
+
+def in_use(name: str) -> ColumnElement[bool]:
+    """The condition that an object has a name and is not deleted."""
+    return and_(objects.c.name == name, objects.c.deleted_utc.is_(None))
+
+
+def find(connection: Connection, name: str, *, deleted: bool = False) -> tuple[int, str]:
+    """Return the id and the name of an object in use, or of the last one ``deleted``.
+
+    Raises
+    ------
+    ObjectNotFound
+        There is none; the next step names those that are spelled alike.
+    """
+    name = clean_name(name)
+    among = objects.c.deleted_utc.is_not(None) if deleted else objects.c.deleted_utc.is_(None)
+    object_id = connection.scalar(
+        select(objects.c.id).where(objects.c.name == name, among).order_by(objects.c.deleted_utc.desc()).limit(1)
+    )
+    if object_id is not None:
+        return object_id, name
+    by_folded = {known.casefold(): known for known in connection.scalars(select(objects.c.name).where(among))}
+    near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
+    state = "deleted object" if deleted else "object"
+    raise ObjectNotFound(
+        f"there is no {state} {name!r} in the catalog",
+        next_step=f"did you mean {' or '.join(map(repr, near))}?"
+        if near
+        else f"list the {state}s: rig catalog list{' --deleted' if deleted else ''}",
+        evidence={"near": near},
+    )
+
+
+def check_free(connection: Connection, name: str) -> None:
+    """Refuse a name that an object in use has, with `ObjectExists`."""
+    if connection.scalar(select(objects.c.id).where(in_use(name))) is not None:
+        raise ObjectExists(
+            f"there is another object {name!r} in the catalog",
+            next_step="choose another name, or rename that one: rig catalog rename",
+        )
 
 
 def object_summaries(connection: Connection, where: ColumnElement[bool]) -> list[ObjectSummary]:
@@ -47,6 +93,7 @@ def object_summaries(connection: Connection, where: ColumnElement[bool]) -> list
                 enrolled_utc=enrolled_utc,
                 views=view_count,
                 unfinished_views=unfinished_views,
+                deleted_utc=row.deleted_utc,
             )
         )
     return summaries
@@ -81,10 +128,12 @@ def enrollment_summaries(connection: Connection, where: ColumnElement[bool]) -> 
 
 def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[StoredView]:
     """Return views, by enrollment and index."""
+    cedd = descriptor(DESCRIPTOR)
     rows = connection.execute(
-        select(views, objects.c.name.label("object_name"))
+        select(views, objects.c.name.label("object_name"), descriptors.c.packed, descriptors.c.settings)
         .join(enrollments, views.c.enrollment_id == enrollments.c.id)
         .join(objects)
+        .outerjoin(descriptors, described_by(cedd))
         .where(where)
         .order_by(views.c.enrollment_id, views.c.view_index)
     ).all()
@@ -101,11 +150,13 @@ def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[Sto
                 commanded_deg=row.commanded_deg,
                 encoder_deg=row.encoder_deg,
                 azimuth_deg=row.azimuth_deg,
-                descriptor=hbr.unpack(row.descriptor),
+                descriptor=None if row.packed is None else cedd.unpack(row.packed),
                 captured_ns=row.captured_ns,
                 imu_deg=row.imu_deg,
                 imu_sigma_deg=row.imu_sigma_deg,
                 evidence=row.evidence,
+                region=None if row.packed is None else region_of(row.settings),
+                front_end=row.front_end,
             ),
             captured_utc=row.captured_utc,
             image=row.image,
@@ -116,47 +167,69 @@ def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[Sto
     ]
 
 
-def model_set(connection: Connection) -> tuple[hbr.Views, NDArray[np.int64]]:
+def described_by(kind: Descriptor) -> ColumnElement[bool]:
+    """The condition that a row of `descriptors` is of a view and comparable to what this program computes."""
+    return and_(
+        descriptors.c.view_id == views.c.id, descriptors.c.name == kind.name, descriptors.c.version == kind.version
+    )
+
+
+def retrieved() -> ColumnElement[bool]:
+    """The condition that an object is retrieved through an enrollment."""
+    return and_(enrollments.c.status == EnrollmentStatus.COMPLETE, objects.c.deleted_utc.is_(None))
+
+
+def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDArray[np.int64]]:
     """Return the views of all complete enrollments, by object and index, and their ids.
 
     Raises
     ------
-    CatalogError
-        Some were described by another version of the descriptor and cannot be compared.
+    DescriptorOutdated
+        Some are not described by this version of the descriptor and cannot be compared.
     """
-    complete = enrollments.c.status == EnrollmentStatus.COMPLETE
-    ours = and_(views.c.descriptor_kind == DESCRIPTOR_KIND, views.c.descriptor_version == DESCRIPTOR_VERSION)
-    stranger = connection.execute(
-        select(objects.c.name, views.c.descriptor_kind, views.c.descriptor_version)
-        .join(enrollments, views.c.enrollment_id == enrollments.c.id)
-        .join(objects)
-        .where(complete, ~ours)
-        .limit(1)
-    ).first()
-    if stranger is not None:
-        raise CatalogError(
-            f"{stranger.name!r} is described by {stranger.descriptor_kind} {stranger.descriptor_version}; "
-            f"this program compares {DESCRIPTOR_KIND} {DESCRIPTOR_VERSION}",
-            next_step="use the program that it was enrolled with, or enroll it again with --replace",
-        )
     rows = connection.execute(
-        select(enrollments.c.object_id, views.c.id, views.c.azimuth_deg, views.c.descriptor)
-        .join(enrollments, views.c.enrollment_id == enrollments.c.id)
-        .where(complete)
-        .order_by(enrollments.c.object_id, views.c.view_index)
+        select(objects.c.id, objects.c.name, views.c.id, views.c.azimuth_deg, descriptors.c.packed)
+        .select_from(objects)
+        .join(enrollments)
+        .join(views, views.c.enrollment_id == enrollments.c.id)
+        .outerjoin(descriptors, described_by(kind))
+        .where(retrieved())
+        .order_by(objects.c.id, views.c.view_index)
     ).all()
     if not rows:
         return hbr.Views.empty(), np.empty(0, np.int64)
-    object_ids, view_ids, azimuths_deg, packed = zip(*rows, strict=True)
-    known_ids, object_index = np.unique(np.array(object_ids, np.int64), return_inverse=True)
-    names = {row.id: row.name for row in connection.execute(select(objects.c.id, objects.c.name))}
+    object_ids, names, view_ids, azimuths_deg, packed = zip(*rows, strict=True)
+    if None in packed:
+        raise _outdated(connection, kind, {name for name, levels in zip(names, packed, strict=True) if levels is None})
+    _, first, object_index = np.unique(np.array(object_ids, np.int64), return_index=True, return_inverse=True)
     loaded = hbr.Views(
-        descriptors=hbr.unpack_rows(b"".join(packed)),
+        descriptors=_unpacked(kind, packed),
         azimuth_deg=np.array(azimuths_deg, np.float64),
         object_index=object_index,
-        object_names=tuple(names[int(object_id)] for object_id in known_ids),
+        object_names=tuple(names[i] for i in first),
     )
     return loaded, np.array(view_ids, np.int64)
+
+
+def _unpacked(kind: Descriptor, packed: Sequence[bytes]) -> NDArray[np.uint8]:
+    if kind.name == DESCRIPTOR:
+        return hbr.unpack_rows(b"".join(packed))
+    return np.stack([kind.unpack(levels) for levels in packed])
+
+
+def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> DescriptorOutdated:
+    versions = connection.scalars(
+        select(descriptors.c.version).where(descriptors.c.name == kind.name).distinct().order_by(descriptors.c.version)
+    ).all()
+    found = f"by {kind.name} {', '.join(map(str, versions))}" if versions else f"by no {kind.name} at all"
+    shown = ", ".join(map(repr, sorted(names)[:3]))
+    option = "" if kind.name == DESCRIPTOR else f" --descriptor {kind.name}"
+    return DescriptorOutdated(
+        f"{shown}{' and others' if len(names) > 3 else ''} cannot be compared: this program compares {kind.name} "
+        f"{kind.version}, the catalog is described {found}",
+        next_step=f"describe the stored images anew: rig catalog redescribe{option}",
+        evidence={"objects": len(names), "versions": list(versions), "version": kind.version},
+    )
 
 
 def _sitting(row: Row[Any]) -> Sitting:
@@ -164,4 +237,5 @@ def _sitting(row: Row[Any]) -> Sitting:
         id=row.id,
         started_utc=row.started_utc,
         provenance=Provenance(bench=row.bench, devices=row.devices, conditions=row.conditions, software=row.software),
+        reference_image=row.reference_image,
     )

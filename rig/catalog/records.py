@@ -19,6 +19,8 @@ from rig.errors import UsageError
 MAX_NAME_LENGTH: Final = 100
 
 JsonObject = Mapping[str, Any]
+Region = tuple[int, int, int, int]
+"""Part of an image: x, y, width, height in pixels."""
 
 
 class EnrollmentStatus(StrEnum):
@@ -30,7 +32,8 @@ class EnrollmentStatus(StrEnum):
     SUPERSEDED = "superseded"
 
 
-def _software() -> str:
+def this_software() -> str:
+    """Return the name and version of this program."""
     try:
         return f"hbr-rig {metadata.version('hbr-rig')}"
     except metadata.PackageNotFoundError:
@@ -61,7 +64,7 @@ class Provenance:
     bench: str
     devices: JsonObject
     conditions: JsonObject = field(default_factory=dict)
-    software: str = field(default_factory=_software)
+    software: str = field(default_factory=this_software)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "devices", as_json(self.devices, "the identities of the devices"))
@@ -70,11 +73,15 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class Sitting:
-    """An uninterrupted part of an enrollment; the bench clock of its views has one origin."""
+    """An uninterrupted part of an enrollment; the bench clock of its views has one origin.
+
+    `reference_image` shows the empty table, relative to the catalog's folder, where one was stored.
+    """
 
     id: int
     started_utc: datetime
     provenance: Provenance
+    reference_image: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,17 +93,24 @@ class ViewRecord:
     index
         Place in the plan of the enrollment, from 0.
     commanded_deg, encoder_deg
-        Table angle asked for and read, unwrapped.
+        Table angle asked for and read, unwrapped; None of views that no bench has taken.
     azimuth_deg
         Orientation of the camera around the object, in [0, 360).
     descriptor : uint8 array (144,)
-        CEDD levels 0..7.
+        CEDD levels 0..7; None of a stored view that has none (`rig catalog redescribe`).
     captured_ns
-        Start of the exposure on the bench's clock.
+        Start of the exposure on the bench's clock; None of views that no bench has taken.
     imu_deg, imu_sigma_deg
         Table angle by the IMU, unwrapped, and its standard uncertainty; both None where there is none.
     evidence
         The numbers it was judged by (sharpness, exposure, settling, locks), units in the keys, as JSON values.
+    region
+        The part of the image that is described: x, y, width, height in pixels; None for all of it.
+    front_end
+        What found the object in the image and balanced its colours, or why it did not, as JSON values; None where
+        nothing tried.
+    further : mapping of name to uint8 array
+        Levels by further descriptors (`hbr.descriptors`), to be stored beside CEDD.
 
     Raises
     ------
@@ -105,18 +119,22 @@ class ViewRecord:
     """
 
     index: int
-    commanded_deg: float
-    encoder_deg: float
+    commanded_deg: float | None
+    encoder_deg: float | None
     azimuth_deg: float
-    descriptor: NDArray[np.uint8]
-    captured_ns: int
+    descriptor: NDArray[np.uint8] | None
+    captured_ns: int | None
     imu_deg: float | None = None
     imu_sigma_deg: float | None = None
     evidence: JsonObject = field(default_factory=dict)
+    region: Region | None = None
+    front_end: JsonObject | None = None
+    further: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("index", "captured_ns"):
-            object.__setattr__(self, name, operator.index(getattr(self, name)))
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, operator.index(getattr(self, name)))
         for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):
             value = getattr(self, name)
             if value is None:
@@ -140,6 +158,12 @@ class ViewRecord:
                 next_step="give the standard uncertainty, which is not negative",
             )
         object.__setattr__(self, "evidence", as_json(self.evidence, f"the evidence of view {self.index}"))
+        if self.front_end is not None:
+            object.__setattr__(
+                self, "front_end", as_json(self.front_end, f"what the front end says of view {self.index}")
+            )
+        if self.region is not None:
+            object.__setattr__(self, "region", tuple(operator.index(number) for number in self.region))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +175,7 @@ class StoredView:
     enrollment_id: int
     sitting: Sitting
     record: ViewRecord
-    captured_utc: datetime
+    captured_utc: datetime | None
     image: str
     image_sha256: str
     image_bytes: int
@@ -186,6 +210,7 @@ class ObjectSummary:
     enrolled_utc: datetime | None
     views: int
     unfinished_views: int | None
+    deleted_utc: datetime | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,6 +4,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from sqlalchemy import (
+    DDL,
     JSON,
     BigInteger,
     CheckConstraint,
@@ -21,6 +22,7 @@ from sqlalchemy import (
     Text,
     TypeDecorator,
     UniqueConstraint,
+    event,
 )
 
 from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
@@ -28,12 +30,11 @@ from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
 
-SCHEMA_VERSION: Final = 1
-"""Version of the tables below (`PRAGMA user_version`)."""
+SCHEMA_VERSION: Final = 2
+"""Version of the tables below (`PRAGMA user_version`); `rig.catalog.migrations` has a step from each one before."""
 
-DESCRIPTOR_KIND: Final = "cedd"
-DESCRIPTOR_VERSION: Final = 1
-"""Raised when `hbr.describe` changes its answer for an image."""
+DESCRIPTOR: Final = "cedd"
+"""What objects are retrieved by where nobody says otherwise (`hbr.descriptors`)."""
 
 
 class Utc(TypeDecorator[datetime]):
@@ -64,12 +65,15 @@ objects = Table(
     "objects",
     METADATA,
     Column("id", Integer, primary_key=True),
-    Column("name", String(MAX_NAME_LENGTH), nullable=False, unique=True),
+    Column("name", String(MAX_NAME_LENGTH), nullable=False),
     Column("label", Text, nullable=False),
     Column("note", Text, nullable=False),
     Column("created_utc", Utc, nullable=False),
+    Column("deleted_utc", Utc),  # what was deleted is kept until it is collected (`gc`)
     sqlite_autoincrement=True,
 )
+
+Index("uq_objects_name", objects.c.name, unique=True, sqlite_where=objects.c.deleted_utc.is_(None))
 
 _STATUSES = ", ".join(f"'{status}'" for status in EnrollmentStatus)
 
@@ -104,6 +108,10 @@ sittings = Table(
     Column("software", Text, nullable=False),
     Column("devices", JSON, nullable=False),
     Column("conditions", JSON, nullable=False),
+    # the empty table as this sitting's camera saw it
+    Column("reference_image", Text),
+    Column("reference_image_sha256", String(64)),
+    Column("reference_image_bytes", Integer),
 )
 
 views = Table(
@@ -113,8 +121,8 @@ views = Table(
     Column("enrollment_id", ForeignKey("enrollments.id"), nullable=False),
     Column("view_index", Integer, CheckConstraint("view_index >= 0", name="view_index"), nullable=False),
     Column("sitting_id", ForeignKey("sittings.id"), nullable=False, index=True),
-    Column("commanded_deg", Float, nullable=False),
-    Column("encoder_deg", Float, nullable=False),
+    Column("commanded_deg", Float),  # NULL: unknown, of views that no bench has taken
+    Column("encoder_deg", Float),
     Column("imu_deg", Float),
     Column("imu_sigma_deg", Float),
     Column(
@@ -123,15 +131,48 @@ views = Table(
         CheckConstraint("azimuth_deg >= 0 AND azimuth_deg < 360", name="azimuth_deg"),
         nullable=False,
     ),
-    Column("descriptor_kind", Text, nullable=False),
-    Column("descriptor_version", Integer, nullable=False),
-    Column("descriptor", LargeBinary, CheckConstraint("length(descriptor) = 54", name="descriptor"), nullable=False),
-    Column("captured_utc", Utc, nullable=False),
-    Column("captured_ns", BigInteger, nullable=False),
+    Column("captured_utc", Utc),
+    Column("captured_ns", BigInteger),
     Column("image", Text, nullable=False),
     Column("image_sha256", String(64), nullable=False),
     Column("image_bytes", Integer, nullable=False),
     Column("evidence", JSON, nullable=False),
+    Column("front_end", JSON(none_as_null=True)),
     UniqueConstraint("enrollment_id", "view_index"),
     sqlite_autoincrement=True,
 )
+
+# Levels of different versions must not be compared; `settings` say which part of the image they are of.
+descriptors = Table(
+    "descriptors",
+    METADATA,
+    Column("view_id", ForeignKey("views.id"), primary_key=True),
+    Column("name", Text, primary_key=True),
+    Column("version", Integer, primary_key=True),
+    Column("settings", JSON, nullable=False),
+    Column("packed", LargeBinary, nullable=False),
+    sqlite_with_rowid=False,
+)
+
+audit = Table(
+    "audit",
+    METADATA,
+    Column("id", Integer, primary_key=True),
+    Column("time_utc", Utc, nullable=False),
+    Column("user", Text, nullable=False),
+    Column("host", Text, nullable=False),
+    Column("software", Text, nullable=False),
+    Column("action", Text, nullable=False),
+    Column("object_name", Text),
+    Column("details", JSON, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+APPEND_ONLY: Final = tuple(
+    f"CREATE TRIGGER audit_no_{change.lower()} BEFORE {change} ON audit "
+    "BEGIN SELECT RAISE(ABORT, 'the audit log is only appended to'); END"
+    for change in ("UPDATE", "DELETE")
+)
+
+for _trigger in APPEND_ONLY:
+    event.listen(audit, "after_create", DDL(_trigger))  # type: ignore[no-untyped-call]

@@ -1,0 +1,66 @@
+"""Who did what, when: a log that is only appended to, in the transaction of the change itself."""
+
+import os
+import pwd
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import Connection, insert, select
+
+from rig.catalog.records import JsonObject, as_json, this_software
+from rig.catalog.schema import audit
+from rig.clock import Clock
+
+
+@dataclass(frozen=True, slots=True)
+class AuditEntry:
+    """One thing that was done, by which user of which computer, with which program, to which object."""
+
+    id: int
+    time_utc: datetime
+    user: str
+    host: str
+    software: str
+    action: str
+    object_name: str | None
+    details: JsonObject
+
+
+def append(connection: Connection, clock: Clock, action: str, object_name: str | None = None, **details: Any) -> None:
+    """Log an action within the transaction that carries it out."""
+    connection.execute(
+        insert(audit).values(
+            time_utc=clock.utc(),
+            user=_user(),
+            host=socket.gethostname(),
+            software=this_software(),
+            action=action,
+            object_name=object_name,
+            details=as_json(details, "the details for the log"),
+        )
+    )
+
+
+def entries(connection: Connection, since: datetime | None = None, object_name: str | None = None) -> list[AuditEntry]:
+    """Return the log, oldest first."""
+    wanted = select(audit).order_by(audit.c.id)
+    if since is not None:
+        wanted = wanted.where(audit.c.time_utc >= since)
+    if object_name is not None:
+        wanted = wanted.where(audit.c.object_name == object_name)
+    return [AuditEntry(**_fields(row._mapping)) for row in connection.execute(wanted)]
+
+
+def _fields(row: Mapping[Any, Any]) -> dict[str, Any]:
+    return {str(key): value for key, value in row.items()}
+
+
+def _user() -> str:
+    # the account, not LOGNAME, which anybody may set
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return str(os.getuid())

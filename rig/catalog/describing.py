@@ -1,0 +1,76 @@
+"""From a stored image to the descriptors that the catalog keeps of it."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.descriptors import Descriptor, descriptor, names
+from rig.catalog.records import JsonObject, Region
+from rig.errors import CatalogError, UsageError
+
+
+def known_descriptor(name: str) -> Descriptor:
+    """Return the descriptor of this name; a `UsageError` lists those there are."""
+    try:
+        return descriptor(name)
+    except ValueError as error:
+        raise UsageError(f"there is no descriptor {name!r}", next_step=f"choose one of {', '.join(names())}") from error
+
+
+def settings_of(region: Region | None) -> dict[str, Any]:
+    """Return the settings of a descriptor as they are stored with it."""
+    return {} if region is None else {"region": list(region)}
+
+
+def region_of(settings: JsonObject) -> Region | None:
+    """Return the part of the image that a stored descriptor is of; None for all of it.
+
+    Raises
+    ------
+    CatalogError
+        It was described in a way that this program does not know.
+    """
+    match dict(settings):
+        case {} if not settings:
+            return None
+        case {"region": [int(x), int(y), int(width), int(height)], **other} if not other:
+            return x, y, width, height
+    raise CatalogError(
+        f"a view is described with settings that this program does not know: {dict(settings)}",
+        next_step="update hbr-rig on this computer, or describe the views anew: rig catalog redescribe",
+    )
+
+
+def within(image_bgr: NDArray[np.uint8], region: Region | None) -> NDArray[np.uint8]:
+    """Return the part of an image, uint8 (h, w, 3).
+
+    Raises
+    ------
+    UsageError
+        The region does not lie within the image.
+    """
+    if region is None:
+        return image_bgr
+    x, y, width, height = region
+    if min(x, y) < 0 or min(width, height) < 1 or x + width > image_bgr.shape[1] or y + height > image_bgr.shape[0]:
+        raise UsageError(
+            f"the region {list(region)} does not lie within an image of {image_bgr.shape[1]}x{image_bgr.shape[0]}",
+            next_step="give a region within the images: x, y, width, height in pixels",
+        )
+    return image_bgr[y : y + height, x : x + width]
+
+
+def packed_rows(
+    levels: NDArray[np.uint8], further: Mapping[str, NDArray[np.uint8]], default: str, region: Region | None
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the descriptors of one view, without its id."""
+    for name, found in {default: levels, **further}.items():
+        kind = known_descriptor(name)
+        yield {
+            "name": name,
+            "version": kind.version,
+            "settings": settings_of(region),
+            "packed": kind.pack(found),
+        }

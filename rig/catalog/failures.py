@@ -1,0 +1,87 @@
+"""What goes wrong with a catalog, in words."""
+
+import errno
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from sqlalchemy.exc import DBAPIError
+
+from rig.errors import CatalogBusy, CatalogError, RigError
+
+DATABASE_NAME: Final = "catalog.sqlite"
+
+
+@contextmanager
+def in_words(root: Path, busy_timeout_s: float) -> Iterator[None]:
+    """Turn the errors of SQLite and of the file system into those of the catalog in the folder ``root``."""
+    try:
+        yield
+    except (DBAPIError, sqlite3.Error) as error:
+        told = _of_sqlite(error.orig if isinstance(error, DBAPIError) else error, root, busy_timeout_s)
+        if told is None:
+            raise
+        raise told from error
+    except OSError as error:
+        raise _of_system(error, root) from error
+
+
+def absent(root: Path) -> CatalogError:
+    """Return the error that there is no catalog in a folder."""
+    if root.exists() and not root.is_dir():
+        return CatalogError(
+            f"{root} is a file, not the folder of a catalog", next_step="give the folder of the catalog"
+        )
+    return CatalogError(f"there is no catalog in {root}", next_step="check the path, or enroll an object to create it")
+
+
+def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -> RigError | None:
+    evidence = {"sqlite": str(error)}
+    match getattr(error, "sqlite_errorcode", 0) & 0xFF:
+        case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED | sqlite3.SQLITE_PROTOCOL:
+            return CatalogBusy(
+                f"another process is writing to the catalog {root} "
+                f"and was not done after {busy_timeout_s:g} s; nothing was changed",
+                next_step="wait until it is done and try again",
+                evidence=evidence,
+            )
+        case sqlite3.SQLITE_NOTADB:
+            return CatalogError(
+                f"{root / DATABASE_NAME} is not a catalog", next_step="give the folder of a catalog", evidence=evidence
+            )
+        case sqlite3.SQLITE_CORRUPT:
+            return CatalogError(
+                f"the catalog {root / DATABASE_NAME} is damaged",
+                next_step="copy the folder as it is, then restore the database from a backup",
+                evidence=evidence,
+            )
+        case sqlite3.SQLITE_FULL:
+            return _of_system(OSError(errno.ENOSPC, str(error)), root)
+        case sqlite3.SQLITE_CANTOPEN | sqlite3.SQLITE_READONLY | sqlite3.SQLITE_PERM:
+            return _of_system(OSError(errno.EACCES, str(error)), root)
+        case sqlite3.SQLITE_IOERR:
+            return _of_system(OSError(errno.EIO, str(error)), root)
+    return None
+
+
+def _of_system(error: OSError, root: Path) -> CatalogError:
+    evidence = {"errno": errno.errorcode.get(error.errno or 0, "unknown"), "system": str(error)}
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return CatalogError(
+            f"the disk of the catalog {root} is full; this change was not stored, all earlier ones are safe",
+            next_step="free some space, then go on with the enrollment",
+            evidence=evidence,
+        )
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return CatalogError(
+            f"no permission to use the catalog {root}",
+            next_step="have the folder and its files made writable for this user, or give another folder",
+            evidence=evidence,
+        )
+    return CatalogError(
+        f"the catalog {root} cannot be used: {error}",
+        next_step="check the folder and its disk; a catalog belongs on a local disk",
+        evidence=evidence,
+    )

@@ -1,0 +1,105 @@
+"""Brings a catalog of an earlier version up to date, with a backup."""
+
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from os import PathLike
+from pathlib import Path
+
+from sqlalchemy import Connection, NullPool, create_engine
+
+from rig.catalog import audit, migrations
+from rig.catalog.database import is_there, version_of
+from rig.catalog.failures import DATABASE_NAME, absent, in_words
+from rig.catalog.schema import SCHEMA_VERSION
+from rig.clock import Clock
+from rig.errors import CatalogDamaged
+from rig.files import sync_file, sync_folder
+
+
+@dataclass(frozen=True, slots=True)
+class Migration:
+    """From which version to which; `backup` is the database as it was, None where nothing was to be done."""
+
+    before: int
+    after: int
+    backup: Path | None
+
+
+def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 5.0) -> Migration:
+    """Bring the catalog in the folder ``path`` to the version of this program, in one transaction.
+
+    The database as it was stays beside it, ``catalog-v1-20260131T120000Z.sqlite``; images are not touched.
+
+    Raises
+    ------
+    CatalogError
+        There is no catalog, it is of a newer version, or the disk is full or fails.
+    CatalogDamaged
+        Its rows do not refer to each other as they should; nothing was changed.
+    CatalogBusy
+        Another process kept the catalog for longer than the timeout.
+    """
+    root = Path(path).expanduser().absolute()
+    with in_words(root, busy_timeout_s):
+        if not is_there(root):
+            raise absent(root)
+        file = root / DATABASE_NAME
+        engine = create_engine(
+            "sqlite://",
+            creator=partial(sqlite3.connect, file, timeout=busy_timeout_s, isolation_level=None),
+            poolclass=NullPool,
+        )
+        with engine.connect() as connection:
+            connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # tables that others refer to are replaced
+            connection.exec_driver_sql("PRAGMA synchronous = FULL")
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+            try:
+                done = _migrate(connection, root, file, clock)
+            except BaseException:
+                connection.exec_driver_sql("ROLLBACK")
+                raise
+            connection.exec_driver_sql("COMMIT")
+    return done
+
+
+def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Migration:
+    before = version_of(connection, root)
+    if before == SCHEMA_VERSION:
+        return Migration(before, before, None)
+    backup = root / f"catalog-v{before}-{clock.utc():%Y%m%dT%H%M%SZ}.sqlite"
+    _back_up(file, backup)
+    _run_steps(connection, before)
+    if broken := connection.exec_driver_sql("PRAGMA foreign_key_check").all():
+        raise CatalogDamaged(
+            f"{len(broken)} rows of the catalog {root} refer to others that are missing; it was left as it is",
+            next_step="restore the catalog from a backup, or ask for help with a copy of it",
+            evidence={"tables": sorted({row[0] for row in broken})},
+        )
+    connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
+    audit.append(connection, clock, "migrated", before=before, after=SCHEMA_VERSION, backup=backup.name)
+    return Migration(before, SCHEMA_VERSION, backup)
+
+
+def _back_up(file: Path, backup: Path) -> None:
+    part = backup.with_suffix(".part")
+    part.unlink(missing_ok=True)
+    with closing(sqlite3.connect(file)) as source, closing(sqlite3.connect(part)) as target:
+        source.backup(target)
+    sync_file(part)
+    part.replace(backup)
+    sync_folder(backup.parent)
+
+
+def _run_steps(connection: Connection, before: int) -> None:
+    # imported here: alembic is needed once in the life of a catalog
+    from alembic.migration import MigrationContext
+    from alembic.operations import Operations
+    from alembic.script import ScriptDirectory
+
+    folder = str(Path(migrations.__file__).parent)
+    steps = ScriptDirectory(folder, version_locations=[folder])
+    with Operations.context(MigrationContext.configure(connection)):
+        for step in reversed(list(steps.iterate_revisions(str(SCHEMA_VERSION), str(before)))):
+            step.module.upgrade()
