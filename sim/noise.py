@@ -31,6 +31,10 @@ class NoiseModel:
     """Standard deviation of the zero-rate output from part to part (specified within ±20 °/s)."""
     gyro_bias_walk_dps_rts: float = 0.0003
     """Random walk of the bias, per square root of a second."""
+    gyro_bias_slope_dps_c: float = 0.02
+    """Standard deviation of the zero rate's slope over temperature (specified: ±20 °/s between −40 and 85 °C)."""
+    imu_warm_up_c: float = 5.0
+    """How much warmer than its surroundings the sensor gets after power-on."""
     gyro_scale_error: float = 0.01
     """Standard deviation of the relative scale error (specified within ±3 %)."""
     accel_noise_g_rthz: float = 0.0004

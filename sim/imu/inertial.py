@@ -10,15 +10,18 @@ from scipy.signal import butter, lfilter, lfilter_zi
 from sim.motion import Floats
 from sim.world import World
 
+WARM_UP_S = 300.0
+"""Time constant of the warming up, of a sensor on a small board in still air."""
+
 
 class InertialModel:
     """Rate and specific force at the sensor of one part, drawn from the world's noise model.
 
     The rate is the table's, about the vertical as the mounting tilt shows it to the sensor, averaged over each internal
-    sample, so that a knock is felt however short it is; with a scale error for each axis, a bias that walks, and white
-    noise of the given one-sided density. The force is gravity with a bias and white noise. Both pass a second-order
-    Butterworth low-pass. Left out: the centripetal and tangential acceleration of a sensor off the axis (1 cm at
-    90 °/s: 2.5 mg).
+    sample, so that a knock is felt however short it is; with a scale error for each axis, a bias that walks and follows
+    the sensor's own warming up, and white noise of the given one-sided density. The force is gravity with a bias and
+    white noise. Both pass a second-order Butterworth low-pass. Left out: the centripetal and tangential acceleration of
+    a sensor off the axis (1 cm at 90 °/s: 2.5 mg).
 
     Parameters
     ----------
@@ -31,8 +34,9 @@ class InertialModel:
     ----------
     up : float64 (3,)
         The vertical in the sensor's axes.
-    gyro_gain, gyro_bias_dps, accel_bias_g : float64 (3,)
-        Truth that tests compare with and may set; the gyro's bias walks on from it.
+    gyro_gain, gyro_bias_dps, gyro_slope_dps_c, accel_bias_g : float64 (3,)
+        Truth that tests compare with and may set; the gyro's bias walks on from it, and grows by the slope with every
+        degree of warmth.
     """
 
     def __init__(self, world: World, name: str) -> None:
@@ -44,6 +48,8 @@ class InertialModel:
         self.accel_bias_g: Floats = noise.accel_bias_g * part.standard_normal(3)
         roll, pitch = (radians(noise.imu_tilt_deg * z) for z in part.standard_normal(2))
         self.up: Floats = np.array([-sin(pitch), sin(roll) * cos(pitch), cos(roll) * cos(pitch)])
+        self.gyro_slope_dps_c: Floats = noise.gyro_bias_slope_dps_c * part.standard_normal(3)
+        self._powered_ns = world.clock.now_ns()
         self._density: Floats = np.repeat([noise.gyro_noise_dps_rthz, noise.accel_noise_g_rthz], 3)
         self.restart()
 
@@ -52,6 +58,11 @@ class InertialModel:
         self._last_ns = self._world.clock.now_ns()
         self._last_deg = self._world.table_deg()
         self._filter_state: Floats | None = None
+
+    def warmth_c(self, times_ns: NDArray[np.int64]) -> Floats:
+        """Return how much warmer than its surroundings the sensor is at the given times, (n,)."""
+        since_s = np.maximum(times_ns - self._powered_ns, 0) * 1e-9
+        return -self._world.noise.imu_warm_up_c * np.expm1(-since_s / WARM_UP_S)
 
     def sample(self, times_ns: NDArray[np.int64], rate_hz: float, bandwidth_hz: float) -> tuple[Floats, Floats]:
         """Return rate (°/s) and specific force (g), each (n, 3), at consecutive internal sample times.
@@ -72,6 +83,7 @@ class InertialModel:
 
         felt = np.empty((n, 6))
         felt[:, :3] = rate_dps[:, None] * (self.gyro_gain * self.up) + bias
+        felt[:, :3] += self.warmth_c(times_ns)[:, None] * self.gyro_slope_dps_c
         felt[:, 3:] = self.up + self.accel_bias_g
         b, a, settled = _low_pass(rate_hz, bandwidth_hz)
         state = settled * felt[0] if self._filter_state is None else self._filter_state

@@ -55,10 +55,10 @@ Words = np.ndarray[tuple[int, int], np.dtype[np.int16]]
 class SimMpu6050:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
-    World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `clock_error` (how much too fast its
-    clock runs, relatively; set before it wakes, or by `run_clock`), `who_am_i` (a clone answers otherwise),
-    `power_cycle`, and `distortions`, each of which is given the samples' words, int16 (n, 7), and returns those that
-    are kept.
+    World side: `inertial` (bias, gain and vertical of this part, and its warmth), `temperature_c` (of its
+    surroundings), `clock_error` (how much too fast its clock runs, relatively; set before it wakes, or by `run_clock`),
+    `who_am_i` (a clone answers otherwise), `power_cycle`, and `distortions`, each of which is given the samples' words,
+    int16 (n, 7), and returns those that are kept.
     """
 
     def __init__(self, world: World, *, ad0: bool = False, who_am_i: int = 0x68) -> None:
@@ -181,8 +181,11 @@ class SimMpu6050:
         first = max(self._taken, due - FIFO_SIZE // 2)  # the FIFO holds no more: a frame has a word at least
         self._taken = due
         ticks = np.arange(first * decimation + 1, due * decimation + 1)
-        gyro, accel = self.inertial.sample(self._epoch_ns + tick_ns * ticks, internal_hz, BANDWIDTH_HZ[filter_setting])
-        words = self._quantised(gyro[decimation - 1 :: decimation], accel[decimation - 1 :: decimation])
+        times_ns = self._epoch_ns + tick_ns * ticks
+        gyro, accel = self.inertial.sample(times_ns, internal_hz, BANDWIDTH_HZ[filter_setting])
+        kept = slice(decimation - 1, None, decimation)
+        die_c = self.temperature_c + self.inertial.warmth_c(times_ns[kept])
+        words = self._quantised(gyro[kept], accel[kept], die_c)
         for distort in self.distortions:
             words = distort(words)
         registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = words[-1].tobytes()
@@ -194,11 +197,11 @@ class SimMpu6050:
                 del self._fifo[:-FIFO_SIZE]
                 registers[INT_STATUS] |= FIFO_OFLOW
 
-    def _quantised(self, gyro: Floats, accel: Floats) -> Words:
+    def _quantised(self, gyro: Floats, accel: Floats, die_c: Floats) -> Words:
         """Return the samples (n, 7) as the big-endian words of the data registers, saturated."""
         values = np.empty((len(gyro), 7))
         values[:, :3] = accel * LSB_PER_G[self._registers[ACCEL_CONFIG] >> 3 & 3]
-        values[:, 3] = (self.temperature_c - 36.53) * 340
+        values[:, 3] = (die_c - 36.53) * 340
         values[:, 4:] = gyro * LSB_PER_DPS[self._registers[GYRO_CONFIG] >> 3 & 3]
         words: Words = np.clip(np.rint(values), -32768, 32767).astype(">i2")
         return words
