@@ -1,0 +1,238 @@
+"""Who answers on a servo bus and on an I2C bus, by questions that change nothing."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from errno import EBUSY, ENXIO, EREMOTEIO
+
+import serial
+from dynamixel_sdk import COMM_RX_CORRUPT, Protocol2PacketHandler
+from smbus2 import SMBus
+
+from rig.clock import Clock
+from rig.devices.dynamixel.bus import DynamixelBus
+from rig.devices.dynamixel.port import ClockedPort, LineBabble, Wire
+from rig.devices.dynamixel.registers import model_numbers
+from rig.errors import DeviceRefused, DeviceSilent
+from rig.host import Host
+
+BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
+"""What servos of Protocol 2.0 are set to: the factory's first, then by how common they are."""
+BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9_600)
+"""The same for Protocol 1.0."""
+
+_ANSWER_1_S = 0.02
+"""How long a servo of Protocol 1.0 and its adapter take to answer; each id is asked by itself there."""
+_STATUS_READS = 8
+_STATUS = (120, 27)
+"""Realtime Tick to Present Temperature: two servos with one id do not agree on these for long."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundServo:
+    """A servo that answered; ``model`` is None where no control table is known for its number."""
+
+    bus_id: int
+    baud: int
+    protocol: int
+    model: str | None
+    model_number: int
+    firmware: int
+
+    def __str__(self) -> str:
+        name = self.model.replace("_", "-").upper() if self.model else f"unknown model {self.model_number}"
+        return f"{name}, firmware {self.firmware}, id {self.bus_id} at {self.baud} baud (protocol {self.protocol}.0)"
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What one baud rate brought.
+
+    ``doubtful`` are ids under which something answers that is no whole packet, time after time: two servos with one
+    id. ``noise`` is True where bytes came that belong to no id: another baud rate, another master, a bad line.
+    """
+
+    baud: int
+    protocol: int
+    servos: tuple[FoundServo, ...] = ()
+    doubtful: tuple[int, ...] = ()
+    noise: bool = False
+
+    @property
+    def anything(self) -> bool:
+        return bool(self.servos or self.doubtful)
+
+
+def scan_servos(wire: Wire, clock: Clock, bauds: Sequence[int] = BAUD_RATES, *, protocol: int = 2) -> Iterator[Heard]:
+    """Ask at each baud rate who is there, and yield what was heard; at last the wire has the baud rate it had.
+
+    Takes about a second a baud rate, four at 9,600; with Protocol 1.0, where each id is asked, five.
+
+    Raises
+    ------
+    serial.SerialException, OSError
+        The adapter was pulled out.
+    """
+    before = wire.baudrate
+    try:
+        for baud in bauds:
+            port = ClockedPort(wire, clock)
+            try:
+                port.setBaudRate(baud)
+            except (ValueError, NotImplementedError):  # this adapter has no such rate
+                continue
+            yield _heard_2(port, baud) if protocol == 2 else _heard_1(port, baud)
+    finally:
+        with suppress(serial.SerialException, OSError, ValueError):
+            wire.baudrate = before
+
+
+def spoiled_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) -> int:
+    """Return how many of some reads of a servo's status came back spoiled; the bus must not retry by itself."""
+    spoiled = 0
+    address, size = _STATUS if bus.protocol == 2 else (36, 8)
+    for _ in range(reads):
+        try:
+            bus.read_block(bus_id, address, size)
+        except DeviceRefused:
+            continue
+        except DeviceSilent:
+            spoiled += 1
+    return spoiled
+
+
+def _heard_2(port: ClockedPort, baud: int) -> Heard:
+    try:
+        answers, result = Protocol2PacketHandler().broadcastPing(port)
+    except LineBabble:
+        return Heard(baud, 2, noise=True)
+    finally:
+        port.is_using = False
+    port.drain()
+    servos = [_servo(bus_id, baud, 2, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
+    bus = DynamixelBus(port, retries=0)
+    doubtful = [servo.bus_id for servo in servos if spoiled_reads(bus, servo.bus_id) > _STATUS_READS // 2]
+    if result == COMM_RX_CORRUPT:  # the answers of servos with one id fall into each other: each id is asked by itself
+        doubtful += [bus_id for bus_id in range(253) if bus_id not in answers and _spoils(bus, bus_id)]
+    return Heard(baud, 2, tuple(servos), tuple(sorted(doubtful)), result == COMM_RX_CORRUPT and not doubtful)
+
+
+def _heard_1(port: ClockedPort, baud: int) -> Heard:
+    servos = []
+    doubtful = []
+    bus = DynamixelBus(_Hasty(port), retries=0, protocol=1)
+    for bus_id in range(253):
+        corrupt = bus.statistics.corrupt
+        try:
+            head = bus.read_block(bus_id, 0, 3)
+        except DeviceRefused:
+            continue
+        except DeviceSilent:
+            if bus.statistics.corrupt > corrupt and _spoils(bus, bus_id):
+                doubtful.append(bus_id)
+            continue
+        servos.append(_servo(bus_id, baud, 1, int.from_bytes(head[:2], "little"), head[2]))
+    return Heard(baud, 1, tuple(servos), tuple(doubtful), len(doubtful) == 253)
+
+
+class _Hasty(ClockedPort):
+    """A port that waits for an answer no longer than a servo and its adapter take."""
+
+    def __init__(self, port: ClockedPort) -> None:
+        super().__init__(port.ser, port.clock)
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802 - the SDK's name
+        self.setPacketTimeoutMillis(packet_length * self.tx_time_per_byte + 1e3 * _ANSWER_1_S)
+
+
+def _servo(bus_id: int, baud: int, protocol: int, number: int, firmware: int) -> FoundServo:
+    return FoundServo(bus_id, baud, protocol, model_numbers().get(number), number, firmware)
+
+
+def _spoils(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
+    """Return whether something answers an id every time, and never with a whole packet."""
+    for _ in range(pings):
+        corrupt = bus.statistics.corrupt
+        try:
+            bus.ping(bus_id)
+        except DeviceRefused:
+            return False
+        except DeviceSilent:
+            if bus.statistics.corrupt == corrupt:
+                return False
+        else:
+            return False
+    return True
+
+
+# -- I2C --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Chip:
+    """A kind of sensor: where it may be, and the register that says which it is."""
+
+    name: str
+    driver: str | None
+    addresses: tuple[int, ...]
+    register: int
+    value: int
+
+
+CHIPS = (
+    Chip("MPU-6050", "mpu6050", (0x68, 0x69), 0x75, 0x68),
+    Chip("MPU-6500", None, (0x68, 0x69), 0x75, 0x70),
+    Chip("MPU-9250", None, (0x68, 0x69), 0x75, 0x71),
+    Chip("MPU-9255", None, (0x68, 0x69), 0x75, 0x73),
+    Chip("ICM-20948", None, (0x68, 0x69), 0x00, 0xEA),
+    Chip("BNO055", "bno055", (0x28, 0x29), 0x00, 0xA0),
+    Chip("LSM6DSOX", None, (0x6A, 0x6B), 0x0F, 0x6C),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundImu:
+    """Somebody at an address where IMUs are; ``driver`` is None where the rig has none for it, or it is unknown.
+
+    ``trouble`` says what else was found there: an unknown chip, a kernel driver that holds the address.
+    """
+
+    bus: str
+    address: int
+    name: str
+    driver: str | None
+    trouble: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.trouble}" if self.trouble else "")
+
+
+def scan_imus(host: Host, bus: int | str) -> list[FoundImu]:
+    """Return who answers at the addresses that IMUs have; no other address is asked, and nothing is written.
+
+    Raises
+    ------
+    OSError
+        The bus cannot be opened, or does not move.
+    """
+    name = host.i2c_name(bus)
+    found = []
+    with SMBus(host.i2c_path(bus)) as wire:
+        for address in sorted({address for chip in CHIPS for address in chip.addresses}):
+            said: dict[int, int] = {}
+            try:
+                for register in sorted({chip.register for chip in CHIPS if address in chip.addresses}):
+                    said[register] = wire.read_byte_data(address, register)
+            except OSError as error:
+                if error.errno == EBUSY:
+                    found.append(FoundImu(name, address, "something", None, "a driver of the kernel holds the address"))
+                elif error.errno not in (ENXIO, EREMOTEIO):
+                    raise
+                continue
+            chips = [c for c in CHIPS if address in c.addresses and said[c.register] == c.value]
+            if chips:
+                found.append(FoundImu(name, address, chips[0].name, chips[0].driver))
+            else:
+                values = ", ".join(f"register {register:#04x} is {value:#04x}" for register, value in said.items())
+                found.append(FoundImu(name, address, "unknown chip", None, values))
+    return found

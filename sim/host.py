@@ -1,0 +1,143 @@
+"""The computer that a simulated bench hangs on: files as Linux lays them out, and the simulated wires behind them."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rig.config import RigConfig
+from rig.devices.dynamixel import settings
+from rig.devices.dynamixel.bus import DynamixelBus
+from rig.devices.dynamixel.port import ClockedPort, Wire
+from rig.devices.dynamixel.registers import control_table, protocol_of
+from rig.devices.opencv_camera import Capture
+from rig.errors import DeviceNotFound
+from rig.host import SERIAL_NAMES, LinuxHost, User
+from sim.parts import SimParts
+
+
+class Computer:
+    """Lays out, below a folder, what Linux shows of devices: device files, sysfs, /proc and /etc/group."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._usb = 0
+        for folder in ("dev", "proc", "sys/class"):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+
+    def write(self, path: str, text: str = "") -> Path:
+        file = self.root / path.lstrip("/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding="utf-8")
+        return file
+
+    def link(self, path: str, target: Path) -> None:
+        file = self.root / path.lstrip("/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.symlink_to(target)
+
+    def group(self, name: str, gid: int, *members: str) -> None:
+        """Add a line to /etc/group."""
+        known = (self.root / "etc/group").read_text() if (self.root / "etc/group").exists() else ""
+        self.write("etc/group", f"{known}{name}:x:{gid}:{','.join(members)}\n")
+
+    def process(self, pid: int, command: str, *holds: str) -> None:
+        """Add a process with device files open."""
+        self.write(f"proc/{pid}/cmdline", command.replace(" ", "\0") + "\0")
+        for number, path in enumerate(holds, start=3):
+            self.link(f"proc/{pid}/fd/{number}", self.root / path.lstrip("/"))
+
+    def serial_port(
+        self,
+        name: str = "ttyUSB0",
+        *,
+        serial: str = "SIM00001",
+        latency_ms: int | None = 1,
+        mode: int = 0o660,
+        by_id: str | None = None,
+    ) -> None:
+        """Plug in a U2D2 (an FTDI adapter); ``by_id`` is its stable name."""
+        self._usb += 1
+        usb = f"sys/devices/usb1/1-{self._usb}"
+        facts = {"idVendor": "0403", "idProduct": "6014", "manufacturer": "FTDI", "product": "USB <-> Serial Converter"}
+        for key, value in {**facts, "serial": serial}.items():
+            self.write(f"{usb}/{key}", f"{value}\n")
+        port = self.root / usb / f"1-{self._usb}:1.0" / name
+        port.mkdir(parents=True)
+        self.link(f"sys/class/tty/{name}/device", port)
+        if latency_ms is not None:
+            self.write(f"sys/bus/usb-serial/devices/{name}/latency_timer", f"{latency_ms}\n")
+        self.write(f"dev/{name}").chmod(mode)
+        by_id = by_id or f"/dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_{serial}-if00-port0"
+        self.link(by_id, self.root / "dev" / name)
+
+    def i2c_bus(self, number: int = 1, name: str = "bcm2835 (i2c@7e804000)", *, mode: int = 0o660) -> None:
+        self.write(f"sys/class/i2c-dev/i2c-{number}/name", f"{name}\n")
+        self.write(f"dev/i2c-{number}").chmod(mode)
+
+    def camera(self, number: int = 0, name: str = "HD Webcam", *, index: int = 0, mode: int = 0o660) -> None:
+        """Plug in a camera's node; those with an index above 0 carry no images."""
+        self.write(f"sys/class/video4linux/video{number}/name", f"{name}\n")
+        self.write(f"sys/class/video4linux/video{number}/index", f"{index}\n")
+        self.write(f"dev/video{number}").chmod(mode)
+        self.link(f"dev/v4l/by-id/usb-{name.replace(' ', '_')}-video-index{number}", self.root / f"dev/video{number}")
+
+    def keeps_time(self, synchronised: bool = True) -> None:
+        """Run a service that asks time servers."""
+        (self.root / "run/systemd/timesync").mkdir(parents=True, exist_ok=True)
+        if synchronised:
+            self.write("run/systemd/timesync/synchronized")
+
+
+class SimHost(LinuxHost):
+    """A laid-out computer with the simulated devices at the places where ``config`` looks for them."""
+
+    def __init__(self, root: Path, parts: SimParts, config: RigConfig, user: User | None = None) -> None:
+        super().__init__(root, parts.world.clock, user or User.current())
+        self.parts = parts
+        self._port = config.servo.port
+        self._bus = self.i2c_name(config.imu.bus)
+
+    def open_wire(self, path: str, baud: int) -> Wire:
+        if self._at(path).resolve() != self._at(self._port).resolve():
+            raise DeviceNotFound(f"There is no port {path}.", next_step="Plug the adapter in.", evidence={"port": path})
+        self.parts.open_wires()
+        self.parts.adapter.baudrate = baud
+        return self.parts.adapter
+
+    def i2c_path(self, bus: int | str) -> str:
+        return self.parts.i2c.path if self.i2c_name(bus) == self._bus else self.i2c_name(bus)
+
+    def open_capture(self, source: int | str) -> Capture:
+        if not self.parts.camera.reopen():
+            raise DeviceNotFound(f"There is no camera {source}.", next_step="Plug the camera in.")
+        return self.parts.camera
+
+
+@contextmanager
+def simulated_host(config: RigConfig, parts: SimParts) -> Iterator[SimHost]:
+    """Yield the computer of a simulated bench, its servo set up as the bench does when it is opened."""
+    with TemporaryDirectory(prefix="sim-host-") as folder:
+        computer = Computer(Path(folder))
+        name = Path(config.servo.port).name
+        stable = config.servo.port.startswith("/dev/serial/by-id/")
+        if SERIAL_NAMES.fullmatch(name):
+            computer.serial_port(name)
+        else:
+            computer.serial_port(by_id=config.servo.port if stable else None)
+            if not stable:
+                computer.link(config.servo.port, Path(folder, "dev/ttyUSB0"))
+        number = re.search(r"(\d+)$", str(config.imu.bus))
+        computer.i2c_bus(int(number[1]) if number else 1)
+        number = re.search(r"(\d+)$", str(config.camera.source))
+        computer.camera(int(number[1]) if number else 0)
+        computer.keeps_time()
+        _set_up(parts, config.servo.id, config.servo.model)
+        yield SimHost(Path(folder), parts, config)
+
+
+def _set_up(parts: SimParts, bus_id: int, model: str) -> None:
+    bus = DynamixelBus(ClockedPort(parts.adapter, parts.world.clock), protocol=protocol_of(model))
+    table = control_table(model)
+    settings.write(bus, bus_id, table, settings.compare(bus, bus_id, table))
