@@ -65,6 +65,7 @@ class SimCapture:
     Frame k is exposed from k / 30 s on and arrives `READOUT_NS` after its exposure. Up to four frames that nobody
     fetches are kept, the oldest; then new ones are lost until there is room, as V4L2 does. A frame is drawn when it is
     retrieved, from the world's past at its own exposure, so frames that are dropped cost nothing and change nothing.
+    There are two modes, 640x480 and 320x240, chosen by the width.
     Properties follow OpenCV's V4L2 backend: its units, False from `set` and 0 from `get` for what the camera lacks.
 
     Attributes
@@ -92,6 +93,7 @@ class SimCapture:
         self.tampers: list[Callable[[Image, int], Image]] = []
         self._world = world
         self._clock = world.clock
+        self._binning = 1
         self._sensor = Sensor(world.noise, world.rng("camera"))
         self._backdrop = empty_platter()
         self._open = self._plugged = True
@@ -170,8 +172,8 @@ class SimCapture:
         self._meter()
         now = self._controls[-1][1]
         values: dict[int, float] = {
-            cv2.CAP_PROP_FRAME_WIDTH: WIDTH,
-            cv2.CAP_PROP_FRAME_HEIGHT: HEIGHT,
+            cv2.CAP_PROP_FRAME_WIDTH: WIDTH // self._binning,
+            cv2.CAP_PROP_FRAME_HEIGHT: HEIGHT // self._binning,
             cv2.CAP_PROP_FPS: FPS,
             cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else start_ns(self._grabbed) * 1e-6,
             cv2.CAP_PROP_BUFFERSIZE: now.buffers,
@@ -190,6 +192,10 @@ class SimCapture:
         self._meter()
         now = self._controls[-1][1]
         match prop:
+            case cv2.CAP_PROP_FRAME_WIDTH if value in (WIDTH, WIDTH // 2):
+                if value != self.get(prop):
+                    self._binning = round(WIDTH / value)
+                    self._sensor = Sensor(self._world.noise, self._world.rng("camera"), self._binning)
             case cv2.CAP_PROP_FRAME_WIDTH | cv2.CAP_PROP_FRAME_HEIGHT | cv2.CAP_PROP_FPS:
                 return value == self.get(prop)
             case cv2.CAP_PROP_BUFFERSIZE if _BUFFERS_RANGE[0] <= value <= _BUFFERS_RANGE[1]:

@@ -31,21 +31,24 @@ class Sensor:
         Its imperfections.
     rng
         Draws the noise that all frames take their part of.
+    binning
+        Of how many pixels, along each side, one is made.
     """
 
-    def __init__(self, noise: NoiseModel, rng: np.random.Generator) -> None:
+    def __init__(self, noise: NoiseModel, rng: np.random.Generator, binning: int = 1) -> None:
+        self._size = width, height = WIDTH // binning, HEIGHT // binning
         self._noise = noise
         levels_per_e = 255 / (noise.full_well_e or NoiseModel().full_well_e)
         self._shot = levels_per_e if noise.full_well_e else 0.0
-        self._dark_variance = np.full((HEIGHT, WIDTH, 3), (levels_per_e * noise.read_noise_e) ** 2, dtype=np.float32)
+        self._dark_variance = np.full((height, width, 3), (levels_per_e * noise.read_noise_e) ** 2, dtype=np.float32)
         noisy = noise.full_well_e > 0 or noise.read_noise_e > 0
-        shape = (HEIGHT + _TILE_MARGIN, WIDTH + _TILE_MARGIN, 3)
+        shape = (height + _TILE_MARGIN, width + _TILE_MARGIN, 3)
         self._tile = rng.standard_normal(shape, dtype=np.float32) if noisy else None
-        self._vignette = _vignette(noise.vignetting)
+        self._vignette = _vignette(noise.vignetting, width, height)
         self._light_key: Gains | None = None
-        self._light_map = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
+        self._light_map = np.empty((height, width, 3), dtype=np.float32)
         self._gain_key: Gains | None = None
-        self._gain_map = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
+        self._gain_map = np.empty((height, width, 3), dtype=np.float32)
 
     def expose(
         self,
@@ -56,7 +59,7 @@ class Sensor:
         gains: Gains,
         rng: np.random.Generator,
     ) -> Image:
-        """Return one frame, uint8 (480, 640, 3).
+        """Return one frame, uint8 (480, 640, 3), or smaller by the binning.
 
         Parameters
         ----------
@@ -77,22 +80,25 @@ class Sensor:
         if gains != self._gain_key:
             self._gain_key = gains
             self._gain_map[:] = gains
+        if scene.shape[1] != self._size[0]:
+            scene = cv2.resize(scene, self._size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         signal = cv2.multiply(scene, self._light_map, scale=max(flicker, 0.0) * exposure, dtype=cv2.CV_32F)
         if self._tile is not None:
+            width, height = self._size
             y, x = rng.integers(0, _TILE_MARGIN, 2, endpoint=True)
             # var = levels_per_e · signal + (levels_per_e · read noise)²: EMVA 1288, in grey levels
             sigma = cv2.scaleAdd(signal, self._shot, self._dark_variance)
             cv2.sqrt(sigma, dst=sigma)
-            cv2.multiply(sigma, self._tile[y : y + HEIGHT, x : x + WIDTH], dst=sigma)
+            cv2.multiply(sigma, self._tile[y : y + height, x : x + width], dst=sigma)
             cv2.add(signal, sigma, dst=signal)
         return np.asarray(cv2.multiply(signal, self._gain_map, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
-def _vignette(loss: float) -> NDArray[np.float32]:
+def _vignette(loss: float, width: int, height: int) -> NDArray[np.float32]:
     """Return the share of light that reaches each pixel, falling with the square of the distance from the middle."""
-    x = (np.arange(WIDTH) - (WIDTH - 1) / 2)[None, :, None]
-    y = (np.arange(HEIGHT) - (HEIGHT - 1) / 2)[:, None, None]
-    square = (x**2 + y**2) / (((WIDTH - 1) / 2) ** 2 + ((HEIGHT - 1) / 2) ** 2)
+    x = (np.arange(width) - (width - 1) / 2)[None, :, None]
+    y = (np.arange(height) - (height - 1) / 2)[:, None, None]
+    square = (x**2 + y**2) / (((width - 1) / 2) ** 2 + ((height - 1) / 2) ** 2)
     return np.repeat(1 - loss * square, 3, axis=2).astype(np.float32)
 
 
