@@ -1,0 +1,41 @@
+/* The rig head: talks to the host, and makes the bench safe when it must.
+ *
+ * Two contexts: `head_tick` in a timer interrupt, every TICK_US, holds the safety and never waits for the other;
+ * `head_step` in the main loop does everything else. What both touch is written with the tick kept out. */
+#ifndef HEAD_HEAD_H
+#define HEAD_HEAD_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "frame.h"
+#include "imu.h"
+
+struct head {
+    /* Shared with the tick. */
+    volatile uint8_t state, faults, inputs;
+    volatile bool changed;
+    volatile uint16_t silence; /* ticks since the last beat */
+    uint16_t deadman;          /* ticks that a silence may last */
+    uint8_t open_ticks;        /* how long the e-stop's loop has been open */
+    uint8_t light;
+
+    /* Main loop only. */
+    uint8_t reset_cause;
+    bool streaming;
+    uint8_t sequence; /* of the events */
+    uint8_t received[FRAME_LINE];
+    uint8_t received_length;
+    bool answered; /* the reply to the last request is kept, for a host that did not hear it */
+    uint8_t reply[FRAME_MAX];
+    uint8_t reply_length;
+    uint8_t request[FRAME_HEADER];
+    struct counters counters;
+    struct imu imu;
+};
+
+void head_init(struct head *head);
+void head_step(struct head *head);
+void head_tick(struct head *head);
+
+#endif

@@ -1,0 +1,411 @@
+#include "imu.h"
+
+#include <string.h>
+
+#include "hal.h"
+
+/* Register numbers: RM-MPU-6000A rev 4.2 and BST-BNO055-DS000. */
+#define MPU_SMPLRT_DIV 0x19
+#define MPU_FIFO_EN 0x23
+#define MPU_INT_PIN_CFG 0x37
+#define MPU_USER_CTRL 0x6A
+#define MPU_PWR_MGMT_1 0x6B
+#define MPU_FIFO_COUNTH 0x72
+#define MPU_FIFO_R_W 0x74
+#define MPU_WHO_AM_I 0x75
+#define MPU_ID 0x68
+#define MPU_FRAME 14   /* accelerometer, temperature, gyro: seven words */
+#define MPU_FULL 1008  /* the last count at which another frame fits into 1024 bytes, less one frame */
+
+#define BNO_CHIP_ID 0x00
+#define BNO_ACC_DATA 0x08
+#define BNO_TEMP 0x34
+#define BNO_UNIT_SEL 0x3B
+#define BNO_OPR_MODE 0x3D
+#define BNO_SYS_TRIGGER 0x3F
+#define BNO_ID 0xA0
+#define BNO_MODE_IMU 0x08
+#define BNO_BURST 18   /* accelerometer, magnetometer, gyro */
+#define BNO_GYRO 12
+#define BNO_PERIOD_US 10000 /* of its fusion */
+#define BNO_POLLS 100  /* between two looks at temperature and mode */
+
+#define ATTEMPTS 3
+#define TRANSFER_US 5000 /* the longest takes 0.6 ms at 400 kHz; a sensor may stretch the clock */
+#define LOOK_US 50000    /* without an edge, ask the FIFO itself: is the line not wired, or the sensor gone? */
+#define AGAIN_US 100000  /* between two tries to get a lost sensor back */
+
+enum phase {
+    OFF,
+    IDENTIFY,
+    IDENTIFIED,
+    WRITE,
+    WRITTEN,
+    WAITING,
+    VERIFIED,
+    MPU_RUN,
+    MPU_COUNTED,
+    MPU_FETCH,
+    MPU_FETCHED,
+    BNO_RUN,
+    BNO_READ,
+    BNO_LOOKED,
+    LOST,
+};
+
+/* A step of the set-up: bytes to write, the register first, and the wait after them. */
+struct step {
+    uint8_t length;
+    uint8_t bytes[5];
+    uint16_t wait_ms;
+};
+
+enum { MPU_STEP_SETTINGS = 2, MPU_STEP_EMPTY = 5 };
+
+static const struct step mpu_steps[] = {
+    {2, {MPU_PWR_MGMT_1, 0x80}, 100}, /* device reset */
+    {2, {MPU_PWR_MGMT_1, 0x01}, 50},  /* awake, clocked by the gyro */
+    {5, {MPU_SMPLRT_DIV, 0, 0, 0, 0}, 0},
+    {2, {MPU_FIFO_EN, 0xF8}, 0},            /* temperature, gyro, accelerometer */
+    {3, {MPU_INT_PIN_CFG, 0x00, 0x01}, 0},  /* a pulse of 50 us for each sample */
+    {2, {MPU_USER_CTRL, 0x04}, 0},          /* the FIFO can only be emptied while it is off */
+    {2, {MPU_USER_CTRL, 0x40}, 0},
+};
+
+static const struct step bno_steps[] = {
+    {2, {BNO_OPR_MODE, 0x00}, 20},
+    {2, {BNO_SYS_TRIGGER, 0x20}, 700}, /* reset: it does not answer for 650 ms */
+    {2, {BNO_UNIT_SEL, 0x01}, 0},      /* mg, degrees a second, degrees Celsius */
+    {2, {BNO_OPR_MODE, BNO_MODE_IMU}, 20},
+};
+
+static void count(uint16_t *counter) {
+    if (*counter != UINT16_MAX) {
+        ++*counter;
+    }
+}
+
+static bool passed(uint32_t now, uint32_t due) {
+    return (int32_t)(now - due) >= 0;
+}
+
+static bool is_mpu(const struct imu *imu) {
+    return imu->model == IMU_MODEL_MPU6050;
+}
+
+/* -- transfers --------------------------------------------------------------------------------------------------- */
+
+static void transfer(struct imu *imu, uint8_t write_length, uint8_t read_length) {
+    imu->began_us = hal_micros();
+    hal_i2c_start(imu->address, imu->sent, write_length, imu->got, read_length);
+}
+
+static void read_registers(struct imu *imu, uint8_t first, uint8_t length) {
+    imu->sent[0] = first;
+    transfer(imu, 1, length);
+}
+
+static void lost(struct imu *imu, uint8_t status) {
+    imu->status = status;
+    imu->attempts = 0;
+    imu->phase = LOST;
+    imu->due_us = hal_micros() + AGAIN_US;
+}
+
+static void empty_fifo(struct imu *imu) {
+    imu->frames = 0;
+    imu->at = MPU_STEP_EMPTY;
+    imu->phase = WRITE;
+}
+
+/* Whether the transfer has ended well. Where it failed, `again` is the phase that repeats it. */
+static bool ended(struct imu *imu, struct counters *counters, uint8_t again) {
+    enum hal_i2c_result result = hal_i2c_result();
+    uint8_t status = IMU_STATUS_ABSENT;
+    if (result == HAL_I2C_BUSY) {
+        if (!passed(hal_micros(), imu->began_us + TRANSFER_US)) {
+            return false;
+        }
+        count(&counters->timeouts);
+    }
+    if (result == HAL_I2C_DONE) {
+        imu->attempts = 0;
+        return true;
+    }
+    if (result == HAL_I2C_NACK) {
+        count(&counters->nacks);
+    } else if (hal_i2c_free()) {
+        count(&counters->recoveries);
+    } else {
+        status = IMU_STATUS_BUS_STUCK;
+    }
+    if (++imu->attempts >= ATTEMPTS) {
+        lost(imu, status);
+    } else if (again == MPU_FETCH && result != HAL_I2C_NACK) {
+        /* It broke off and took some of a frame along: what the FIFO holds no longer begins with one. */
+        empty_fifo(imu);
+    } else {
+        imu->phase = again;
+        imu->due_us = hal_micros();
+    }
+    return false;
+}
+
+/* -- setting up -------------------------------------------------------------------------------------------------- */
+
+void imu_init(struct imu *imu) {
+    memset(imu, 0, sizeof *imu);
+}
+
+uint8_t imu_setup(struct imu *imu, uint8_t model, uint8_t address, uint8_t divider, uint8_t filter, uint8_t range) {
+    if (model > IMU_MODEL_BNO055 || address < 0x08 || address > 0x77 || filter < 1 || filter > 6 || range > 3) {
+        return REFUSAL_OUT_OF_RANGE;
+    }
+    if (hal_i2c_result() == HAL_I2C_BUSY) {
+        hal_i2c_free();
+    }
+    imu_init(imu);
+    if (model == IMU_MODEL_NONE) {
+        return REFUSAL_NONE;
+    }
+    imu->status = IMU_STATUS_STARTING;
+    imu->phase = IDENTIFY;
+    imu->model = model;
+    imu->address = address;
+    imu->divider = divider;
+    imu->filter = filter;
+    imu->range = range;
+    imu->period_us = is_mpu(imu) ? (uint32_t)1000 * (divider + 1U) : BNO_PERIOD_US;
+    return REFUSAL_NONE;
+}
+
+/* Put the bytes of step `at` into `sent`; returns their number. */
+static uint8_t load_step(struct imu *imu) {
+    const struct step *step = is_mpu(imu) ? &mpu_steps[imu->at] : &bno_steps[imu->at];
+    memcpy(imu->sent, step->bytes, sizeof step->bytes);
+    if (is_mpu(imu) && imu->at == MPU_STEP_SETTINGS) {
+        imu->sent[1] = imu->divider;
+        imu->sent[2] = imu->filter;
+        imu->sent[3] = (uint8_t)(imu->range << 3);
+    }
+    return step->length;
+}
+
+static bool settings_kept(const struct imu *imu) {
+    if (!is_mpu(imu)) {
+        return (imu->got[0] & 0x0F) == BNO_MODE_IMU;
+    }
+    return imu->got[0] == imu->divider && imu->got[1] == imu->filter && imu->got[2] == imu->range << 3;
+}
+
+/* The sensor runs, for the first time or again: what it did not take meanwhile counts as lost. */
+static void run(struct imu *imu, struct counters *counters) {
+    uint32_t now = hal_micros(), edge_us;
+    if (imu->sampled) {
+        imu->newest = (uint16_t)(imu->newest + (now - imu->last_us) / imu->period_us);
+        if (imu->status != IMU_STATUS_RUNNING) {
+            count(&counters->restarts);
+        }
+    }
+    if (!imu->edges_come || imu->status != IMU_STATUS_RUNNING) {
+        imu->edges = hal_imu_edges(&edge_us);
+        imu->base = (uint16_t)(imu->newest - imu->edges);
+        imu->edges_come = false;
+    }
+    imu->status = IMU_STATUS_RUNNING;
+    imu->last_us = now;
+    imu->due_us = now + (is_mpu(imu) ? LOOK_US : imu->period_us);
+    imu->phase = is_mpu(imu) ? MPU_RUN : BNO_RUN;
+}
+
+/* -- sampling ---------------------------------------------------------------------------------------------------- */
+
+/* The FIFO's count is known: date what it holds. The newest sample belongs to the last edge if none came meanwhile. */
+static void look(struct imu *imu, struct counters *counters) {
+    uint32_t now = hal_micros(), edge_us;
+    uint16_t bytes = (uint16_t)(imu->got[0] << 8 | imu->got[1]);
+    uint16_t edges = hal_imu_edges(&edge_us);
+    uint8_t frames = (uint8_t)(bytes / MPU_FRAME);
+    imu->phase = MPU_RUN;
+    if (bytes > MPU_FULL) {
+        count(&counters->fifo_overflows);
+        empty_fifo(imu);
+        return;
+    }
+    if (edges != imu->edges && passed(edge_us, imu->began_us)) {
+        return; /* an edge came while we asked: whether the count knows of it cannot be told. Ask again */
+    }
+    if (!frames) {
+        bool silent = edges == imu->edges && passed(now, imu->last_us + LOOK_US + imu->period_us);
+        imu->edges = edges;
+        imu->due_us = now + (imu->edges_come ? LOOK_US : imu->period_us / 2);
+        if (silent) {
+            lost(imu, IMU_STATUS_SETTINGS_LOST); /* it takes no samples: browned out, it fell asleep */
+        }
+        return;
+    }
+    if (bytes % MPU_FRAME) { /* a frame that is just being written, or one that was cut */
+        if (++imu->polls > ATTEMPTS) {
+            imu->polls = 0;
+            empty_fifo(imu);
+        }
+        imu->due_us = now;
+        return;
+    }
+    imu->polls = 0;
+    uint16_t newest = (uint16_t)(imu->newest + frames);
+    if (edges != imu->edges) {
+        if (!imu->edges_come) {
+            imu->base = (uint16_t)(newest - edges);
+            imu->edges_come = true;
+        }
+        newest = (uint16_t)(imu->base + edges);
+        imu->newest_us = edge_us;
+    } else {
+        imu->edges_come = false;
+        imu->newest_us = now - imu->period_us / 2;
+    }
+    imu->newest = newest;
+    imu->edges = edges;
+    imu->frames = frames;
+    imu->due_us = now + (imu->edges_come ? LOOK_US : imu->period_us / 2);
+    imu->phase = MPU_FETCH;
+}
+
+static void mpu_sample(struct imu *imu, struct imu_sample *sample) {
+    uint8_t older = --imu->frames;
+    sample->index = (uint16_t)(imu->newest - older);
+    sample->time_us = imu->newest_us - older * imu->period_us;
+    sample->flags = imu->edges_come ? SAMPLE_FLAG_EDGE : 0;
+    for (uint8_t i = 0; i < 7; i++) {
+        sample->words[i] = (int16_t)(imu->got[2 * i] << 8 | imu->got[2 * i + 1]);
+    }
+    imu->last_us = sample->time_us;
+    imu->sampled = true;
+    imu->phase = imu->frames ? MPU_FETCH : MPU_RUN;
+}
+
+static void bno_sample(struct imu *imu, struct imu_sample *sample) {
+    sample->index = ++imu->newest;
+    sample->time_us = imu->began_us;
+    sample->flags = 0;
+    for (uint8_t i = 0; i < 3; i++) {
+        sample->words[i] = (int16_t)get_u16(imu->got + 2 * i);
+        sample->words[4 + i] = (int16_t)get_u16(imu->got + BNO_GYRO + 2 * i);
+    }
+    sample->words[3] = imu->temperature;
+    imu->last_us = imu->began_us;
+    imu->sampled = true;
+    imu->phase = BNO_RUN;
+}
+
+bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sample) {
+    uint32_t now = hal_micros(), edge_us;
+    switch (imu->phase) {
+    case IDENTIFY:
+        imu->at = 0;
+        read_registers(imu, is_mpu(imu) ? MPU_WHO_AM_I : BNO_CHIP_ID, 1);
+        imu->phase = IDENTIFIED;
+        break;
+    case IDENTIFIED:
+        if (ended(imu, counters, IDENTIFY)) {
+            imu->who_am_i = imu->got[0];
+            imu->phase = WRITE;
+            if (imu->who_am_i != (is_mpu(imu) ? MPU_ID : BNO_ID)) {
+                lost(imu, IMU_STATUS_WRONG_ID);
+            }
+        }
+        break;
+    case WRITE:
+        transfer(imu, load_step(imu), 0);
+        imu->phase = WRITTEN;
+        break;
+    case WRITTEN:
+        if (ended(imu, counters, WRITE)) {
+            const struct step *step = is_mpu(imu) ? &mpu_steps[imu->at] : &bno_steps[imu->at];
+            imu->due_us = now + (uint32_t)1000 * step->wait_ms;
+            imu->phase = WAITING;
+        }
+        break;
+    case WAITING:
+        if (!passed(now, imu->due_us)) {
+            break;
+        }
+        if (++imu->at < (is_mpu(imu) ? sizeof mpu_steps / sizeof *mpu_steps : sizeof bno_steps / sizeof *bno_steps)) {
+            imu->phase = WRITE;
+            break;
+        }
+        imu->at--;
+        read_registers(imu, is_mpu(imu) ? MPU_SMPLRT_DIV : BNO_OPR_MODE, is_mpu(imu) ? 3 : 1);
+        imu->phase = VERIFIED;
+        break;
+    case VERIFIED:
+        if (ended(imu, counters, WAITING)) {
+            if (settings_kept(imu)) {
+                run(imu, counters);
+            } else {
+                lost(imu, IMU_STATUS_SETTINGS_LOST);
+            }
+        }
+        break;
+    case MPU_RUN:
+        if (passed(now, imu->due_us) || hal_imu_edges(&edge_us) != imu->edges) {
+            read_registers(imu, MPU_FIFO_COUNTH, 2);
+            imu->phase = MPU_COUNTED;
+        }
+        break;
+    case MPU_COUNTED:
+        if (ended(imu, counters, MPU_RUN)) {
+            look(imu, counters);
+        }
+        break;
+    case MPU_FETCH:
+        read_registers(imu, MPU_FIFO_R_W, MPU_FRAME);
+        imu->phase = MPU_FETCHED;
+        break;
+    case MPU_FETCHED:
+        if (ended(imu, counters, MPU_FETCH)) {
+            mpu_sample(imu, sample);
+            return true;
+        }
+        break;
+    case BNO_RUN:
+        if (passed(now, imu->due_us)) {
+            while (passed(now, imu->due_us += imu->period_us)) {
+                imu->newest++; /* too late for this one */
+            }
+            read_registers(imu, BNO_ACC_DATA, BNO_BURST);
+            imu->phase = BNO_READ;
+        }
+        break;
+    case BNO_READ:
+        if (ended(imu, counters, BNO_RUN)) {
+            bno_sample(imu, sample);
+            if (imu->polls++ == 0) {
+                read_registers(imu, BNO_TEMP, BNO_OPR_MODE - BNO_TEMP + 1);
+                imu->phase = BNO_LOOKED;
+            } else if (imu->polls == BNO_POLLS) {
+                imu->polls = 0;
+            }
+            return true;
+        }
+        break;
+    case BNO_LOOKED:
+        if (ended(imu, counters, BNO_RUN)) {
+            imu->temperature = (int8_t)imu->got[0];
+            imu->phase = BNO_RUN;
+            if ((imu->got[BNO_OPR_MODE - BNO_TEMP] & 0x0F) != BNO_MODE_IMU) {
+                lost(imu, IMU_STATUS_SETTINGS_LOST);
+            }
+        }
+        break;
+    case LOST:
+        if (passed(now, imu->due_us)) {
+            imu->phase = IDENTIFY;
+        }
+        break;
+    default:
+        break;
+    }
+    return false;
+}

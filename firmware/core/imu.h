@@ -1,0 +1,49 @@
+/* Sampling of the IMU: sets the sensor up, reads it in the background, and gets it back when it is lost. */
+#ifndef HEAD_IMU_H
+#define HEAD_IMU_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "protocol.h"
+
+struct imu_sample {
+    uint16_t index;
+    uint32_t time_us;
+    uint8_t flags;
+    int16_t words[7]; /* accelerometer x, y, z; temperature; gyro x, y, z */
+};
+
+struct imu {
+    uint8_t status, who_am_i;
+
+    /* As asked for. */
+    uint8_t model, address, divider, filter, range;
+    uint32_t period_us;
+
+    /* Where we are. */
+    uint8_t phase;
+    uint8_t at;       /* step of the script */
+    uint8_t attempts; /* at the present transfer */
+    bool sampled;     /* there was a sample since the last set-up was asked for */
+    bool edges_come;  /* the data-ready line is wired */
+    uint8_t frames;   /* still to be read of the FIFO */
+    uint8_t polls;    /* MPU-6050: odd counts in a row; BNO055: samples since its mode was looked at */
+    uint16_t edges;   /* counted when the FIFO was last looked at */
+    uint16_t base;    /* added to the count of edges it makes the index */
+    uint16_t newest;  /* index of the newest sample that the sensor took */
+    uint32_t due_us, began_us, newest_us, last_us;
+    int16_t temperature;
+    uint8_t sent[6];
+    uint8_t got[20];
+};
+
+void imu_init(struct imu *imu);
+
+/* Begin to set the sensor up; returns a refusal. */
+uint8_t imu_setup(struct imu *imu, uint8_t model, uint8_t address, uint8_t divider, uint8_t filter, uint8_t range);
+
+/* Go on; true where `*sample` has a new one. */
+bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sample);
+
+#endif
