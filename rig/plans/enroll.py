@@ -1,6 +1,6 @@
 """The plan that enrolls an object: one turn, a checked view at every step, each durable before the table turns on."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 
 from hbr.angles import wrap360
 from rig.bench import Bench
@@ -8,6 +8,7 @@ from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.clock import seconds_between
 from rig.errors import RigError, RotationDisagreement
 from rig.plans.capture import capture, moved
+from rig.plans.estimate import even_azimuths, table_angles
 from rig.plans.events import Accepted, Enrolled, Event, Started, plain
 from rig.turntable import Move, Turntable
 from rig.view import Viewer
@@ -26,9 +27,9 @@ def enroll(
 ) -> Generator[Event, None, Enrolled]:
     """Enroll the object ``name`` with views at even steps; yields events and returns the last of them.
 
-    The table turns upwards from 0, so that its play is taken up; view k has the azimuth −k·360/views. An interrupted
-    enrollment keeps its views: ``resume`` takes the missing ones, of an object that nobody has moved since.
-    Closing the generator takes the torque off.
+    The table turns upwards from 0, so that its play is taken up; view k has the azimuth −k·360/views. Where the cable
+    does not reach for that, it begins further back. An interrupted enrollment keeps its views: ``resume`` takes the
+    missing ones, of an object that nobody has moved since. Closing the generator takes the torque off.
 
     Raises
     ------
@@ -54,12 +55,20 @@ def enroll(
         enrollment = catalog.resume(name, provenance=provenance)
         views = len(enrollment.planned_azimuth_deg)
     else:
-        planned_deg = [float(wrap360(-k * 360.0 / views)) for k in range(views)]
         enrollment = catalog.begin(
-            name, planned_azimuth_deg=planned_deg, provenance=provenance, label=label, note=note, replace=replace
+            name,
+            planned_azimuth_deg=even_azimuths(views, bench.config.table.limits_deg),
+            provenance=provenance,
+            label=label,
+            note=note,
+            replace=replace,
         )
+    angles_deg = table_angles(enrollment.planned_azimuth_deg, bench.config.table.limits_deg)
     missing = enrollment.missing()
-    yield Started("enroll", enrollment.object_name, len(missing), dict(provenance.conditions))
+    to_go = {index: angles_deg[index] for index in missing}
+    yield Started(
+        "enroll", enrollment.object_name, len(missing), dict(provenance.conditions), angles_deg=tuple(to_go.values())
+    )
     started_ns = bench.clock.now_ns()
     retakes = 0
     if missing:
@@ -69,21 +78,21 @@ def enroll(
             if not resume:
                 enrollment.discard()  # a mistyped name leaves nothing behind
             raise
-        retakes = yield from _take_views(bench, enrollment, missing)
+        retakes = yield from _take_views(bench, enrollment, to_go)
     enrollment.finish()
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done
     return done
 
 
-def _take_views(bench: Bench, enrollment: Enrollment, missing: tuple[int, ...]) -> Generator[Event, None, int]:
-    """Take and store the missing views, turn back to 0, and return how many frames were taken again."""
+def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float]) -> Generator[Event, None, int]:
+    """Take and store the views at these table angles, turn back to 0, and return how many frames were taken again."""
     viewer = Viewer(bench.camera, bench.config.view)
     retakes = 0
     imu = _ImuAngle()
     with Turntable(bench) as table:
-        for index in missing:
-            move = table.goto(index * 360.0 / len(enrollment.planned_azimuth_deg))
+        for index, angle_deg in angles_deg.items():
+            move = table.goto(angle_deg)
             yield moved(index, move)
             if move.agreement is None or not move.agreement.agrees:
                 raise _disagreement(move)
@@ -100,6 +109,7 @@ def _take_views(bench: Bench, enrollment: Enrollment, missing: tuple[int, ...]) 
                 imu_deg=imu.angle_deg,
                 imu_sigma_deg=imu.sigma_deg,
                 evidence=plain(shot.evidence),
+                region=bench.config.view.roi,
             )
             enrollment.add(record, shot.image_bgr)
             yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr)

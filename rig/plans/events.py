@@ -19,7 +19,8 @@ _OUTSIDE = {"json": False}
 class Started:
     """A plan begins: ``plan`` is "enroll" or "identify", ``views`` how many views it takes at most.
 
-    ``strategy`` and ``seed`` decide where an identification looks.
+    ``angles_deg`` are the table angles that an enrollment goes to; ``strategy`` and ``seed`` decide where an
+    identification looks.
     """
 
     plan: str
@@ -28,6 +29,7 @@ class Started:
     conditions: dict[str, Any]
     strategy: str | None = None
     seed: int | None = None
+    angles_deg: tuple[float, ...] = ()
     schema: int = SCHEMA
 
 
@@ -120,6 +122,57 @@ class Enrolled:
 
 
 @dataclass(frozen=True, slots=True)
+class Item:
+    """The next object of a tray, ``number`` (from 1) ``of`` so many.
+
+    ``action`` is "enroll", "resume" (the views that are missing), "anew" (an interrupted enrollment, of an object that
+    was moved since), or "skip", with the reason in ``why``.
+    """
+
+    number: int
+    of: int
+    name: str
+    action: str
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Resemblance:
+    """An enrolled object that looks the same from some sides.
+
+    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise; ``share`` of the views; ``similarity`` is the
+    largest of any two views.
+    """
+
+    name: str
+    arcs_deg: tuple[tuple[float, float], ...]
+    share: float
+    similarity: float
+
+
+@dataclass(frozen=True, slots=True)
+class Insight:
+    """What a new object will be taken for: itself, turned by ``period_deg``, and other objects.
+
+    ``period_deg`` is 360 where no turn makes it look the same, 0 where it looks alike from everywhere, None where there
+    are too few views to tell. ``neighbours`` is how alike neighbouring views are, ``alike`` those a period apart.
+    """
+
+    name: str
+    period_deg: float | None
+    neighbours: float | None
+    alike: float | None
+    lookalikes: tuple[Resemblance, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """Nothing happens until somebody does something: ``why`` says what."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
 class Identified:
     """The answer: an object's name, or None for "unknown".
 
@@ -141,7 +194,7 @@ class Identified:
     reason: str
 
 
-Event = Started | Moved | Rejected | Accepted | Ranked | Decided | Enrolled | Identified
+Event = Started | Moved | Rejected | Accepted | Ranked | Decided | Enrolled | Identified | Item | Insight | Waiting
 
 
 def event_dict(event: Event) -> dict[str, Any]:

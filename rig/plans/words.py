@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from rig.plans.events import Decided, Identified, Moved
+from rig.plans.events import Decided, Identified, Insight, Moved, Resemblance
 
 
 def decision_words(decided: Decided) -> str:
@@ -50,6 +50,37 @@ def answer_words(answer: Identified) -> str:
         if answer.margin <= 0 and len(answer.candidates) > 1:
             found += f"; not sure, {answer.candidates[1].name} looks as likely"
     return f"{found}. {sentence(answer.reason)}"
+
+
+def symmetry_words(insight: Insight) -> str:
+    """Return what an object's views say about its pose; nothing where they say nothing."""
+    if insight.period_deg is None or insight.neighbours is None or insight.alike is None:
+        return ""
+    numbers = f"similarity {insight.alike:.3f}, of neighbouring views {insight.neighbours:.3f}"
+    if insight.period_deg == 0:
+        return f"looks alike from everywhere (at least {numbers}): its pose will not be known"
+    if insight.period_deg < 360:
+        return f"looks the same every {insight.period_deg:g}° ({numbers}): its pose will be known up to that"
+    return ""
+
+
+def resemblance_words(one: Resemblance) -> str:
+    """Return from which sides an object looks like another one: "looks like mug-03 from 120–200°"."""
+    if one.arcs_deg == ((0.0, 360.0),):
+        return f"looks like {one.name} from all sides"
+    arcs = [f"{a:.0f}°" if a == b else f"{a:.0f}–{b:.0f}°" for a, b in one.arcs_deg]
+    several = f"{', '.join(arcs[:-1])} and {arcs[-1]}" if len(arcs) > 1 else arcs[0]
+    return f"looks like {one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {several}"
+
+
+def duration_words(seconds: float) -> str:
+    """Return a time as people read it: "43 s", "2 min 05 s", "1 h 20 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
 def sentence(words: str) -> str:

@@ -1,0 +1,136 @@
+"""How long an enrollment takes, and where the table goes for it: known before anything moves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+from hbr.angles import wrap360
+from rig.clock import seconds_between
+from rig.config import RigConfig
+from rig.devices.servo import MotionProfile
+from rig.errors import LimitExceeded
+from rig.plans.events import Accepted, Event
+from rig.turntable import FIRST_REST_S, motion_seconds
+
+RINGING_S: Final = 0.22
+"""How long a platter goes on ringing before encoder and gyro are quiet."""
+
+FRAMES: Final = 1.5
+"""Frames that pass until one was exposed whole after the table came to rest."""
+
+_FLOAT_DEG: Final = 1e-6
+
+
+def even_azimuths(views: int, limits_deg: tuple[float, float]) -> list[float]:
+    """Return the azimuths of ``views`` even steps of one turn, in the order in which the table takes them.
+
+    They begin at azimuth 0, where the cable's limits let the table turn up from 0; else further back.
+    """
+    step_deg = 360.0 / views
+    start_deg = 0.0
+    if 360.0 - step_deg > limits_deg[1]:
+        reach_deg = limits_deg[1] - (360.0 - step_deg)
+        start_deg = max(reach_deg // step_deg * step_deg, limits_deg[0])
+    return [float(wrap360(-(start_deg + k * step_deg))) for k in range(views)]
+
+
+def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float]) -> tuple[float, ...]:
+    """Return the table's angle, unwrapped, for each planned azimuth: upwards all the way, within the limits.
+
+    The table turns backwards under a camera that goes around, and upwards so that its play stays taken up.
+
+    Raises
+    ------
+    LimitExceeded
+        The cable does not reach for so many views in a row.
+    """
+    if not azimuth_deg:
+        return ()
+    angles = [-float(wrap360(azimuth_deg[0]))]
+    for before, after in pairwise(azimuth_deg):
+        angles.append(angles[-1] + float(wrap360(before - after)))
+    low, high = limits_deg
+    turns = [
+        whole
+        for whole in range(int(low // 360) - 1, int(high // 360) + 3)
+        if low - _FLOAT_DEG <= angles[0] + 360.0 * whole and angles[-1] + 360.0 * whole <= high + _FLOAT_DEG
+    ]
+    if not turns:
+        raise LimitExceeded(
+            f"The cable does not reach for these views: they take {angles[-1] - angles[0]:.0f}° in one direction.",
+            next_step="Widen table.limits_deg if the cable allows it, or enroll the object anew with --replace: "
+            "views planned on this bench fit its cable.",
+            evidence={
+                "from_deg": angles[0],
+                "to_deg": angles[-1],
+                "limits_deg": list(limits_deg),
+            },
+        )
+    nearest = min(turns, key=lambda whole: (abs(angles[0] + 360.0 * whole), whole))
+    return tuple(angle + 360.0 * nearest for angle in angles)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionModel:
+    """The time that moves and views take, from the table's profile and the camera's frame rate."""
+
+    config: RigConfig
+
+    def move_s(self, distance_deg: float) -> float:
+        """Return the time of a move by ``distance_deg`` until the table is at rest; downwards it goes a bit below."""
+        table = self.config.table
+        profile = MotionProfile(table.velocity_dps, table.acceleration_dps2)
+        seconds = 2 * table.quiet_s + RINGING_S + motion_seconds(distance_deg, profile)
+        if distance_deg < 0:
+            seconds += motion_seconds(table.approach_deg, profile) + 2 * table.poll_s
+        return seconds
+
+    @property
+    def view_s(self) -> float:
+        """The time until a frame is there."""
+        return FRAMES / self.config.camera.fps
+
+    def enrollment_s(self, start_deg: float, angles_deg: Sequence[float]) -> float:
+        """Return the time of views at these table angles, begun at ``start_deg``, and of the way back to 0."""
+        if not angles_deg:
+            return 0.0
+        stops = [start_deg, *angles_deg]
+        moves = sum(self.move_s(b - a) for a, b in pairwise(stops))
+        return FIRST_REST_S + moves + len(angles_deg) * self.view_s + self.move_s(-angles_deg[-1])
+
+
+class TimeLeft:
+    """Time left of an enrollment: the motion model, corrected by how long the views so far really took.
+
+    Parameters
+    ----------
+    model
+        Of the bench.
+    angles_deg
+        Table angles of the views to come, in their order.
+    """
+
+    def __init__(self, model: MotionModel, angles_deg: Sequence[float]) -> None:
+        self._model = model
+        self._angles_deg = angles_deg
+        self._done = 0
+        self._exposed_ns: list[int] = []
+
+    def add(self, event: Event) -> None:
+        """Take the next event of the plan."""
+        if isinstance(event, Accepted):
+            self._done += 1
+            self._exposed_ns.append(event.evidence.exposed_ns)
+
+    @property
+    def seconds(self) -> float:
+        """Time of the bench until the table is back at 0."""
+        model, done, angles = self._model, self._done, self._angles_deg
+        if not done:
+            return model.enrollment_s(angles[0] if angles else 0.0, angles)
+        left = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[done - 1 :]))
+        expected = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[:done]))
+        if done > 1 and expected > 0:
+            left *= seconds_between(self._exposed_ns[0], self._exposed_ns[-1]) / expected
+        return left + model.move_s(-angles[-1])
