@@ -16,10 +16,10 @@ from rig.clock import Clock
 from rig.devices.imu import ImuIdentity, ImuSamples
 from rig.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 
-_SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
+SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
 _USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W, _WHO_AM_I = 0x6A, 0x6B, 0x72, 0x74, 0x75
 
-_EXPECTED_ID = 0x68
+EXPECTED_ID = 0x68
 _DEVICE_RESET, _ASLEEP, _CLOCK_PLL_GYRO_X = 0x80, 0x40, 0x01
 _FIFO_ENABLE, _FIFO_RESET, _FIFO_GYRO_XYZ = 0x40, 0x04, 0x70
 _RESET_S, _START_S = 0.1, 0.05
@@ -29,13 +29,13 @@ _FRAME, _FIFO_FULL = 6, 1018
 """A frame of three words, and the last count at which another frame still fits into the 1024 bytes."""
 
 _ATTEMPTS, _RETRY_PAUSE_S = 3, 0.002
-_NOISE_DPS_RTHZ = 0.005
-_LSB_PER_G = 16384.0
-_LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
+NOISE_DPS_RTHZ = 0.005
+LSB_PER_G = 16384.0
+LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
 _FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}
 """DLPF_CFG by the gyro's bandwidth in Hz; all run at an internal rate of 1 kHz."""
 
-_OTHERS = {
+OTHERS = {
     0x70: "an MPU-6500 sold as an MPU-6050",
     0x71: "an MPU-9250",
     0x73: "an MPU-9255",
@@ -104,8 +104,8 @@ class Mpu6050:
         self._address = address
         self._range_dps = range_dps
         self._bus_name = bus if isinstance(bus, str) else f"/dev/i2c-{bus}"
-        self._settings = _settings(range_dps, rate_hz, bandwidth_hz)
-        self._period_ns = 1_000_000 * (1 + self._settings[_SMPLRT_DIV][0])
+        self._settings = settings(range_dps, rate_hz, bandwidth_hz)
+        self._period_ns = 1_000_000 * (1 + self._settings[SMPLRT_DIV][0])
         self._newest_ns = clock.now_ns()
         self.statistics = Mpu6050Statistics()
         self._bus = _open(self._bus_name)
@@ -122,7 +122,7 @@ class Mpu6050:
 
     @property
     def range_dps(self) -> float:
-        return 32767 / _LSB_PER_DPS[self._range_dps]
+        return 32767 / LSB_PER_DPS[self._range_dps]
 
     def close(self) -> None:
         self._bus.close()
@@ -154,7 +154,7 @@ class Mpu6050:
         data = self._pop(count) if count else b""
         if data is None:
             return self._start_over()
-        gyro = np.frombuffer(data, ">i2").reshape(-1, 3) / _LSB_PER_DPS[self._range_dps]
+        gyro = np.frombuffer(data, ">i2").reshape(-1, 3) / LSB_PER_DPS[self._range_dps]
         time_ns = np.empty(0, np.int64)
         if steps := samples + missing:
             newest_ns = self._newest_ns + steps * self._period_ns
@@ -166,7 +166,7 @@ class Mpu6050:
     def read_gravity_g(self) -> NDArray[np.float64]:
         """Return one accelerometer reading (3,), in g; raises as `read_samples` does."""
         self._check_settings()
-        return np.frombuffer(self._read(_ACCEL_XOUT_H, 6), ">i2") / _LSB_PER_G
+        return np.frombuffer(self._read(_ACCEL_XOUT_H, 6), ">i2") / LSB_PER_G
 
     def temperature_c(self) -> float:
         """Return the temperature of the sensor's die (register 65); raises as `read_samples` does."""
@@ -186,15 +186,15 @@ class Mpu6050:
                 "holds the address).",
                 evidence=silent.evidence,
             ) from silent
-        if got != _EXPECTED_ID:
-            likely = _OTHERS.get(got, "another chip; address 0x68 is also that of the clocks DS1307 and DS3231")
+        if got != EXPECTED_ID:
+            likely = OTHERS.get(got, "another chip; address 0x68 is also that of the clocks DS1307 and DS3231")
             raise DeviceMismatch(
                 f"WHO_AM_I at I2C address {self._address:#04x} of {self._bus_name} is {got:#04x}, "
-                f"expected {_EXPECTED_ID:#04x} (MPU-6050): probably {likely}",
+                f"expected {EXPECTED_ID:#04x} (MPU-6050): probably {likely}",
                 next_step="Check the wiring, or give the address of the MPU-6050; another chip needs its own driver.",
-                evidence={"got": got, "expected": _EXPECTED_ID},
+                evidence={"got": got, "expected": EXPECTED_ID},
             )
-        return ImuIdentity("MPU-6050", self._address, got, _NOISE_DPS_RTHZ)
+        return ImuIdentity("MPU-6050", self._address, got, NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
         self._write(_PWR_MGMT_1, _DEVICE_RESET)
@@ -278,14 +278,14 @@ class Mpu6050:
         ) from failure
 
 
-def _settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:
+def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:
     """Return the values to write, and to find again, by their first register."""
     mistakes: dict[str, Any] = {}
     divider = round(1000 / rate_hz) if 3.9 < rate_hz <= 1000 else 0
     if not (1 <= divider <= 256 and abs(1000 / divider - rate_hz) < 1e-6 * rate_hz):
         mistakes["rate_hz"] = f"{rate_hz:g}: give 1000 divided by a whole number up to 256"
-    if range_dps not in _LSB_PER_DPS:
-        mistakes["range_dps"] = f"{range_dps}: give one of {', '.join(map(str, _LSB_PER_DPS))}"
+    if range_dps not in LSB_PER_DPS:
+        mistakes["range_dps"] = f"{range_dps}: give one of {', '.join(map(str, LSB_PER_DPS))}"
     if bandwidth_hz not in _FILTERS:
         mistakes["bandwidth_hz"] = f"{bandwidth_hz}: give one of {', '.join(map(str, _FILTERS))}"
     if mistakes:
@@ -294,9 +294,9 @@ def _settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, by
             next_step="Correct these values of the IMU in the configuration.",
             evidence=mistakes,
         )
-    full_scale = list(_LSB_PER_DPS).index(range_dps) << 3
+    full_scale = list(LSB_PER_DPS).index(range_dps) << 3
     return {
-        _SMPLRT_DIV: bytes([divider - 1, _FILTERS[bandwidth_hz], full_scale, 0]),  # and CONFIG, GYRO_, ACCEL_CONFIG
+        SMPLRT_DIV: bytes([divider - 1, _FILTERS[bandwidth_hz], full_scale, 0]),  # and CONFIG, GYRO_, ACCEL_CONFIG
         _FIFO_EN: bytes([_FIFO_GYRO_XYZ]),
         _USER_CTRL: bytes([_FIFO_ENABLE, _CLOCK_PLL_GYRO_X]),  # and PWR_MGMT_1
     }
