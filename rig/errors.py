@@ -96,6 +96,13 @@ class DeviceFault(RigError):
     title = "device fault"
 
 
+class FirmwareMismatch(DeviceMismatch):
+    """The rig head's firmware and this program speak different versions of their protocol."""
+
+    code = 420
+    title = "other firmware"
+
+
 class LimitExceeded(RigError):
     """A motion would leave the table's limits (its cable)."""
 
@@ -206,6 +213,27 @@ class StateNotKept(RigError):
 
     code = 515
     title = "bench state"
+
+
+class EmergencyStop(RigError):
+    """The e-stop is pressed, or its loop is open: the rig head has switched off light and servo power."""
+
+    code = 520
+    title = "e-stop"
+
+
+class HostWasSilent(RigError):
+    """The rig head heard nothing from this computer for too long, and made the bench safe by itself."""
+
+    code = 521
+    title = "deadman"
+
+
+class HeadRestarted(RigError):
+    """The rig head restarted in the middle of its work (brown-out, watchdog, reset): its outputs went off."""
+
+    code = 522
+    title = "rig head restarted"
 
 
 class ViewRejected(RigError):
