@@ -88,7 +88,7 @@ def live(bench: Bench, *, turns: int = 8) -> Generator[Moved | Fact, None, Fact]
     each_way = max(ceil(turns * 360 / (ends_deg[1] - ends_deg[0]) / 2), MIN_LEGS)
     when_utc = bench.clock.utc()
     legs: list[Leg] = []
-    with Turntable(bench) as table:
+    with Turntable(bench, trust_gyro=False) as table:
         start_deg = min(max(table.rest_deg, low_deg), high_deg)
         may_return = True
         try:

@@ -21,6 +21,8 @@ from rig.devices.servo import Servo
 from rig.errors import ConfigError, RigError
 from rig.facts import FactStore, State, apparatus, put_in_force
 from rig.facts.store import CALIBRATIONS
+from rig.safety import Safety
+from rig.state import MemoryStore, StateStore
 
 GROUP = "rig.benches"
 
@@ -45,7 +47,8 @@ class Bench(AbstractContextManager["Bench"]):
     """The open devices of one bench, on one clock.
 
     ``conditions`` says under which noise model or calibration the bench works, ``findings`` what opening it revealed
-    that a person should know; both are kept with every enrollment. ``wires`` is what must be closed after the devices.
+    that a person should know; both are kept with every enrollment. ``state`` is where the table's turns and faults
+    outlive the program, ``wires`` what must be closed after the devices.
     """
 
     name: str
@@ -57,8 +60,13 @@ class Bench(AbstractContextManager["Bench"]):
     operator: Operator = field(default_factory=ObjectStandsThere)
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
+    state: StateStore = field(default_factory=MemoryStore, repr=False)
     wires: ExitStack = field(default_factory=ExitStack, repr=False)
+    safety: Safety = field(init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.safety = Safety(self.servo, self.config, self.clock, self.state)
 
     def __enter__(self) -> Self:
         return self
@@ -97,7 +105,6 @@ class Bench(AbstractContextManager["Bench"]):
             "imu": _plain(self.imu.identity),
             "camera": _plain(self.camera.identity),
         }
-
 
     def apparatus(self, *parts: str) -> dict[str, Any]:
         """Return what a calibration of some of the devices (all of them by default) is bound to."""

@@ -14,6 +14,7 @@ from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
 from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
+from rig.state import BenchLock, FileStore, StateStore
 
 
 class NoOptions(Section):
@@ -27,18 +28,39 @@ class HardwareBench:
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:  # noqa: ARG002
         """Open the real devices on the system's clock; it has no options, and ``seed`` no meaning."""
+        clock, state_path = SystemClock(), config.state_path("hardware")
         with ExitStack() as wires:
+            wires.callback(BenchLock(state_path, clock).close)
             wire = open_serial(config.servo.port, config.servo.baud)
             wires.callback(wire.close)
             capture = open_capture(config.camera.source)
             wires.callback(capture.release)
-            bench = assemble("hardware", config, SystemClock(), wire=wire, i2c_bus=config.imu.bus, capture=capture)
+            bench = assemble(
+                "hardware",
+                config,
+                clock,
+                wire=wire,
+                i2c_bus=config.imu.bus,
+                capture=capture,
+                state=FileStore(state_path),
+            )
             bench.wires = wires.pop_all()
             return bench
 
 
-def assemble(name: str, config: RigConfig, clock: Clock, *, wire: Wire, i2c_bus: int | str, capture: Capture) -> Bench:
+def assemble(
+    name: str,
+    config: RigConfig,
+    clock: Clock,
+    *,
+    wire: Wire,
+    i2c_bus: int | str,
+    capture: Capture,
+    state: StateStore,
+) -> Bench:
     """Put the drivers on their wires; a simulated bench is assembled by the same lines as a real one.
+
+    Nothing moves, and torque stays as it was found; whether the table may move is then known (`Bench.safety`).
 
     Raises
     ------
@@ -63,11 +85,16 @@ def assemble(name: str, config: RigConfig, clock: Clock, *, wire: Wire, i2c_bus:
             settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
             name=f"camera {config.camera.source}",
         )
+        findings += tuple(
+            f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}"
+            for n in camera.not_taken
+        )
+        bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state)
+        bench.safety.connect()
+        bench.safety.checks.append(imu.read_samples)
+        bench.findings += bench.safety.findings
         opened.pop_all()
-    findings += tuple(
-        f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}" for n in camera.not_taken
-    )
-    return Bench(name, config, clock, servo, imu, camera, findings=findings)
+    return bench
 
 
 HARDWARE: BenchKind = HardwareBench()

@@ -227,8 +227,13 @@ class GyroHeading:
         self._restart()
         return rotation
 
-    def since_rest(self) -> Rotation:
-        """Return the rotation since the last `end`, by the samples collected so far.
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest sample collected; 0 where there is none."""
+        return int(self._time_ns[-1]) if self._time_ns.size else 0
+
+    def since_rest(self, until_ns: int | None = None) -> Rotation:
+        """Return the rotation since the last `end`, by the samples collected so far (those until ``until_ns``).
 
         Raises
         ------
@@ -237,8 +242,12 @@ class GyroHeading:
         """
         if self.bias is None:
             raise NotReady("the gyro's bias is not known", next_step="Measure it at rest first.")
-        duration_s = self._count / self._imu.rate_hz
-        angle_deg = self._to_table * (self._sum_dps / self._imu.rate_hz - self.bias.rate_dps * duration_s)
+        count, sum_dps = self._count, self._sum_dps
+        if until_ns is not None:
+            later = self._rate_dps[np.searchsorted(self._time_ns, until_ns, side="right") :]
+            count, sum_dps = count - later.size, sum_dps - float(later.sum())
+        duration_s = count / self._imu.rate_hz
+        angle_deg = self._to_table * (sum_dps / self._imu.rate_hz - self.bias.rate_dps * duration_s)
         drift_deg = abs(self._to_table) * hypot(self._arw * sqrt(duration_s), self.bias.sigma_dps * duration_s)
         sigma_deg = hypot(drift_deg, self._scale_sigma * angle_deg)
         return Rotation(angle_deg, sigma_deg, duration_s, not self._trouble, self._trouble)

@@ -1,17 +1,29 @@
 """The table: goes to an angle, always from the same side, and knows when it is at rest and how far it really turned."""
 
 from collections import deque
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from math import ceil, floor, isfinite, sqrt
+from math import ceil, copysign, floor, isfinite, sqrt
 from types import TracebackType
 from typing import Self
 
 from rig.bench import Bench
 from rig.clock import seconds_between
-from rig.devices.servo import MotionProfile, ServoState
-from rig.errors import DeviceFault, LimitExceeded, MotionTimeout, NotReady, RigError
+from rig.devices.servo import MotionProfile
+from rig.errors import (
+    DeviceRefused,
+    DeviceSilent,
+    FollowingError,
+    LimitExceeded,
+    MotionTimeout,
+    NoProgress,
+    NotReady,
+    RigError,
+    SupplyLost,
+    WatchdogTripped,
+)
 from rig.heading import Agreement, GyroHeading, Rotation, Stillness, compare, finite
+from rig.watch import SlipWatch, Watch, unfit
 
 QUIET_COUNTS = 3
 """Encoder counts that readings at rest may differ by: one of quantisation, the rest of its noise."""
@@ -21,6 +33,9 @@ FIRST_REST_S = 0.6
 
 SETTLE_ALLOWANCE_S = 2.5
 """Time for ringing to die down and for a slow bus, on top of the motion's own."""
+
+STOP_ALLOWANCE_S = 0.5
+"""Time for a stop on top of its ramp; then the torque goes off anyhow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +76,24 @@ def motion_seconds(distance_deg: float, profile: MotionProfile) -> float:
 class Turntable(AbstractContextManager["Turntable"]):
     """The table of an open bench, with torque on for the length of a ``with`` block.
 
-    Entering moves nothing: the servo is told to hold where it is. Leaving, on whatever way, takes the torque off.
+    Entering moves nothing: whether the table may move is asked of `rig.safety`, then the servo is told to hold where it
+    is. Leaving, on whatever way, takes the torque off.
+
+    Parameters
+    ----------
+    bench
+        An open one.
+    trust_gyro
+        Whether a motion is broken off when the gyro contradicts the encoder; a calibration of the gyro does not.
     """
 
-    def __init__(self, bench: Bench) -> None:
+    def __init__(self, bench: Bench, *, trust_gyro: bool = True) -> None:
         self._config = bench.config.table
+        self._limits = bench.config.safety
         self._servo = bench.servo
         self._clock = bench.clock
+        self._safety = bench.safety
+        self._trust_gyro = trust_gyro
         imu = bench.config.imu
         self._heading = GyroHeading(
             bench.imu,
@@ -80,9 +106,9 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._profile: MotionProfile | None = None
         self._rest_deg = 0.0
         self._play_taken_up = False
-        self._broken_off = False
 
     def __enter__(self) -> Self:
+        self._safety.prepare()
         try:
             self._servo.torque_on()
             # After torque on, which clears the watchdog: one that trips sets the profile back to unlimited.
@@ -94,7 +120,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         except BaseException:
             self.__exit__(None, None, None)
             raise
-        self._broken_off = False
         return self
 
     def __exit__(
@@ -103,6 +128,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._profile = None
         try:
             self._servo.torque_off()
+            self._safety.released()
         except RigError:
             if error is None:
                 raise
@@ -114,14 +140,15 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def angle_deg(self) -> float:
         """Return the table's angle by the encoder, now."""
-        return self._to_table(self._servo.read_state().position_deg)
+        return self._safety.reference.to_table(self._servo.read_state().position_deg)
 
     def check_target(self, target_deg: float) -> None:
         """Raise `LimitExceeded` where the cable does not reach."""
         low, high = self._config.limits_deg
         if not low <= target_deg <= high:
             raise LimitExceeded(
-                f"The table cannot turn to {target_deg:.1f}°: its cable reaches from {low:g}° to {high:g}°.",
+                f"The table cannot turn from {self._rest_deg:.1f}° to {target_deg:.1f}°: "
+                f"its cable reaches from {low:g}° to {high:g}° ({low / 360:+.2f} to {high / 360:+.2f} turns).",
                 next_step="Give an angle within the limits, or the same view a turn earlier (subtract or add 360).",
                 evidence={"from_deg": round(self._rest_deg, 2), "to_deg": target_deg, "limits_deg": [low, high]},
             )
@@ -137,6 +164,11 @@ class Turntable(AbstractContextManager["Turntable"]):
         turns = range(ceil((low - target_deg) / 360), floor((high - target_deg) / 360) + 1)
         return min((target_deg + 360 * k for k in turns), key=lambda angle: abs(angle - self._rest_deg))
 
+    def unwound_deg(self) -> float:
+        """Return the angle equivalent to the present rest with the cable unwound: within half a turn of 0."""
+        turns = round(self._rest_deg / 360.0)
+        return self._rest_deg - 360.0 * turns
+
     def hold(self) -> Move:
         """Stay, and return once the table is at rest: the move of no rotation before a first view."""
         return self._move(self._rest_deg, ())
@@ -148,10 +180,16 @@ class Turntable(AbstractContextManager["Turntable"]):
         ------
         LimitExceeded
             Before anything moves.
-        MotionTimeout
-            The table did not arrive, or did not come to rest, within the computed time; it was stopped.
-        DeviceFault, DeviceSilent
-            The servo reported a hardware error or fell silent; its own watchdog stops it.
+        Stalled, Overloaded, FollowingError, NoProgress, Overheated, SupplyOutOfRange, RotationDisagreement
+            See `rig.watch`; the table was stopped, and the fault is latched.
+        MotionTimeout, DeviceFault
+            It did not come to rest within the computed time, or the servo reported a hardware error; latched as well.
+        WatchdogTripped, SupplyLost, DeviceSilent
+            The computer was too slow, or the servo lost its supply or its cable; its own watchdog stops it.
+        MotionStopped
+            Somebody asked for a stop.
+        FaultLatched, NotReady
+            An earlier motion was broken off.
         """
         self.check_target(target_deg)
         return self._move(target_deg, self._waypoints(target_deg))
@@ -174,12 +212,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         return Stillness(peak, change, turned.angle_deg, still)
 
     # -- inside ---------------------------------------------------------------------------------------------------
-
-    def _to_table(self, servo_deg: float) -> float:
-        return self._config.direction * (servo_deg - self._config.zero_deg)
-
-    def _to_servo(self, table_deg: float) -> float:
-        return self._config.direction * table_deg + self._config.zero_deg
 
     def _waypoints(self, target_deg: float) -> tuple[float, ...]:
         """Return the stops on the way: a motion that would end downwards first goes below the target."""
@@ -206,29 +238,20 @@ class Turntable(AbstractContextManager["Turntable"]):
             raise NotReady(
                 "The table has no torque.", next_step="Use it in a with block: `with Turntable(bench) as table:`."
             )
-        if self._broken_off:
-            raise NotReady(
-                "The last motion was broken off: where the table rests is in doubt.",
-                next_step="Find the cause, then leave the with block and enter it anew.",
-            )
+        self._safety.require_ready()
         started_ns, start_deg = self._clock.now_ns(), self._rest_deg
         self._learn_bias(self._config.quiet_s)  # it wanders: each rest measures it anew
         self._heading.begin()
-        try:
-            for waypoint in waypoints:
-                self._servo.arm_watchdog(self._config.watchdog_s)
-                self._servo.move_to(self._to_servo(waypoint))
-                allowed_s = 1.5 * motion_seconds(waypoint - self._rest_deg, self._profile) + SETTLE_ALLOWANCE_S
-                # Only the last stop must be a rest; on the way it is enough to have arrived.
-                quiet_s = self._config.quiet_s if waypoint is waypoints[-1] else 0.0
-                self._wait_for_rest(waypoint, quiet_s, allowed_s)
-            if not waypoints:
-                self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
-            self._servo.disarm_watchdog()
-        except BaseException:
-            self._broken_off = True
-            self._stop()
-            raise
+        if not waypoints:
+            self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
+        else:
+            with self._safety.motion((start_deg, *waypoints), self._stop) as motion:
+                slip = SlipWatch(self._limits, start_deg) if self._trust_gyro else None
+                for waypoint in waypoints:
+                    # Only the last stop must be a rest; on the way it is enough to have arrived.
+                    self._approach(waypoint, self._config.quiet_s if waypoint is waypoints[-1] else 0.0, slip)
+                self._servo.disarm_watchdog()
+                motion.arrived(self._safety.reference.to_servo(self._rest_deg))
         self._play_taken_up = self._play_taken_up or bool(waypoints)
         gyro = self._heading.end()
         rotation_deg = self._rest_deg - start_deg
@@ -239,20 +262,54 @@ class Turntable(AbstractContextManager["Turntable"]):
             )
         return Move(target_deg, self._rest_deg, rotation_deg, gyro, agreement, started_ns, self._clock.now_ns())
 
-    def _wait_for_rest(self, goal_deg: float, quiet_s: float, allowed_s: float) -> None:
+    def _approach(self, goal_deg: float, quiet_s: float, slip: SlipWatch | None) -> None:
+        """Go to ``goal_deg`` under watch, and return when the table has arrived there and been quiet for so long."""
+        assert self._profile is not None
+        watch = Watch(
+            self._limits,
+            self._servo.limits,
+            start_deg=self._rest_deg,
+            goal_deg=goal_deg,
+            tolerance_deg=self._config.tolerance_deg,
+            cruise_dps=self._profile.velocity_dps,
+        )
+        allowed_s = 1.5 * motion_seconds(goal_deg - self._rest_deg, self._profile) + SETTLE_ALLOWANCE_S
+        try:
+            self._servo.arm_watchdog(self._config.watchdog_s)
+            self._servo.move_to(self._safety.reference.to_servo(goal_deg))
+            self._wait_for_rest(goal_deg, quiet_s, allowed_s, watch, slip)
+        except (DeviceRefused, FollowingError, MotionTimeout, NoProgress) as symptom:
+            raise self._cause(symptom) from None
+
+    def _wait_for_rest(
+        self,
+        goal_deg: float,
+        quiet_s: float,
+        allowed_s: float,
+        watch: Watch | None = None,
+        slip: SlipWatch | None = None,
+    ) -> None:
         """Poll until the servo is in position and encoder and gyro have been quiet for ``quiet_s``.
 
         The polling feeds the servo's watchdog.
         """
-        config = self._config
+        config, to_table = self._config, self._safety.reference.to_table
         start_ns = self._clock.now_ns()
         readings: deque[tuple[int, float]] = deque()
         while True:
             self._clock.sleep(config.poll_s)
+            self._safety.heed_stop()
             state = self._servo.read_state()
             self._heading.update()
-            self._refuse_faults(state)
-            angle_deg = self._to_table(state.position_deg)
+            angle_deg = to_table(state.position_deg)
+            if watch:
+                lag_deg = None if state.trajectory_deg is None else state.trajectory_deg - state.position_deg
+                watch.look(state, angle_deg, lag_deg)
+            elif cause := unfit(state, self._limits, self._servo.limits):
+                self._safety.latch(cause)
+                raise cause
+            if slip:
+                self._look_for_slip(slip, state.time_ns, angle_deg)
             arrived = state.in_position and not state.moving and abs(angle_deg - goal_deg) <= config.tolerance_deg
             if not arrived:
                 readings.clear()
@@ -276,6 +333,12 @@ class Turntable(AbstractContextManager["Turntable"]):
                     },
                 )
 
+    def _look_for_slip(self, slip: SlipWatch, time_ns: int, angle_deg: float) -> None:
+        slip.note(time_ns, angle_deg)
+        if encoder := slip.encoder_deg(self._heading.newest_ns):
+            at_ns, rotation_deg = encoder
+            slip.compare(rotation_deg, self._heading.since_rest(at_ns))
+
     def _quiet(self, readings: deque[tuple[int, float]], quiet_s: float) -> bool:
         """Return whether the readings span ``quiet_s`` without a motion; drops those older than needed."""
         while len(readings) > 1 and seconds_between(readings[1][0], readings[-1][0]) >= quiet_s:
@@ -289,16 +352,45 @@ class Turntable(AbstractContextManager["Turntable"]):
             return True
         return self._heading.peak_dps(quiet_s) <= self._config.quiet_dps
 
-    def _refuse_faults(self, state: ServoState) -> None:
-        if state.hardware_errors:
-            raise DeviceFault(
-                f"The servo stopped with a hardware error: {', '.join(state.hardware_errors)}.",
-                next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
-                evidence={"temperature_c": state.temperature_c, "voltage_v": round(state.voltage_v, 1)},
+    def _cause(self, symptom: RigError) -> RigError:
+        """Return why the servo does not do what it was told, where it knows; else ``symptom`` itself."""
+        try:
+            condition = self._servo.read_condition()
+        except RigError:
+            return symptom
+        if condition.watchdog_tripped:
+            return WatchdogTripped(
+                "The servo heard nothing from the computer for too long, and stopped the table by itself.",
+                next_step="Was the computer asleep, or too busy? Start again; an enrollment goes on with --resume.",
+                evidence={"watchdog_s": self._config.watchdog_s, **symptom.evidence},
             )
+        if condition.power_lost:
+            return SupplyLost(
+                "The servo was without supply for a moment: its torque is off, and it forgot its turns.",
+                next_step="Check the supply, its plug and its cable.",
+                evidence=symptom.evidence,
+            )
+        if condition.hardware_errors:
+            return unfit(self._servo.read_state(), self._limits, self._servo.limits) or symptom
+        return symptom
 
-    def _stop(self) -> None:
-        """Bring the table to a stop where it is; a servo that does not hear this is stopped by its watchdog."""
-        with suppress(RigError, OSError):
-            self._servo.move_to(self._servo.read_state().position_deg)
+    def _stop(self) -> bool:
+        """Bring the table to a stop along its ramp; return False where the servo hears nothing: its watchdog stops it.
+
+        The servo's own goal would be behind the table before it could stop there, and it would come back to it.
+        """
+        try:
+            state = self._servo.read_state()
+            ramp_dps2 = self._profile.acceleration_dps2 if self._profile else self._config.acceleration_dps2
+            ahead_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
+            self._servo.move_to(state.position_deg + ahead_deg)
+            give_up_ns = self._clock.now_ns() + round((abs(state.velocity_dps) / ramp_dps2 + STOP_ALLOWANCE_S) * 1e9)
+            while state.moving and self._clock.now_ns() < give_up_ns:
+                self._clock.sleep(self._config.poll_s)
+                state = self._servo.read_state()
             self._servo.disarm_watchdog()
+        except DeviceSilent:
+            return False
+        except RigError:  # it refuses: the watchdog has stopped it already, or its torque is off
+            return True
+        return True

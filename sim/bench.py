@@ -13,6 +13,7 @@ from rig.clock import SystemClock
 from rig.config import RigConfig, Section
 from rig.errors import ObjectNotFound, UsageError
 from rig.hardware import assemble
+from rig.state import MemoryStore, StateStore
 from sim.clock import VirtualClock
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
@@ -60,7 +61,8 @@ class ShelfOperator:
     """The hand that takes things from the shelf: to be enrolled they stand by the platter's mark, to be found anyhow.
 
     Every placement misses the table's axis by a little, as hands do. Once a bench is open, ``parts`` is what it is made
-    of, and ``faults`` what goes wrong with that.
+    of, and ``faults`` what goes wrong with that. ``state`` is what benches in this world remember of the table; whoever
+    sets a new one up looks at its cable, and says that it hangs free.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class ShelfOperator:
         self.yaw_deg = yaw_deg
         self.parts: SimParts | None = None
         self.faults: Faults | None = None
+        self.state: StateStore = MemoryStore()
         self._rng = world.rng("operator")
 
     def place(self, name: str | None) -> None:
@@ -141,7 +144,17 @@ def open_sim_bench(
             wires.callback(operator.faults.clear)
         parts.open_wires()
         operator.faults.schedule(*faults)
-        bench = assemble("sim", config, world.clock, wire=parts.adapter, i2c_bus=parts.i2c.path, capture=parts.camera)
+        bench = assemble(
+            "sim",
+            config,
+            world.clock,
+            wire=parts.adapter,
+            i2c_bus=parts.i2c.path,
+            capture=parts.camera,
+            state=operator.state,
+        )
+        if operator.state.load().table is None and bench.safety.fault is None:
+            bench.safety.declare_turns(0)
         bench.wires = wires.pop_all()
     bench.operator = operator
     bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}

@@ -82,6 +82,11 @@ class Servo(Protocol):
         ...
 
     @property
+    def turn_deg(self) -> float:
+        """Angle after which the encoder reads the same again: what a servo without supply loses count of."""
+        ...
+
+    @property
     def limits(self) -> ServoLimits: ...
 
     @property

@@ -64,5 +64,8 @@ def motion_bench(*settings: str, noise: NoiseModel | None = None, seed: int = 0)
         servo = open_servo(wires)
         imu = Mpu6050(i2c.path, clock=wires.world.clock)
         config = load_config(overrides=settings)
-        yield Bench("test", config, wires.world.clock, servo, imu, camera=None), wires  # type: ignore[arg-type]
+        bench = Bench("test", config, wires.world.clock, servo, imu, camera=None)  # type: ignore[arg-type]
+        bench.safety.connect()
+        bench.safety.declare_turns(0)
+        yield bench, wires
         imu.close()

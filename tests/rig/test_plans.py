@@ -326,19 +326,30 @@ def test_the_cable_is_unwound_when_a_decision_would_leave_the_limits(simulated, 
     assert -181 <= s.world.shaft()[0] <= 186
 
 
-def test_during_an_identification_the_gyro_is_believed_when_the_platter_slips(shelf_of_three):
+def test_during_an_identification_the_gyro_is_believed_when_the_platter_slips_a_little(shelf_of_three):
     s, index = shelf_of_three
     s.operator.next_object, s.operator.yaw_deg = "toy-car", 10.0
     moves = []
     for event in identify(s.bench, index):
         if isinstance(event, Decided) and not moves[1:]:
-            s.world.clock.call_at(s.world.clock.now_ns() + 500_000_000, lambda: s.world.slip(20.0, 0.2))
+            s.world.clock.call_at(s.world.clock.now_ns() + 500_000_000, lambda: s.world.slip(9.0, 0.2))
         if isinstance(event, Moved):
             moves.append(event)
         if isinstance(event, Accepted) and event.index == 1:
             off_deg = wrap180(event.azimuth_deg + s.world.table_deg())
     assert not moves[1].agrees
     assert off_deg == pytest.approx(0, abs=4 * moves[1].imu_sigma_deg)
+
+
+def test_a_loose_platter_ends_an_identification_in_the_middle_of_the_move(shelf_of_three):
+    s, index = shelf_of_three
+    s.operator.next_object = "toy-car"
+    with pytest.raises(RotationDisagreement, match="so far"):
+        for event in identify(s.bench, index):
+            if isinstance(event, Decided):
+                s.world.clock.call_at(s.world.clock.now_ns() + 500_000_000, lambda: s.world.slip(20.0, 0.2))
+    assert s.bench.safety.fault.code == RotationDisagreement.code
+    assert torque(s) == 0
 
 
 def test_an_empty_catalog_is_said_before_anything_moves(simulated):

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.devices.servo import MotionProfile
-from rig.errors import DeviceFault, DeviceSilent, LimitExceeded, MotionTimeout, NotReady
+from rig.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NotReady, Stalled
+from rig.safety import State
 from rig.turntable import Turntable, motion_seconds
 from sim.noise import NoiseModel
 from sim.servo import Frame
@@ -103,14 +104,18 @@ def test_motion_needs_torque():
         Turntable(bench).goto(5.0)
 
 
-def test_a_jammed_table_times_out_or_faults_and_is_left_without_torque():
+def test_a_jammed_table_is_found_long_before_the_servo_shuts_down_and_is_left_without_torque():
     with motion_bench() as (bench, wires):
-        with pytest.raises((MotionTimeout, DeviceFault)) as caught, Turntable(bench) as table:
+        with pytest.raises(Stalled) as caught, Turntable(bench) as table:
             table.goto(10.0)
             wires.device.jam()
+            jammed_ns = wires.world.clock.now_ns()
             table.goto(60.0)
-        assert caught.value.exit_code in (4, 5)
-        assert caught.value.next_step
+        assert (wires.world.clock.now_ns() - jammed_ns) * 1e-9 < 1.5
+        assert caught.value.exit_code == 5
+        assert bench.safety.state is State.FAULT
+        assert bench.safety.fault.code == Stalled.code
+        assert wires.device.memory["Hardware Error Status"] == 0
         assert wires.device.memory["Torque Enable"] == 0
 
 
@@ -247,20 +252,22 @@ def test_a_time_out_can_be_told_in_json_although_the_gyro_knows_nothing():
     assert told["evidence"]["peak_rate_dps"] is None
 
 
-def test_no_motion_follows_one_that_was_broken_off_until_the_table_is_taken_anew():
+def test_no_motion_follows_one_that_was_broken_off_until_its_fault_is_acknowledged():
     with motion_bench() as (bench, wires):
         table = Turntable(bench)
         with table:
             table.goto(10.0)
             wires.device.jam()
-            with pytest.raises((MotionTimeout, DeviceFault)):
+            with pytest.raises(Stalled):
                 table.goto(60.0)
             sent = len(wires.instructions)
-            with pytest.raises(NotReady, match="broken off"):
+            with pytest.raises(FaultLatched, match="blocked"):
                 table.goto(10.0)
             assert len(wires.instructions) == sent
+        with pytest.raises(FaultLatched), table:
+            pass
+        assert wires.device.memory["Torque Enable"] == 0
         wires.device.free()
-        wires.device.power_cycle()
-        wires.world.clock.sleep(1.0)
+        bench.safety.acknowledge()
         with table:
             assert table.goto(20.0).agrees

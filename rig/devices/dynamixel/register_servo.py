@@ -109,6 +109,10 @@ class RegisterServo(ABC):
         return self.deg_per_count / self._gear_ratio
 
     @property
+    def turn_deg(self) -> float:
+        return 360.0 / self._gear_ratio
+
+    @property
     def bus(self) -> DynamixelBus:
         return self._bus
 

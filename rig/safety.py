@@ -1,0 +1,417 @@
+"""The one state machine that says whether the table may move, and what must happen before it may move again.
+
+    DISCONNECTED ──connect──▶ CONNECTED ──refer──▶ READY ◀──arrive── MOVING
+         ▲                        │  ▲               │                 │
+         │ lose                 doubt│ recheck       └──────start──────▶
+     (any state)                  ▼  │                                 │ stop
+                         UNREFERENCED│                    STOPPED ◀────┘
+                                     └────────────────────────┘
+    (any state) ──latch──▶ FAULT ──acknowledge──▶ CONNECTED
+
+There is no way to set a state: each is reached by what happened, through the table of transitions alone, and a motion
+is a `with` block, which cannot be left without arriving, a stop or a latched fault. A fault outlives the process, and a
+pulled cable; it ends when a person acknowledges it and its cause is gone.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from enum import Enum, StrEnum, auto
+from types import MappingProxyType
+
+from rig.clock import Clock
+from rig.config import RigConfig
+from rig.devices.servo import Servo
+from rig.errors import (
+    DeviceFault,
+    DeviceSilent,
+    FaultLatched,
+    FollowingError,
+    MotionStopped,
+    MotionTimeout,
+    NoProgress,
+    NotReady,
+    Overheated,
+    Overloaded,
+    RigError,
+    RotationDisagreement,
+    Stalled,
+    StateNotKept,
+    SupplyOutOfRange,
+    Unreferenced,
+)
+from rig.reference import Reference, judge
+from rig.state import BenchState, Fault, MemoryStore, SavedTable, StateStore
+from rig.watch import unfit
+
+LATCHING = (
+    DeviceFault,
+    MotionTimeout,
+    RotationDisagreement,
+    FollowingError,
+    Stalled,
+    Overloaded,
+    Overheated,
+    SupplyOutOfRange,
+    NoProgress,
+)
+"""Errors that, when they end a motion, leave a fault: something is wrong with the bench and a person must look."""
+
+
+class State(StrEnum):
+    """Of a bench's table."""
+
+    DISCONNECTED = "disconnected"
+    CONNECTED = "connected"
+    UNREFERENCED = "unreferenced"
+    READY = "ready"
+    MOVING = "moving"
+    STOPPED = "stopped"
+    FAULT = "fault"
+
+
+class Happening(Enum):
+    """What takes the machine from one state to another."""
+
+    CONNECT = auto()
+    REFER = auto()
+    DOUBT = auto()
+    START = auto()
+    ARRIVE = auto()
+    STOP = auto()
+    RECHECK = auto()
+    LATCH = auto()
+    ACKNOWLEDGE = auto()
+    LOSE = auto()
+
+
+_S, _H = State, Happening
+_ALWAYS = {_H.LATCH: _S.FAULT, _H.LOSE: _S.DISCONNECTED}
+_JUDGED = {_H.REFER: _S.READY, _H.DOUBT: _S.UNREFERENCED}
+TRANSITIONS: Mapping[State, Mapping[Happening, State]] = MappingProxyType(
+    {
+        _S.DISCONNECTED: {**_ALWAYS, _H.CONNECT: _S.CONNECTED},
+        _S.CONNECTED: {**_ALWAYS, **_JUDGED},
+        _S.UNREFERENCED: {**_ALWAYS, **_JUDGED},
+        _S.READY: {**_ALWAYS, **_JUDGED, _H.START: _S.MOVING},
+        _S.MOVING: {**_ALWAYS, _H.ARRIVE: _S.READY, _H.STOP: _S.STOPPED},
+        _S.STOPPED: {**_ALWAYS, _H.RECHECK: _S.CONNECTED},
+        # A fault stays while the cable is pulled and put in again.
+        _S.FAULT: {_H.LATCH: _S.FAULT, _H.LOSE: _S.FAULT, _H.CONNECT: _S.FAULT, _H.ACKNOWLEDGE: _S.CONNECTED},
+    }
+)
+
+
+class Motion:
+    """A motion in progress; one that was not said to have `arrived` counts as broken off."""
+
+    def __init__(self) -> None:
+        self.position_deg: float | None = None
+
+    def arrived(self, position_deg: float) -> None:
+        """Say where, by the servo's own count, the motion came to rest."""
+        self.position_deg = position_deg
+
+
+class Safety:
+    """State, latched fault and reference of one bench's table.
+
+    Parameters
+    ----------
+    servo
+        Asked for its condition; nothing is written to it but on `acknowledge` with a reboot.
+    config
+        Of the bench.
+    clock
+        For the dates of faults.
+    store
+        Where the state outlives the process; None keeps it in memory.
+    """
+
+    def __init__(self, servo: Servo, config: RigConfig, clock: Clock, store: StateStore | None = None) -> None:
+        self._servo = servo
+        self._config = config
+        self._clock = clock
+        self._store: StateStore = store or MemoryStore()
+        self._kept = self._store.load()
+        self._state = State.FAULT if self._kept.fault else State.DISCONNECTED
+        self._doubt = ""
+        self._findings: list[str] = []
+        self.reference = Reference(config.table, self._kept.table.shift_deg if self._kept.table else 0.0)
+        self.checks: list[Callable[[], object]] = []
+        """Called before a fault is acknowledged; each raises a `RigError` where its device is not well."""
+
+    # -- what is ------------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        return self._state
+
+    @property
+    def fault(self) -> Fault | None:
+        """The latched fault, perhaps of a program that ended long ago."""
+        return self._kept.fault
+
+    @property
+    def doubt(self) -> str:
+        """Why the table is `State.UNREFERENCED`; empty where it is not."""
+        return self._doubt
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """In what condition the servo was found when it was connected, for the operator."""
+        return tuple(self._findings)
+
+    # -- what happens -------------------------------------------------------------------------------------------------
+
+    def connect(self) -> State:
+        """Look at the servo that was opened, and judge where the table stands; nothing moves.
+
+        Raises
+        ------
+        DeviceSilent
+            The servo does not answer.
+        """
+        condition = self._servo.read_condition()
+        self._findings = [f"the bench's state is lost: {self._kept.damage}"] if self._kept.damage else []
+        if condition.torque:
+            self._findings.append("the servo's torque was on: the last program had no chance to switch it off")
+        if condition.watchdog_tripped:
+            self._findings.append("the servo's watchdog had stopped it: the last program died, or the cable was pulled")
+        elif condition.watchdog_armed:
+            self._findings.append("the servo's watchdog was still armed: the last program died while the table moved")
+        if condition.hardware_errors:
+            self._findings.append(f"the servo reports: {', '.join(condition.hardware_errors)}")
+        self._go(Happening.CONNECT)
+        self._judge()
+        return self._state
+
+    def prepare(self) -> None:
+        """Make sure that the table may move now; before torque comes on.
+
+        Raises
+        ------
+        FaultLatched
+            A fault waits to be acknowledged.
+        Unreferenced
+            How far the cable is wound up is in doubt.
+        MotionStopped
+            Somebody has asked for a stop.
+        DeviceMismatch, DeviceSilent
+            After a lost connection another servo answers, or none.
+        """
+        if self._store.stop_requested():
+            self._store.clear_stop()
+            raise _stopped()
+        if self._state in (State.DISCONNECTED, State.STOPPED):
+            self._servo.verify()
+            self._go(Happening.CONNECT if self._state is State.DISCONNECTED else Happening.RECHECK)
+        if self._state is not State.FAULT:
+            self._judge()
+        self.require_ready()
+        self._save(table=self._table(self._servo.read_state().position_deg))
+
+    def require_ready(self) -> None:
+        """Raise `FaultLatched`, `Unreferenced` or another `NotReady` unless the table may move."""
+        if self._state is not State.READY:
+            raise self._refusal()
+
+    @contextmanager
+    def motion(self, ends_deg: tuple[float, ...], stop: Callable[[], bool]) -> Iterator[Motion]:
+        """Be `State.MOVING` for the length of a ``with`` block, on a way between ``ends_deg`` (of the table).
+
+        Whatever breaks the block off calls ``stop``, which stops the table and returns whether the servo heard it; then
+        it is STOPPED, DISCONNECTED, or a FAULT is latched. The way is on the disk before anything moves.
+
+        Raises
+        ------
+        NotReady
+            The table may not move in this state.
+        StateNotKept
+            The way cannot be written down; nothing has moved.
+        """
+        self.require_ready()
+        motion = Motion()
+        path = [self.reference.to_servo(angle) for angle in ends_deg]
+        self._save(table=self._table(self._servo.read_state().position_deg, (min(path), max(path))))
+        self._go(Happening.START)
+        try:
+            yield motion
+            if motion.position_deg is None:
+                raise MotionStopped("The motion was broken off.", next_step="Start it anew.")
+        except BaseException as error:
+            heard = False
+            try:
+                heard = stop()
+            finally:
+                if isinstance(error, LATCHING):
+                    self.latch(error)
+                else:
+                    self._go(Happening.STOP if heard else Happening.LOSE)
+            raise
+        self._go(Happening.ARRIVE)
+        self._save(table=self._table(motion.position_deg))
+
+    def heed_stop(self) -> None:
+        """Raise `MotionStopped` if somebody asked for a stop; called in every round of the control loop."""
+        if self._store.stop_requested():
+            raise _stopped()
+
+    def released(self) -> None:
+        """Take note that the torque is off: where the table rests is kept, and a stop that was asked for is done."""
+        with suppress(DeviceSilent, StateNotKept):  # what was written before the motion stays true
+            if self._judged():
+                self._save(table=self._table(self._servo.read_state().position_deg))
+        self._store.clear_stop()
+
+    def latch(self, error: RigError) -> None:
+        """Latch a fault: nothing moves until it is acknowledged. The first one stays until then."""
+        self._go(Happening.LATCH)
+        if self._kept.fault is None:
+            fault = Fault.of(error, self._clock.utc().isoformat(timespec="seconds"))
+            try:
+                self._save(fault=fault)
+            except StateNotKept as unkept:
+                self._kept = self._kept.model_copy(update={"fault": fault})
+                error.add_note(f"The fault is latched in this program alone. {unkept.what}")
+
+    def acknowledge(self, *, reboot: bool = False) -> State:
+        """Acknowledge the latched fault after its cause is gone: servo, settings, supply and angle are verified.
+
+        What cannot be seen in a table at rest (a jam, a loose platter) shows in the next motion.
+
+        Parameters
+        ----------
+        reboot
+            Restart the servo first: nothing else clears its hardware errors.
+
+        Returns
+        -------
+        State
+            READY, or UNREFERENCED where the turns are in doubt.
+
+        Raises
+        ------
+        DeviceFault, Overheated, SupplyOutOfRange, DeviceMismatch, DeviceSilent
+            The cause is still there; the fault stays.
+        """
+        if self._state in (State.DISCONNECTED, State.STOPPED):
+            self.prepare()
+        if reboot:
+            if self._judged():
+                self._save(table=self._table(self._servo.read_state().position_deg))
+            self._servo.reboot()
+        else:
+            self._servo.verify()
+        if cause := unfit(self._servo.read_state(), self._config.safety, self._servo.limits, again=True):
+            raise cause
+        for check in self.checks:
+            check()
+        if self._state is State.FAULT:
+            self._save(fault=None)
+            self._go(Happening.ACKNOWLEDGE)
+        self._judge()
+        return self._state
+
+    def declare(self, table_deg: float) -> None:
+        """Take it from a person who has looked at the cable that the table now stands at ``table_deg``.
+
+        Raises
+        ------
+        NotReady
+            The servo is not connected, or a fault is latched.
+        """
+        if Happening.REFER not in TRANSITIONS[self._state]:
+            raise self._refusal()
+        position_deg = self._servo.read_state().position_deg
+        self.reference.declare(position_deg, table_deg)
+        self._save(table=self._table(position_deg))
+        self._doubt = ""
+        self._go(Happening.REFER)
+
+    def declare_turns(self, turns: int) -> None:
+        """Take it from a person that the cable is wound up by ``turns`` whole turns; the zero stays where it was.
+
+        Raises
+        ------
+        NotReady
+            As of `declare`; or a gear hides from the servo where within its turn the table is.
+        """
+        if self._doubt and self._servo.turn_deg < 360.0:
+            raise NotReady(
+                "With a gear, the servo alone does not tell where within its turn the table stands.",
+                next_step="Turn the table by hand to its zero, with the cable hanging free, and give `rig home --set`.",
+            )
+        self.declare(self.reference.with_turns(self._servo.read_state().position_deg, turns))
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _go(self, happening: Happening) -> None:
+        following = TRANSITIONS[self._state].get(happening)
+        if following is None:
+            raise self._refusal()
+        self._state = following
+
+    def _judged(self) -> bool:
+        """Compare what the servo says with what was written down; return whether the turns are beyond doubt."""
+        state, condition = self._servo.read_state(), self._servo.read_condition()
+        judgement = judge(self._kept.table, self._servo.identity, state.position_deg, condition, self._servo.turn_deg)
+        self.reference.shift_deg = judgement.shift_deg
+        self._findings += [finding for finding in judgement.findings if finding not in self._findings]
+        self._doubt = judgement.doubt
+        return not judgement.doubt
+
+    def _judge(self) -> None:
+        """Go where the comparison leads; a fault stays."""
+        certain = self._judged()
+        if self._state is not State.FAULT:
+            self._go(Happening.REFER if certain else Happening.DOUBT)
+
+    def _refusal(self) -> NotReady:
+        """Return why nothing may move, and what to do."""
+        if self._kept.fault is not None:
+            fault = self._kept.fault
+            return FaultLatched(
+                f"A fault is latched since {fault.utc}: {fault.what}",
+                next_step=f"{fault.next_step} Then `rig acknowledge`.",
+                evidence={"code": fault.code, **fault.evidence},
+            )
+        match self._state:
+            case State.UNREFERENCED:
+                return Unreferenced(
+                    f"How far the table's cable is wound up is in doubt: {self._doubt}.",
+                    next_step="Look at the cable, then say how many whole turns it is wound up: `rig home --turns 0` "
+                    "if it hangs free. Or turn the table by hand to where zero shall be: `rig home --set`.",
+                )
+            case State.STOPPED:
+                return NotReady(
+                    "The last motion was broken off: where the table rests is in doubt.",
+                    next_step="Find the cause, then leave the with block and enter it anew.",
+                )
+            case _:
+                return NotReady(
+                    f"The table is {self._state}.", next_step="Open the bench, and move it in `with Turntable(bench):`."
+                )
+
+    def _table(self, position_deg: float, path_deg: tuple[float, float] | None = None) -> SavedTable:
+        identity = self._servo.identity
+        return SavedTable(
+            model_number=identity.model_number,
+            bus_id=identity.bus_id,
+            firmware=identity.firmware,
+            position_deg=position_deg,
+            shift_deg=self.reference.shift_deg,
+            path_deg=path_deg,
+        )
+
+    def _save(self, **values: SavedTable | Fault | None) -> None:
+        kept: BenchState = self._kept.model_copy(update={**values, "damage": ""})
+        if kept != self._kept:
+            self._store.save(kept)
+            self._kept = kept
+
+
+def _stopped() -> MotionStopped:
+    return MotionStopped(
+        "The table was stopped, as `rig stop` asked for; its torque is off.",
+        next_step="Give the command again when the table may move; an enrollment goes on with --resume.",
+    )
