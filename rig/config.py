@@ -40,7 +40,10 @@ class ServoConfig(Section):
     port: str = Field("/dev/ttyUSB0", description="serial port of the U2D2 or another adapter")
     baud: int = Field(57600, ge=9600, le=4_500_000, description="bits per second; the servo's factory setting is 57600")
     id: int = Field(1, ge=0, le=252, description="id on the bus")
-    model: str = Field("xl430_w250", description="model as in the SDK's control tables")
+    model: str = Field("xl430_w250", description="model as in the SDK's control tables, or ax_12a")
+    gear_ratio: float = Field(
+        1.0, gt=0, le=1000, description="turns of the servo for one of the table; table.direction tells the sense"
+    )
     retries: int = Field(
         3, ge=0, le=20, description="repetitions of a spoiled transaction before the servo counts as silent"
     )
@@ -50,10 +53,16 @@ class ServoConfig(Section):
 class TableConfig(Section):
     """How the table moves and when it counts as settled."""
 
+    mode: Literal["turntable", "pan"] = Field(
+        "turntable", description="turntable: turns beyond one revolution, and counts the turns; pan: stays within one"
+    )
     direction: Literal[1, -1] = Field(
         1, description="+1: rising servo position turns counter-clockwise seen from above"
     )
-    zero_deg: Degrees = Field(180.0, description="servo angle at table angle 0")
+    carries: Literal["object", "camera"] = Field(
+        "object", description="what the servo turns: the object before the camera, or the camera around the object"
+    )
+    zero_deg: Degrees = Field(180.0, description="servo angle at table angle 0, on the table's side of the gear")
     limits_deg: tuple[Degrees, Degrees] = Field(
         (-400.0, 400.0), description="cable budget: lowest and highest table angle"
     )
@@ -76,10 +85,13 @@ class TableConfig(Section):
 
     @field_validator("limits_deg")
     @classmethod
-    def _limits_hold_a_turn(cls, limits_deg: tuple[float, float]) -> tuple[float, float]:
+    def _limits_hold_a_turn(cls, limits_deg: tuple[float, float], others: ValidationInfo) -> tuple[float, float]:
         low, high = limits_deg
-        if not (low <= 0 <= high and high - low >= 360):
-            raise ValueError("must span at least one turn and hold 0, e.g. [-400, 400]")
+        pan = others.data.get("mode") == "pan"
+        if pan and not (low <= 0 <= high and low < high):
+            raise ValueError("must be the lowest and the highest angle, and hold 0, e.g. [-150, 150]")
+        if not pan and not (low <= 0 <= high and high - low >= 360):
+            raise ValueError('must span at least one turn and hold 0, e.g. [-400, 400], unless mode = "pan"')
         if max(-low, high) > MAX_LIMIT_DEG:
             raise ValueError(f"must stay within ±{MAX_LIMIT_DEG:g}, which a servo in extended position mode reaches")
         return limits_deg
@@ -91,6 +103,11 @@ class TableConfig(Section):
         if watchdog_s < 2 * poll_s:
             raise ValueError(f"must be at least twice poll_s, which is {poll_s:g}: the control loop feeds the watchdog")
         return watchdog_s
+
+    @property
+    def orientation_sign(self) -> int:
+        """Sense of the camera's orientation o around the object: o = −θ where the table θ turns the object, else θ."""
+        return 1 if self.carries == "camera" else -1
 
 
 class SafetyConfig(Section):
@@ -115,16 +132,32 @@ class SafetyConfig(Section):
 class ImuConfig(Section):
     """Where the IMU is and how it is mounted."""
 
+    model: Literal["mpu6050", "bno055"] = Field("mpu6050", description="which sensor rides on the platter")
     bus: int | str = Field(1, description="I2C bus number, or the path of its device")
-    address: int = Field(0x68, ge=0x08, le=0x77, description="I2C address; 0x69 with AD0 high")
+    address: int = Field(
+        0x68,
+        ge=0x08,
+        le=0x77,
+        validate_default=True,
+        description="I2C address; an MPU-6050 has 0x68, or 0x69 with AD0 high; a BNO055 0x28, or 0x29 with ADR high",
+    )
     axis: Literal["x", "y", "z"] = Field("z", description="the sensor's axis along the table's")
     sign: Literal[1, -1] = Field(1, description="+1 where a counter-clockwise turn reads positive")
     range_dps: Literal[250, 500, 1000, 2000] = Field(250, description="full scale of the gyro")
-    rate_hz: float = Field(200.0, ge=4, le=1000, description="samples per second")
+    rate_hz: float = Field(200.0, ge=4, le=1000, description="samples per second (MPU-6050; a BNO055 has 100)")
+    bandwidth_hz: Literal[188, 98, 42, 20, 10, 5] = Field(
+        42, description="of the MPU-6050's low-pass; below half of rate_hz, or noise folds down"
+    )
     scale: float = Field(1.0, ge=0.8, le=1.25, description="true rate per rate read, from calibration")
     scale_uncertainty: float = Field(
         0.012, ge=0, le=0.1, description="standard uncertainty of the scale; 0.012 uncalibrated"
     )
+
+    @field_validator("address")
+    @classmethod
+    def _address_of_the_model(cls, address: int, others: ValidationInfo) -> int:
+        # The default is an MPU-6050's; no BNO055 can have it.
+        return 0x28 if others.data.get("model") == "bno055" and address == 0x68 else address
 
 
 class CameraConfig(Section):

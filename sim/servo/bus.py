@@ -7,6 +7,7 @@ from itertools import takewhile
 from typing import Protocol
 
 from sim.clock import VirtualClock
+from sim.servo.protocol1 import PacketParser1, status_packet1
 from sim.servo.protocol2 import (
     BROADCAST_ID,
     InstructionPacket,
@@ -69,6 +70,11 @@ class Device(Protocol):
     """What the bus asks of a servo."""
 
     @property
+    def protocol(self) -> int:
+        """Which protocol it speaks: 1 or 2."""
+        ...
+
+    @property
     def bus_id(self) -> int: ...
     @property
     def baudrate(self) -> int: ...
@@ -109,7 +115,7 @@ class ServoBus:
         self._devices: list[Device] = []
         self._deliver: Callable[[Frame], None] | None = None
         self._sent_until_ns = 0
-        self._parser = PacketParser()
+        self._parsers: dict[int, PacketParser1 | PacketParser] = {1: PacketParser1(), 2: PacketParser()}
         self._heard = Frame(Source.HOST, 0, 1, b"")
 
     def attach(self, device: Device) -> None:
@@ -149,20 +155,31 @@ class ServoBus:
 
     def _hear(self, frame: Frame) -> None:
         if frame.baudrate != self._heard.baudrate or frame.start_ns - self._heard.end_ns > ABANDON_S * 1e9:
-            self._parser.reset()
+            for parser in self._parsers.values():
+                parser.reset()
         self._heard = frame
-        for packet in self._parser.feed(frame.data):
-            self._dispatch(packet, frame.baudrate)
+        for protocol, parser in self._parsers.items():
+            for packet in parser.feed(frame.data):
+                self._dispatch(packet, frame.baudrate, protocol)
 
-    def _dispatch(self, packet: InstructionPacket, baudrate: int) -> None:
+    def _dispatch(self, packet: InstructionPacket, baudrate: int, protocol: int) -> None:
         # Ids and delays as they were before the instruction: what it changes holds from the next one on.
-        called = [(d, d.bus_id, d.return_delay_ns) for d in self._devices if d.powered and d.baudrate == baudrate]
+        called = [
+            (d, d.bus_id, d.return_delay_ns)
+            for d in self._devices
+            if d.powered and d.baudrate == baudrate and d.protocol == protocol
+        ]
         answers = [
             Answer(bus_id, delay_ns, status)
             for device, bus_id, delay_ns in called
             if (status := device.execute(packet)) is not None
         ]
-        if packet.instruction in CHAINED_READS:
+        if protocol == 1:
+            now_ns = self.clock.now_ns()
+            frames = [
+                Frame(Source.DEVICE, now_ns + a.delay_ns, baudrate, status_packet1(a.bus_id, a.status)) for a in answers
+            ]
+        elif packet.instruction in CHAINED_READS:
             frames = self._chain(packet, answers, baudrate)
         else:
             slot_ns = 0

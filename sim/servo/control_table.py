@@ -91,6 +91,11 @@ class Memory:
         """Set them, in the order of `live`."""
         self._image[FIRST_LIVE_REGISTER : self._live_end] = block
 
+    @property
+    def starts_with_torque(self) -> bool:
+        """Whether the Startup Configuration, which not all models have, asks for torque at power-up."""
+        return "Startup Configuration" in self._registers and self["Startup Configuration"] == 1
+
     def forget_ram(self) -> None:
         """Set the RAM area to its initial values, as at power-up."""
         self._restore(RAM_START, self._size)

@@ -15,7 +15,7 @@ from sim.servo.models import (
     ServoModel,
 )
 from sim.servo.motor import Motor
-from sim.world import World
+from sim.servo.shaft import Shaft
 
 IN_POSITION_COUNTS = 4
 FOLLOWING_ERROR_COUNTS = 100
@@ -53,7 +53,7 @@ class Controller:
     but do not act.
     """
 
-    def __init__(self, world: World, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
+    def __init__(self, world: Shaft, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
         self._world = world
         self._memory = memory
         self._motor = motor

@@ -10,7 +10,7 @@ from sim.servo.models import BAUD_RATES, COUNTS_PER_TURN, MODELS, POSITION_MODE
 from sim.servo.motor import Motor
 from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, Status, StatusError
 from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
-from sim.world import World
+from sim.servo.shaft import Shaft
 
 BOOT_S = 0.2
 """How long a servo is silent after power-up or Reboot; the e-manual gives no number."""
@@ -38,7 +38,7 @@ class XSeriesServo:
     Parameters
     ----------
     world
-        The world it turns. A second servo on the same bus has a world of its own on the same clock.
+        The world it turns, or a gear on it. A second servo on the same bus has a world of its own on the same clock.
     model
         A name of `sim.servo.models.MODELS`.
     bus_id, baudrate
@@ -60,9 +60,11 @@ class XSeriesServo:
         reports something else.
     """
 
+    protocol = 2
+
     def __init__(
         self,
-        world: World,
+        world: Shaft,
         model: str = "xl430_w250",
         *,
         bus_id: int = 1,
@@ -298,6 +300,9 @@ class XSeriesServo:
         self._registered = None
         self.memory.forget_ram()
         self._controller.start()
+        if self.memory.starts_with_torque:
+            self.memory["Torque Enable"] = 1
+            self._on_torque_enable()
         self._judge()
 
     def _factory_reset(self, option: int, everyones: bool) -> None:

@@ -57,6 +57,7 @@ _RANGES: dict[str, Container[int]] = {
     "Torque Enable": range(2),
     "LED": range(2),
     "Status Return Level": range(3),
+    "Startup Configuration": range(2),  # its bit for restoring RAM is not emulated
     "Velocity I Gain": range(16_384),
     "Velocity P Gain": range(16_384),
     "Position D Gain": range(16_384),

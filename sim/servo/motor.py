@@ -5,7 +5,7 @@ from math import exp
 
 from sim.motion import Trajectory, rest, to_position, to_velocity
 from sim.servo.models import DEG_PER_COUNT, PWM_FULL, ServoModel
-from sim.world import World
+from sim.servo.shaft import Shaft
 
 FRICTION_LOAD = 0.04
 """Part of the stall torque that the gears' friction takes while the shaft turns."""
@@ -50,7 +50,7 @@ class Motor:
     calls it now and then while the motor is `busy`.
     """
 
-    def __init__(self, world: World, model: ServoModel) -> None:
+    def __init__(self, world: Shaft, model: ServoModel) -> None:
         self.supply_v = model.supply_v
         self.commanded = rest(world.clock.now_ns() * 1e-9, world.shaft()[0])
         self._world = world

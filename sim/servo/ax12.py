@@ -1,0 +1,418 @@
+"""One simulated AX-12A: its control table, what it answers in Protocol 1.0, and what tests may do to it in the world.
+
+Source: e-manual page "AX-12+, AX-12A". Addresses are written down here once more, not shared with the driver, so that
+an error in one does not hide in the other. Kept but without effect: LEDs, compliance, punch, Max Torque.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from sim.clock import Timer
+from sim.servo.models import ServoModel
+from sim.servo.motor import Motor
+from sim.servo.protocol1 import Error
+from sim.servo.protocol2 import BROADCAST_ID, Instruction, InstructionPacket, Status
+from sim.servo.shaft import Shaft
+
+DEG_PER_COUNT = 300.0 / 1023.0
+DPS_PER_UNIT = 0.111 * 6.0
+CENTER_COUNTS = 512
+BOOT_S = 0.2
+SUPERVISION_S = 0.1
+RETURN_DELAY_UNIT_NS = 2_000
+BAUD_RATES = {
+    1: 1_000_000,
+    3: 500_000,
+    4: 400_000,
+    7: 250_000,
+    9: 200_000,
+    16: 115_200,
+    34: 57_600,
+    103: 19_200,
+    207: 9_600,
+}
+"""Baud rates by the register's value n: 2,000,000 / (n + 1), as near as it comes."""
+
+_COUNTS = range(1024)
+_BYTE = range(256)
+_DIRECTION = 0x400  # bit 10 of speed and load: clockwise
+_ARRIVED_COUNTS = 2
+_MOVING_DPS = 1.0
+
+AX_12A = ServoModel(
+    name="ax_12a",
+    firmware=24,
+    initial=MappingProxyType({}),
+    ranges=MappingProxyType({"ID": range(254)}),
+    supply_v=12.0,
+    no_load_dps=59.0 * 6.0,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A register: where it is, what it begins with, and what may be written (nothing: it is read only)."""
+
+    address: int
+    size: int
+    initial: int
+    allowed: range | None
+
+
+ENTRIES: dict[str, Entry] = {
+    "Model Number": Entry(0, 2, 12, None),
+    "Firmware Version": Entry(2, 1, 24, None),
+    "ID": Entry(3, 1, 1, range(254)),
+    "Baud Rate": Entry(4, 1, 1, range(1, 255)),
+    "Return Delay Time": Entry(5, 1, 250, range(255)),
+    "CW Angle Limit": Entry(6, 2, 0, _COUNTS),
+    "CCW Angle Limit": Entry(8, 2, 1023, _COUNTS),
+    "Temperature Limit": Entry(11, 1, 70, range(100)),
+    "Min Voltage Limit": Entry(12, 1, 60, range(50, 161)),
+    "Max Voltage Limit": Entry(13, 1, 140, range(50, 161)),
+    "Max Torque": Entry(14, 2, 1023, _COUNTS),
+    "Status Return Level": Entry(16, 1, 2, range(3)),
+    "Alarm LED": Entry(17, 1, 36, range(128)),
+    "Shutdown": Entry(18, 1, 36, range(128)),
+    "Torque Enable": Entry(24, 1, 0, range(2)),
+    "LED": Entry(25, 1, 0, range(2)),
+    "CW Compliance Margin": Entry(26, 1, 1, _BYTE),
+    "CCW Compliance Margin": Entry(27, 1, 1, _BYTE),
+    "CW Compliance Slope": Entry(28, 1, 32, _BYTE),
+    "CCW Compliance Slope": Entry(29, 1, 32, _BYTE),
+    "Goal Position": Entry(30, 2, 0, _COUNTS),
+    "Moving Speed": Entry(32, 2, 0, range(2048)),
+    "Torque Limit": Entry(34, 2, 1023, _COUNTS),
+    "Present Position": Entry(36, 2, 0, None),
+    "Present Speed": Entry(38, 2, 0, None),
+    "Present Load": Entry(40, 2, 0, None),
+    "Present Voltage": Entry(42, 1, 0, None),
+    "Present Temperature": Entry(43, 1, 0, None),
+    "Registered": Entry(44, 1, 0, None),
+    "Moving": Entry(46, 1, 0, None),
+    "Lock": Entry(47, 1, 0, range(2)),
+    "Punch": Entry(48, 2, 32, _COUNTS),
+}
+SIZE = 50
+RAM_START = 24
+
+
+class Image:
+    """The control table's bytes, by register name."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray(SIZE)
+        self.restore(0)
+
+    def __getitem__(self, name: str) -> int:
+        entry = ENTRIES[name]
+        return int.from_bytes(self._bytes[entry.address : entry.address + entry.size], "little")
+
+    def __setitem__(self, name: str, value: int) -> None:
+        entry = ENTRIES[name]
+        self._bytes[entry.address : entry.address + entry.size] = value.to_bytes(entry.size, "little")
+
+    def restore(self, start: int) -> None:
+        """Set everything from address ``start`` on to its initial value."""
+        for name, entry in ENTRIES.items():
+            if entry.address >= start:
+                self[name] = entry.initial
+
+    def read(self, address: int, size: int) -> bytes | None:
+        """Return ``size`` bytes, or None where they leave the table."""
+        return bytes(self._bytes[address : address + size]) if size > 0 and address + size <= SIZE else None
+
+    def entries(self, address: int, data: bytes) -> list[tuple[str, int]] | None:
+        """Return the registers that a write sets, or None where one is cut, out of its range or read only."""
+        at = {entry.address: (name, entry) for name, entry in ENTRIES.items()}
+        found, i = [], 0
+        while i < len(data):
+            name, entry = at.get(address + i, ("", None))
+            if entry is None or entry.allowed is None or i + entry.size > len(data):
+                return None
+            value = int.from_bytes(data[i : i + entry.size], "little")
+            if value not in entry.allowed:
+                return None
+            found.append((name, value))
+            i += entry.size
+        return found or None
+
+
+class Ax12Servo:
+    """A servo of Protocol 1.0 whose horn is the table's shaft: 0..300° in joint mode, turning without end as a wheel.
+
+    Both angle limits 0 make a wheel. As on the device, a goal written while torque is off switches it on. After a
+    shutdown (overload, heat) Torque Limit is 0, and holds nothing until it is written again.
+
+    Parameters
+    ----------
+    shaft
+        What it turns.
+    bus_id, baudrate
+        As left by whoever set the servo up.
+    center_counts
+        What the position reads at the shaft's angle 0.
+
+    Raises
+    ------
+    ValueError
+        No such id or baud rate.
+    """
+
+    protocol = 1
+    model = AX_12A
+
+    def __init__(
+        self, shaft: Shaft, *, bus_id: int = 1, baudrate: int = 1_000_000, center_counts: int = CENTER_COUNTS
+    ) -> None:
+        if bus_id not in range(254):
+            raise ValueError(f"no servo has the id {bus_id}: choose one of 0 to 253")
+        if baudrate not in BAUD_RATES.values():
+            known = ", ".join(map(str, sorted(BAUD_RATES.values())))
+            raise ValueError(f"no AX-12A speaks at {baudrate} baud: choose one of {known}")
+        self.memory = Image()
+        self.memory["ID"] = bus_id
+        self.memory["Baud Rate"] = next(n for n, rate in BAUD_RATES.items() if rate == baudrate)
+        self.motor = Motor(shaft, AX_12A)
+        self._shaft = shaft
+        self._clock = shaft.clock
+        self._center = center_counts
+        self._rng = shaft.rng(f"servo-{bus_id}")
+        self._registered: tuple[int, bytes] | None = None
+        self._overload = False
+        self._supervision: Timer | None = None
+        self._booting: Timer | None = None
+        self._on_write: dict[str, Callable[[], None]] = {
+            "Torque Enable": self._on_torque_enable,
+            "Goal Position": self._on_goal,
+            "Moving Speed": self._on_speed,
+            "Torque Limit": self._on_torque_limit,
+        }
+        self._powered = True
+
+    # -- the bus's side -------------------------------------------------------------------------------------------
+
+    @property
+    def bus_id(self) -> int:
+        return self.memory["ID"]
+
+    @property
+    def baudrate(self) -> int:
+        n = self.memory["Baud Rate"]
+        return BAUD_RATES.get(n, 2_000_000 // (n + 1))
+
+    @property
+    def return_delay_ns(self) -> int:
+        return self.memory["Return Delay Time"] * RETURN_DELAY_UNIT_NS
+
+    @property
+    def powered(self) -> bool:
+        return self._powered
+
+    def execute(self, packet: InstructionPacket) -> Status | None:
+        """Do what ``packet`` asks if it concerns this servo, and return the answer if there is one to give."""
+        everyones = packet.bus_id == BROADCAST_ID
+        if not self._powered or not (everyones or packet.bus_id == self.bus_id):
+            return None
+        level = self.memory["Status Return Level"]
+        if not packet.intact:
+            return None if everyones else Status(self._trouble() | Error.CHECKSUM)
+        error, data = self._perform(packet)
+        ping = packet.instruction == Instruction.PING
+        answers = ping or (not everyones and level >= 2 - (packet.instruction == Instruction.READ))
+        return Status(self._trouble() | error, data) if answers else None
+
+    def _perform(self, packet: InstructionPacket) -> tuple[int, bytes]:
+        parameters = packet.parameters
+        match packet.instruction:
+            case Instruction.PING:
+                return 0, b""
+            case Instruction.READ if len(parameters) == 2:
+                self._refresh()
+                data = self.memory.read(parameters[0], parameters[1])
+                return (Error.RANGE, b"") if data is None else (0, data)
+            case Instruction.WRITE if len(parameters) >= 2:
+                return self._write(parameters[0], parameters[1:]), b""
+            case Instruction.REG_WRITE if len(parameters) >= 2:
+                if error := self._refusal(self.memory.entries(parameters[0], parameters[1:])):
+                    return error, b""
+                self._registered = parameters[0], parameters[1:]
+                self.memory["Registered"] = 1
+            case Instruction.ACTION if self._registered is not None:
+                registered, self._registered = self._registered, None
+                self.memory["Registered"] = 0
+                return self._write(*registered), b""
+            case Instruction.FACTORY_RESET:
+                self.memory.restore(0)
+                self.power_cycle()
+            case Instruction.SYNC_WRITE if packet.bus_id == BROADCAST_ID and len(parameters) > 2:
+                address, size = parameters[0], parameters[1]
+                for i in range(2, len(parameters) - size, size + 1):
+                    if parameters[i] == self.bus_id:
+                        self._write(address, parameters[i + 1 : i + 1 + size])
+            case _:
+                return Error.INSTRUCTION, b""
+        return 0, b""
+
+    def _write(self, address: int, data: bytes) -> int:
+        entries = self.memory.entries(address, data)
+        if error := self._refusal(entries):
+            return error
+        assert entries is not None
+        for name, value in entries:
+            self.memory[name] = value
+            if hook := self._on_write.get(name):
+                hook()
+        return 0
+
+    def _refusal(self, entries: list[tuple[str, int]] | None) -> int:
+        if entries is None:
+            return Error.RANGE
+        low, high = self.memory["CW Angle Limit"], self.memory["CCW Angle Limit"]
+        for name, value in entries:
+            if name == "Goal Position" and not self._wheel and not low <= value <= high:
+                return Error.ANGLE_LIMIT
+            if ENTRIES[name].address < RAM_START and self.memory["Lock"]:
+                return Error.INSTRUCTION
+        return 0
+
+    # -- the world's side -----------------------------------------------------------------------------------------
+
+    def turn_by_hand(self, angle_deg: float, speed_dps: float = 90.0) -> float:
+        """Turn the shaft by ``angle_deg``, with torque off; return how many seconds the hand takes.
+
+        Raises
+        ------
+        ValueError
+            The servo holds the shaft.
+        """
+        return self.motor.push(angle_deg, speed_dps, 4 * speed_dps)
+
+    def jam(self) -> None:
+        """Block the shaft."""
+        self.motor.jam()
+        self._supervise()
+
+    def free(self) -> None:
+        """Unblock the shaft."""
+        self.motor.free()
+        self._supervise()
+
+    def set_voltage(self, supply_v: float) -> None:
+        self.motor.supply_v = supply_v
+        self._supervise()
+
+    def set_temperature(self, temperature_c: float) -> None:
+        self.motor.set_temperature(temperature_c)
+        self._supervise()
+
+    def power_off(self) -> None:
+        """Cut the supply."""
+        self._powered = False
+        self.motor.release()
+        for timer in (self._supervision, self._booting):
+            if timer:
+                timer.cancel()
+
+    def power_cycle(self) -> None:
+        """Cut the supply and give it back; the servo answers after `BOOT_S`."""
+        self.power_off()
+        self._booting = self._clock.call_at(self._clock.now_ns() + round(BOOT_S * 1e9), self._start)
+
+    # -- inside ---------------------------------------------------------------------------------------------------
+
+    @property
+    def _wheel(self) -> bool:
+        return self.memory["CW Angle Limit"] == self.memory["CCW Angle Limit"] == 0
+
+    def _start(self) -> None:
+        self._powered, self._overload, self._registered = True, False, None
+        self.memory.restore(RAM_START)
+        self.memory["Torque Limit"] = self.memory["Max Torque"]
+
+    def _trouble(self) -> int:
+        """Return the error bits of the hardware's state."""
+        motor, memory = self.motor, self.memory
+        bits = 0
+        if not memory["Min Voltage Limit"] <= motor.supply_v * 10 <= memory["Max Voltage Limit"]:
+            bits |= Error.VOLTAGE
+        if motor.temperature_c(motor.state().load) > memory["Temperature Limit"]:
+            bits |= Error.OVERHEATING
+        return bits | (Error.OVERLOAD if self._overload else 0)
+
+    def _supervise(self) -> None:
+        """Judge the servo's health now, and again and again while its load varies."""
+        if self._supervision:
+            self._supervision.cancel()
+            self._supervision = None
+        if not self._powered:
+            return
+        self.motor.settle()
+        self._overload |= self.motor.overloaded
+        if self._trouble() & self.memory["Shutdown"] and self.memory["Torque Enable"]:
+            self.memory["Torque Enable"] = self.memory["Torque Limit"] = 0
+            self.motor.release()
+        if self.motor.busy:
+            due_ns = self._clock.now_ns() + round(SUPERVISION_S * 1e9)
+            self._supervision = self._clock.call_at(due_ns, self._supervise)
+
+    def _on_torque_enable(self) -> None:
+        if not self.memory["Torque Enable"]:
+            self.motor.release()
+        elif not self.memory["Torque Limit"]:
+            self.memory["Torque Enable"] = 0
+        elif not self.motor.driven:
+            self.motor.hold()
+            self.memory["Goal Position"] = self._position()
+
+    def _on_torque_limit(self) -> None:
+        if self.memory["Torque Limit"]:
+            self._overload = False
+
+    def _on_goal(self) -> None:
+        if self._wheel:
+            return
+        goal = self.memory["Goal Position"]
+        if not self.memory["Torque Enable"]:
+            self.memory["Torque Enable"] = 1
+            self._on_torque_enable()
+            if not self.motor.driven:
+                return
+            self.memory["Goal Position"] = goal
+        speed = (self.memory["Moving Speed"] & 0x3FF) * DPS_PER_UNIT
+        v_max = min(speed, self.motor.fastest_dps) if speed else self.motor.fastest_dps
+        self.motor.go_to((goal - self._center) * DEG_PER_COUNT, v_max, self.motor.steepest_dps2)
+        self._supervise()
+
+    def _on_speed(self) -> None:
+        if self._wheel and self.memory["Torque Enable"]:
+            speed = self.memory["Moving Speed"]
+            dps = (speed & 0x3FF) / 1023 * self.motor.fastest_dps
+            self.motor.turn_at(-dps if speed & _DIRECTION else dps, self.motor.steepest_dps2)
+            self._supervise()
+
+    def _position(self) -> int:
+        """Return the position's reading: beyond the 300° of its potentiometer it stays at the end."""
+        noise_deg = self._shaft.noise.encoder_noise_deg
+        error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
+        counts = round((self._shaft.shaft()[0] + error_deg) / DEG_PER_COUNT + self._center)
+        return min(max(counts, 0), 1023)
+
+    def _refresh(self) -> None:
+        """Fill in the registers that follow the world."""
+        memory, motor = self.memory, self.motor
+        state = motor.state()
+        memory["Present Position"] = self._position()
+        memory["Present Speed"] = _signed(state.speed_dps / DPS_PER_UNIT)
+        memory["Present Load"] = _signed(state.load * 1000)
+        memory["Present Voltage"] = min(max(round(motor.terminal_v(state.load) * 10), 0), 255)
+        memory["Present Temperature"] = min(max(round(motor.temperature_c(state.load)), 0), 255)
+        goal_deg = (memory["Goal Position"] - self._center) * DEG_PER_COUNT
+        away = motor.driven and not self._wheel and abs(state.angle_deg - goal_deg) > _ARRIVED_COUNTS * DEG_PER_COUNT
+        memory["Moving"] = int(abs(state.speed_dps) > _MOVING_DPS or away)
+
+
+def _signed(value: float) -> int:
+    """Return a magnitude of up to 1023 with its direction in bit 10, clockwise (falling) set."""
+    return min(abs(round(value)), 1023) | (_DIRECTION if value < 0 else 0)

@@ -1,0 +1,51 @@
+"""What a servo turns: the table's shaft itself, or a gear on it."""
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from sim.clock import VirtualClock
+from sim.motion import Trajectory
+from sim.noise import NoiseModel
+from sim.world import World
+
+
+class Shaft(Protocol):
+    """The part of a `World` that a servo uses; a world is the shaft of its own table."""
+
+    clock: VirtualClock
+    noise: NoiseModel
+
+    def rng(self, name: str) -> np.random.Generator: ...
+    def drive(self, shaft: Trajectory) -> None: ...
+    def shaft(self, time_ns: int | None = None) -> tuple[float, float]: ...
+
+
+class Geared:
+    """The servo's side of a gear: ``ratio`` turns of the servo for one of the table."""
+
+    def __init__(self, world: World, ratio: float) -> None:
+        self.clock, self.noise = world.clock, world.noise
+        self._world = world
+        self._ratio = ratio
+
+    def rng(self, name: str) -> np.random.Generator:
+        return self._world.rng(name)
+
+    def drive(self, shaft: Trajectory) -> None:
+        """Let the servo follow ``shaft``, in degrees of its own."""
+        ratio = self._ratio
+        self._world.drive(
+            replace(
+                shaft,
+                position_deg=shaft.position_deg / ratio,
+                velocity_dps=shaft.velocity_dps / ratio,
+                acceleration_dps2=shaft.acceleration_dps2 / ratio,
+            )
+        )
+
+    def shaft(self, time_ns: int | None = None) -> tuple[float, float]:
+        """Return angle (°) and speed (°/s) of the servo."""
+        angle, speed = self._world.shaft(time_ns)
+        return angle * self._ratio, speed * self._ratio
