@@ -33,3 +33,12 @@ def sync_file(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def make_folder(path: Path, *, within: Path) -> None:
+    """Create ``path`` and the folders between it and ``within``, each durably known to the one above it."""
+    path.mkdir(parents=True, exist_ok=True)
+    for above in path.parents:
+        sync_folder(above)
+        if above == within:
+            return

@@ -41,6 +41,7 @@ from rig.catalog.records import (
 from rig.catalog.schema import DESCRIPTOR, enrollments, objects, sittings, views
 from rig.clock import Clock
 from rig.errors import CatalogError, ObjectExists, UsageError
+from rig.files import make_folder
 
 
 class ModelSet(NamedTuple):
@@ -415,7 +416,7 @@ class Catalog:
             sitting=Sitting(sitting_id, now, provenance),
             planned_azimuth_deg=plan,
         )
-        images.make_folder(self.path / enrollment.folder, within=self.path)
+        make_folder(self.path / enrollment.folder, within=self.path)
         return enrollment
 
 

@@ -10,11 +10,10 @@ from tempfile import TemporaryDirectory
 
 from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, event, insert
 
-from rig.catalog import images
 from rig.catalog.failures import DATABASE_NAME, absent, in_words
 from rig.catalog.schema import APPLICATION_ID, METADATA, SCHEMA_VERSION
 from rig.errors import CatalogError, CatalogOutdated
-from rig.files import sync_folder
+from rig.files import make_folder, sync_folder
 
 
 class Database:
@@ -84,7 +83,7 @@ class Database:
         if not is_there(self.root):
             if not create:
                 raise absent(self.root)
-            images.make_folder(self.root, within=next(above for above in self.root.parents if above.exists()))
+            make_folder(self.root, within=next(above for above in self.root.parents if above.exists()))
             self._create()
         with self.read() as connection:
             _check_up_to_date(connection, self.root)

@@ -1,0 +1,226 @@
+"""What a catalog holds and weighs, and taking out for good what nobody uses."""
+
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from sqlalchemy import Connection, and_, case, delete, func, or_, select
+
+from hbr.descriptors import descriptor, names
+from rig.catalog import audit, staging
+from rig.catalog.catalog import Catalog
+from rig.catalog.failures import DATABASE_NAME
+from rig.catalog.records import EnrollmentStatus
+from rig.catalog.schema import SCHEMA_VERSION, descriptors, enrollments, objects, sittings, views
+
+LOST: Final = "lost+found"
+"""Folder of files that `verify` set aside."""
+
+_OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
+
+
+@dataclass(frozen=True, slots=True)
+class DescriptorStatistics:
+    """How many views are described by a version of a descriptor; `current` if this program compares it."""
+
+    name: str
+    version: int
+    views: int
+    current: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Sizes in bytes. `collectable_*`: what `collect_garbage` would free."""
+
+    schema_version: int
+    objects: int
+    deleted_objects: int
+    enrollments: dict[str, int]
+    views: int
+    image_bytes: int
+    database_bytes: int
+    free_disk_bytes: int
+    labels: dict[str, int]
+    benches: dict[str, int]
+    descriptors: tuple[DescriptorStatistics, ...]
+    log_entries: int
+    deleted_image_bytes: int
+    old_image_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Collected:
+    """What was taken out for good."""
+
+    objects: tuple[str, ...]
+    enrollments: int
+    views: int
+    files: int
+    bytes: int
+
+
+def statistics(catalog: Catalog) -> Statistics:
+    """Count what the catalog holds."""
+    known = {name: descriptor(name).version for name in names()}
+    with catalog.database.read() as connection:
+        total, in_use = connection.execute(
+            select(func.count(), func.count(case((objects.c.deleted_utc.is_(None), 1)))).select_from(objects)
+        ).one()
+        weights = {
+            (status, deleted): (count, view_count, size or 0)
+            for status, deleted, count, view_count, size in connection.execute(
+                select(
+                    enrollments.c.status,
+                    objects.c.deleted_utc.is_not(None).label("deleted"),
+                    func.count(enrollments.c.id.distinct()),
+                    func.count(views.c.id),
+                    func.sum(views.c.image_bytes),
+                )
+                .join(objects)
+                .outerjoin(views, views.c.enrollment_id == enrollments.c.id)
+                .group_by(enrollments.c.status, "deleted")
+            )
+        }
+        labels = connection.execute(
+            select(objects.c.label, func.count())
+            .where(objects.c.deleted_utc.is_(None))
+            .group_by(objects.c.label)
+            .order_by(objects.c.label)
+        ).all()
+        benches = connection.execute(
+            select(sittings.c.bench, func.count(views.c.id))
+            .join(views, views.c.sitting_id == sittings.c.id)
+            .group_by(sittings.c.bench)
+            .order_by(sittings.c.bench)
+        ).all()
+        described = connection.execute(
+            select(descriptors.c.name, descriptors.c.version, func.count())
+            .group_by(descriptors.c.name, descriptors.c.version)
+            .order_by(descriptors.c.name, descriptors.c.version)
+        ).all()
+        entries = len(audit.entries(connection))
+    counts: dict[str, int] = {}
+    for (status, _), (count, _, _) in weights.items():
+        counts[status] = counts.get(status, 0) + count
+    return Statistics(
+        schema_version=SCHEMA_VERSION,
+        objects=in_use,
+        deleted_objects=total - in_use,
+        enrollments=counts,
+        views=sum(view_count for _, view_count, _ in weights.values()),
+        image_bytes=sum(size for _, _, size in weights.values()),
+        database_bytes=sum(file.stat().st_size for file in catalog.path.glob(f"{DATABASE_NAME}*")),
+        free_disk_bytes=shutil.disk_usage(catalog.path).free,
+        labels=dict(labels),
+        benches=dict(benches),
+        descriptors=tuple(
+            DescriptorStatistics(name, version, count, known.get(name) == version) for name, version, count in described
+        ),
+        log_entries=entries,
+        deleted_image_bytes=sum(size for (_, deleted), (_, _, size) in weights.items() if deleted),
+        old_image_bytes=sum(
+            size for (status, deleted), (_, _, size) in weights.items() if not deleted and status in _OLD
+        ),
+    )
+
+
+def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = False) -> Collected:
+    """Take out for good what was deleted, what `verify` set aside, and what is left of imports that were cut off.
+
+    The rows go first, in one transaction; a crash in between leaves files without rows, which `verify` finds. Levels of
+    earlier versions of a descriptor go where a view has the present one.
+
+    Parameters
+    ----------
+    old
+        Also the superseded and abandoned enrollments of objects in use.
+    dry_run
+        Only tell.
+
+    Raises
+    ------
+    CatalogError, CatalogBusy
+        The catalog cannot be written.
+    """
+    transaction = catalog.database.read if dry_run else catalog.database.write
+    with transaction() as connection:
+        doomed = connection.execute(
+            select(enrollments.c.id, objects.c.name, objects.c.deleted_utc)
+            .join(objects)
+            .where(
+                or_(
+                    objects.c.deleted_utc.is_not(None),
+                    enrollments.c.status.in_(_OLD if old else ()),
+                )
+            )
+        ).all()
+        ids = [row.id for row in doomed]
+        files = _files_of(connection, ids)
+        view_count = connection.scalar(select(func.count()).where(views.c.enrollment_id.in_(ids))) or 0
+        gone = tuple(
+            connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_not(None)).order_by(objects.c.id))
+        )
+        if not dry_run:
+            _delete_rows(connection, ids)
+    paths = [catalog.path / file for file in files]
+    for folder in (catalog.path / LOST, *staging.abandoned(catalog.path)):
+        paths += [path for path in folder.rglob("*") if path.is_file()]
+    size = 0
+    for path in paths:
+        with suppress(FileNotFoundError):
+            size += path.stat().st_size
+    collected = Collected(gone, len(ids), view_count, len(paths), size)
+    if not dry_run:
+        with catalog.database.in_words():
+            _remove(catalog.path, paths)
+        if ids or gone or paths:
+            catalog.note(
+                "collected garbage", objects=list(gone), enrollments=len(ids), views=view_count, freed_bytes=size
+            )
+    return collected
+
+
+def _files_of(connection: Connection, ids: Sequence[int]) -> list[str]:
+    return [
+        *connection.scalars(select(views.c.image).where(views.c.enrollment_id.in_(ids))),
+        *connection.scalars(
+            select(sittings.c.reference_image).where(
+                sittings.c.enrollment_id.in_(ids), sittings.c.reference_image.is_not(None)
+            )
+        ),
+    ]
+
+
+def _delete_rows(connection: Connection, ids: Sequence[int]) -> None:
+    of_them = select(views.c.id).where(views.c.enrollment_id.in_(ids))
+    connection.execute(delete(descriptors).where(descriptors.c.view_id.in_(of_them)))
+    connection.execute(delete(views).where(views.c.enrollment_id.in_(ids)))
+    connection.execute(delete(sittings).where(sittings.c.enrollment_id.in_(ids)))
+    connection.execute(delete(enrollments).where(enrollments.c.id.in_(ids)))
+    connection.execute(delete(objects).where(objects.c.deleted_utc.is_not(None)))
+    later = descriptors.alias()
+    for name in names():
+        version = descriptor(name).version
+        connection.execute(
+            delete(descriptors).where(
+                descriptors.c.name == name,
+                descriptors.c.version < version,
+                select(later.c.view_id)
+                .where(and_(later.c.view_id == descriptors.c.view_id, later.c.name == name, later.c.version == version))
+                .exists(),
+            )
+        )
+
+
+def _remove(root: Path, paths: Sequence[Path]) -> None:
+    folders: set[Path] = set()
+    for path in paths:
+        path.unlink(missing_ok=True)
+        folders.update(above for above in path.parents if above != root and above.is_relative_to(root))
+    for folder in sorted(folders, key=lambda path: len(path.parts), reverse=True):
+        with suppress(OSError):  # it is in use
+            folder.rmdir()
