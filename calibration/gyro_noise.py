@@ -1,0 +1,281 @@
+"""What the gyro shows while nothing moves: its zero, how that follows temperature, its noise, and how it wanders.
+
+The Allan variance of the rate over the time τ, overlapping, from the integrated angle θ (IEEE Std 952, annex C):
+
+    σ²(τ) = Σ (θ(t + 2τ) − 2θ(t + τ) + θ(t))² / (2τ²·n)
+
+White noise of the angle random walk N gives N²/τ, a random walk K of the rate K²·τ/3. Both are fitted together; where
+they are equal lies the lowest value of the curve, which divided by 0.664 is called the bias instability. Samples of an
+Allan variance over many τ share their data, so that the uncertainties come from a parametric bootstrap: the fit is
+repeated on series drawn with the fitted N and K.
+"""
+
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from calibration.events import Progress
+from rig.bench import Bench
+from rig.errors import UsageError
+from rig.facts import Estimate, Fact
+
+NAME = "imu.noise"
+VALID_DAYS = 365
+
+BLOCK_S = 1.0
+"""Samples are averaged over this first: so long that what the sensor's low-pass remembers of the last is below 1 %."""
+MIN_MINUTES = 3.0
+BOOTSTRAPS = 100
+MIN_WARMTH_C = 1.0
+"""Over a smaller change of temperature nothing can be said about the slope."""
+MAX_ARW_DEG_RTS = 0.02
+"""Six times the sensor's datasheet: beyond it something shakes, or the sensor is broken."""
+MAX_STEP_SIGMA = 7.0
+"""Largest deviation of one block from its neighbours: of 10⁶ blocks of noise none is further off."""
+INSTABILITY = sqrt(2 * np.log(2) / np.pi)
+"""0.664, the Allan deviation of flicker noise over its coefficient."""
+_DRAIN_S = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """What the sensor delivered at rest, averaged over blocks.
+
+    ``gyro_dps`` float64 (n, 3), about the sensor's axes; ``temperature_c`` float64 (n,); ``lost`` samples that are
+    missing between blocks.
+    """
+
+    gyro_dps: NDArray[np.float64]
+    temperature_c: NDArray[np.float64]
+    block_s: float
+    lost: int = 0
+
+
+def live(bench: Bench, *, minutes: float = 20.0) -> Generator[Progress | Fact, None, Fact]:
+    """Listen to the sensor for some ``minutes`` while the table stands without torque; yields progress, then the fact.
+
+    Soon after power-on the sensor warms up: only then the slope over temperature can be told.
+
+    Raises
+    ------
+    UsageError
+        Fewer than `MIN_MINUTES`.
+    DeviceFault, DeviceSilent
+        The sensor fails.
+    """
+    if minutes < MIN_MINUTES:
+        raise UsageError(
+            f"{minutes:g} minutes are too few to see the gyro's zero wander.",
+            next_step=f"Give at least {MIN_MINUTES:g}; 20 are usual.",
+        )
+    imu, clock = bench.imu, bench.clock
+    when_utc = clock.utc()
+    per_block = round(BLOCK_S * imu.rate_hz)
+    waiting = np.empty((0, 3))
+    blocks: list[NDArray[np.float64]] = []
+    temperatures: list[float] = []
+    lost = 0
+    imu.read_samples()  # what waited since the bench was opened
+    needed = round(minutes * 60 / BLOCK_S)
+    told = 0
+    while len(blocks) < needed:
+        clock.sleep(_DRAIN_S)
+        new = imu.read_samples()
+        lost += new.lost
+        waiting = np.concatenate([waiting, new.gyro_dps])
+        temperature_c = imu.temperature_c()
+        while len(waiting) >= per_block:
+            blocks.append(waiting[:per_block].mean(axis=0))
+            temperatures.append(temperature_c)
+            waiting = waiting[per_block:]
+        if (share := len(blocks) / needed) * 20 >= told + 1:
+            told = int(share * 20)
+            yield Progress(min(share, 1.0), f"{share:.0%} of {minutes:g} minutes, {temperature_c:.1f} °C")
+    rest = Rest(np.array(blocks), np.array(temperatures), per_block / imu.rate_hz, lost)
+    fact = from_data(
+        rest,
+        column="xyz".index(bench.config.imu.axis),
+        when_utc=when_utc,
+        device=bench.apparatus("imu"),
+    )
+    yield fact
+    return fact
+
+
+def from_data(rest: Rest, *, column: int, when_utc: datetime, device: Mapping[str, Any], seed: int = 0) -> Fact:
+    """Fit the noise of the vertical gyro (``column`` of the sensor's axes) and judge it.
+
+    Parameters
+    ----------
+    rest
+        What was heard.
+    when_utc, device
+        Kept with the fact.
+    seed
+        Of the bootstrap.
+    """
+    rate = rest.gyro_dps[:, column]
+    refusals = _disturbances(rest, column)
+    warmed = float(np.ptp(rest.temperature_c)) >= MIN_WARMTH_C
+    trend = rest.temperature_c if warmed else np.zeros(rate.size)
+    fitted = np.array(_fit(rate, rest.block_s, trend))
+    drawn = np.array(
+        [_fit(series, rest.block_s, trend) for series in _bootstrap(fitted, rest.block_s, rate.size, seed)]
+    )
+    # Taking out the trend takes some of the wandering with it: what the bootstrap lacks of what it was drawn with, the
+    # fit lacks too.
+    lack = np.divide(fitted, drawn.mean(axis=0), out=np.ones(2), where=fitted > 0)
+    arw, walk = (fitted * lack).tolist()
+    drawn *= lack**2
+    arw_sigma, walk_sigma = drawn.std(axis=0, ddof=1).tolist()
+    longest_s = rate.size * rest.block_s / 4
+    instability = _instability(arw, walk, longest_s)
+    instability_sigma = float(np.std([_instability(n, k, longest_s) for n, k in drawn.tolist()], ddof=1))
+    if arw > MAX_ARW_DEG_RTS:
+        refusals.append(
+            f"The angle random walk is {arw:.4f} °/√s, above {MAX_ARW_DEG_RTS:g}: the bench shakes, or the sensor is "
+            "broken. Keep people and fans off the bench and calibrate again."
+        )
+    bias_sigma = sqrt(arw**2 / (rate.size * rest.block_s) + walk**2 * rate.size * rest.block_s / 3)
+    estimates = {
+        "angle_random_walk": Estimate(arw, arw_sigma, "°/√s"),
+        "rate_random_walk": Estimate(walk, walk_sigma, "°/s/√s"),
+        "bias_instability": Estimate(instability, instability_sigma, "°/s"),
+        "bias": Estimate(float(rate.mean()), bias_sigma, "°/s"),
+    }
+    if warmed:
+        slope, slope_sigma = _slope(rate, rest.temperature_c, arw, walk, rest.block_s)
+        estimates["bias_slope"] = Estimate(slope, slope_sigma, "°/s/°C")
+    steady = rate - _slope(rate, trend)[0] * trend
+    taus, deviation, freedom = allan(steady, rest.block_s)
+    model = np.sqrt(arw**2 / taus + walk**2 * taus / 3)
+    return Fact(
+        name=NAME,
+        estimates=estimates,
+        residual=float(np.max(np.abs(np.log(deviation / model)) * np.sqrt(freedom / 2))),
+        limit=None,
+        residual_unit="σ",
+        refusals=tuple(refusals),
+        valid_days=VALID_DAYS,
+        when_utc=when_utc,
+        device=device,
+        evidence={
+            "minutes": rate.size * rest.block_s / 60,
+            "temperature_c": [float(rest.temperature_c.min()), float(rest.temperature_c.max())],
+            "lost_samples": rest.lost,
+            "bias_dps": rest.gyro_dps.mean(axis=0).tolist(),
+            "tau_s": taus.tolist(),
+            "allan_deviation_dps": deviation.tolist(),
+            "allan_deviation_model_dps": model.tolist(),
+        },
+    )
+
+
+def allan(
+    rate: NDArray[np.float64], period_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return τ (s), the overlapping Allan deviation, and its degrees of freedom, over octaves of τ.
+
+    Parameters
+    ----------
+    rate
+        Float64 (n,), evenly spaced by ``period_s``.
+    """
+    angle = np.concatenate([[0.0], np.cumsum(rate)]) * period_s
+    spans = 2 ** np.arange(int(np.log2(rate.size / 4)) + 1)
+    second = [angle[2 * m :] - 2 * angle[m:-m] + angle[: -2 * m] for m in spans]
+    taus: NDArray[np.float64] = spans * period_s
+    variance = np.array([(d**2).mean() for d in second]) / (2 * taus**2)
+    # Degrees of freedom of an overlapping estimate under white frequency noise (NIST SP 1065, table 5).
+    n = rate.size
+    freedom: NDArray[np.float64] = (3 * (n - 1) / (2 * spans) - 2 * (n - 2) / n) * 4 * spans**2 / (4 * spans**2 + 5)
+    return taus, np.sqrt(variance), np.maximum(freedom, 1.0)
+
+
+def rotation_sigma_deg(fact: Fact, seconds: float) -> float:
+    """Return the standard uncertainty that noise and wandering give a rotation measured over ``seconds``.
+
+    The zero is taken to be known exactly when the rotation begins: σ² = N²·t + K²·t³/3.
+    """
+    arw, walk = fact.estimates["angle_random_walk"].value, fact.estimates["rate_random_walk"].value
+    return sqrt(arw**2 * seconds + walk**2 * seconds**3 / 3)
+
+
+def _fit(rate: NDArray[np.float64], period_s: float, trend: NDArray[np.float64]) -> tuple[float, float]:
+    """Return angle random walk and rate random walk by weighted, non-negative least squares on the Allan variance.
+
+    What follows ``trend`` is taken out first.
+    """
+    slope, _ = _slope(rate, trend)
+    rate = rate - slope * trend
+    taus, deviation, freedom = allan(rate, period_s)
+    weights = np.sqrt(freedom / 2) / deviation**2
+    n2, k2 = nnls(np.column_stack([1 / taus, taus / 3]) * weights[:, None], deviation**2 * weights)[0]
+    return sqrt(n2), sqrt(k2)
+
+
+def _bootstrap(
+    fitted: NDArray[np.float64], period_s: float, size: int, seed: int
+) -> Generator[NDArray[np.float64], None, None]:
+    arw, walk = fitted
+    rng = np.random.default_rng(seed)
+    for _ in range(BOOTSTRAPS):
+        white, steps = rng.standard_normal((2, size))
+        yield arw / sqrt(period_s) * white + walk * sqrt(period_s) * np.cumsum(steps)
+
+
+def _instability(arw: float, walk: float, longest_s: float) -> float:
+    """Return the lowest Allan deviation within ``longest_s``, over 0.664."""
+    tau = min(sqrt(3) * arw / walk if walk else longest_s, longest_s)
+    return sqrt(arw**2 / tau + walk**2 * tau / 3) / INSTABILITY
+
+
+def _slope(
+    rate: NDArray[np.float64],
+    temperature_c: NDArray[np.float64],
+    arw: float = 1.0,
+    walk: float = 0.0,
+    block_s: float = 1.0,
+) -> tuple[float, float]:
+    """Return the slope of the zero over temperature, °/s/°C, and its standard uncertainty.
+
+    Generalised least squares: over spans of the length where white noise and wandering are equally strong, the
+    differences of neighbouring means are nearly independent.
+    """
+    tau = sqrt(3) * arw / walk if walk else np.inf
+    span = int(np.clip(tau / block_s, 1, rate.size // 8))
+    count = rate.size // span
+    means = np.column_stack([rate, temperature_c])[: count * span].reshape(count, span, 2).mean(axis=1)
+    steps = np.diff(means, axis=0)
+    norm = float((steps[:, 1] ** 2).sum())
+    if norm == 0:
+        return 0.0, np.inf
+    slope = float((steps[:, 0] * steps[:, 1]).sum()) / norm
+    seconds = span * block_s
+    return slope, sqrt((2 * arw**2 / seconds + 2 * walk**2 * seconds / 3) / norm)
+
+
+def _disturbances(rest: Rest, column: int) -> list[str]:
+    """Return why the table did not rest, or the record is not whole."""
+    refusals = []
+    steps = np.diff(rest.gyro_dps[:, column])
+    typical = 1.4826 * float(np.median(np.abs(steps)))
+    jumps = np.flatnonzero(np.abs(steps) > MAX_STEP_SIGMA * max(typical, 1e-9))
+    if jumps.size:
+        at_s = (int(jumps[0]) + 1) * rest.block_s
+        refusals.append(
+            f"After {at_s:.0f} s the rate jumped by {abs(steps[jumps[0]]):.3f} °/s: the table was touched or shaken. "
+            "Keep hands off and calibrate again."
+        )
+    if rest.lost:
+        refusals.append(
+            f"The sensor lost {rest.lost} samples: another program used the bus, or the computer was busy. Close what "
+            "runs beside this and calibrate again."
+        )
+    return refusals
