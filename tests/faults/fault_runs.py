@@ -1,0 +1,191 @@
+"""An enrollment and an identification under faults, and what can be said about each when it is over."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from angle_code import Coded, coded_deg
+from sqlalchemy import func, select
+
+import hbr
+from hbr.angles import wrap180
+from rig.bench import Bench
+from rig.catalog import Catalog, StoredView
+from rig.catalog.queries import stored_views
+from rig.catalog.schema import enrollments, views
+from rig.config import load_config
+from rig.errors import RigError
+from rig.plans.enroll import enroll
+from rig.plans.events import Accepted, Enrolled, Event, Identified
+from rig.plans.identify import identify
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.faults import Fault, Faults
+from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
+from sim.parts import SimParts
+from sim.world import World
+
+VIEWS = 72
+NAME = "toy-car"
+KNOWN = (NAME, "cereal-puzzle", "dice")
+NOISE = NoiseModel(full_well_e=0, read_noise_e=0)
+"""The bench's noise, but that of the pixels, which costs most of a run and bears on nothing here."""
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+"""Frames of a quarter of the size, which cost a quarter."""
+STANDING_S = 1.0
+"""Longer than the servo's watchdog takes to stop the table."""
+
+
+def things() -> dict[str, Coded]:
+    return {name: Coded(shelf()[name]) for name in KNOWN}
+
+
+@dataclass
+class Rig:
+    """A simulated bench that outlives its openings, with a catalog on a real disk."""
+
+    parts: SimParts
+    operator: ShelfOperator
+    folder: Path
+    settings: tuple[str, ...] = SMALL
+
+    def bench(self, *faults: str) -> Bench:
+        scheduled = [Fault.parse(text) for text in faults]
+        return open_sim_bench(load_config(None, self.settings), self.operator, faults=scheduled, parts=self.parts)
+
+    @contextmanager
+    def opened(self, *faults: str) -> Iterator[tuple[Bench, Catalog]]:
+        with self.bench(*faults) as bench, Catalog.open(self.folder, clock=bench.clock) as catalog:
+            yield bench, catalog
+
+    @property
+    def world(self) -> World:
+        return self.parts.world
+
+    @property
+    def faults(self) -> Faults:
+        assert self.operator.faults is not None
+        return self.operator.faults
+
+    @property
+    def torque(self) -> bool:
+        """Whether the servo holds the shaft, by its own register."""
+        return bool(self.parts.servo.memory["Torque Enable"])
+
+
+@contextmanager
+def new_rig(folder: Path, *settings: str, seed: int = 7) -> Iterator[Rig]:
+    world = World(noise=NOISE, seed=seed)
+    settings = (*SMALL, *settings)
+    config = load_config(None, settings)
+    with SimParts.connected(config, world) as parts:
+        rig = Rig(parts, ShelfOperator(world, things()), folder, settings)
+        try:
+            yield rig
+        finally:
+            if rig.operator.faults:
+                rig.operator.faults.clear()
+
+
+@dataclass
+class Outcome:
+    """How a plan ended: with an answer or an error; ``found_s`` is how long after the first fault it ended."""
+
+    events: list[Event] = field(default_factory=list)
+    error: RigError | None = None
+    found_s: float = 0.0
+
+    @property
+    def code(self) -> int | None:
+        return None if self.error is None else self.error.code
+
+    @property
+    def stored(self) -> set[int]:
+        """Indices of the views that were reported as stored."""
+        return {event.index for event in self.events if isinstance(event, Accepted)}
+
+
+def enrollment(rig: Rig, *faults: str, resume: bool = False, replace: bool = False, views: int = VIEWS) -> Outcome:
+    outcome = Outcome()
+    try:
+        with rig.opened(*faults) as (bench, catalog):
+            plan = enroll(bench, catalog, NAME, views=None if resume else views, resume=resume, replace=replace)
+            outcome.events.extend(plan)
+    except RigError as error:
+        outcome.error = error
+    _time(rig, outcome)
+    return outcome
+
+
+def identification(rig: Rig, *faults: str, yaw_deg: float = 77.0) -> Outcome:
+    rig.operator.next_object, rig.operator.yaw_deg = NAME, yaw_deg
+    outcome = Outcome()
+    try:
+        with rig.opened(*faults) as (bench, _):
+            outcome.events.extend(identify(bench, known_views()))
+    except RigError as error:
+        outcome.error = error
+    _time(rig, outcome)
+    return outcome
+
+
+def _time(rig: Rig, outcome: Outcome) -> None:
+    began = [occurrence.time_ns for occurrence in rig.faults.history if occurrence.began]
+    outcome.found_s = (rig.world.clock.now_ns() - began[0]) * 1e-9 if began else 0.0
+
+
+@cache
+def known_views() -> hbr.ViewIndex:
+    """Return the views of three objects, enrolled without any fault."""
+    with TemporaryDirectory() as folder, new_rig(Path(folder), seed=1) as rig, rig.opened() as (bench, catalog):
+        for name in KNOWN:
+            for _ in enroll(bench, catalog, name, views=24):
+                pass
+        return hbr.ViewIndex(catalog.views().views)
+
+
+def check_stored(rig: Rig, expected: set[int], *, tolerance_deg: float, planned: int = VIEWS) -> None:
+    """Check that exactly the expected views are stored, each whole, and each at the angle that its picture carries."""
+    with Catalog.open(rig.folder, clock=rig.world.clock) as catalog:
+        stored = newest_views(catalog)
+        assert {view.record.index for view in stored} == expected
+        for view in stored:
+            image = catalog.read_image(view)
+            true_deg = coded_deg(image)
+            assert true_deg is not None, f"view {view.record.index} shows no object"
+            off_deg = float(wrap180(view.record.azimuth_deg + true_deg))
+            assert abs(off_deg) <= tolerance_deg, f"view {view.record.index} is {off_deg:+.2f}° off"
+            planned_deg = -view.record.index * 360.0 / planned
+            assert abs(wrap180(view.record.azimuth_deg - planned_deg)) <= 1.0
+            x, y, width, height = load_config(None, rig.settings).view.roi or (0, 0, 320, 240)
+            region = image[y : y + height, x : x + width]
+            assert np.array_equal(hbr.describe(region), view.record.descriptor)
+
+
+def newest_views(catalog: Catalog) -> list[StoredView]:
+    """Return the views of the newest enrollment, complete or not."""
+    with catalog.database.read() as connection:
+        newest = connection.scalar(select(func.max(enrollments.c.id)))
+        return stored_views(connection, views.c.enrollment_id == newest)
+
+
+def check_stands(rig: Rig) -> None:
+    """Check that the table comes to a stand, and stays there."""
+    rig.world.clock.sleep(STANDING_S)
+    before = rig.world.shaft()
+    assert before[1] == 0
+    rig.world.clock.sleep(STANDING_S)
+    assert rig.world.shaft() == before
+
+
+def answer(outcome: Outcome) -> Identified | None:
+    last = outcome.events[-1] if outcome.events else None
+    return last if isinstance(last, Identified) else None
+
+
+def enrolled(outcome: Outcome) -> bool:
+    return bool(outcome.events) and isinstance(outcome.events[-1], Enrolled)

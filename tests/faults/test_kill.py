@@ -1,0 +1,60 @@
+"""A process that is killed at any moment of an enrollment loses no view that it has reported, and can go on."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import killed_enrollments
+import pytest
+from fault_runs import NAME, check_stored, enrolled, enrollment, new_rig
+from killed_enrollments import VIEWS
+
+from rig.catalog import Catalog
+
+BATCHES = 2
+KILLS, KILLS_NIGHTLY = 40, 200
+
+
+@pytest.mark.parametrize("batch", range(BATCHES))
+def test_whatever_moment_a_process_is_killed_at_its_reported_views_are_whole_and_it_resumes(
+    tmp_path: Path, request: pytest.FixtureRequest, batch: int
+) -> None:
+    """40 kills; with ``--hypothesis-profile=nightly`` 200."""
+    nightly = request.config.getoption("--hypothesis-profile") == "nightly"
+    kills = (KILLS_NIGHTLY if nightly else KILLS) // BATCHES
+    done = subprocess.run(
+        [sys.executable, killed_enrollments.__file__, str(tmp_path), str(kills), str(batch)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=110,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.returncode == 0, done.stderr
+    runs = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(runs) == kills
+    killed = [run for run in runs if run["killed"]]
+    assert len(killed) > kills / 2
+    assert len({len(run["reported"]) for run in killed}) > 3  # at different moments indeed
+    for run in runs:
+        check_one(tmp_path / str(run["number"]), run["reported"])
+
+
+def check_one(folder: Path, reported: list[int]) -> None:
+    assert reported == list(range(len(reported)))
+    with new_rig(folder, seed=1) as rig:
+        with Catalog.open(folder, clock=rig.world.clock) as catalog:
+            begun = bool(catalog.objects())
+            unfinished = catalog.resumable(NAME) if begun else None
+            present = set(unfinished.present) if unfinished else set(range(VIEWS)) if begun else set()
+        assert set(reported) <= present
+        assert len(present) <= len(reported) + 1  # the last one may have been stored, but not yet reported
+        check_stored(rig, present, tolerance_deg=0.5, planned=VIEWS)
+        if unfinished or not begun:
+            resumed = enrollment(rig, resume=begun, views=VIEWS)
+            assert enrolled(resumed), resumed.error
+            assert resumed.stored == set(range(VIEWS)) - present
+            check_stored(rig, set(range(VIEWS)), tolerance_deg=0.5, planned=VIEWS)
+    assert not list(folder.rglob("*.part"))
