@@ -59,6 +59,38 @@ def region(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8
     return image_bgr[y : y + height, x : x + width]
 
 
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """What the region of a frame looks like; see `ViewEvidence`."""
+
+    sharpness: float
+    mean_level: float
+    dark_share: float
+    saturated_share: float
+
+    def reasons(self, config: ViewConfig) -> list[str]:
+        """Return why a frame that looks so is not taken."""
+        reasons = []
+        if self.mean_level < config.min_mean or self.dark_share > config.max_dark:
+            reasons.append(f"too dark (mean level {self.mean_level:.1f}, {self.dark_share:.0%} black)")
+        if self.saturated_share > config.max_saturated:
+            reasons.append(f"overexposed ({self.saturated_share:.0%} saturated)")
+        if self.sharpness < config.min_sharpness:
+            reasons.append(f"blurred (sharpness {self.sharpness:.1f} < {config.min_sharpness:g})")
+        return reasons
+
+
+def looks(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Looks:
+    """Measure the region of interest of a frame, uint8 (H, W, 3)."""
+    grey = cv2.cvtColor(region(image_bgr, config), cv2.COLOR_BGR2GRAY)
+    return Looks(
+        sharpness=float(cv2.Laplacian(grey, cv2.CV_16S).var()),
+        mean_level=float(grey.mean()),
+        dark_share=float(np.count_nonzero(grey < DARK_LEVEL) / grey.size),
+        saturated_share=float(np.count_nonzero(grey == 255) / grey.size),
+    )
+
+
 def describe(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8]:
     """Return the CEDD levels, uint8 (144,), of a frame's region of interest."""
     return hbr.describe(region(image_bgr, config))
@@ -99,15 +131,15 @@ class Viewer:
 
     def _judge(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:
         config = self._config
-        grey = cv2.cvtColor(region(frame.image_bgr, config), cv2.COLOR_BGR2GRAY)
+        seen = looks(frame.image_bgr, config)
         locks = self._camera.read_locks()
         evidence = ViewEvidence(
             settled_ns=settled_ns,
             exposed_ns=frame.exposed_ns,
-            sharpness=float(cv2.Laplacian(grey, cv2.CV_16S).var()),
-            mean_level=float(grey.mean()),
-            dark_share=float(np.count_nonzero(grey < DARK_LEVEL) / grey.size),
-            saturated_share=float(np.count_nonzero(grey == 255) / grey.size),
+            sharpness=seen.sharpness,
+            mean_level=seen.mean_level,
+            dark_share=seen.dark_share,
+            saturated_share=seen.saturated_share,
             repeated=self._last is not None and np.array_equal(frame.image_bgr, self._last),
             locks=locks,
             locks_hold=locks == self._locks,
@@ -127,10 +159,5 @@ class Viewer:
             reasons.append("the camera repeated its last frame")
         if not evidence.locks_hold:
             reasons.append("exposure or white balance is not as locked")
-        if evidence.mean_level < config.min_mean or evidence.dark_share > config.max_dark:
-            reasons.append(f"too dark (mean level {evidence.mean_level:.1f}, {evidence.dark_share:.0%} black)")
-        if evidence.saturated_share > config.max_saturated:
-            reasons.append(f"overexposed ({evidence.saturated_share:.0%} saturated)")
-        if evidence.sharpness < config.min_sharpness:
-            reasons.append(f"blurred (sharpness {evidence.sharpness:.1f} < {config.min_sharpness:g})")
+        reasons += seen.reasons(config)
         return Attempt(number, frame.image_bgr, evidence, tuple(reasons))
