@@ -8,12 +8,13 @@ from pydantic import BaseModel
 from rig.bench import Bench, BenchKind
 from rig.clock import Clock, SystemClock
 from rig.config import RigConfig, Section
-from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.port import ClockedPort, Wire, open_serial
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import Wire, open_serial
 from rig.devices.dynamixel.register_servo import prepare_servo
-from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
 from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
+from rig.devices.servo import Servo
+from rig.errors import ConfigError
 from rig.state import BenchLock, FileStore, StateStore
 
 
@@ -66,14 +67,12 @@ def assemble(
     ------
     DeviceNotFound, DeviceMismatch, DeviceSilent
         A device is not there, is another one, or does not answer. The wires are left to the caller.
+    ConfigError
+        The servo cannot be what the configuration wants it to be, or does not reach the table's limits.
     """
-    servo = DynamixelServo(
-        DynamixelBus(ClockedPort(wire, clock, config.servo.port), config.servo.retries),
-        bus_id=config.servo.id,
-        model=config.servo.model,
-        clock=clock,
-    )
-    findings = prepare_servo(servo, write=config.servo.write_settings)
+    servo = open_servo(wire, config.servo, clock, config.table.mode)
+    findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
+    _check_reach(config, servo)
     with ExitStack() as opened:
         imu = Mpu6050(
             i2c_bus, address=config.imu.address, clock=clock, range_dps=config.imu.range_dps, rate_hz=config.imu.rate_hz
@@ -95,6 +94,22 @@ def assemble(
         bench.findings += bench.safety.findings
         opened.pop_all()
     return bench
+
+
+def _check_reach(config: RigConfig, servo: Servo) -> None:
+    """Raise `ConfigError` where the table's limits lie beyond what the servo reaches."""
+    table, (low, high) = config.table, servo.reach_deg
+    first, last = sorted(table.direction * limit + table.zero_deg for limit in table.limits_deg)
+    if low - servo.resolution_deg <= first and last <= high + servo.resolution_deg:
+        return
+    reached = sorted(table.direction * (end - table.zero_deg) for end in (low, high))
+    raise ConfigError(
+        f"The servo reaches {low:.0f}° to {high:.0f}°; the table's limits would take it from {first:.0f}° to "
+        f"{last:.0f}°.",
+        next_step=f"Set table.limits_deg within [{reached[0]:.0f}, {reached[1]:.0f}], or put table.zero_deg, the "
+        "servo's angle at table angle 0, into the middle of what it reaches.",
+        evidence={"limits_deg": list(table.limits_deg), "zero_deg": table.zero_deg, "reach_deg": [low, high]},
+    )
 
 
 HARDWARE: BenchKind = HardwareBench()

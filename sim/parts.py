@@ -9,12 +9,16 @@ import serial
 
 from rig.config import RigConfig
 from rig.devices.dynamixel.port import READ_SLICE_S
+from rig.devices.dynamixel.registers import protocol_of
 from rig.errors import ConfigError, DeviceNotFound
 from sim.camera import SimCapture
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
-from sim.servo import ServoBus, SimSerial, XSeriesServo
+from sim.servo import Ax12Servo, Geared, ServoBus, SimSerial, XSeriesServo
+from sim.servo.shaft import Shaft
 from sim.world import World
+
+SimulatedServo = XSeriesServo | Ax12Servo
 
 
 @dataclass
@@ -26,7 +30,7 @@ class SimParts(AbstractContextManager["SimParts"]):
 
     world: World
     servo_bus: ServoBus
-    servo: XSeriesServo
+    servo: SimulatedServo
     adapter: SimSerial
     i2c: SimI2cBus
     imu: SimMpu6050
@@ -75,9 +79,13 @@ class SimParts(AbstractContextManager["SimParts"]):
                 ) from error
 
 
-def _servo(world: World, config: RigConfig) -> XSeriesServo:
+def _servo(world: World, config: RigConfig) -> SimulatedServo:
+    servo = config.servo
+    shaft: Shaft = world if servo.gear_ratio == 1 else Geared(world, servo.gear_ratio)
     try:
-        return XSeriesServo(world, config.servo.model, bus_id=config.servo.id, baudrate=config.servo.baud)
+        if protocol_of(servo.model) == 1:
+            return Ax12Servo(shaft, bus_id=servo.id, baudrate=servo.baud)
+        return XSeriesServo(shaft, servo.model, bus_id=servo.id, baudrate=servo.baud)
     except ValueError as error:
         raise ConfigError(
             "The simulated bench has no such servo.",

@@ -7,6 +7,7 @@ an error in one does not hide in the other. Kept but without effect: LEDs, compl
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 from sim.clock import Timer
 from sim.servo.models import ServoModel
@@ -96,6 +97,7 @@ ENTRIES: dict[str, Entry] = {
 }
 SIZE = 50
 RAM_START = 24
+_LIVE = slice(36, 47)
 
 
 class Image:
@@ -112,6 +114,14 @@ class Image:
     def __setitem__(self, name: str, value: int) -> None:
         entry = ENTRIES[name]
         self._bytes[entry.address : entry.address + entry.size] = value.to_bytes(entry.size, "little")
+
+    def live(self) -> bytes:
+        """Return the registers that follow the world."""
+        return bytes(self._bytes[_LIVE])
+
+    def set_live(self, data: bytes) -> None:
+        """Have them report something else."""
+        self._bytes[_LIVE] = data
 
     def restore(self, start: int) -> None:
         """Set everything from address ``start`` on to its initial value."""
@@ -158,6 +168,11 @@ class Ax12Servo:
     ------
     ValueError
         No such id or baud rate.
+
+    Attributes
+    ----------
+    distortions
+        Called with the memory each time its live registers have been filled in: see `XSeriesServo`.
     """
 
     protocol = 1
@@ -179,8 +194,10 @@ class Ax12Servo:
         self._clock = shaft.clock
         self._center = center_counts
         self._rng = shaft.rng(f"servo-{bus_id}")
+        self.distortions: list[Callable[[Any], None]] = []
         self._registered: tuple[int, bytes] | None = None
         self._overload = False
+        self._failed = 0
         self._supervision: Timer | None = None
         self._booting: Timer | None = None
         self._on_write: dict[str, Callable[[], None]] = {
@@ -230,6 +247,8 @@ class Ax12Servo:
                 return 0, b""
             case Instruction.READ if len(parameters) == 2:
                 self._refresh()
+                for distort in self.distortions:
+                    distort(self.memory)
                 data = self.memory.read(parameters[0], parameters[1])
                 return (Error.RANGE, b"") if data is None else (0, data)
             case Instruction.WRITE if len(parameters) >= 2:
@@ -307,9 +326,29 @@ class Ax12Servo:
         self.motor.set_temperature(temperature_c)
         self._supervise()
 
+    def fail(self, error: int) -> None:
+        """Raise bits of the error byte, until the next power-up."""
+        self._failed |= error
+        self._supervise()
+
+    def trip_watchdog(self) -> None:
+        """Do nothing: it has none."""
+
+    def slip_encoder(self, angle_deg: float) -> None:
+        """Let the potentiometer slip by ``angle_deg``; the shaft follows what it now reads."""
+        self._center += round(angle_deg / DEG_PER_COUNT)
+        if self.motor.driven:
+            self._on_goal()
+
+    def power_on(self) -> None:
+        """Give the supply back; the servo answers after `BOOT_S`."""
+        if not self._powered:
+            self.power_cycle()
+
     def power_off(self) -> None:
         """Cut the supply."""
         self._powered = False
+        self.memory["Torque Enable"] = 0
         self.motor.release()
         for timer in (self._supervision, self._booting):
             if timer:
@@ -327,7 +366,7 @@ class Ax12Servo:
         return self.memory["CW Angle Limit"] == self.memory["CCW Angle Limit"] == 0
 
     def _start(self) -> None:
-        self._powered, self._overload, self._registered = True, False, None
+        self._powered, self._overload, self._failed, self._registered = True, False, 0, None
         self.memory.restore(RAM_START)
         self.memory["Torque Limit"] = self.memory["Max Torque"]
 
@@ -339,7 +378,7 @@ class Ax12Servo:
             bits |= Error.VOLTAGE
         if motor.temperature_c(motor.state().load) > memory["Temperature Limit"]:
             bits |= Error.OVERHEATING
-        return bits | (Error.OVERLOAD if self._overload else 0)
+        return bits | self._failed | (Error.OVERLOAD if self._overload else 0)
 
     def _supervise(self) -> None:
         """Judge the servo's health now, and again and again while its load varies."""
