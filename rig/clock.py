@@ -1,6 +1,8 @@
 """The one clock of a bench: the only module that asks the operating system for the time."""
 
+import threading
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Protocol
 
@@ -20,6 +22,13 @@ class Clock(Protocol):
         """Return the civil time, for records that people read."""
         ...
 
+    def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
+        """Call ``action`` about every ``seconds`` beside the program, until the function returned is called.
+
+        ``action`` raises nothing, and keeps out of what the program is just doing: it may run in another thread.
+        """
+        ...
+
 
 class SystemClock:
     """The computer's own monotonic clock."""
@@ -33,6 +42,23 @@ class SystemClock:
 
     def utc(self) -> datetime:
         return datetime.now(UTC)  # noqa: TID251
+
+    def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
+        over = threading.Event()
+
+        def run() -> None:
+            while not over.wait(seconds):
+                action()
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+
+        def cancel() -> None:
+            over.set()
+            if thread is not threading.current_thread():
+                thread.join()
+
+        return cancel
 
 
 def seconds_between(start_ns: int, end_ns: int) -> float:

@@ -62,6 +62,29 @@ class VirtualClock:
         heapq.heappush(self._timers, (timer.at_ns, next(self._order), timer))
         return timer
 
+    def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
+        """Call ``action`` every ``seconds`` of virtual time, in the middle of whatever sleeps then."""
+        timer: Timer | None = None
+        over = False
+
+        def tick() -> None:
+            action()
+            if not over:
+                wait()
+
+        def wait() -> None:
+            nonlocal timer
+            timer = self.call_at(self._now_ns + round(seconds * 1e9), tick)
+
+        def cancel() -> None:
+            nonlocal over
+            over = True
+            if timer is not None:
+                timer.cancel()
+
+        wait()
+        return cancel
+
     def next_event_ns(self) -> int | None:
         """Return the time of the next pending callback, or None."""
         while self._timers and not self._timers[0][2].pending:
