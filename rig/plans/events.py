@@ -53,6 +53,20 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True)
+class Unwinding:
+    """The table is about to go the long way round, because its cable reaches no further: ``turns`` whole turns back.
+
+    Angles of the table in degrees, unwrapped; ``limits_deg`` is how far the cable reaches.
+    """
+
+    index: int
+    from_deg: float
+    to_deg: float
+    turns: int
+    limits_deg: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
 class Rejected:
     """A frame was not taken, and why."""
 
@@ -173,6 +187,17 @@ class Waiting:
 
 
 @dataclass(frozen=True, slots=True)
+class Failed:
+    """An object could not be identified, and the plan goes on with the next one; the fields are the error's."""
+
+    error: str
+    code: int
+    what: str
+    evidence: dict[str, Any]
+    next_step: str
+
+
+@dataclass(frozen=True, slots=True)
 class Identified:
     """The answer: an object's name, or None for "unknown".
 
@@ -194,7 +219,21 @@ class Identified:
     reason: str
 
 
-Event = Started | Moved | Rejected | Accepted | Ranked | Decided | Enrolled | Identified | Item | Insight | Waiting
+Event = (
+    Started
+    | Moved
+    | Unwinding
+    | Rejected
+    | Accepted
+    | Ranked
+    | Decided
+    | Enrolled
+    | Identified
+    | Item
+    | Insight
+    | Waiting
+    | Failed
+)
 
 
 def event_dict(event: Event) -> dict[str, Any]:

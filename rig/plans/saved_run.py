@@ -193,7 +193,7 @@ def load_run(folder: Path) -> SavedRun:
         lines = _json_lines(_bytes(folder / "events.jsonl"), cut=True)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder, str(error)) from error
-    failed = lines.pop() if lines and "error" in lines[-1] else None
+    failed = lines.pop() if lines and "event" not in lines[-1] else None
     return SavedRun(folder, about, config, views, failed, tuple(lines))
 
 

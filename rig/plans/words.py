@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from rig.plans.events import Decided, Identified, Insight, Moved, Resemblance
+from rig.plans.events import Decided, Identified, Insight, Moved, Resemblance, Unwinding
 
 
 def decision_words(decided: Decided) -> str:
@@ -40,6 +40,15 @@ def move_words(moved: Moved) -> str:
     return f"{words}; they disagree{bound}, the gyro is believed"
 
 
+def unwinding_words(unwinding: Unwinding) -> str:
+    """Return that the table goes the long way round, and why."""
+    low_deg, high_deg = unwinding.limits_deg
+    return (
+        f"unwinding the cable: the table goes the long way, from {unwinding.from_deg:.1f}° to {unwinding.to_deg:.1f}° "
+        f"({counted(unwinding.turns, 'turn')} back; the cable reaches from {low_deg:g}° to {high_deg:g}°)"
+    )
+
+
 def answer_words(answer: Identified) -> str:
     """Return the answer, how sure it is and why the search ended; an unknown object with its nearest three."""
     if answer.name is None:
@@ -71,6 +80,13 @@ def resemblance_words(one: Resemblance) -> str:
     arcs = [f"{a:.0f}°" if a == b else f"{a:.0f}–{b:.0f}°" for a, b in one.arcs_deg]
     several = f"{', '.join(arcs[:-1])} and {arcs[-1]}" if len(arcs) > 1 else arcs[0]
     return f"looks like {one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {several}"
+
+
+def insight_words(insight: Insight) -> list[str]:
+    """Return what an object will be taken for, a line for each finding."""
+    lines = [words] if (words := symmetry_words(insight)) else []
+    lines += [f"{resemblance_words(one)} (similarity up to {one.similarity:.3f})" for one in insight.lookalikes]
+    return lines if insight.lookalikes else [*lines, "looks like no other enrolled object"]
 
 
 def duration_words(seconds: float) -> str:
