@@ -13,6 +13,7 @@ import numpy as np
 
 from hbr._cedd_tables import HUE_BINS, HUE_WEIGHT, LOW_HIGH, REPRESENTATIVES, SATURATION, VALUE
 from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.checks import check_image
 
 #: Bins of the descriptor: 6 texture classes of 24 colours, bin = 24 * texture + colour.
 BINS: Final = 144
@@ -51,7 +52,7 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
     TypeError, ValueError
         The image is no uint8 array, or is not of shape (H, W, 3).
     """
-    _check_image(image_bgr)
+    check_image(image_bgr)
     image = np.ascontiguousarray(image_bgr)
     grid = _grid(*image.shape[:2])
     if 0 in grid[:2]:
@@ -94,28 +95,18 @@ def describe(image_bgr: ImageArray, *, size: tuple[int, int] | None = None) -> L
     TypeError, ValueError
         As for `cedd`, or `size` is not of positive multiples of 80.
     """
-    _check_image(image_bgr)
+    check_image(image_bgr)
     if size is not None and any(side <= 0 or side % GRID for side in size):
         raise ValueError(f"size is {size}; both sides must be positive multiples of {GRID}, e.g. (640, 480)")
     height, width = image_bgr.shape[:2]
     return cedd(_resize(image_bgr, *(size or _covered_size(width, height))))
 
 
-def _check_image(image: object) -> None:
-    if not isinstance(image, np.ndarray):
-        raise TypeError(
-            f"the image is a {type(image).__name__}, not an array; cv2.imread returns None if it cannot read the file"
-        )
-    if image.dtype != np.uint8:
-        raise TypeError(f"the image is of {image.dtype}; scale it to 0..255 and convert it with .astype(np.uint8)")
-    if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
-        raise ValueError(f"the image is grey, shape {image.shape}; use cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)")
-    if image.ndim == 3 and image.shape[2] == 4:
-        raise ValueError(f"the image has alpha, shape {image.shape}; composite it, or use cv2.COLOR_BGRA2BGR")
-    if image.ndim != 3 or image.shape[2] != 3:
-        raise ValueError(f"the image has shape {image.shape}; one BGR image of shape (H, W, 3) is needed")
-    if image.size == 0:
-        raise ValueError(f"the image is empty, shape {image.shape}; check the capture or the crop")
+def covered(image_bgr: ImageArray) -> ImageArray:
+    """The image at the size that `describe` brings it to."""
+    check_image(image_bgr)
+    height, width = image_bgr.shape[:2]
+    return _resize(image_bgr, *_covered_size(width, height))
 
 
 def _covered_size(width: int, height: int) -> tuple[int, int]:

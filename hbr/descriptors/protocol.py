@@ -3,6 +3,7 @@
 from typing import Protocol
 
 from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.frontend import Sighting
 
 
 class Descriptor(Protocol):
@@ -29,8 +30,14 @@ class Descriptor(Protocol):
     @property
     def length(self) -> int: ...
 
-    def describe(self, image_bgr: ImageArray) -> LevelArray:
-        """Describe an image, uint8 (H, W, 3) in BGR, by levels, uint8 (length,).
+    def describe(self, view: ImageArray | Sighting, /) -> LevelArray:
+        """Describe a view by levels, uint8 (length,).
+
+        Parameters
+        ----------
+        view : uint8 array (H, W, 3), or Sighting
+            An image in BGR is taken as it is by the paper's descriptor, and goes through `hbr.sight` for those that
+            need the object alone; a `Sighting` has been through it, and serves several descriptors.
 
         Raises
         ------

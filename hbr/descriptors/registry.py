@@ -2,10 +2,26 @@
 
 from typing import Final
 
+from hbr.descriptors.colours import Colours
+from hbr.descriptors.edges import Edges
+from hbr.descriptors.joined import Joined
 from hbr.descriptors.plain import Cedd
 from hbr.descriptors.protocol import Descriptor
 
-_KNOWN: Final[dict[str, Descriptor]] = {known.name: known for known in (Cedd(),)}
+_CEDD: Final = Cedd()
+_EDGES: Final = Edges()
+_COLOURS: Final = Colours()
+_KNOWN: Final[dict[str, Descriptor]] = {
+    known.name: known
+    for known in (
+        _CEDD,
+        Cedd(name="cedd-blurred", blur=0.9),
+        _COLOURS,
+        _EDGES,
+        Joined("cedd+colours", 1, (_CEDD, _COLOURS), (0.5, 0.5)),
+        Joined("edges+colours", 1, (_EDGES, _COLOURS), (0.7, 0.3)),
+    )
+}
 
 
 def descriptor(name: str) -> Descriptor:

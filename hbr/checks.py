@@ -1,0 +1,27 @@
+"""What an image must be."""
+
+import numpy as np
+
+
+def check_image(image: object) -> None:
+    """Refuse what is no uint8 array of shape (H, W, 3) with pixels in it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The message says what it is instead, and what to do.
+    """
+    if not isinstance(image, np.ndarray):
+        raise TypeError(
+            f"the image is a {type(image).__name__}, not an array; cv2.imread returns None if it cannot read the file"
+        )
+    if image.dtype != np.uint8:
+        raise TypeError(f"the image is of {image.dtype}; scale it to 0..255 and convert it with .astype(np.uint8)")
+    if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
+        raise ValueError(f"the image is grey, shape {image.shape}; use cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)")
+    if image.ndim == 3 and image.shape[2] == 4:
+        raise ValueError(f"the image has alpha, shape {image.shape}; composite it, or use cv2.COLOR_BGRA2BGR")
+    if image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"the image has shape {image.shape}; one BGR image of shape (H, W, 3) is needed")
+    if image.size == 0:
+        raise ValueError(f"the image is empty, shape {image.shape}; check the capture or the crop")
