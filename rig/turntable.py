@@ -138,6 +138,11 @@ class Turntable(AbstractContextManager["Turntable"]):
         """Angle by the encoder at the last rest."""
         return self._rest_deg
 
+    @property
+    def limits_deg(self) -> tuple[float, float]:
+        """How far the cable reaches."""
+        return self._config.limits_deg
+
     def angle_deg(self) -> float:
         """Return the table's angle by the encoder, now."""
         return self._safety.reference.to_table(self._servo.read_state().position_deg)
@@ -164,10 +169,15 @@ class Turntable(AbstractContextManager["Turntable"]):
         turns = range(ceil((low - target_deg) / 360), floor((high - target_deg) / 360) + 1)
         return min((target_deg + 360 * k for k in turns), key=lambda angle: abs(angle - self._rest_deg))
 
+    def turns_back(self, target_deg: float) -> int:
+        """Return by how many whole turns the way to ``target_deg`` is longer than the shortest to the same view."""
+        return abs(round((target_deg - self._rest_deg) / 360.0))
+
     def unwound_deg(self) -> float:
-        """Return the angle equivalent to the present rest with the cable unwound: within half a turn of 0."""
-        turns = round(self._rest_deg / 360.0)
-        return self._rest_deg - 360.0 * turns
+        """Return the angle equivalent to the present rest that leaves the cable wound up the least."""
+        low, high = self._config.limits_deg
+        angle = self._rest_deg - 360.0 * round(self._rest_deg / 360.0)
+        return angle if low <= angle <= high else self._rest_deg
 
     def hold(self) -> Move:
         """Stay, and return once the table is at rest: the move of no rotation before a first view."""

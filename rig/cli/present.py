@@ -8,40 +8,18 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
-from rig.plans.events import (
-    Accepted,
-    Decided,
-    Enrolled,
-    Event,
-    Failed,
-    Identified,
-    Insight,
-    Item,
-    Moved,
-    Ranked,
-    Rejected,
-    Started,
-    Unwinding,
-    Waiting,
-)
+from rig.plans.events import Accepted, Decided, Enrolled, Event, Identified, Moved, Ranked, Rejected, Started, Unwinding
 from rig.plans.words import (
     answer_words,
     azimuth_words,
     counted,
     decision_words,
-    duration_words,
-    insight_words,
     move_words,
     signed,
     unwinding_words,
 )
 
 SHOWN = 3
-
-
-def console(*, stderr: bool = False) -> Console:
-    """Return the screen, or the pipe: colours and width are as the terminal, NO_COLOR and COLUMNS have them."""
-    return Console(stderr=stderr)
 
 
 def line(event: Event) -> str:
@@ -58,32 +36,18 @@ def line(event: Event) -> str:
         case Accepted():
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():
-            leaders = ", ".join(
-                f"{c.name} {c.score:.3f} at {azimuth_words(c.pose_deg)}°" for c in event.candidates[:SHOWN]
-            )
+            leaders = ", ".join(f"{c.name} {c.score:.3f}" for c in event.candidates[:SHOWN])
             return f"  leading: {leaders} (sure lead {signed(event.margin, 3)})"
         case Decided():
             return f"  {decision_words(event)} The table goes to {event.target_deg:.1f}°."
         case Enrolled():
             retakes = f", {counted(event.retakes, 'frame')} taken again" if event.retakes else ""
-            took = duration_words(event.seconds)
-            return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
+            return f"{event.name}: {counted(event.views, 'view')} enrolled in {event.seconds:.0f} s{retakes}"
         case Identified():
             return (
                 f"{answer_words(event)}\n  score {event.score:.3f} a view (unknown below {event.min_score:.3f}), "
-                f"sure lead {signed(event.margin, 3)}, {counted(event.views, 'view')}, "
-                f"{event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
+                f"{counted(event.views, 'view')}, {event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
             )
-        case Item(action="skip"):
-            return f"{event.number} of {event.of}  {event.name}: left out, {event.why}"
-        case Item():
-            return ""
-        case Insight():
-            return "\n".join(f"  {words}" for words in insight_words(event))
-        case Waiting():
-            return f"Waiting for {event.why}; Ctrl+C ends."
-        case Failed():
-            return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
 
 
 class Progress:
@@ -95,7 +59,7 @@ class Progress:
             BarColumn(),
             MofNCompleteColumn(),
             TimeRemainingColumn(),
-            console=console(stderr=True),
+            console=Console(stderr=True),
             disable=not sys.stderr.isatty(),
         )
         self._task = self._bar.add_task(title, total=None, start=False)

@@ -4,7 +4,7 @@ from collections.abc import Generator
 
 from rig.errors import ViewRejected
 from rig.heading import finite
-from rig.plans.events import Event, Moved, Rejected
+from rig.plans.events import Event, Moved, Rejected, Unwinding
 from rig.turntable import Move, Turntable
 from rig.view import Attempt, Viewer
 
@@ -23,6 +23,26 @@ def moved(index: int, move: Move) -> Moved:
         agrees=move.agrees,
         seconds=move.seconds,
     )
+
+
+def announced(index: int, table: Turntable, target_deg: float) -> Generator[Event, None, Move]:
+    """Turn the table to ``target_deg``; that it goes the long way round, unwinding its cable, is said before.
+
+    Raises
+    ------
+    LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
+        See `Turntable.goto`.
+    """
+    if turns := table.turns_back(target_deg):
+        yield Unwinding(index, table.rest_deg, target_deg, turns, table.limits_deg)
+    return table.goto(target_deg)
+
+
+def unwind(index: int, table: Turntable) -> Generator[Event, None, None]:
+    """Leave the table with the same view before the camera and its cable unwound, whoever comes next."""
+    target_deg = table.unwound_deg()
+    if table.turns_back(target_deg):
+        yield from announced(index, table, target_deg)
 
 
 def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Generator[Event, None, Attempt]:

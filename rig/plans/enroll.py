@@ -7,7 +7,7 @@ from rig.bench import Bench
 from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.clock import seconds_between
 from rig.errors import RigError, RotationDisagreement
-from rig.plans.capture import capture, moved
+from rig.plans.capture import announced, capture, moved
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.plans.events import Accepted, Enrolled, Event, Started, plain
 from rig.turntable import Move, Turntable
@@ -92,10 +92,13 @@ def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, f
     imu = _ImuAngle()
     with Turntable(bench) as table:
         for index, angle_deg in angles_deg.items():
-            move = table.goto(angle_deg)
+            move = yield from announced(index, table, angle_deg)
             yield moved(index, move)
             if move.agreement is None or not move.agreement.agrees:
-                raise _disagreement(move)
+                disagreement = _disagreement(move)
+                if move.agreement is not None:
+                    bench.safety.latch(disagreement)  # a platter that slips once slips again
+                raise disagreement
             imu.add(move)
             shot = yield from capture(index, viewer, table, move.settled_ns)
             retakes += shot.number - 1
@@ -114,7 +117,7 @@ def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, f
             enrollment.add(record, shot.image_bgr)
             yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr)
         # The servo forgets whole turns without its supply; a cable left wound up would be wound further the next time.
-        table.goto(0.0)
+        yield from announced(index, table, 0.0)
     return retakes
 
 

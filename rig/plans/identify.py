@@ -6,7 +6,8 @@ import hbr
 from hbr.angles import wrap360
 from rig.bench import Bench
 from rig.clock import seconds_between
-from rig.plans.capture import capture, moved
+from rig.errors import RigError
+from rig.plans.capture import announced, capture, moved, unwind
 from rig.plans.events import Accepted, Decided, Event, Identified, Started
 from rig.plans.search import SHOWN, Search
 from rig.plans.strategies import Stop, Strategy, Turn
@@ -64,6 +65,7 @@ def identify(
     started_ns = bench.clock.now_ns()
     travelled_deg = 0.0
     number = 0
+    trouble: RigError | None = None
     with Turntable(bench) as table:
         move = table.hold()
         orientation_deg = -move.encoder_deg
@@ -83,10 +85,15 @@ def identify(
                 break
             decided = _decided(number, step, table, top)
             yield decided
-            move = table.goto(decided.target_deg)
+            move = yield from announced(number, table, decided.target_deg)
             travelled_deg += abs(move.rotation_deg)
             orientation_deg -= move.rotation_deg  # as the table turns, the camera goes around the object backwards
             number += 1
+        seconds = seconds_between(started_ns, bench.clock.now_ns())
+        try:
+            yield from unwind(number, table)
+        except RigError as error:
+            trouble = error  # the answer is known, and must not be lost
     best = ranked.candidates[0]
     answer = Identified(
         name=best.name if best.score >= search.min_score else None,
@@ -98,10 +105,12 @@ def identify(
         yaw_deg=search.yaw_deg(ranked),
         views=number + 1,
         travelled_deg=travelled_deg,
-        seconds=seconds_between(started_ns, bench.clock.now_ns()),
+        seconds=seconds,
         reason=step.why,
     )
     yield answer
+    if trouble:
+        raise trouble
     return answer
 
 
