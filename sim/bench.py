@@ -13,7 +13,7 @@ from rig.clock import SystemClock
 from rig.config import RigConfig, Section
 from rig.errors import ObjectNotFound, UsageError
 from rig.hardware import assemble
-from rig.state import MemoryStore, StateStore
+from rig.state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.clock import VirtualClock
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
@@ -170,9 +170,30 @@ class SimBenchKind:
         assert isinstance(options, SimOptions)
         things = photographs(options.objects) if options.objects else shelf()
         clock = VirtualClock(start_utc=SystemClock().utc())
-        world = World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock)
-        operator = ShelfOperator(world, things, next_object=options.object, yaw_deg=options.yaw_deg)
-        return open_sim_bench(config, operator, faults=read_faults(options.faults))
+        with ExitStack() as held:
+            state = _state(config, held)
+            start_deg = _stands_at_deg(config, state)
+            world = World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock, start_deg=start_deg)
+            operator = ShelfOperator(world, things, next_object=options.object, yaw_deg=options.yaw_deg)
+            operator.state = state
+            bench = open_sim_bench(config, operator, faults=read_faults(options.faults))
+            bench.wires.enter_context(held.pop_all())
+        return bench
+
+
+def _state(config: RigConfig, held: ExitStack) -> StateStore:
+    """Return where the bench's state is kept: in memory, unless the configuration says where it should outlive us."""
+    if config.state_dir is None:
+        return MemoryStore()
+    path = config.state_path("sim")
+    held.callback(BenchLock(path, SystemClock()).close)
+    return FileStore(path)
+
+
+def _stands_at_deg(config: RigConfig, state: StateStore) -> float:
+    """Return where the last simulated run left the table: as on a real bench, only the supply was off meanwhile."""
+    table = state.load().table
+    return table.position_deg + table.shift_deg - 180.0 / config.servo.gear_ratio if table else 0.0
 
 
 SIM: BenchKind = SimBenchKind()

@@ -54,17 +54,24 @@ class World:
 
     Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. With ``noise`` and ``seed`` the
     whole run is determined: each emulator draws from its own stream (`rng`), so one more reading of one device does not
-    change what another one sees. Whoever is in ``watchers`` is told what happens.
+    change what another one sees. Whoever is in ``watchers`` is told what happens. The table stands at ``start_deg`` first.
     """
 
-    def __init__(self, *, noise: NoiseModel | None = None, seed: int = 0, clock: VirtualClock | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        noise: NoiseModel | None = None,
+        seed: int = 0,
+        clock: VirtualClock | None = None,
+        start_deg: float = 0.0,
+    ) -> None:
         self.clock = clock or VirtualClock()
         self.noise = noise or NoiseModel()
         self.seed = seed
         self.watchers: list[Callable[[Happening], None]] = []
         self._scenes: list[tuple[int, Scene]] = [(0, Scene())]
         first = self._platter()
-        first.follow(rest(0.0, 0.0), None)
+        first.follow(rest(0.0, start_deg), None)
         self._motions: list[tuple[int, Platter]] = [(0, first)]
         self._slips: list[tuple[float, float, float]] = []
 
