@@ -103,6 +103,13 @@ class FirmwareMismatch(DeviceMismatch):
     title = "other firmware"
 
 
+class DeviceUnplugged(DeviceSilent):
+    """The port of a device is gone from the computer."""
+
+    code = 421
+    title = "unplugged"
+
+
 class LimitExceeded(RigError):
     """A motion would leave the table's limits (its cable)."""
 

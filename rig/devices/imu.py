@@ -30,11 +30,14 @@ class ImuSamples:
     lost : int
         Samples that the sensor took but could not hand over (FIFO overflow) before these; an integral across them is
         void.
+    time_uncertainty_ns : int or None
+        Largest standard uncertainty of ``time_ns``; None where it is not known.
     """
 
     time_ns: NDArray[np.int64]
     gyro_dps: NDArray[np.float64]
     lost: int = 0
+    time_uncertainty_ns: int | None = None
 
 
 class Imu(Protocol):

@@ -1,0 +1,76 @@
+"""What the sensors on a rig head mean by their words."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rig.devices import mpu6050
+from rig.devices.head.protocol import Imu, ImuModel
+from rig.errors import ConfigError
+
+BNO055_RANGE_DPS = 2000.0
+BNO055_RATE_HZ = 100.0
+"""Of its fusion; in the fusion modes it sets its ranges itself (BST-BNO055-DS000, 3.5)."""
+BNO055_NOISE_DPS_RTHZ = 0.014
+"""BST-BNO055-DS000, table 0-2: output noise density of the gyroscope."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadSensor:
+    """A sensor as it was set up: its scales, and the request that sets it up.
+
+    ``others`` names the likely chip for other values of ``who_am_i``; ``start_s`` is how long it may take to run.
+    """
+
+    name: str
+    setup: Imu
+    rate_hz: float
+    range_dps: float
+    noise_dps_rthz: float
+    lsb_per_dps: float
+    lsb_per_g: float
+    temperature_c: Callable[[int], float]
+    who_am_i: int
+    others: dict[int, str]
+    start_s: float
+
+
+def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, bandwidth_hz: int) -> HeadSensor:
+    """Return the sensor ``kind`` (``mpu6050`` or ``bno055``) with these settings; a BNO055 has its own rate and range.
+
+    Raises
+    ------
+    ConfigError
+        There is no such sensor, or it has no such setting.
+    """
+    if kind == "bno055":
+        return HeadSensor(
+            name="BNO055",
+            setup=Imu(ImuModel.BNO055, address, divider=0, filter=1, range=0),
+            rate_hz=BNO055_RATE_HZ,
+            range_dps=BNO055_RANGE_DPS,
+            noise_dps_rthz=BNO055_NOISE_DPS_RTHZ,
+            lsb_per_dps=16.0,
+            lsb_per_g=1000.0,
+            temperature_c=float,
+            who_am_i=0xA0,
+            others={},
+            start_s=2.5,
+        )
+    if kind != "mpu6050":
+        raise ConfigError(
+            f"a rig head knows no sensor {kind!r}", next_step="Set head.sensor to mpu6050 or bno055.", evidence={}
+        )
+    divider, dlpf, full_scale, _ = mpu6050.settings(range_dps, rate_hz, bandwidth_hz)[mpu6050.SMPLRT_DIV]
+    return HeadSensor(
+        name="MPU-6050",
+        setup=Imu(ImuModel.MPU6050, address, divider=divider, filter=dlpf, range=full_scale >> 3),
+        rate_hz=1000.0 / (divider + 1),
+        range_dps=32767 / mpu6050.LSB_PER_DPS[range_dps],
+        noise_dps_rthz=mpu6050.NOISE_DPS_RTHZ,
+        lsb_per_dps=mpu6050.LSB_PER_DPS[range_dps],
+        lsb_per_g=mpu6050.LSB_PER_G,
+        temperature_c=lambda raw: raw / 340 + 36.53,
+        who_am_i=mpu6050.EXPECTED_ID,
+        others=mpu6050.OTHERS,
+        start_s=0.6,
+    )
