@@ -1,7 +1,7 @@
 """The simulated bench: one world, and the real drivers on simulated wires."""
 
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,13 @@ from rig.clock import SystemClock
 from rig.config import RigConfig, Section
 from rig.errors import ObjectNotFound, UsageError
 from rig.hardware import assemble
+from rig.host import Host
 from rig.state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.clock import VirtualClock
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
+from sim.host import simulated_host
 from sim.noise import NoiseModel
 from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
@@ -169,16 +171,31 @@ class SimBenchKind:
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
         assert isinstance(options, SimOptions)
         things = photographs(options.objects) if options.objects else shelf()
-        clock = VirtualClock(start_utc=SystemClock().utc())
         with ExitStack() as held:
             state = _state(config, held)
-            start_deg = _stands_at_deg(config, state)
-            world = World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock, start_deg=start_deg)
+            world = _world(options, seed, _stands_at_deg(config, state))
             operator = ShelfOperator(world, things, next_object=options.object, yaw_deg=options.yaw_deg)
             operator.state = state
             bench = open_sim_bench(config, operator, faults=read_faults(options.faults))
             bench.wires.enter_context(held.pop_all())
         return bench
+
+    @contextmanager
+    def host(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Host]:
+        """Yield the simulated computer; the devices' faults that need no motion happen there, too."""
+        assert isinstance(options, SimOptions)
+        with SimParts.connected(config, _world(options, seed)) as parts, simulated_host(config, parts) as host:
+            faults = Faults(parts)
+            faults.schedule(*read_faults(options.faults))
+            try:
+                yield host
+            finally:
+                faults.clear()
+
+
+def _world(options: SimOptions, seed: int | None, start_deg: float = 0.0) -> World:
+    clock = VirtualClock(start_utc=SystemClock().utc())
+    return World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock, start_deg=start_deg)
 
 
 def _state(config: RigConfig, held: ExitStack) -> StateStore:

@@ -1,0 +1,100 @@
+"""The camera: its mode, its locks, and how old and how good its frames are."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+
+from rig.clock import seconds_between
+from rig.devices.camera import Camera
+from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+from rig.doctor.case import Case
+from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.errors import DeviceNotFound
+from rig.view import looks
+
+FRAMES = 6
+MAX_AGE_S = 0.5
+"""From the start of an exposure until the program has the frame; the table stands still for as long, each view."""
+
+
+def camera(case: Case) -> Iterator[Finding]:
+    """Open the camera with its locks, and take some frames."""
+    if case.holder is not None:
+        yield warning("camera", "not opened: the bench is in use", case.rig("stop"))
+        return
+    config = case.config.camera
+    try:
+        capture = case.host.open_capture(config.source)
+    except DeviceNotFound as error:
+        yield of_error("camera", error)
+        return
+    with ExitStack() as opened:
+        opened.callback(capture.release)
+        settings = CameraSettings(**config.model_dump(exclude={"source"}))
+        source = OpenCvCamera(capture, clock=case.host.clock, settings=settings, name=f"camera {config.source}")
+        identity = source.identity
+        case.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+        text = f"{identity.name}: {identity.width}x{identity.height} at {identity.fps:.3g} frames/s"
+        yield fine("camera", f"{text}, frames timed by {source.time_base.value} exposure")
+        yield from _locks(case, source)
+        yield from _frames(case, source)
+
+
+def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
+    locks = source.read_locks()
+    for refused in source.not_taken:
+        yield warning(
+            "camera",
+            f"{refused.setting}: asked for {refused.asked:g}, the camera reports {refused.reported:g}",
+            case.rig("config show camera"),
+        )
+    automatic = [
+        name
+        for name, value, wanted in (
+            ("exposure", locks.auto_exposure, case.config.camera.exposure_us),
+            ("white balance", locks.auto_white_balance, case.config.camera.white_balance_k),
+        )
+        if value or (value is None and wanted is not None)
+    ]
+    if automatic:
+        text = f"{' and '.join(automatic)} not locked: views of one object may differ from each other"
+        yield warning("camera", text, "v4l2-ctl --list-ctrls")
+    elif not source.not_taken:
+        exposure = "?" if locks.exposure_us is None else f"{locks.exposure_us / 1e3:.3g} ms"
+        balance = "?" if locks.white_balance_k is None else f"{locks.white_balance_k:.0f} K"
+        yield fine("camera", f"locked and read back: exposure {exposure}, white balance {balance}")
+
+
+def _frames(case: Case, source: Camera) -> Iterator[Finding]:
+    clock = case.host.clock
+    ages, images = [], []
+    start_ns = clock.now_ns()
+    after_ns = start_ns
+    for _ in range(FRAMES):
+        frame = source.capture(after_ns)
+        ages.append(seconds_between(frame.exposed_ns, clock.now_ns()))
+        images.append(frame.image_bgr)
+        after_ns = frame.exposed_ns + 1
+    rate = FRAMES / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
+    age = max(ages)
+    text = f"frames are {1e3 * age:.0f} ms old when they come, {rate:.3g} a second"
+    evidence: dict[str, Any] = {"frame_age_s": age, "frames_per_s": rate}
+    if all(np.array_equal(images[0], image) for image in images[1:]):
+        mend = "Unplug the camera, plug it in again, then: " + case.rig("doctor")
+        yield bad("camera", f"frozen: {FRAMES} frames are the same to the pixel", mend, **evidence)
+    elif age > MAX_AGE_S:
+        yield warning(
+            "camera", f"{text}: slow", "Try another USB port, or a smaller camera.width and height", **evidence
+        )
+    else:
+        yield fine("camera", text, **evidence)
+    seen = looks(images[-1], case.config.view)
+    words = f"mean level {seen.mean_level:.0f}, sharpness {seen.sharpness:.0f}, {seen.saturated_share:.1%} saturated"
+    reasons = seen.reasons(case.config.view)
+    if reasons:
+        mend = "Look at light, exposure and focus; an empty table may look blurred: " + case.rig("config show view")
+        yield warning("camera", f"a frame as it is would not be taken: {'; '.join(reasons)}", mend)
+    else:
+        yield fine("camera", f"a frame as it is would be taken: {words}")

@@ -1,0 +1,206 @@
+"""The computer: who holds the bench, its ports and permissions, its disk and its clock."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+
+from rig.clock import seconds_between
+from rig.doctor.case import Case
+from rig.doctor.finding import Finding, bad, fine, warning
+from rig.host import Node, SerialPort
+from rig.state import FileStore
+
+LATENCY_MS = 1
+"""What an FTDI adapter's latency timer should be; 16 by default, and each reading waits for it."""
+_FTDI = "0403"
+
+VIEW_BYTES = 500_000
+"""An image of 640x480 with a sensor's noise, lossless."""
+LITTLE_ROOM, TOO_LITTLE_ROOM = 2_000_000_000, 200_000_000
+
+_PAUSE_S, _PAUSE_ERROR_S = 0.02, 0.25
+_STEP_S = 0.5
+_OLDEST_UTC = datetime(2025, 1, 1, tzinfo=UTC)
+
+RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
+
+
+def bench_state(case: Case) -> Iterator[Finding]:
+    """Who works with the bench, and what it must not forget: a latched fault, a damaged file."""
+    path = case.config.state_path(case.bench)
+    if case.holder is not None:
+        who = f"process {case.holder.pid} ({case.holder.command})" if case.holder.pid else "another process"
+        text = f"in use by {who}: servo, IMU and camera are left to it"
+        yield warning("bench", text, case.rig("stop"), pid=case.holder.pid)
+    state = FileStore(path).load()
+    if state.damage:
+        yield bad("bench", state.damage, case.rig("home --set"), exit_code=5)
+    if state.fault is not None:
+        fault = state.fault
+        text = f"fault {fault.code} ({fault.title}) is latched since {fault.utc}: {fault.what}"
+        yield bad("bench", text, case.rig("acknowledge"), exit_code=5, code=fault.code, next_step=fault.next_step)
+    if case.holder is None and not state.damage and state.fault is None:
+        yield fine("bench", f"{case.bench}: free, no fault latched", state=str(path))
+
+
+def ports(case: Case) -> Iterator[Finding]:
+    """The servo's serial port, the IMU's bus and the camera's device file: there, permitted, free, fast."""
+    wanted = case.config.servo.port
+    found = case.host.serial_ports()
+    port = next((p for p in found if case.host.same_file(p.path, wanted)), None)
+    if port is None:
+        yield _missing(case, wanted, found)
+    else:
+        yield from _access(case, "port", port, "dialout")
+        if port.latency_ms is not None:
+            yield _latency(case, port)
+    bus = case.host.i2c_name(case.config.imu.bus)
+    buses = case.host.i2c_buses()
+    node = next((n for n in buses if case.host.same_file(n.path, bus)), None)
+    if node is not None:
+        yield from _access(case, "port", node, "i2c")
+    elif buses:
+        mend = case.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
+        yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", mend)
+    else:
+        yield bad("port", f"there is no I2C bus {bus}, nor any other", "sudo raspi-config nonint do_i2c 0")
+    source = case.config.camera.source
+    if isinstance(source, str) and not source.isdigit() and not source.startswith("/dev/"):
+        return  # a file or a stream
+    camera = f"/dev/video{source}" if str(source).isdigit() else str(source)
+    cameras = case.host.cameras()
+    node = next((n for n in cameras if case.host.same_file(n.path, camera)), None)
+    if node is not None:
+        yield from _access(case, "port", node, "video")
+    elif cameras:
+        yield bad(
+            "port",
+            f"there is no camera {camera}; there is {_names(cameras)}",
+            case.set("camera.source", cameras[0].stable or cameras[0].path),
+        )
+    else:
+        yield bad(
+            "port", f"there is no camera {camera}, nor any other", "Connect the camera, then: " + case.rig("find")
+        )
+
+
+def disk(case: Case) -> Iterator[Finding]:
+    """Room for views, and a disk that is this computer's own."""
+    path = case.catalog_path
+    there = case.host.disk(path)
+    views = there.free_bytes // VIEW_BYTES
+    text = f"{there.free_bytes / 1e9:.1f} GB free for {path}: about {views // case.config.enroll.views} more objects"
+    if there.free_bytes < TOO_LITTLE_ROOM:
+        yield bad("disk", text, case.rig("catalog gc"), exit_code=7, free_bytes=there.free_bytes)
+    elif there.free_bytes < LITTLE_ROOM:
+        yield warning("disk", text, case.rig("catalog gc"), free_bytes=there.free_bytes)
+    else:
+        yield fine("disk", text, free_bytes=there.free_bytes)
+    if there.network:
+        mend = case.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
+        yield warning("disk", f"{path} is on a network file system, where locks may not hold", mend)
+
+
+def clock(case: Case) -> Iterator[Finding]:
+    """Monotonic time that runs at the right pace, and a civil time that may be written into records."""
+    time = case.host.clock
+    start_ns, start_utc = time.now_ns(), time.utc()
+    time.sleep(_PAUSE_S)
+    passed_s = seconds_between(start_ns, time.now_ns())
+    civil_s = (time.utc() - start_utc).total_seconds()
+    if not _PAUSE_S * 0.9 <= passed_s <= _PAUSE_S + _PAUSE_ERROR_S:
+        text = (
+            f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.0f} ms: this computer is overloaded, or sleeps"
+        )
+        yield warning("clock", text, "Close other programs, switch power saving off, then: " + case.rig("doctor"))
+    else:
+        yield fine("clock", f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.1f} ms", pause_s=passed_s)
+    now = time.utc()
+    synchronised = case.host.time_synchronised()
+    mend = "sudo timedatectl set-ntp true"
+    if abs(civil_s - passed_s) > _STEP_S:
+        yield warning("clock", f"the civil time jumped by {civil_s - passed_s:+.1f} s while it was watched", mend)
+    elif now < _OLDEST_UTC or now > _OLDEST_UTC + timedelta(days=365 * 50):
+        yield bad("clock", f"the date is wrong: {now:%Y-%m-%d %H:%M} UTC; what is stored would carry it", mend, 1)
+    elif synchronised is False:
+        text = f"{now:%Y-%m-%d %H:%M} UTC, but no time server has been reached since this computer started"
+        yield warning("clock", text, mend)
+    elif synchronised is None:
+        yield warning("clock", f"{now:%Y-%m-%d %H:%M} UTC, kept by no time server that is known here", mend)
+    else:
+        yield fine("clock", f"{now:%Y-%m-%d %H:%M} UTC, kept by a time server")
+
+
+def udev_rules(ports_found: list[SerialPort]) -> str:
+    """Return rules for udev: a short latency, a lasting name for the adapter, and access for who is logged in."""
+    lines = [
+        f"# {RULES_FILE}: made by `rig doctor --udev`",
+        f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{LATENCY_MS}"',
+    ]
+    named = False
+    for port in ports_found:
+        if port.usb.get("serial"):
+            link = "" if named else ', SYMLINK+="rig-servo"'
+            named = True
+            lines.append(
+                f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{port.usb["idVendor"]}", '
+                f'ATTRS{{idProduct}}=="{port.usb.get("idProduct", "")}", ATTRS{{serial}}=="{port.usb["serial"]}", '
+                f'GROUP="dialout", MODE="0660", TAG+="uaccess"{link}'
+            )
+    lines.append('SUBSYSTEM=="i2c-dev", GROUP="i2c", MODE="0660", TAG+="uaccess"')
+    lines.append('SUBSYSTEM=="video4linux", GROUP="video", MODE="0660", TAG+="uaccess"')
+    return "\n".join(lines) + "\n"
+
+
+def udev_command(case: Case) -> str:
+    """Return the command that puts the rules in force."""
+    return (
+        f"{case.rig('doctor --udev')} | sudo tee {RULES_FILE} && "
+        "sudo udevadm control --reload && sudo udevadm trigger --action=add"
+    )
+
+
+def _missing(case: Case, wanted: str, found: list[SerialPort]) -> Finding:
+    usb = [port for port in found if port.usb]
+    if not usb:
+        mend = "Plug the U2D2 in, then: " + case.rig("find")
+        return bad("port", f"there is no serial port {wanted}, nor any other on USB", mend)
+    mend = case.set("servo.port", usb[0].stable or usb[0].path) if len(usb) == 1 else case.rig("setup")
+    return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", mend)
+
+
+def _access(case: Case, topic: str, node: Node, usual_group: str) -> Iterator[Finding]:
+    if node.holders:
+        who = " and ".join(map(str, node.holders))
+        if not (case.holder and case.holder.pid in {process.pid for process in node.holders}):
+            modem = "ModemManager" in node.holders[0].command
+            mend = "sudo systemctl disable --now ModemManager" if modem else f"kill {node.holders[0].pid}"
+            yield bad(topic, f"{node.path} is held by {who}", mend, holders=who)
+            return
+    if node.usable:
+        yield fine(topic, f"{node.path}: {node.name}" + (f" ({node.stable})" if node.stable else ""))
+        return
+    group = node.group or usual_group
+    text = f"{case.host.user.name} may not use {node.path} ({node.name})"
+    if group == "root":
+        yield bad(topic, f"{text}: it belongs to root alone", udev_command(case))
+    elif case.host.joined(group):
+        yield bad(topic, f"{text} yet: the group {group} counts from the next login on", f"newgrp {group}")
+    else:
+        mend = f"sudo usermod -aG {group} {case.host.user.name}"
+        yield bad(topic, f"{text}: the group {group} may; log in again after this", mend, group=group)
+
+
+def _latency(case: Case, port: SerialPort) -> Finding:
+    text = f"latency timer of {port.path} is {port.latency_ms} ms"
+    if port.latency_ms is None or port.latency_ms <= LATENCY_MS:
+        return fine("port", text, latency_ms=port.latency_ms)
+    return warning(
+        "port",
+        f"{text}: each reading waits for it; {LATENCY_MS} ms is right (for good: {case.rig('doctor --udev')})",
+        f"echo {LATENCY_MS} | sudo tee {port.latency_file}",
+        latency_ms=port.latency_ms,
+    )
+
+
+def _names(nodes: list[Node] | list[SerialPort]) -> str:
+    return ", ".join(f"{node.path} ({node.name})" for node in nodes)

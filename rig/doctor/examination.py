@@ -1,0 +1,58 @@
+"""Run all checks of a bench, each by itself: what hangs or fails is one more finding."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from threading import Thread
+
+from rig.doctor.case import Case
+from rig.doctor.finding import Finding, bad, of_error
+from rig.errors import RigError
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Something to look at: findings are yielded as they are made, none later than ``deadline_s`` after the last."""
+
+    topic: str
+    look: Callable[[Case], Iterator[Finding]]
+    deadline_s: float = 15.0
+    if_it_hangs: str = "Unplug the device, plug it in again, and start over"
+
+
+def examine(case: Case, checks: Iterable[Check]) -> Iterator[Finding]:
+    """Yield what the checks find, in their order; none of them can stop the others.
+
+    A check runs in a thread of its own, because a driver in the kernel may never return: after the deadline it is left
+    to itself, and ends with the program.
+    """
+    for check in checks:
+        findings: SimpleQueue[Finding | None] = SimpleQueue()
+        Thread(target=_run, args=(case, check, findings.put), name=check.topic, daemon=True).start()
+        while True:
+            try:
+                finding = findings.get(timeout=check.deadline_s)
+            except Empty:
+                text = f"the check did not come to an end within {check.deadline_s:g} s and was given up"
+                yield bad(check.topic, text, check.if_it_hangs, exit_code=9)
+                break
+            if finding is None:
+                break
+            yield finding
+
+
+def _run(case: Case, check: Check, tell: Callable[[Finding | None], None]) -> None:
+    try:
+        for finding in check.look(case):
+            tell(finding)
+    except RigError as error:
+        tell(of_error(check.topic, error))
+    except OSError as error:  # a device that was pulled out meanwhile, a file that cannot be read
+        tell(bad(check.topic, f"the check broke off: {error}", case.rig("doctor"), error=repr(error)))
+    except Exception as error:  # a doctor must not die of what it finds; this is a bug, and is told as one
+        text = f"the check itself failed: {type(error).__name__}: {error}"
+        tell(bad(check.topic, text, "Report this with the output of `rig doctor --json`", exit_code=1))
+    finally:
+        with suppress(RuntimeError):  # the interpreter is going down
+            tell(None)

@@ -1,0 +1,189 @@
+"""The servo: who answers, as what, in what state; reads only."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+from rig.clock import seconds_between
+from rig.config import ServoConfig
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import Wire
+from rig.devices.dynamixel.register_servo import RegisterServo
+from rig.devices.dynamixel.registers import protocol_of
+from rig.doctor.case import Case
+from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos
+from rig.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
+
+READS = 50
+SLOW = 1 / 3
+"""Share of the control loop's period that a reading may take; where it takes more it mostly is the latency timer."""
+POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then: "
+
+
+def servo(case: Case) -> Iterator[Finding]:
+    """Find the configured servo, whoever else is on its bus, and look at its settings, supply and temperature."""
+    if case.holder is not None:
+        yield warning("servo", "not asked: the bench is in use", case.rig("stop"))
+        return
+    config = case.config.servo
+    with ExitStack() as opened:
+        try:
+            wire = case.host.open_wire(config.port, config.baud)
+        except DeviceNotFound as error:
+            yield of_error("servo", error)
+            return
+        opened.callback(wire.close)
+        try:
+            found = open_servo(wire, config, case.host.clock)
+        except DeviceNotFound:
+            yield from _elsewhere(case, wire)
+            return
+        except DeviceMismatch as error:
+            yield of_error("servo", error, case.set("servo.model", error.evidence["got"]))
+            return
+        except DeviceSilent as error:
+            yield from _alone(case, wire)
+            yield of_error("servo", error)
+            return
+        identity = found.identity
+        case.identities["servo"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+        name = identity.model.replace("_", "-").upper()
+        yield fine(
+            "servo", f"{name}, firmware {identity.firmware}, id {config.id} at {config.baud} baud, {config.port}"
+        )
+        yield from (warning("servo", remark, case.rig("config show servo")) for remark in found.remarks)
+        yield from _alone(case, wire)
+        yield from _settings(case, found)
+        yield from _condition(case, found)
+        yield from _line(case, found)
+
+
+def _elsewhere(case: Case, wire: Wire) -> Iterator[Finding]:
+    """Nobody answers where the configuration says: look at the other baud rates, and say who is there instead."""
+    config = case.config.servo
+    protocol = protocol_of(config.model)
+    rates = BAUD_RATES if protocol == 2 else BAUD_RATES_1
+    there: list[FoundServo] = []
+    for heard in scan_servos(wire, case.host.clock, [config.baud, *(b for b in rates if b != config.baud)]):
+        if heard.doubtful:
+            yield _duplicate(case, heard)
+            return
+        there += heard.servos
+    wanted = f"no servo answers at id {config.id}, {config.baud} baud, {config.port}"
+    if not there:
+        yield bad("servo", f"{wanted}, nor any other at any baud rate", POWER + case.rig("doctor"))
+        return
+    if len(there) > 1:
+        listed = "; ".join(map(str, there))
+        yield bad("servo", f"{wanted}; {len(there)} others do: {listed}", case.rig("setup"))
+        return
+    yield bad("servo", f"{wanted}; there is {there[0]}", _follow(case, config, there[0]))
+
+
+def _follow(case: Case, config: ServoConfig, there: FoundServo) -> str:
+    """Return the command that makes the configuration say what there is."""
+    differing = {
+        "servo.id": (config.id, there.bus_id),
+        "servo.baud": (config.baud, there.baud),
+        "servo.model": (config.model, there.model or config.model),
+    }
+    changes = [case.set(key, now) for key, (was, now) in differing.items() if was != now]
+    return changes[0] if len(changes) == 1 else case.rig("setup")
+
+
+def _alone(case: Case, wire: Wire) -> Iterator[Finding]:
+    """Say who else answers at this baud rate, and whether two answer at once."""
+    config = case.config.servo
+    if protocol_of(config.model) == 1:
+        return  # has no broadcast ping: `rig find` asks each id
+    for heard in scan_servos(wire, case.host.clock, [config.baud]):
+        others = [servo for servo in heard.servos if servo.bus_id != config.id]
+        if heard.doubtful:
+            yield _duplicate(case, heard)
+        elif heard.noise:
+            text = "bytes arrive that are no servo's: another program or adapter on the line, or a loose contact"
+            yield warning("servo", text, "Take everything but the servo off the bus, then: " + case.rig("doctor"))
+        elif others:
+            listed = "; ".join(map(str, others))
+            yield fine("servo", f"also on the bus, left alone: {listed}")
+        else:
+            yield fine("servo", "alone on its bus, no id twice")
+
+
+def _duplicate(case: Case, heard: Heard) -> Finding:
+    ids = ", ".join(map(str, heard.doubtful))
+    return bad(
+        "servo",
+        f"two servos answer at once to id {ids} at {heard.baud} baud (or the line is very bad)",
+        f"Unplug one of the two, then: {case.rig(f'servo set-id {_free_id(heard)}')}",
+        ids=list(heard.doubtful),
+        baud=heard.baud,
+    )
+
+
+def _free_id(heard: Heard) -> int:
+    taken = {servo.bus_id for servo in heard.servos} | set(heard.doubtful)
+    return next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
+
+
+def _settings(case: Case, found: RegisterServo) -> Iterator[Finding]:
+    differences = found.setting_differences()
+    if not differences:
+        yield fine("servo", "its permanent settings (EEPROM) are as the rig needs them")
+    for difference in differences:
+        yield bad(
+            "servo",
+            f"EEPROM {difference}",
+            case.rig("servo settings --write"),
+            register=difference.register,
+            found=difference.found,
+            wanted=difference.wanted,
+        )
+
+
+def _condition(case: Case, found: RegisterServo) -> Iterator[Finding]:
+    state, limits, safety = found.read_state(), found.limits, case.config.safety
+    condition = found.read_condition()
+    if condition.hardware_errors:
+        text = f"reports a hardware error: {', '.join(condition.hardware_errors)}; torque stays off until it restarts"
+        yield bad("servo", text, case.rig("acknowledge --reboot"), hardware_errors=list(condition.hardware_errors))
+    if condition.watchdog_tripped:
+        yield warning("servo", "its watchdog tripped: a program died while the table moved", case.rig("status"))
+    if condition.torque:
+        yield warning("servo", "its torque is on although nobody works with it", case.rig("stop"))
+    low, high = limits.voltage_v
+    margin = safety.voltage_margin_v
+    text = f"supply {state.voltage_v:.1f} V (the servo shuts down outside {low:.1f}..{high:.1f} V)"
+    if not low <= state.voltage_v <= high:
+        yield bad("servo", text, "Check the power supply and its plug", voltage_v=state.voltage_v)
+    elif not low + margin <= state.voltage_v <= high - margin:
+        yield warning("servo", text, "Check the power supply and its plug", voltage_v=state.voltage_v)
+    else:
+        yield fine("servo", text, voltage_v=state.voltage_v)
+    text = f"temperature {state.temperature_c:.0f} °C (the servo shuts down above {limits.temperature_c:.0f} °C)"
+    if state.temperature_c >= limits.temperature_c - safety.temperature_margin_c:
+        mend = "Let it cool, and look for what makes the table hard to turn"
+        yield bad("servo", text, mend, temperature_c=state.temperature_c)
+    else:
+        yield fine("servo", text, temperature_c=state.temperature_c)
+
+
+def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
+    clock = case.host.clock
+    before = found.line
+    start_ns = clock.now_ns()
+    for _ in range(READS):
+        found.read_state()
+    each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
+    after = found.line
+    again = after["retries"] - before["retries"]
+    text = f"{READS} readings of {each_ms:.1f} ms each, {again} repeated"
+    if again > READS // 10:
+        yield warning("servo", text, "Check the plugs of the servo's cable", retries=again, reading_ms=each_ms)
+    elif each_ms > SLOW * 1e3 * case.config.table.poll_s:
+        port = next((p for p in case.host.serial_ports() if case.host.same_file(p.path, case.config.servo.port)), None)
+        mend = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
+        mend = mend or case.rig("servo set-baud 1000000")
+        yield warning("servo", text + ": slow", mend, retries=again, reading_ms=each_ms)
+    else:
+        yield fine("servo", text, retries=again, reading_ms=each_ms)
