@@ -13,7 +13,7 @@ from rig.clock import SystemClock
 from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table
-from rig.errors import DeviceNotFound, DeviceRefused, DeviceSilent
+from rig.errors import DeviceRefused, DeviceSilent
 from sim.servo import Frame
 
 TABLE = control_table("xl430_w250")
@@ -182,17 +182,6 @@ def test_an_adapter_pulled_while_the_line_is_drained_is_silent(monkeypatch):
     monkeypatch.setattr(bus.port, "drain", pull_and_drain)
     with pytest.raises(DeviceSilent, match="does not answer"):
         bus.ping(1)
-
-
-def test_a_port_that_another_program_holds_is_told_as_busy():
-    far, near = os.openpty()
-    first = open_serial(os.ttyname(near), 57_600)
-    with pytest.raises(DeviceNotFound) as caught:
-        open_serial(os.ttyname(near), 57_600)
-    assert "Close the other program" in caught.value.next_step
-    first.close()
-    os.close(near)
-    os.close(far)
 
 
 def test_the_answer_to_a_question_that_was_cut_short_is_never_taken_for_the_next_one():
