@@ -4,8 +4,8 @@ Behaviour follows the register map RM-MPU-6000A rev 4.2 and the product specific
 names and numbers are written down here once more, not shared with the driver, so that an error in one does not hide in
 the other.
 
-Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, the interrupt
-pin, the signal paths' reset, the motion processor, and start-up times. The low-pass is of second order, and the
+Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, interrupts other
+than a new sample's, the signal paths' reset, the motion processor, and start-up times. The low-pass is of second order, and the
 accelerometer follows the gyro's rate and bandwidth.
 """
 
@@ -18,7 +18,7 @@ from sim.motion import Floats
 from sim.world import World
 
 SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, FIFO_EN = 0x19, 0x1A, 0x1B, 0x1C, 0x23
-INT_STATUS, ACCEL_XOUT_H, GYRO_ZOUT_L = 0x3A, 0x3B, 0x48
+INT_ENABLE, INT_STATUS, ACCEL_XOUT_H, GYRO_ZOUT_L = 0x38, 0x3A, 0x3B, 0x48
 USER_CTRL, PWR_MGMT_1 = 0x6A, 0x6B
 FIFO_COUNTH, FIFO_COUNTL, FIFO_R_W, WHO_AM_I = 0x72, 0x73, 0x74, 0x75
 
@@ -37,7 +37,7 @@ _WRITABLE = {  # the bits that keep what is written; all others of the map read 
     **dict.fromkeys((GYRO_CONFIG, ACCEL_CONFIG), 0xF8),
     CONFIG: 0x3F,
     0x37: 0xFE,  # INT_PIN_CFG
-    0x38: 0x19,  # INT_ENABLE
+    INT_ENABLE: 0x19,
     0x69: 0x30,  # MOT_DETECT_CTRL
     USER_CTRL: 0x70,
     PWR_MGMT_1: 0x6F,
@@ -93,6 +93,13 @@ class SimMpu6050:
         self._pointer = 0
         self._pointed = True
         self._begin_sampling()
+
+    def next_edge_ns(self, after_ns: int) -> int | None:
+        """Return when the interrupt pin rises next after ``after_ns``: at each sample, where that is enabled."""
+        if self._registers[PWR_MGMT_1] & SLEEP or not self._registers[INT_ENABLE] & DATA_RDY:
+            return None
+        period_ns = self._internal_clock()[1] * (1 + self._registers[SMPLRT_DIV])
+        return self._epoch_ns + max((after_ns - self._epoch_ns) // period_ns + 1, 1) * period_ns
 
     # -- bus side -------------------------------------------------------------------------------------------------
 
@@ -164,6 +171,11 @@ class SimMpu6050:
         self._taken = 0
         self.inertial.restart()
 
+    def _internal_clock(self) -> tuple[int, int]:
+        """Return the nominal rate (Hz) before the divider, and the true period (ns)."""
+        internal_hz = 8000 if self._registers[CONFIG] & 0x07 in (0, 7) else 1000
+        return internal_hz, round(1e9 / internal_hz / (1 + self.clock_error))
+
     def _clear_data(self) -> None:
         self._registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = bytes(GYRO_ZOUT_L + 1 - ACCEL_XOUT_H)
 
@@ -173,8 +185,7 @@ class SimMpu6050:
         if registers[PWR_MGMT_1] & SLEEP:
             return
         filter_setting, decimation = registers[CONFIG] & 0x07, 1 + registers[SMPLRT_DIV]
-        internal_hz = 8000 if filter_setting in (0, 7) else 1000
-        tick_ns = round(1e9 / internal_hz / (1 + self.clock_error))
+        internal_hz, tick_ns = self._internal_clock()
         due = (self._clock.now_ns() - self._epoch_ns) // (tick_ns * decimation)
         if due == self._taken:
             return
