@@ -80,7 +80,7 @@ def _intermittent(parts: SimParts, values: Values, _rng: np.random.Generator) ->
     return repeatedly(parts.world.clock, values["period"], parts.imu.power_cycle)
 
 
-@kind("i2c_nack", "The gyro does not acknowledge now and then: a long cable.", rate=share(0.1, "the transfers"))
+@kind("i2c_nack", "The gyro does not acknowledge now and then: a long cable.", rate=share(0.02, "the transfers"))
 def _nack(parts: SimParts, values: Values, rng: np.random.Generator) -> End:
     def refuses(_address: int) -> bool:
         return bool(rng.random() < values["rate"])

@@ -148,16 +148,24 @@ def known_views() -> hbr.ViewIndex:
         return hbr.ViewIndex(catalog.views().views)
 
 
-def check_stored(rig: Rig, expected: set[int], *, tolerance_deg: float, planned: int = VIEWS) -> None:
-    """Check that exactly the expected views are stored, each whole, and each at the angle that its picture carries."""
+def check_stored(
+    rig: Rig, expected: set[int], *, tolerance_deg: float, planned: int = VIEWS, offset: bool = False
+) -> None:
+    """Check that exactly the expected views are stored, each whole, and each at the angle that its picture carries.
+
+    With ``offset``, all of them may be off by the same angle.
+    """
     with Catalog.open(rig.folder, clock=rig.world.clock) as catalog:
         stored = newest_views(catalog)
         assert {view.record.index for view in stored} == expected
+        zero_deg = 0.0
         for view in stored:
             image = catalog.read_image(view)
             true_deg = coded_deg(image)
             assert true_deg is not None, f"view {view.record.index} shows no object"
-            off_deg = float(wrap180(view.record.azimuth_deg + true_deg))
+            off_deg = float(wrap180(view.record.azimuth_deg + true_deg - zero_deg))
+            if offset and view is stored[0]:
+                zero_deg, off_deg = off_deg, 0.0
             assert abs(off_deg) <= tolerance_deg, f"view {view.record.index} is {off_deg:+.2f}° off"
             planned_deg = -view.record.index * 360.0 / planned
             assert abs(wrap180(view.record.azimuth_deg - planned_deg)) <= 1.0
