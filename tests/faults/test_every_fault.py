@@ -1,0 +1,90 @@
+"""An enrollment of 72 views, and an identification, under every fault of the vocabulary."""
+
+from pathlib import Path
+
+import pytest
+from fault_runs import (
+    NAME,
+    VIEWS,
+    Rig,
+    answer,
+    check_stands,
+    check_stored,
+    enrolled,
+    enrollment,
+    identification,
+    new_rig,
+)
+from scenarios import BOOT_S, FOUND, SCENARIOS, After, Step
+
+from rig.errors import FaultLatched, Unreferenced
+from rig.turntable import Turntable
+from sim.faults import kinds
+
+TOLERANCE_DEG = 0.5
+"""Half the play, the encoder's noise, and a slip too small to be told from the gyro's error over 5°."""
+VIEWS_AGAIN = 12
+"""Of an object that is enrolled anew."""
+
+
+def test_there_is_a_scenario_for_every_fault() -> None:
+    assert set(SCENARIOS) == set(kinds())
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_an_enrollment_is_completed_or_stopped_with_nothing_lost_and_no_wrong_angle(tmp_path: Path, name: str) -> None:
+    scenario = SCENARIOS[name]
+    with new_rig(tmp_path) as rig:
+        outcome = enrollment(rig, scenario.fault)
+        assert outcome.code == scenario.code, outcome.error
+        assert enrolled(outcome) == (scenario.code is None)
+        assert rig.torque == scenario.torque
+        check_stands(rig)
+        if outcome.stored:
+            check_stored(rig, outcome.stored, tolerance_deg=TOLERANCE_DEG)
+        if scenario.code is None:
+            assert outcome.stored == set(range(VIEWS))
+            return
+        rig.faults.clear()
+        rig.world.clock.sleep(BOOT_S)
+        if scenario.step:
+            _refused_until(rig, scenario.step)
+        if scenario.after is After.REPLACE:
+            again = enrollment(rig, replace=True, views=VIEWS_AGAIN)
+            assert enrolled(again), again.error
+            # What slipped stays where it is: the new views agree with each other.
+            check_stored(rig, again.stored, tolerance_deg=TOLERANCE_DEG, planned=VIEWS_AGAIN, offset=True)
+        else:
+            again = enrollment(rig, resume=bool(outcome.events))
+            assert enrolled(again), again.error
+            assert again.stored == set(range(VIEWS)) - outcome.stored
+            check_stored(rig, set(range(VIEWS)), tolerance_deg=TOLERANCE_DEG)
+        assert not rig.torque
+
+
+def _refused_until(rig: Rig, step: Step) -> None:
+    """Check that nothing moves, and take the step after which it may."""
+    with rig.bench() as bench:
+        with pytest.raises(Unreferenced if step is Step.HOME else FaultLatched):
+            Turntable(bench).__enter__()
+        if step is Step.HOME:
+            bench.safety.declare_turns(0)
+        else:
+            bench.safety.acknowledge(reboot=step is Step.REBOOT)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_an_identification_names_the_object_or_is_stopped(tmp_path: Path, name: str) -> None:
+    scenario = SCENARIOS[name]
+    with new_rig(tmp_path) as rig:
+        outcome = identification(rig, scenario.of_identification)
+        assert rig.faults.history, "the fault did not happen"
+        identified = answer(outcome)
+        if isinstance(scenario.answer, int):
+            assert outcome.code == scenario.answer, outcome.error
+        else:
+            assert outcome.error is None
+            assert identified is not None
+            assert identified.name == (NAME if scenario.answer == FOUND else None)
+        assert rig.torque == (scenario.torque and outcome.error is not None)
+        check_stands(rig)
