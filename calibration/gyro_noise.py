@@ -190,7 +190,7 @@ def allan(
     angle = np.concatenate([[0.0], np.cumsum(rate)]) * period_s
     spans = 2 ** np.arange(int(np.log2(rate.size / 4)) + 1)
     second = [angle[2 * m :] - 2 * angle[m:-m] + angle[: -2 * m] for m in spans]
-    taus: NDArray[np.float64] = spans * period_s
+    taus = np.asarray(spans * period_s, dtype=np.float64)
     variance = np.array([(d**2).mean() for d in second]) / (2 * taus**2)
     # Degrees of freedom of an overlapping estimate under white frequency noise (NIST SP 1065, table 5).
     n = rate.size

@@ -78,6 +78,9 @@ class TableConfig(Section):
     backlash_deg: float = Field(
         0.5, ge=0, le=10, description="largest play between encoder and platter that is no fault"
     )
+    settle_s: float = Field(
+        0.46, gt=0, le=10, description="time from the end of a motion until the table is found at rest, for estimates"
+    )
     quiet_dps: float = Field(0.35, gt=0, le=10, description="largest rate that the gyro may see at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")

@@ -6,15 +6,14 @@ from itertools import pairwise
 from typing import Final
 
 from hbr.angles import wrap360
+from rig.bench import Bench
+from rig.catalog import Catalog, ObjectSummary, clean_name
 from rig.clock import seconds_between
 from rig.config import RigConfig
 from rig.devices.servo import MotionProfile
 from rig.errors import LimitExceeded
 from rig.plans.events import Accepted, Event
-from rig.turntable import FIRST_REST_S, motion_seconds
-
-RINGING_S: Final = 0.22
-"""How long a platter goes on ringing before encoder and gyro are quiet."""
+from rig.turntable import FIRST_REST_S, Turntable, motion_seconds
 
 FRAMES: Final = 1.5
 """Frames that pass until one was exposed whole after the table came to rest."""
@@ -81,7 +80,7 @@ class MotionModel:
         """Return the time of a move by ``distance_deg`` until the table is at rest; downwards it goes a bit below."""
         table = self.config.table
         profile = MotionProfile(table.velocity_dps, table.acceleration_dps2)
-        seconds = 2 * table.quiet_s + RINGING_S + motion_seconds(distance_deg, profile)
+        seconds = table.settle_s + motion_seconds(distance_deg, profile)
         if distance_deg < 0:
             seconds += motion_seconds(table.approach_deg, profile) + 2 * table.poll_s
         return seconds
@@ -98,6 +97,108 @@ class MotionModel:
         stops = [start_deg, *angles_deg]
         moves = sum(self.move_s(b - a) for a, b in pairwise(stops))
         return FIRST_REST_S + moves + len(angles_deg) * self.view_s + self.move_s(-angles_deg[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What an enrollment would do.
+
+    ``action`` is "enroll", "resume", "replace", "skip" (it is enrolled already) or "refuse", with the reason in
+    ``why``. ``angles_deg`` are the table's, unwrapped, of the views in their order, ``azimuths_deg`` the views';
+    ``table_deg`` is where the table stands before, ``travel_deg`` what it turns through in all, unwinding included.
+    """
+
+    name: str
+    action: str
+    why: str
+    views: int
+    azimuths_deg: tuple[float, ...]
+    angles_deg: tuple[float, ...]
+    table_deg: float
+    limits_deg: tuple[float, float]
+    travel_deg: float
+    seconds: float
+
+
+def rehearse(
+    bench: Bench,
+    catalog: Catalog | None,
+    names: Sequence[str],
+    *,
+    views: int | None = None,
+    resume: bool = False,
+    replace: bool = False,
+) -> tuple[Rehearsal, ...]:
+    """Say what enrolling these objects would do; nothing moves and nothing is stored.
+
+    Parameters
+    ----------
+    bench
+        An open one.
+    catalog
+        None where none was made yet.
+    names
+        Of the objects. Of more than one, complete ones are skipped and interrupted ones resumed, as a tray does.
+    views, resume, replace
+        As for `enroll`.
+
+    Raises
+    ------
+    UsageError
+        A name cannot be used.
+    LimitExceeded
+        The cable does not reach for the views that are left.
+    """
+    known = {} if catalog is None else {summary.name: summary for summary in catalog.objects()}
+    table_deg = Turntable(bench).angle_deg()
+    limits_deg = bench.config.table.limits_deg
+    model = MotionModel(bench.config)
+    found = []
+    for name in map(clean_name, names):
+        action, why = _action(known.get(name), resume=resume, replace=replace, tray=len(names) > 1)
+        azimuths: Sequence[float] = ()
+        if action in ("enroll", "replace"):
+            azimuths = even_azimuths(views or bench.config.enroll.views, limits_deg)
+            angles = table_angles(azimuths, limits_deg)
+        elif action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
+            every = table_angles(kept.planned_azimuth_deg, limits_deg)
+            azimuths = [kept.planned_azimuth_deg[index] for index in kept.missing]
+            angles = tuple(every[index] for index in kept.missing)
+        else:
+            angles = ()
+        stops = [table_deg, *angles, 0.0] if angles else [table_deg]
+        found.append(
+            Rehearsal(
+                name=name,
+                action=action,
+                why=why,
+                views=len(angles),
+                azimuths_deg=tuple(azimuths),
+                angles_deg=angles,
+                table_deg=table_deg,
+                limits_deg=limits_deg,
+                travel_deg=sum(abs(b - a) for a, b in pairwise(stops)),
+                seconds=model.enrollment_s(table_deg, angles),
+            )
+        )
+        table_deg = 0.0 if angles else table_deg
+    return tuple(found)
+
+
+def _action(known: ObjectSummary | None, *, resume: bool, replace: bool, tray: bool) -> tuple[str, str]:
+    unfinished = known.unfinished_views if known else None
+    if unfinished is not None:
+        if resume or tray:
+            return "resume", ""
+        return ("replace", "") if replace else ("refuse", "its enrollment is unfinished: add --resume or --replace")
+    if resume:
+        return "refuse", "it has no unfinished enrollment: leave --resume out"
+    if known is not None and known.views:
+        if replace:
+            return "replace", ""
+        why = f"it is enrolled already, with {known.views} views"
+        return ("skip", why) if tray else ("refuse", f"{why}: add --replace to enroll it anew")
+    return "enroll", ""
 
 
 class TimeLeft:

@@ -1,0 +1,66 @@
+"""The time that moves take: the profile is found again, new moves are foretold, and a hindered one is refused."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from calibration.motion_model import DISTANCES_DEG, Timed, from_data, live, predicted_s
+from rig.errors import UsageError
+from rig.facts import Fact
+from rig.turntable import Turntable
+
+WHEN = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+def drawn(rng: np.random.Generator, pace: float, wind_up: float, delay: float) -> list[Timed]:
+    distances = np.array([d * sign for _ in range(3) for d in DISTANCES_DEG for sign in (1, -1)])
+    reach = np.abs(distances)
+    seconds = np.where(reach * pace < wind_up, 2 * np.sqrt(reach * pace * wind_up), reach * pace + wind_up) + delay
+    seconds += rng.normal(0, 0.03, seconds.size)
+    return [Timed(float(d), float(t)) for d, t in zip(distances, seconds, strict=True)]
+
+
+def fit(moves: list[Timed]) -> Fact:
+    return from_data(moves, when_utc=WHEN, device={})
+
+
+def test_the_truth_lies_within_the_stated_uncertainty():
+    rng = np.random.default_rng(1)
+    z = {"pace": [], "wind_up": [], "delay": []}
+    for _ in range(60):
+        truth = {"pace": rng.uniform(0.008, 0.025), "wind_up": rng.uniform(0.15, 0.5), "delay": rng.uniform(0.3, 0.6)}
+        for name, estimate in fit(drawn(rng, **truth)).estimates.items():
+            z[name].append((estimate.value - truth[name]) / estimate.uncertainty)
+    for name, values in z.items():
+        assert 0.8 < np.sqrt(np.mean(np.square(values))) < 1.25, name
+        assert (np.abs(values) < 1.96).mean() >= 0.85, name
+
+
+def test_moves_that_were_not_timed_are_foretold(simulated):
+    s = simulated("table.velocity_dps=60", "table.acceleration_dps2=150", seed=4)
+    *_, fact = live(s.bench)
+    assert fact.passed, fact.refusals
+    assert fact.estimates["pace"].value == pytest.approx(1 / 60, rel=0.05)
+    assert s.bench.config.table.approach_deg == 3.0
+    with Turntable(s.bench) as table:
+        table.goto(5.0)
+        for goal_deg in (35.0, 170.0, 178.0):
+            distance_deg = goal_deg - table.rest_deg
+            assert table.goto(goal_deg).seconds == pytest.approx(predicted_s(fact, distance_deg), abs=0.25)
+
+
+def test_a_hindered_move_is_refused():
+    moves = drawn(np.random.default_rng(2), 0.012, 0.3, 0.4)
+    moves[5] = replace(moves[5], seconds=moves[5].seconds + 1.0)
+    fact = fit(moves)
+    assert "something hindered it" in fact.refusals[0]
+    assert not fact.settings
+    # One bad move does not drag the others along.
+    assert fact.estimates["pace"].value == pytest.approx(0.012, rel=0.05)
+
+
+def test_too_few_rounds_are_a_mistake_of_usage(simulated):
+    with pytest.raises(UsageError):
+        next(live(simulated().bench, rounds=1))
