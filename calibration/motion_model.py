@@ -142,4 +142,5 @@ def from_data(moves: Sequence[Timed], *, when_utc: datetime, device: Mapping[str
 def _seconds(p: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
     pace, wind_up, delay = p
     ramps_only = distance * pace < wind_up
-    return np.where(ramps_only, 2 * np.sqrt(distance * pace * wind_up), distance * pace + wind_up) + delay
+    moving = np.where(ramps_only, 2 * np.sqrt(distance * pace * wind_up), distance * pace + wind_up)
+    return np.asarray(moving + delay, dtype=np.float64)
