@@ -45,6 +45,10 @@ class ViewIndex:
     def __init__(self, views: Views, method: Method = "auto") -> None:
         if method not in get_args(Method):
             raise ValueError(f"method {method!r} is unknown; use one of {', '.join(get_args(Method))}")
+        if views.descriptors.shape[1] != BINS:
+            raise ValueError(
+                f"the views are of {views.descriptor}; this search compares CEDD alone, use hbr.DenseIndex"
+            )
         self.views = views
         self._method = method
         self._searcher: _Searcher = _searcher(views.descriptors, method)

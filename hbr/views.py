@@ -1,7 +1,7 @@
 """The model set: the views of the enrolled objects, as arrays."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -12,6 +12,7 @@ from hbr._segments import ranges
 from hbr.angles import wrap360
 from hbr.arrays import FloatArray, IndexArray, LevelArray
 from hbr.cedd import BINS
+from hbr.descriptors import descriptor as descriptor_of
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -24,14 +25,16 @@ class Views:
 
     Parameters
     ----------
-    descriptors : uint8 array (n, 144)
-        CEDD levels 0..7.
+    descriptors : uint8 array (n, length)
+        Levels of the descriptor; of CEDD 144, each 0..7.
     azimuth_deg : float64 array (n,)
         Orientation of the camera around the object, counter-clockwise seen from above; kept in [0, 360).
     object_index : integer array (n,)
         Index of each view's object in `object_names`.
     object_names : sequence of str
         Distinct names. An object may be without views.
+    descriptor : str
+        Name of the descriptor that all views were described by.
 
     Raises
     ------
@@ -43,6 +46,7 @@ class Views:
     azimuth_deg: FloatArray
     object_index: IndexArray
     object_names: tuple[str, ...]
+    descriptor: str = "cedd"
 
     def __post_init__(self) -> None:
         names = tuple(self.object_names)
@@ -50,7 +54,7 @@ class Views:
             repeated = next(name for name in names if names.count(name) > 1)
             raise ValueError(f"object name {repeated!r} occurs twice; give each object a name of its own")
         azimuth_deg = np.asarray(self.azimuth_deg, np.float64)
-        _check_views(self.descriptors, azimuth_deg, np.asarray(self.object_index), len(names))
+        _check_views(self.descriptors, azimuth_deg, np.asarray(self.object_index), len(names), self.descriptor)
         object.__setattr__(self, "descriptors", _read_only(self.descriptors))
         object.__setattr__(self, "azimuth_deg", _read_only(wrap360(azimuth_deg)))
         object.__setattr__(self, "object_index", _read_only(np.asarray(self.object_index, np.intp)))
@@ -60,19 +64,31 @@ class Views:
         return len(self.descriptors)
 
     @classmethod
-    def empty(cls) -> "Views":
+    def empty(cls, descriptor: str = "cedd") -> "Views":
         """No objects, no views."""
-        return cls(np.empty((0, BINS), np.uint8), np.empty(0), np.empty(0, np.intp), ())
+        none = np.empty((0, descriptor_of(descriptor).length), np.uint8)
+        return cls(none, np.empty(0), np.empty(0, np.intp), (), descriptor)
 
     @classmethod
-    def of_object(cls, name: str, descriptors: LevelArray, azimuth_deg: ArrayLike) -> "Views":
+    def of_object(cls, name: str, descriptors: LevelArray, azimuth_deg: ArrayLike, descriptor: str = "cedd") -> "Views":
         """Views of one object."""
-        return cls(descriptors, np.asarray(azimuth_deg, np.float64), np.zeros(len(descriptors), np.intp), (name,))
+        azimuths = np.asarray(azimuth_deg, np.float64)
+        return cls(descriptors, azimuths, np.zeros(len(descriptors), np.intp), (name,), descriptor)
 
     @classmethod
     def concatenate(cls, parts: Sequence["Views"]) -> "Views":
-        """All views of the parts in their order; objects of the same name become one."""
-        parts = [cls.empty(), *parts]
+        """All views of the parts in their order; objects of the same name become one.
+
+        Raises
+        ------
+        ValueError
+            The parts are of different descriptors.
+        """
+        kinds = dict.fromkeys(part.descriptor for part in parts) or {"cedd": None}
+        if len(kinds) > 1:
+            raise ValueError(f"views of {' and '.join(kinds)} cannot be compared; describe all by one descriptor")
+        (kind,) = kinds
+        parts = [cls.empty(kind), *parts]
         names = tuple(dict.fromkeys(name for part in parts for name in part.object_names))
         index = {name: i for i, name in enumerate(names)}
         renumbered = [
@@ -83,11 +99,17 @@ class Views:
             np.concatenate([part.azimuth_deg for part in parts]),
             np.concatenate(renumbered),
             names,
+            kind,
         )
 
     def select(self, rows: IndexArray | NDArray[np.bool_]) -> "Views":
         """The views of these indices, or where a mask holds; every object keeps its index and name."""
-        return Views(self.descriptors[rows], self.azimuth_deg[rows], self.object_index[rows], self.object_names)
+        return replace(
+            self,
+            descriptors=self.descriptors[rows],
+            azimuth_deg=self.azimuth_deg[rows],
+            object_index=self.object_index[rows],
+        )
 
     def of(self, object_index: int) -> IndexArray:
         """Indices of the views of an object, ascending."""
@@ -107,13 +129,14 @@ class Views:
 
 
 def _check_views(
-    descriptors: object, azimuth_deg: FloatArray, object_index: NDArray[np.generic], name_count: int
+    descriptors: object, azimuth_deg: FloatArray, object_index: NDArray[np.generic], name_count: int, descriptor: str
 ) -> None:
     if not isinstance(descriptors, np.ndarray) or descriptors.dtype != np.uint8:
         kind = getattr(descriptors, "dtype", type(descriptors).__name__)
         raise TypeError(f"descriptors are of {kind}; stack the uint8 rows that cedd or describe returns")
-    if descriptors.ndim != 2 or descriptors.shape[1] != BINS:
-        raise ValueError(f"descriptors have shape {descriptors.shape}; the shape (n, {BINS}) is needed")
+    length = descriptor_of(descriptor).length
+    if descriptors.ndim != 2 or descriptors.shape[1] != length:
+        raise ValueError(f"descriptors have shape {descriptors.shape}; {descriptor} needs the shape (n, {length})")
     count = len(descriptors)
     for name, column in (("azimuth_deg", azimuth_deg), ("object_index", object_index)):
         if column.shape != (count,):
@@ -122,7 +145,7 @@ def _check_views(
         raise TypeError(f"object_index is of {object_index.dtype}; integers are needed")
     if not count:
         return
-    if descriptors.max() > 7:
+    if descriptor.startswith("cedd") and descriptors[:, :BINS].max() > 7:
         raise ValueError(f"a level of {descriptors.max()}; CEDD levels are 0..7, unpack packed descriptors first")
     if not np.isfinite(azimuth_deg).all():
         raise ValueError(f"azimuth of view {np.isfinite(azimuth_deg).argmin()} is not finite; leave such views out")

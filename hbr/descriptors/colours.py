@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.packing import check_levels
 from hbr.frontend import CROP_PX, Sighting, sight
 
@@ -60,12 +60,13 @@ class Colours:
         levels: FloatArray = np.clip(steps + 128, 0, 255)
         return levels.astype(np.uint8)
 
+    def prepared(self, rows: LevelArray, /) -> "_Kernel":
+        check_levels(self, rows)
+        return _Kernel(rows * _STEP)
+
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        check_levels(self, a, b)
-        x, y = a * _STEP, b * _STEP
-        squares = np.einsum("ij,ij->i", x, x)[:, None] + np.einsum("ij,ij->i", y, y) - 2 * x @ y.T
-        similar: FloatArray = np.exp(np.maximum(squares, 0) / (-2 * _WIDTH**2))
-        return similar
+        check_levels(self, a)
+        return self.prepared(b).similarity(a)
 
     def pack(self, levels: LevelArray) -> bytes:
         check_levels(self, levels)
@@ -75,6 +76,27 @@ class Colours:
         if len(packed) != self.size_bytes:
             raise ValueError(f"{len(packed)} bytes; {self.name} has {self.size_bytes}, check how it was stored")
         return np.frombuffer(packed, np.uint8)
+
+
+class _Kernel:
+    def __init__(self, rows: FloatArray) -> None:
+        self._rows = rows
+        self._squares = np.einsum("ij,ij->i", rows, rows)
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        own = queries * _STEP
+        apart = np.einsum("ij,ij->i", own, own)[:, None] + self._squares - 2 * own @ self._rows.T
+        return _fallen(apart)
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        part, squares = self._rows[rows], self._squares[rows]
+        return _fallen(squares[:, :, None] + squares[:, None, :] - 2 * part @ part.transpose(0, 2, 1))
+
+
+def _fallen(squares: FloatArray) -> FloatArray:
+    """The kernel at these squared distances."""
+    similar: FloatArray = np.exp(np.maximum(squares, 0) / (-2 * _WIDTH**2))
+    return similar
 
 
 def _coefficients(crop: ImageArray, cover: NDArray[np.uint8]) -> FloatArray:

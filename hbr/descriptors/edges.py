@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.packing import check_levels, pack_quarters, unpack_quarters
 from hbr.frontend import CROP_PX, Sighting, sight
 
@@ -51,9 +51,13 @@ class Edges:
         image = (view if isinstance(view, Sighting) else sight(view)).alone
         return np.searchsorted(_BORDERS, _histogram(image)).astype(np.uint8)
 
+    def prepared(self, rows: LevelArray, /) -> "_Cosine":
+        check_levels(self, rows)
+        return _Cosine(_unit(rows))
+
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        check_levels(self, a, b)
-        return _unit(a) @ _unit(b).T
+        check_levels(self, a)
+        return self.prepared(b).similarity(a)
 
     def pack(self, levels: LevelArray) -> bytes:
         check_levels(self, levels)
@@ -90,7 +94,19 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
     return roots
 
 
-def _unit(levels: LevelArray) -> FloatArray:
-    rows = _REPRESENTATIVES[levels]
-    rows /= np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]
+class _Cosine:
+    def __init__(self, unit: NDArray[np.float32]) -> None:
+        self._unit = unit
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        return np.minimum(_unit(queries) @ self._unit.T, 1, dtype=np.float64)
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        part = self._unit[rows]
+        return np.minimum(part @ part.transpose(0, 2, 1), 1, dtype=np.float64)
+
+
+def _unit(levels: LevelArray) -> NDArray[np.float32]:
+    rows: NDArray[np.float32] = _REPRESENTATIVES.astype(np.float32)[levels]
+    rows /= np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))[:, None]
     return rows

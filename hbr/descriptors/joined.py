@@ -1,12 +1,13 @@
 """Several descriptors as one."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.packing import check_levels
-from hbr.descriptors.protocol import Descriptor
+from hbr.descriptors.protocol import Comparison, Descriptor
 from hbr.frontend import Sighting, sight
 
 
@@ -31,12 +32,15 @@ class Joined:
         seen = view if isinstance(view, Sighting) else sight(view)
         return np.concatenate([part.describe(seen) for part in self.parts])
 
+    def prepared(self, rows: LevelArray, /) -> "_Average":
+        check_levels(self, rows)
+        columns = self._columns()
+        parts = [part.prepared(rows[:, own]) for part, own in zip(self.parts, columns, strict=True)]
+        return _Average(parts, self.weights, columns)
+
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        check_levels(self, a, b)
-        total = np.zeros((len(a), len(b)))
-        for part, weight, columns in zip(self.parts, self.weights, self._columns(), strict=True):
-            total += weight * part.similarity(a[:, columns], b[:, columns])
-        return total
+        check_levels(self, a)
+        return self.prepared(b).similarity(a)
 
     def pack(self, levels: LevelArray) -> bytes:
         check_levels(self, levels)
@@ -54,3 +58,22 @@ class Joined:
     def _columns(self) -> list[slice]:
         ends = np.cumsum([part.length for part in self.parts]).tolist()
         return [slice(end - part.length, end) for end, part in zip(ends, self.parts, strict=True)]
+
+
+class _Average:
+    def __init__(self, parts: Sequence[Comparison], weights: Sequence[float], columns: Sequence[slice]) -> None:
+        self._parts, self._weights, self._columns = parts, weights, columns
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        return self._weighted(
+            [p.similarity(queries[:, own]) for p, own in zip(self._parts, self._columns, strict=True)]
+        )
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        return self._weighted([part.among(rows) for part in self._parts])
+
+    def _weighted(self, similar: Sequence[FloatArray]) -> FloatArray:
+        total = self._weights[0] * similar[0]
+        for weight, part in zip(self._weights[1:], similar[1:], strict=True):
+            total += weight * part
+        return total

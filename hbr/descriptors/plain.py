@@ -6,11 +6,12 @@ from typing import Final
 import cv2
 import numpy as np
 
-from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.cedd import BINS, cedd, covered, describe
+from hbr.descriptors.packing import check_levels
 from hbr.frontend import Sighting
 from hbr.packing import PACKED_BYTES, pack, unpack
-from hbr.tanimoto import tanimoto
+from hbr.tanimoto import squares, tanimoto, tanimoto_of_dots
 
 #: Blocks of the grid along either side of an image that it covers.
 _BLOCKS: Final = 40
@@ -42,6 +43,10 @@ class Cedd:
         blurred = cv2.GaussianBlur(image, (0, 0), sigma[1], sigmaY=sigma[0], borderType=cv2.BORDER_REPLICATE)
         return cedd(blurred.astype(np.uint8, copy=False))
 
+    def prepared(self, rows: LevelArray, /) -> "_Tanimoto":
+        check_levels(self, rows)
+        return _Tanimoto(rows)
+
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return tanimoto(a, b)
 
@@ -50,3 +55,19 @@ class Cedd:
 
     def unpack(self, packed: bytes) -> LevelArray:
         return unpack(packed)
+
+
+class _Tanimoto:
+    def __init__(self, rows: LevelArray) -> None:
+        # float32 holds products of levels 0..7 exactly
+        self._rows = rows.astype(np.float32)
+        self._squares = squares(self._rows)
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        own = queries.astype(np.float32)
+        return tanimoto_of_dots((own @ self._rows.T).astype(np.float64), squares(own)[:, None], self._squares)
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        part, lengths = self._rows[rows], self._squares[rows]
+        dots = (part @ part.transpose(0, 2, 1)).astype(np.float64)
+        return tanimoto_of_dots(dots, lengths[:, :, None], lengths[:, None, :])

@@ -2,8 +2,20 @@
 
 from typing import Protocol
 
-from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.frontend import Sighting
+
+
+class Comparison(Protocol):
+    """Rows of levels made ready for many comparisons."""
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        """Similarity of every query, uint8 (n, length), to every row, float64 (n, m)."""
+        ...
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        """Similarity of rows to each other within groups: indices (g, k) in, float64 (g, k, k) out."""
+        ...
 
 
 class Descriptor(Protocol):
@@ -46,13 +58,23 @@ class Descriptor(Protocol):
         """
         ...
 
+    def prepared(self, rows: LevelArray, /) -> Comparison:
+        """Make rows, uint8 (m, length), ready to be compared with many queries; takes several times their memory.
+
+        Raises
+        ------
+        TypeError, ValueError
+            They are no levels of this descriptor.
+        """
+        ...
+
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         """Similarity of every row of `a`, (n, length), to every row of `b`, (m, length).
 
         Returns
         -------
         float64 array (n, m)
-            0..1; 1 for equal rows that show anything.
+            0..1; 1 for equal rows that show anything, to 1e-6.
 
         Raises
         ------
