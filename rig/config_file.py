@@ -172,6 +172,11 @@ def toml(value: Any) -> str:
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
+def stated(key: Key, value: Any) -> str:
+    """Return a key's value in TOML's notation, as people write it: addresses are hexadecimal."""
+    return f"{value:#04x}" if key[-1] == "address" and type(value) is int else toml(value)
+
+
 # -- where things stand ---------------------------------------------------------------------------------------------
 
 
@@ -183,14 +188,14 @@ def _edited(text: str, key: Key, value: Any, values: Mapping[str, Any]) -> str:
             inline = _merged(values, statement.key, key[len(statement.key) :], value)
             kept = "".join(f"{comment}{newline}" for comment in statement.comments)
             before = text[: statement.start] + kept + text[statement.start : statement.value]
-            return before + toml(inline) + text[statement.end :]
+            return before + stated(statement.key, inline) + text[statement.end :]
     siblings = [s for s in known if s.value is not None and s.key[:-1] == key[:-1]]
     if siblings:
         last = siblings[-1]
         indent = text[last.start : last.start + len(text[last.start :]) - len(text[last.start :].lstrip(" \t"))]
-        line = f"{indent}{_written(key[len(last.table) :])} = {toml(value)}{newline}"
+        line = f"{indent}{_written(key[len(last.table) :])} = {stated(key, value)}{newline}"
         return _inserted(text, _default_line_end(text, last, key, known) or _line_end(text, last.end), line, newline)
-    line = f"{_written(key[-1:])} = {toml(value)}{newline}"
+    line = f"{_written(key[-1:])} = {stated(key, value)}{newline}"
     headers = [s for s in known if s.value is None and s.key == key[:-1]]
     if headers:
         header = headers[-1]

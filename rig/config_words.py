@@ -12,7 +12,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from rig.config_file import Key, toml
+from rig.config_file import Key, stated
 
 _UNITS = {"baud": "bit/s", "width": "px", "height": "px", "fps": "frames/s", "roi": "px"}
 _UNIT_SUFFIXES = {
@@ -87,9 +87,7 @@ def setting_line(facts: KeyFacts, value: Any, origin: str) -> str:
 
 
 def _shown(facts: KeyFacts, value: Any) -> str:
-    if value is None:
-        return ""
-    return f"{value:#04x}" if facts.key[-1] == "address" else toml(value)
+    return "" if value is None else stated(facts.key, value)
 
 
 def unit(name: str) -> str:

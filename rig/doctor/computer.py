@@ -50,14 +50,14 @@ def ports(case: Case) -> Iterator[Finding]:
     if port is None:
         yield _missing(case, wanted, found)
     else:
-        yield from _access(case, "port", port, "dialout")
+        yield from access(case, "port", port, "dialout")
         if port.latency_ms is not None:
             yield _latency(case, port)
     bus = case.host.i2c_name(case.config.imu.bus)
     buses = case.host.i2c_buses()
     node = next((n for n in buses if case.host.same_file(n.path, bus)), None)
     if node is not None:
-        yield from _access(case, "port", node, "i2c")
+        yield from access(case, "port", node, "i2c")
     elif buses:
         mend = case.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
         yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", mend)
@@ -70,7 +70,7 @@ def ports(case: Case) -> Iterator[Finding]:
     cameras = case.host.cameras()
     node = next((n for n in cameras if case.host.same_file(n.path, camera)), None)
     if node is not None:
-        yield from _access(case, "port", node, "video")
+        yield from access(case, "port", node, "video")
     elif cameras:
         yield bad(
             "port",
@@ -168,7 +168,8 @@ def _missing(case: Case, wanted: str, found: list[SerialPort]) -> Finding:
     return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", mend)
 
 
-def _access(case: Case, topic: str, node: Node, usual_group: str) -> Iterator[Finding]:
+def access(case: Case, topic: str, node: Node, usual_group: str) -> Iterator[Finding]:
+    """Say whether a device file can be opened: nobody else has it open, and the user may."""
     if node.holders:
         who = " and ".join(map(str, node.holders))
         if not (case.holder and case.holder.pid in {process.pid for process in node.holders}):

@@ -1,0 +1,75 @@
+"""`rig find`."""
+
+import sys
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.command import Settings, command
+
+if TYPE_CHECKING:
+    from rig.config_file import Key
+    from rig.doctor.finding import Finding
+    from rig.doctor.survey import Survey
+
+
+@command
+def find(
+    settings: Settings,
+    both_protocols: Annotated[
+        bool, typer.Option("--all", help="Ask for AX-12A (protocol 1.0) even where other servos answered; a minute.")
+    ] = False,
+) -> None:
+    """List what is connected: servos at all baud rates, IMUs, cameras; and say what to write into rig.toml.
+
+    Asks only; nothing is written or moved.
+
+    Example: rig find --bench sim
+    """
+    from rig.cli.doctor import case_of, print_finding
+    from rig.cli.present import console
+    from rig.config_file import with_values
+    from rig.doctor.examination import examine
+    from rig.doctor.survey import Survey
+
+    screen = console()
+    findings: list[Finding] = []
+    survey = Survey(both_protocols, say)
+    with case_of(settings) as case:
+        case.require_free()
+        for finding in examine(case, survey.checks):
+            findings.append(finding)
+            if not settings.json:
+                print_finding(screen, finding)
+    wanted = proposal(survey)
+    if settings.json:
+        settings.print_json(
+            {
+                "findings": [finding.as_dict() for finding in findings],
+                "settings": {".".join(key): value for key, value in wanted.items()},
+            }
+        )
+    elif wanted:
+        print(f"\nFor rig.toml (`rig setup` writes it):\n\n{with_values('', wanted)}", end="")
+    if not wanted:
+        raise typer.Exit(4)
+
+
+def proposal(survey: "Survey") -> "dict[Key, Any]":
+    """Return the settings that leave no choice: of devices of which there is one."""
+    from rig.doctor.survey import camera_settings, imu_settings, servo_settings
+
+    wanted: dict[Key, Any] = {}
+    if len(survey.servos) == 1 and not survey.doubtful:
+        wanted |= servo_settings(*survey.servos[0])
+    if len(survey.imus) == 1:
+        wanted |= imu_settings(survey.imus[0])
+    if len(survey.cameras) == 1:
+        wanted |= camera_settings(survey.cameras[0])
+    return wanted
+
+
+def say(text: str) -> None:
+    """Tell who waits at a terminal what is going on; it is gone with the next line."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text[:78]}\r", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,187 @@
+"""What is connected to the computer, and how it would be written into the configuration."""
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import serial
+
+from rig.config_file import Key
+from rig.doctor.case import Case
+from rig.doctor.computer import access
+from rig.doctor.examination import Check
+from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundImu, FoundServo, Heard, scan_imus, scan_servos
+from rig.errors import DeviceNotFound
+from rig.host import Node, SerialPort
+
+_COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
+"""I2C buses with memory, monitors and clock chips on them, which are not to be asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundCamera:
+    """A camera that opened, and the mode it came up in."""
+
+    node: Node
+    width: int
+    height: int
+    fps: float
+
+
+@dataclass
+class Survey:
+    """Looks at all ports, buses and cameras, and keeps what answered.
+
+    Parameters
+    ----------
+    both_protocols
+        Ask for servos of Protocol 1.0 even where some of Protocol 2.0 answered.
+    say
+        Called with what is being done, for those who wait.
+    """
+
+    both_protocols: bool = False
+    say: Callable[[str], None] = lambda _: None
+    ports: tuple[str, ...] | None = None
+    """Serial ports to ask; all that may be asked where it is None."""
+    servos: list[tuple[SerialPort, FoundServo]] = field(default_factory=list)
+    imus: list[FoundImu] = field(default_factory=list)
+    cameras: list[FoundCamera] = field(default_factory=list)
+    doubtful: bool = False
+    """Two servos with one id were heard."""
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        return (
+            Check("servo", self.look_for_servos, deadline_s=90.0),
+            Check("imu", self.look_for_imus),
+            Check("camera", self.look_for_cameras, deadline_s=20.0),
+        )
+
+    def look_for_servos(self, case: Case) -> Iterator[Finding]:
+        known = case.host.serial_ports()
+        if self.ports is not None:
+            known = [port for port in known if port.path in self.ports]
+        asked = [p for p in known if p.usb or case.host.same_file(p.path, case.config.servo.port)]
+        if not asked:
+            text = f"no serial port on USB{'; there is ' + ', '.join(p.path for p in known) if known else ''}"
+            yield bad("servo", text, "Plug the U2D2 in, then: " + case.rig("find"))
+        for port in asked:
+            yield from self._on_port(case, port)
+
+    def _on_port(self, case: Case, port: SerialPort) -> Iterator[Finding]:
+        troubles = [finding for finding in access(case, "servo", port, "dialout") if finding.mend]
+        if troubles:
+            yield from troubles
+            return
+        before = len(self.servos)
+        try:
+            with closing(case.host.open_wire(port.path, BAUD_RATES[0])) as wire:
+                for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
+                    if protocol == 1 and len(self.servos) > before and not self.both_protocols:
+                        break
+                    for rate in rates:
+                        self.say(f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ...")
+                        for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
+                            yield from self._heard(case, port, heard)
+        except DeviceNotFound as error:
+            yield of_error("servo", error)
+            return
+        except (serial.SerialException, OSError) as error:
+            yield bad("servo", f"{port.path} failed: {error}", "Plug the adapter in again, then: " + case.rig("find"))
+            return
+        if len(self.servos) == before and not self.doubtful:
+            text = f"{port.path} ({port.name}): no servo answers at any baud rate, in either protocol"
+            yield warning("servo", text, "Check the servo's cable and switch on its supply, then: " + case.rig("find"))
+
+    def _heard(self, case: Case, port: SerialPort, heard: Heard) -> Iterator[Finding]:
+        for found in heard.servos:
+            self.servos.append((port, found))
+            yield fine("servo", f"{port.path}: {found}", port=port.path, id=found.bus_id, baud=found.baud)
+        if heard.doubtful:
+            self.doubtful = True
+            ids = ", ".join(map(str, heard.doubtful))
+            text = f"{port.path}: two servos answer at once to id {ids} at {heard.baud} baud"
+            yield bad("servo", text, "Unplug one of the two, then: " + case.rig("servo set-id NEW"))
+        if heard.noise:
+            text = f"{port.path}: bytes at {heard.baud} baud that are no servo's"
+            yield warning("servo", text, "Take everything but servos off the bus, then: " + case.rig("find"))
+
+    def look_for_imus(self, case: Case) -> Iterator[Finding]:
+        configured = case.host.i2c_name(case.config.imu.bus)
+        asked = 0
+        before = len(self.imus)
+        for node in case.host.i2c_buses():
+            if _COMPUTERS_OWN.search(node.name) and not case.host.same_file(node.path, configured):
+                continue
+            asked += 1
+            troubles = [finding for finding in access(case, "imu", node, "i2c") if finding.mend]
+            if troubles:
+                yield from troubles
+                continue
+            self.say(f"{node.path}: asking for IMUs ...")
+            try:
+                there = scan_imus(case.host, node.path)
+            except OSError as error:
+                mend = "Take the sensor's supply off and on; check SDA and SCL for a short"
+                yield bad("imu", f"{node.path} does not move: {error.strerror}", mend)
+                continue
+            for found in there:
+                if found.driver:
+                    self.imus.append(found)
+                    yield fine("imu", str(found), bus=found.bus, address=found.address)
+                else:
+                    yield warning("imu", f"{found}: the rig has no driver for it", "Use an MPU-6050 or a BNO055")
+        if not asked:
+            yield bad("imu", "no I2C bus", "sudo raspi-config nonint do_i2c 0")
+        elif len(self.imus) == before:
+            mend = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + case.rig("find")
+            yield warning("imu", "no IMU answers on any I2C bus", mend)
+
+    def look_for_cameras(self, case: Case) -> Iterator[Finding]:
+        nodes = case.host.cameras()
+        if not nodes:
+            yield warning("camera", "no camera", "Connect the camera, then: " + case.rig("find"))
+        for node in nodes:
+            troubles = [finding for finding in access(case, "camera", node, "video") if finding.mend]
+            if troubles:
+                yield from troubles
+                continue
+            self.say(f"{node.path}: opening ...")
+            try:
+                capture = case.host.open_capture(node.path)
+            except DeviceNotFound as error:
+                yield of_error("camera", error)
+                continue
+            width, height = (round(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            found = FoundCamera(node, width, height, capture.get(cv2.CAP_PROP_FPS))
+            capture.release()
+            self.cameras.append(found)
+            yield fine("camera", f"{node.path}: {node.name}, {width}x{height} at {found.fps:.3g} frames/s")
+
+
+def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:
+    """Return the keys of the configuration that mean this servo."""
+    keys: dict[Key, Any] = {
+        ("servo", "port"): port.stable or port.path,
+        ("servo", "baud"): servo.baud,
+        ("servo", "id"): servo.bus_id,
+    }
+    return keys | ({("servo", "model"): servo.model} if servo.model else {})
+
+
+def imu_settings(found: FoundImu) -> dict[Key, Any]:
+    """Return the keys of the configuration that mean this IMU."""
+    number = found.bus.removeprefix("/dev/i2c-")
+    return {("imu", "bus"): int(number) if number.isdigit() else found.bus, ("imu", "address"): found.address}
+
+
+def camera_settings(found: FoundCamera) -> dict[Key, Any]:
+    """Return the keys of the configuration that mean this camera; its number may be another one after a restart."""
+    number = Path(found.node.path).name.removeprefix("video")
+    return {("camera", "source"): found.node.stable or (int(number) if number.isdigit() else found.node.path)}
