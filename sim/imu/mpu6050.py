@@ -5,8 +5,8 @@ names and numbers are written down here once more, not shared with the driver, s
 the other.
 
 Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, interrupts other
-than a new sample's, the signal paths' reset, the motion processor, and start-up times. The low-pass is of second order, and the
-accelerometer follows the gyro's rate and bandwidth.
+than a new sample's, the signal paths' reset, the motion processor, and start-up times. The low-pass is of second order,
+and the accelerometer follows the gyro's rate and bandwidth.
 """
 
 from collections.abc import Callable
