@@ -3,13 +3,13 @@
 Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, or anybody else's.
 """
 
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 from pydantic import BaseModel
 
@@ -125,6 +125,13 @@ class BenchKind(Protocol):
         ...
 
 
+@runtime_checkable
+class ServoAlone(Protocol):
+    """A kind of bench whose servo can be opened without the other devices: to stop it, whatever else is broken."""
+
+    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Servo]: ...
+
+
 def bench_names() -> list[str]:
     """Return the names of the installed kinds of benches."""
     return sorted(point.name for point in entry_points(group=GROUP))
@@ -148,13 +155,11 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
         There is no such bench, or its options have mistakes.
     DeviceNotFound, DeviceMismatch, DeviceSilent
         A device is not there, is another one, or does not answer.
+    BenchBusy
+        Another program holds the bench.
     """
     config = config or RigConfig()
-    name = name or config.default_bench
-    for wrong in sorted(set(config.bench) - set(bench_names())):
-        bench_kind(wrong)  # a misspelt section is told before anything is opened
-    kind = bench_kind(name)
-    options = validate(kind.options, config.bench.get(name, {}), where="the configuration", prefix=f"bench.{name}")
+    kind, options = _kind(name or config.default_bench, config)
     bench = kind.open(config, options, seed)
     try:
         calibrate(bench, FactStore(config.calibration_path(bench.name)))
@@ -162,6 +167,25 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
         bench.close()
         raise
     return bench
+
+
+@contextmanager
+def open_servo(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Iterator[Servo]:
+    """Open the servo of a bench alone, where its kind knows how, else with all devices; writes nothing to it.
+
+    Raises
+    ------
+    ConfigError, DeviceNotFound, DeviceMismatch, DeviceSilent, BenchBusy
+        As of `open_bench`.
+    """
+    config = config or RigConfig()
+    kind, options = _kind(name or config.default_bench, config)
+    if isinstance(kind, ServoAlone):
+        with kind.open_servo(config, options, seed) as servo:
+            yield servo
+    else:
+        with kind.open(config, options, seed) as bench:
+            yield bench.servo
 
 
 def calibrate(bench: Bench, store: FactStore) -> None:
@@ -182,6 +206,15 @@ def calibrate(bench: Bench, store: FactStore) -> None:
         for standing in standings
         if standing.state is not State.IN_FORCE
     )
+
+
+def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:
+    """Return the kind of bench called ``name``, and its options."""
+    for wrong in sorted(set(config.bench) - set(bench_names())):
+        bench_kind(wrong)  # a misspelt section is told before anything is opened
+    kind = bench_kind(name)
+    where = "the configuration"
+    return kind, validate(kind.options, config.bench.get(name, {}), where=where, prefix=f"bench.{name}")
 
 
 def bench_kind(name: str) -> BenchKind:

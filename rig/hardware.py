@@ -1,6 +1,7 @@
 """The bench of real devices: servo on a serial port, IMU on I2C, camera through OpenCV."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from pydantic import BaseModel
@@ -47,6 +48,16 @@ class HardwareBench:
             )
             bench.wires = wires.pop_all()
             return bench
+
+    @contextmanager
+    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:  # noqa: ARG002
+        """Open the servo alone."""
+        clock = SystemClock()
+        with ExitStack() as wires:
+            wires.callback(BenchLock(config.state_path("hardware"), clock).close)
+            wire = open_serial(config.servo.port, config.servo.baud)
+            wires.callback(wire.close)
+            yield open_servo(wire, config.servo, clock, config.table.mode)
 
 
 def assemble(

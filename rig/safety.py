@@ -339,7 +339,7 @@ class Safety:
         if self._doubt and self._servo.turn_deg < 360.0:
             raise NotReady(
                 "With a gear, the servo alone does not tell where within its turn the table stands.",
-                next_step="Turn the table by hand to its zero, with the cable hanging free, and give `rig home --set`.",
+                next_step="Turn the table by hand to its zero, the cable hanging free, then give `rig home --here`.",
             )
         self.declare(self.reference.with_turns(self._servo.read_state().position_deg, turns))
 
@@ -380,7 +380,7 @@ class Safety:
                 return Unreferenced(
                     f"How far the table's cable is wound up is in doubt: {self._doubt}.",
                     next_step="Look at the cable, then say how many whole turns it is wound up: `rig home --turns 0` "
-                    "if it hangs free. Or turn the table by hand to where zero shall be: `rig home --set`.",
+                    "if it hangs free. Or turn the table by hand to where zero shall be: `rig home --here`.",
                 )
             case State.STOPPED:
                 return NotReady(

@@ -170,7 +170,9 @@ class Turntable(AbstractContextManager["Turntable"]):
         return min((target_deg + 360 * k for k in turns), key=lambda angle: abs(angle - self._rest_deg))
 
     def turns_back(self, target_deg: float) -> int:
-        """Return by how many whole turns the way to ``target_deg`` is longer than the shortest to the same view."""
+        """Return by how many whole turns the cable is unwound on the way to ``target_deg``, which could be shorter."""
+        if abs(target_deg) >= abs(self._rest_deg):
+            return 0
         return abs(round((target_deg - self._rest_deg) / 360.0))
 
     def unwound_deg(self) -> float:

@@ -54,7 +54,8 @@ class World:
 
     Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. With ``noise`` and ``seed`` the
     whole run is determined: each emulator draws from its own stream (`rng`), so one more reading of one device does not
-    change what another one sees. Whoever is in ``watchers`` is told what happens. The table stands at ``start_deg`` first.
+    change what another one sees. Whoever is in ``watchers`` is told what happens. At first the table
+    stands at ``start_deg``.
     """
 
     def __init__(

@@ -78,7 +78,10 @@ class Settings:
     def open_bench(self) -> "Bench":
         from rig.bench import open_bench
 
-        return open_bench(self.bench_name, self.load(), seed=self.seed)
+        bench = open_bench(self.bench_name, self.load(), seed=self.seed)
+        for finding in bench.safety.findings:  # before anything moves
+            print(f"Note: {finding}.", file=sys.stderr)
+        return bench
 
     def open_catalog(self, *, clock: "Clock | None" = None, create: bool = False, read_only: bool = False) -> "Catalog":
         """Open the bench's catalog; to add views to it takes the ``clock`` that they were captured by, the bench's."""
@@ -87,6 +90,13 @@ class Settings:
 
         path = self.load().catalog_path(self.bench_name)
         return Catalog.open(path, clock=clock or SystemClock(), create=create, read_only=read_only)
+
+    def say(self, text: str, data: Any) -> None:
+        """Print ``text`` for people, or ``data`` as one line of JSON."""
+        if self.json:
+            self.print_json(data)
+        else:
+            print(text, flush=True)
 
     def print_json(self, value: Any) -> None:
         """Print one line of JSON on stdout, at once."""

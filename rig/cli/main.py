@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import catalog, config, doctor, enroll, evaluate, identify, table
+from rig.cli import catalog, config, doctor, enroll, evaluate, identify, safety, table
 from rig.cli.command import BenchOption, ConfigOption, JsonOption, SeedOption, SetOption, Settings
 
 GROUP = "rig.commands"
@@ -48,7 +48,10 @@ app.command("enroll")(enroll.enroll)
 app.command("identify")(identify.identify)
 app.command("eval")(evaluate.evaluate)
 app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)
+app.command("home")(table.home)
 app.command("status")(table.status)
+app.command("stop")(safety.stop)
+app.command("acknowledge")(safety.acknowledge)
 app.command("doctor")(doctor.doctor)
 app.add_typer(catalog.app, name="catalog")
 app.add_typer(config.app, name="config")

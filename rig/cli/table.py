@@ -1,10 +1,15 @@
-"""`rig goto` and `rig status`."""
+"""`rig goto`, `rig home` and `rig status`."""
 
-from typing import Annotated
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.command import Settings, command
+
+if TYPE_CHECKING:
+    from rig.safety import Safety
+    from rig.turntable import Turntable
 
 
 @command
@@ -16,17 +21,54 @@ def goto(
 
     Example: rig goto -90 --bench sim
     """
-    from rig.cli.present import line
-    from rig.plans.capture import moved
-    from rig.plans.events import event_dict
     from rig.turntable import Turntable
 
     with settings.open_bench() as bench, Turntable(bench) as table:
-        event = moved(0, table.goto(angle_deg))
-    if settings.json:
-        settings.print_json(event_dict(event))
-    else:
-        print(line(event))
+        _turn(settings, table, angle_deg)
+
+
+@command
+def home(
+    settings: Settings,
+    turns: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="I have looked: the cable is wound up by N whole turns; 0 if it hangs free."),
+    ] = None,
+    here: Annotated[
+        bool, typer.Option("--here", help="I have looked: zero is where the table stands now. Moves nothing.")
+    ] = False,
+) -> None:
+    """Turn the table back to zero; where its turns are in doubt, say first how its cable lies.
+
+    Example: rig home --turns 0 --bench sim
+    """
+    from rig.errors import UsageError
+    from rig.turntable import Turntable
+
+    if here and turns is not None:
+        raise UsageError("--here and --turns exclude each other.", next_step="Give one of them.")
+    with settings.open_bench() as bench:
+        if here:
+            bench.safety.declare(0.0)
+            settings.say("Zero is where the table stands now.", {"table_deg": 0.0})
+            return
+        if turns is not None:
+            bench.safety.declare_turns(turns)
+        with Turntable(bench) as table:
+            _turn(settings, table, 0.0)
+
+
+def _turn(settings: Settings, table: "Turntable", angle_deg: float) -> None:
+    """Turn the table, and tell what is told of any move."""
+    from rig.cli.present import line
+    from rig.plans.capture import announced, moved
+    from rig.plans.events import Event, event_dict
+
+    def steps() -> Iterator[Event]:
+        yield moved(0, (yield from announced(0, table, angle_deg)))
+
+    for event in steps():
+        settings.say(line(event), event_dict(event))
 
 
 @command
@@ -38,11 +80,14 @@ def status(settings: Settings) -> None:
     from rig.plans.events import plain
 
     with settings.open_bench() as bench:
-        state = bench.servo.read_state()
+        state, safety = bench.servo.read_state(), bench.safety
         config = bench.config.table
         report = {
             "bench": bench.name,
-            "table_deg": config.direction * (state.position_deg - config.zero_deg),
+            "state": str(safety.state),
+            "fault": safety.fault.model_dump() if safety.fault else None,
+            "doubt": safety.doubt or None,
+            "table_deg": None if safety.doubt else safety.reference.to_table(state.position_deg),
             "limits_deg": list(config.limits_deg),
             "servo": {**plain(bench.servo.identity), **plain(state)},
             "imu": {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()},
@@ -53,13 +98,21 @@ def status(settings: Settings) -> None:
         settings.print_json(report)
         return
     print(f"bench    {report['bench']}")
-    print(f"table    {report['table_deg']:.2f}° (limits {config.limits_deg[0]:g}°..{config.limits_deg[1]:g}°)")
+    print(f"state    {_state_words(safety)}")
+    print(f"table    {_short(report['table_deg'])}° (limits {config.limits_deg[0]:g}°..{config.limits_deg[1]:g}°)")
     for device in ("servo", "imu", "camera"):
         facts = report[device]
         assert isinstance(facts, dict)
         print(f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in facts.items() if key != "time_ns"))
     for finding in bench.findings:
         print(f"note     {finding}")
+
+
+def _state_words(safety: "Safety") -> str:
+    if safety.fault is not None:
+        fault = safety.fault
+        return f"{safety.state} {fault.code} since {fault.utc}: {fault.what} {fault.next_step} Then `rig acknowledge`."
+    return f"{safety.state}: {safety.doubt} (`rig home --help`)" if safety.doubt else str(safety.state)
 
 
 def _short(value: object) -> str:
