@@ -17,7 +17,8 @@ Similarity = Callable[[LevelArray, LevelArray], FloatArray]
 
 SLACK: Final = 0.01
 """Similarities that differ less are alike: two frames of the same view differ by as much."""
-_FEWEST: Final = 8
+_FEWEST: Final = 18
+"""Neighbours more than 20 degrees apart say nothing about how alike the same view is."""
 _ORDERS: Final = range(2, 13)
 
 
@@ -81,7 +82,7 @@ def symmetry(views: Views, object_index: int, *, similarity: Similarity = tanimo
     Returns
     -------
     Symmetry or None
-        None of fewer than eight views.
+        None of fewer than 18 views.
     """
     descriptors, azimuth_deg = _ring(views, object_index)
     count = len(descriptors)

@@ -6,6 +6,7 @@ Nothing here imports numpy, cv2, scipy or sqlalchemy: `rig --help` must be insta
 import functools
 import inspect
 import json
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.complete import bench_names
 from rig.errors import RigError
 
 if TYPE_CHECKING:
@@ -27,7 +29,13 @@ EXIT_INTERRUPTED = 130
 EXIT_BY_SIGNAL = 128  # plus the signal's number, as shells do
 
 BenchOption = Annotated[
-    str | None, typer.Option("--bench", metavar="NAME", help="Bench to work on: hardware, sim, or a plug-in's.")
+    str | None,
+    typer.Option(
+        "--bench",
+        metavar="NAME",
+        help="Bench to work on: hardware, sim, or a plug-in's.",
+        autocompletion=bench_names,
+    ),
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="Configuration (rig.toml).")]
 SetOption = Annotated[
@@ -35,6 +43,7 @@ SetOption = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, e.g. identify.max_views=4. Repeatable."),
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of a simulated bench.")]
+NoColorOption = Annotated[bool, typer.Option("--no-color", help="No colours; so does NO_COLOR in the environment.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout; text for people goes to stderr.")]
 
 
@@ -71,6 +80,13 @@ class Settings:
             self._loaded["config"] = load_config(self.config, self.overrides)
         return self._loaded["config"]
 
+    def arguments(self) -> list[str]:
+        """Return the words that give these settings to another command."""
+        words = [] if self.bench is None else ["--bench", self.bench]
+        words += [] if self.config is None else ["--config", str(self.config)]
+        words += [word for override in self.overrides for word in ("--set", override)]
+        return words if self.seed is None else [*words, "--seed", str(self.seed)]
+
     @property
     def bench_name(self) -> str:
         return self.bench or self.load().default_bench
@@ -90,6 +106,11 @@ class Settings:
 
         path = self.load().catalog_path(self.bench_name)
         return Catalog.open(path, clock=clock or SystemClock(), create=create, read_only=read_only)
+
+    def catalog_there(self) -> "Catalog | None":
+        """Return the bench's catalog, to be read and closed; None where none was made yet."""
+        path = self.load().catalog_path(self.bench_name)
+        return self.open_catalog(read_only=True) if (path / "catalog.sqlite").exists() else None
 
     def say(self, text: str, data: Any) -> None:
         """Print ``text`` for people, or ``data`` as one line of JSON."""
@@ -120,6 +141,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             ("overrides", None, SetOption),
             ("seed", None, SeedOption),
             ("json_", False, JsonOption),
+            ("no_color", False, NoColorOption),
         )
     ]
     context = inspect.Parameter("ctx", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
@@ -128,6 +150,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def run(ctx: typer.Context, **values: Any) -> None:
         given = [values.pop(name) for name in ("bench", "config", "overrides", "seed", "json_")]
         settings = (ctx.obj or Settings()).merged(*given)
+        if values.pop("no_color"):
+            without_color()
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:  # nohup has a hang-up ignored; so be it
                 signal.signal(number, _terminate)
@@ -136,6 +160,9 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         except RigError as error:
             show_error(error, settings)
             raise typer.Exit(error.exit_code) from None
+        except BrokenPipeError:  # the reader, such as head, has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(EXIT_BY_SIGNAL + signal.SIGPIPE) from None
         except KeyboardInterrupt:
             print("Interrupted; a table that was in use is let go, its torque off.", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
@@ -144,6 +171,11 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     # Typer reads the annotations beside the signature; those of the wrapped function would hide the added ones.
     run.__annotations__ = {p.name: p.annotation for p in [context, *own, *shared]}
     return run
+
+
+def without_color() -> None:
+    """Have everything that is printed from now on, by this program and those it starts, come without colours."""
+    os.environ["NO_COLOR"] = "1"
 
 
 def show_error(error: RigError, settings: Settings) -> None:

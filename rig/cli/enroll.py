@@ -1,62 +1,238 @@
 """`rig enroll`."""
 
+import shlex
 import sys
-from typing import Annotated
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rig.cli.command import Settings, command
+from rig.cli.complete import object_names
+
+if TYPE_CHECKING:
+    from rig.bench import Bench
+    from rig.catalog import Catalog
+    from rig.plans.events import Event
+    from rig.report import EnrollmentRecord
 
 
 @command
 def enroll(
     settings: Settings,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the object that stands on the table.")],
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME", help="Name of the object that stands on the table.", autocompletion=object_names
+        ),
+    ] = None,
     views: Annotated[int | None, typer.Option(min=4, max=720, help="Views in a turn; enroll.views otherwise.")] = None,
-    label: Annotated[str | None, typer.Option(help="A label, to sort and filter by.")] = None,
+    step: Annotated[
+        float | None, typer.Option(min=0.5, max=90, metavar="DEGREES", help="Angle between two views, instead.")
+    ] = None,
+    label: Annotated[list[str] | None, typer.Option(help="A label, to sort and filter by. Repeatable.")] = None,
     note: Annotated[str | None, typer.Option(help="A remark.")] = None,
+    tray: Annotated[
+        Path | None,
+        typer.Option("--list", metavar="FILE", help="Enroll all objects of a CSV file: name, label, note, views."),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Take the missing views of an interrupted enrollment.")
     ] = False,
     replace: Annotated[
         bool, typer.Option("--replace", help="Enroll anew; the old views stay in use until the new ones are complete.")
     ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what would be done, how long it takes and where the table goes.")
+    ] = False,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a page with all views and what was measured.")
+    ] = None,
 ) -> None:
     """Enroll an object: one turn of the table, a checked view at every step.
 
-    Example: rig enroll mug-white --bench sim --views 36
+    p or the space bar pauses and goes on, Ctrl+Z too; Ctrl+C stops and keeps the views.
+
+    Example: rig enroll mug-white --bench sim --views 36 --report mug.html
+
+    Example: rig enroll --list tray.csv --bench sim
     """
-    from rig.cli.present import Progress, line
-    from rig.plans.enroll import enroll as plan
-    from rig.plans.events import Accepted, Enrolled, Moved, Rejected, Started, event_dict
+    from rig.plans.tray import read_tray
+
+    views = _views(views, step)
+    _check(name, tray, label=label, note=note, resume=resume, replace=replace)
+    items = read_tray(tray) if tray else ()
+    labels = ", ".join(label) if label else None
+    if dry_run:
+        _rehearse(settings, [name] if name else [item.name for item in items], views, resume=resume, replace=replace)
+        return
+
+    def again(rerun: str) -> list[str]:
+        words = ["rig", "enroll", *([name, "--resume"] if name else ["--list", str(tray)]), *settings.arguments()]
+        return [f"The views taken so far are kept. {rerun}", f"  {shlex.join(words)}"]
 
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
-        events = plan(bench, catalog, name, views=views, label=label, note=note, resume=resume, replace=replace)
-        kept = 0
+        from rig.bench import ObjectStandsThere
+        from rig.cli.hands import Person
+        from rig.plans.enroll import enroll as enroll_one
+        from rig.plans.tray import Hands, enroll_tray
+
+        job = _Job(settings, bench, catalog)
+        if name is not None:
+            events = enroll_one(
+                bench, catalog, name, views=views, label=labels, note=note, resume=resume, replace=replace
+            )
+            job.run(events, lambda: again("Go on with:"), report)
+        else:
+            person = isinstance(bench.operator, ObjectStandsThere)
+            attendant = Person(job.quiet) if person else Hands()
+            job.run(
+                enroll_tray(bench, catalog, items, views=views, attendant=attendant),
+                lambda: again("The same command goes on with the others:"),
+                report,
+            )
+            job.sum_up(len(items))
+
+
+class _Job:
+    """Runs the plan of one or more enrollments, shows it, and writes the report."""
+
+    def __init__(self, settings: Settings, bench: "Bench", catalog: "Catalog") -> None:
+        from rig.cli.live import EnrollView
+        from rig.cli.present import console
+
+        self._settings = settings
+        self._bench = bench
+        self._catalog = catalog
+        self._screen = console(stderr=settings.json)
+        self._view: EnrollView | None = None
+        self._heading = ""
+        self._records: list[EnrollmentRecord] = []
+        self._kept = 0
+        self._done = 0
+
+    def quiet(self) -> None:
+        """Take the live table off the screen."""
+        if self._view is not None:
+            self._view.__exit__(None, None, None)
+            self._view = None
+
+    def run(self, events: Any, how_on: Callable[[], list[str]], report: Path | None) -> None:
+        from rig.plans.events import Enrolled, Item
+        from rig.plans.insight import insight
+
         try:
-            with Progress(name) as progress:
-                for event in events:
-                    if settings.json:
-                        settings.print_json(event_dict(event))
-                    match event:
-                        case Started():
-                            progress.start(event.views)
-                        case Accepted():
-                            kept += 1
-                            progress.advance()
-                        case Rejected():
-                            progress.note(line(event))
-                        case Moved(agrees=False):
-                            progress.note(line(event))
-                        case Enrolled() if not settings.json:
-                            progress.note(line(event))
-                        case _:
-                            pass
+            for event in events:
+                if isinstance(event, Item):
+                    self.quiet()
+                    self._heading = f"{event.number} of {event.of} "
+                self._tell(event)
+                if isinstance(event, Enrolled):
+                    self._done += 1
+                    self._complete()
+                    found = insight(self._catalog.views().views, event.name)
+                    self._tell(found)
+                    self._records[-1].insight = found
+                    self._kept = 0
         except BaseException:
-            if kept:
-                print(
-                    "The views taken so far are kept; the same command with --resume takes the others.", file=sys.stderr
-                )
+            self.quiet()
+            if self._kept or self._done:
+                print("\n".join(how_on()), file=sys.stderr)
             raise
         finally:
             events.close()
+            self.quiet()
+            if report is not None and self._records:
+                self._write(report)
+
+    def sum_up(self, items: int) -> None:
+        if not self._settings.json:
+            print(f"{self._done} enrolled now; {items} in the list.", file=sys.stderr)
+
+    def _tell(self, event: "Event") -> None:
+        from rig.cli.live import EnrollView
+        from rig.plans.events import Accepted, Started, event_dict
+        from rig.report import EnrollmentRecord
+
+        if self._settings.json:
+            self._settings.print_json(event_dict(event))
+        if isinstance(event, Started):
+            self.quiet()
+            self._records.append(EnrollmentRecord(region=self._bench.config.view.roi))
+        if self._view is None:
+            self._view = EnrollView(self._screen, self._bench.config, self._heading)
+            self._view.__enter__()
+        self._kept += isinstance(event, Accepted)
+        if self._records:
+            self._records[-1].add(event)
+        # people's lines would be the same as the JSON, once more, where neither is looked at
+        if not self._settings.json or self._screen.is_terminal:
+            self._view.add(event)
+
+    def _complete(self) -> None:
+        """Put the views of earlier sittings into the record of a resumed enrollment."""
+        record = self._records[-1]
+        stored = self._catalog.object(record.name).views
+        if len(stored) > len(record.views):
+            record.complete((view.record, self._catalog.read_image(view)) for view in stored)
+
+    def _write(self, path: Path) -> None:
+        from rig.plans.words import counted
+        from rig.report import Meta, render_report, write_report
+
+        names = ", ".join(record.name for record in self._records[:3])
+        title = names if len(self._records) <= 3 else counted(len(self._records), "object")
+        meta = Meta(conditions=self._records[-1].conditions, wall_clock={"date": f"{self._bench.clock.utc():%Y-%m-%d}"})
+        write_report(path, render_report(f"Enrolled: {title}", "", self._records, [], meta=meta))
+        print(f"Report: {path}", file=sys.stderr)
+
+
+def _views(views: int | None, step: float | None) -> int | None:
+    from rig.errors import UsageError
+
+    if step is None:
+        return views
+    if views is not None:
+        raise UsageError("Both --views and --step say how many views there are.", next_step="Give one of them.")
+    count = round(360.0 / step)
+    if abs(count * step - 360.0) > 1e-6:
+        raise UsageError(
+            f"Steps of {step:g}° do not divide a turn evenly.",
+            next_step=f"Give --views {count}, which are {360.0 / count:.2f}° apart, or a step that divides 360.",
+        )
+    return count
+
+
+def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, **texts: Any) -> None:
+    from rig.errors import UsageError
+
+    if (name is None) == (tray is None):
+        raise UsageError(
+            "There is no object to enroll." if name is None else f"Both {name!r} and a list are to be enrolled.",
+            next_step="Give the name of the object, or a list of objects with --list FILE.",
+        )
+    given = [f"--{key}" for key, value in {**texts, "resume": resume, "replace": replace}.items() if value]
+    if tray is not None and given:
+        raise UsageError(
+            f"{', '.join(given)} cannot be used with a list.",
+            next_step="Labels and notes are columns of the list, and it resumes by itself; "
+            "enroll single objects anew with rig enroll NAME --replace.",
+        )
+
+
+def _rehearse(settings: Settings, names: list[str], views: int | None, *, resume: bool, replace: bool) -> None:
+    """Print what an enrollment would do; moves nothing and stores nothing."""
+    from rig.cli.present import console, rehearsal_lines
+    from rig.plans.estimate import rehearse
+    from rig.plans.events import plain
+
+    with settings.open_bench() as bench, settings.catalog_there() or nullcontext() as catalog:
+        found = rehearse(bench, catalog, names, views=views, resume=resume, replace=replace)
+    if settings.json:
+        settings.print_json({"rehearsal": plain(found)})
+        return
+    screen = console()
+    for line in rehearsal_lines(found):
+        screen.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -1,10 +1,20 @@
 """`rig identify`."""
 
-from typing import Annotated
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.command import Settings, command
+from rig.cli.complete import strategy_names
+
+if TYPE_CHECKING:
+    from hbr import ViewIndex
+    from rig.bench import Bench
+    from rig.catalog import Catalog
+    from rig.plans.events import Event
+    from rig.plans.saved_run import RunWriter
 
 EXIT_UNKNOWN = 8
 
@@ -15,32 +25,129 @@ def identify(
     max_views: Annotated[
         int | None, typer.Option(min=1, max=72, help="Views at most; identify.max_views otherwise.")
     ] = None,
+    strategy: Annotated[
+        str,
+        typer.Option(
+            help="How the next view is chosen: ahbr, hbr, sweep, random, or a plug-in's.", autocompletion=strategy_names
+        ),
+    ] = "ahbr",
+    top: Annotated[int, typer.Option(min=1, max=100, help="Candidates that are named.")] = 5,
+    save_run: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Keep frames and decisions, for rig replay and rig report.")
+    ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Wait for the next object after each answer, endlessly; begin empty.")
+    ] = False,
 ) -> None:
     """Find out what stands on the table; ends with exit code 8 if it is unknown.
 
-    Example: rig identify --bench sim --seed 3 --json
-    """
-    from hbr import ViewIndex
-    from rig.cli.present import line
-    from rig.plans.events import Identified, event_dict
-    from rig.plans.identify import identify as plan
+    p or the space bar pauses and goes on, Ctrl+Z too; Ctrl+C stops.
 
+    Example: rig identify --bench sim --seed 3 --strategy sweep --save-run runs/1
+
+    Example: rig identify --watch --bench sim --json
+    """
+    from rig.cli.live import IdentifyView
+    from rig.cli.present import console
+    from rig.plans.events import Identified, Waiting, event_dict
+    from rig.plans.identify import identify as identify_one
+    from rig.plans.strategies import strategy as strategy_named
+    from rig.plans.watch import watch as watch_table
+
+    chosen = strategy_named(strategy)
     if max_views is not None:
         settings = settings.merged(None, None, [f"identify.max_views={max_views}"], None, False)
-    with settings.open_catalog(read_only=True) as catalog:
-        index = ViewIndex(catalog.views().views)
+    screen = console(stderr=settings.json)
     answer = None
-    with settings.open_bench() as bench:
-        events = plan(bench, index)
-        try:
-            for event in events:
-                if settings.json:
-                    settings.print_json(event_dict(event))
-                elif text := line(event):
-                    print(text, flush=True)
-                if isinstance(event, Identified):
-                    answer = event
-        finally:
-            events.close()
+    events: Generator[Event, None, object]
+    with settings.open_catalog(read_only=True) as catalog:
+        model = _Model(catalog)
+        index = model()
+        with settings.open_bench() as bench, IdentifyView(screen) as view:
+            seed = settings.seed or 0
+            if watch:
+                _bring_by_camera(bench)
+                events = watch_table(bench, model, strategy=chosen, seed=seed, top=top)
+            else:
+                events = identify_one(bench, index, strategy=chosen, seed=seed, top=top)
+            keeper = _Keeper(save_run, bench, lambda: model.index, several=watch)
+            try:
+                with keeper:
+                    for event in events:
+                        keeper.add(event)
+                        if settings.json:
+                            settings.print_json(event_dict(event))
+                        # people's lines would be the same as the JSON, once more, where neither is looked at
+                        if not settings.json or screen.is_terminal or isinstance(event, Waiting):
+                            view.add(event)
+                        if isinstance(event, Identified):
+                            answer = event
+            finally:
+                events.close()
     if answer is None or answer.name is None:
         raise typer.Exit(EXIT_UNKNOWN)
+
+
+class _Model:
+    """The enrolled views, loaded again when something was enrolled or deleted meanwhile."""
+
+    def __init__(self, catalog: "Catalog") -> None:
+        self._catalog = catalog
+        self._seen: object = None
+        self.index: ViewIndex
+
+    def __call__(self) -> "ViewIndex":
+        from hbr import ViewIndex
+
+        now = [(summary.name, summary.enrolled_utc, summary.views) for summary in self._catalog.objects()]
+        if now != self._seen:
+            self.index, self._seen = ViewIndex(self._catalog.views().views), now
+        return self.index
+
+
+class _Keeper:
+    """Keeps runs in a folder, where one is given; ``several`` in folders within it, 0001, 0002, ..."""
+
+    def __init__(self, folder: Path | None, bench: "Bench", index: Callable[[], "ViewIndex"], *, several: bool) -> None:
+        self._folder = folder
+        self._bench = bench
+        self._index = index
+        self._several = several
+        self._writer: RunWriter | None = None
+
+    def __enter__(self) -> "_Keeper":
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if self._writer is not None:
+            self._writer.__exit__(None, error, None)
+            self._writer = None
+
+    def add(self, event: "Event") -> None:
+        from rig.plans.events import Failed, Identified, Started
+        from rig.plans.saved_run import RunWriter
+
+        if self._folder is None:
+            return
+        if isinstance(event, Started):
+            folder = self._next() if self._several else self._folder
+            self._writer = RunWriter(folder, self._bench, self._index().views)
+        if self._writer is not None:
+            self._writer.add(event)
+            if isinstance(event, Identified | Failed):
+                self._writer.close()
+                self._writer = None
+
+    def _next(self) -> Path:
+        assert self._folder is not None
+        taken = [int(path.name) for path in self._folder.glob("[0-9][0-9][0-9][0-9]") if path.name.isdecimal()]
+        return self._folder / f"{max(taken, default=0) + 1:04d}"
+
+
+def _bring_by_camera(bench: "Bench") -> None:
+    """Have a bench without hands see by its camera when the next object stands there."""
+    from rig.bench import ObjectStandsThere
+    from rig.presence import TableWatcher
+
+    if isinstance(bench.operator, ObjectStandsThere):
+        bench.operator = TableWatcher(bench)

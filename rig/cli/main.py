@@ -2,12 +2,22 @@
 
 import sys
 from importlib.metadata import entry_points, version
+from io import TextIOWrapper
 from typing import Annotated
 
 import typer
 
-from rig.cli import catalog, config, doctor, enroll, evaluate, identify, safety, table
-from rig.cli.command import BenchOption, ConfigOption, JsonOption, SeedOption, SetOption, Settings
+from rig.cli import catalog, config, doctor, enroll, evaluate, find, identify, runs, safety, table
+from rig.cli.command import (
+    BenchOption,
+    ConfigOption,
+    JsonOption,
+    NoColorOption,
+    SeedOption,
+    SetOption,
+    Settings,
+    without_color,
+)
 
 GROUP = "rig.commands"
 
@@ -34,6 +44,7 @@ def common(
     overrides: SetOption = None,
     seed: SeedOption = None,
     json_: JsonOption = False,
+    _no_color: NoColorOption = False,
     _version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
@@ -46,6 +57,8 @@ common.__doc__ = None  # the help of the program is the app's
 
 app.command("enroll")(enroll.enroll)
 app.command("identify")(identify.identify)
+app.command("replay")(runs.replay)
+app.command("report")(runs.report)
 app.command("eval")(evaluate.evaluate)
 app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)
 app.command("home")(table.home)
@@ -53,6 +66,7 @@ app.command("status")(table.status)
 app.command("stop")(safety.stop)
 app.command("acknowledge")(safety.acknowledge)
 app.command("doctor")(doctor.doctor)
+app.command("find")(find.find)
 app.add_typer(catalog.app, name="catalog")
 app.add_typer(config.app, name="config")
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
@@ -69,4 +83,9 @@ for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
 
 def main() -> None:
     """Run the command line."""
+    if "--no-color" in sys.argv:
+        without_color()  # before anything is printed, help and mistakes of usage included
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without ° or − gets ?, not a traceback
     app()

@@ -1,6 +1,7 @@
 """How the events of a plan read on a terminal."""
 
 import sys
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
@@ -8,18 +9,49 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
-from rig.plans.events import Accepted, Decided, Enrolled, Event, Identified, Moved, Ranked, Rejected, Started, Unwinding
+from rig.plans.estimate import Rehearsal
+from rig.plans.events import (
+    Accepted,
+    Decided,
+    Enrolled,
+    Event,
+    Failed,
+    Identified,
+    Insight,
+    Item,
+    Moved,
+    Ranked,
+    Rejected,
+    Started,
+    Unwinding,
+    Waiting,
+)
 from rig.plans.words import (
     answer_words,
     azimuth_words,
     counted,
     decision_words,
+    duration_words,
+    insight_words,
     move_words,
     signed,
     unwinding_words,
 )
 
 SHOWN = 3
+
+
+class _Screen(Console):
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError  # for `rig.cli.command`, which knows how to end
+
+
+def console(*, stderr: bool = False, plain: bool = False) -> Console:
+    """Return the screen, or the pipe: colours and width are as the terminal, NO_COLOR and COLUMNS have them.
+
+    ``plain`` writes lines as into a pipe, on a terminal too.
+    """
+    return _Screen(stderr=stderr, force_terminal=False if plain else None)
 
 
 def line(event: Event) -> str:
@@ -36,18 +68,59 @@ def line(event: Event) -> str:
         case Accepted():
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():
-            leaders = ", ".join(f"{c.name} {c.score:.3f}" for c in event.candidates[:SHOWN])
+            leaders = ", ".join(
+                f"{c.name} {c.score:.3f} at {azimuth_words(c.pose_deg)}°" for c in event.candidates[:SHOWN]
+            )
             return f"  leading: {leaders} (sure lead {signed(event.margin, 3)})"
         case Decided():
             return f"  {decision_words(event)} The table goes to {event.target_deg:.1f}°."
         case Enrolled():
             retakes = f", {counted(event.retakes, 'frame')} taken again" if event.retakes else ""
-            return f"{event.name}: {counted(event.views, 'view')} enrolled in {event.seconds:.0f} s{retakes}"
+            took = duration_words(event.seconds)
+            return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
         case Identified():
             return (
                 f"{answer_words(event)}\n  score {event.score:.3f} a view (unknown below {event.min_score:.3f}), "
-                f"{counted(event.views, 'view')}, {event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
+                f"sure lead {signed(event.margin, 3)}, {counted(event.views, 'view')}, "
+                f"{event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
             )
+        case Item(action="skip"):
+            return f"{event.number} of {event.of}  {event.name}: left out, {event.why}"
+        case Item():
+            return ""
+        case Insight():
+            return "\n".join(f"  {words}" for words in insight_words(event))
+        case Waiting():
+            return f"Waiting for {event.why}; Ctrl+C ends."
+        case Failed():
+            return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
+
+
+def rehearsal_lines(found: Sequence[Rehearsal]) -> list[str]:
+    """Return what enrollments would do, in lines."""
+    lines = []
+    for one in found:
+        if not one.views:
+            lines.append(f"{one.name}: {'left out' if one.action == 'skip' else 'would be refused'}, {one.why}")
+            continue
+        lines.append(
+            f"{one.name}: {one.action}, {counted(one.views, 'view')}, about {duration_words(one.seconds)} of the bench"
+        )
+        if len(found) > 1:
+            continue
+        first, last = one.angles_deg[0], one.angles_deg[-1]
+        lines += [
+            f"  The table stands at {one.table_deg:.1f}° and "
+            + ("begins there" if abs(one.table_deg - first) < 1 else f"first turns to {first:.1f}°")
+            + f", goes up to {last:.1f}° and back to 0°: {one.travel_deg:.0f}° of travel.",
+            f"  Its cable reaches from {one.limits_deg[0]:g}° to {one.limits_deg[1]:g}°.",
+            "  Table angles: " + ", ".join(f"{angle:.1f}" for angle in one.angles_deg),
+            "  Azimuths:     " + ", ".join(azimuth_words(azimuth) for azimuth in one.azimuths_deg),
+        ]
+    if len(found) > 1:
+        views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
+        lines.append(f"{counted(len(found), 'object')}, {counted(views, 'view')}, about {duration_words(seconds)}")
+    return [*lines, "Nothing was moved or stored."]
 
 
 class Progress:
@@ -59,7 +132,7 @@ class Progress:
             BarColumn(),
             MofNCompleteColumn(),
             TimeRemainingColumn(),
-            console=Console(stderr=True),
+            console=console(stderr=True),
             disable=not sys.stderr.isatty(),
         )
         self._task = self._bar.add_task(title, total=None, start=False)

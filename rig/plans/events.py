@@ -187,6 +187,17 @@ class Waiting:
 
 
 @dataclass(frozen=True, slots=True)
+class Failed:
+    """An object could not be identified, and the plan goes on with the next one; the fields are the error's."""
+
+    error: str
+    code: int
+    what: str
+    evidence: dict[str, Any]
+    next_step: str
+
+
+@dataclass(frozen=True, slots=True)
 class Identified:
     """The answer: an object's name, or None for "unknown".
 
@@ -221,6 +232,7 @@ Event = (
     | Item
     | Insight
     | Waiting
+    | Failed
 )
 
 

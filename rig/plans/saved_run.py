@@ -85,6 +85,9 @@ class RunWriter:
     ) -> None:
         if isinstance(error, RigError):
             self._line(error.as_dict())
+        self.close()
+
+    def close(self) -> None:
         self._events.close()
 
     def add(self, event: Event) -> None:
@@ -218,24 +221,24 @@ def event_of(values: dict[str, Any], frame: Any) -> Event:
         raise ValueError(f"there is no event {name!r}")
     if name == "accepted":
         values["image_bgr"] = frame(values["index"])
-    event: Event = _built(_KINDS[name], values)
+    event: Event = built(_KINDS[name], values)
     return event
 
 
-def _built(kind: Any, value: Any) -> Any:
+def built(kind: Any, value: Any) -> Any:
     """Return JSON values as the type that is meant; fields that a newer program added are left out."""
     origin = get_origin(kind)
     if is_dataclass(kind):
         hints = get_type_hints(kind)
-        given = {f.name: _built(hints[f.name], value[f.name]) for f in fields(kind) if f.name in value}
+        given = {f.name: built(hints[f.name], value[f.name]) for f in fields(kind) if f.name in value}
         return kind(**given)  # type: ignore[operator]
     if origin in (Union, UnionType):
         if value is None and NoneType in get_args(kind):
             return None
-        return _built(next(k for k in get_args(kind) if k is not NoneType), value)
+        return built(next(k for k in get_args(kind) if k is not NoneType), value)
     if origin is tuple:
         items = get_args(kind)
-        return tuple(_built(items[0] if items[-1] is Ellipsis else items[i], item) for i, item in enumerate(value))
+        return tuple(built(items[0] if items[-1] is Ellipsis else items[i], item) for i, item in enumerate(value))
     if kind is float:
         return nan if value is None else float(value)
     if kind in (str, bool, int) and type(value) is not kind:

@@ -67,7 +67,7 @@ def symmetry_words(insight: Insight) -> str:
         return ""
     numbers = f"similarity {insight.alike:.3f}, of neighbouring views {insight.neighbours:.3f}"
     if insight.period_deg == 0:
-        return f"looks alike from everywhere (at least {numbers}): its pose will not be known"
+        return f"looks alike from everywhere (least {numbers}): its pose will not be known"
     if insight.period_deg < 360:
         return f"looks the same every {insight.period_deg:g}° ({numbers}): its pose will be known up to that"
     return ""

@@ -1,21 +1,24 @@
 """What a report needs of a plan's event stream, collected while the plan runs: thumbnails instead of frames."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from hbr.angles import wrap180
+from rig.catalog import ViewRecord
 from rig.plans.events import (
     Accepted,
     Decided,
     Enrolled,
     Event,
     Identified,
+    Insight,
     Moved,
     Ranked,
     Rejected,
     Started,
 )
+from rig.plans.saved_run import built
 from rig.report.contact_sheet import Image, Region, thumbnail
 from rig.report.polar_path import Turn
 from rig.view import ViewEvidence
@@ -56,11 +59,14 @@ class _Looks:
             case Rejected():
                 self._refused.append(", ".join(event.reasons))
             case Accepted():
-                picture = thumbnail(event.image_bgr, self.size, self.region)
                 refused, self._refused = tuple(self._refused), []
-                self.views.append(Look(event.index, event.azimuth_deg, picture, event.evidence, self._move, refused))
+                look = self.look(event.index, event.azimuth_deg, event.image_bgr, event.evidence)
+                self.views.append(replace(look, move=self._move, refused=refused))
             case _:
                 pass
+
+    def look(self, index: int, azimuth_deg: float, image_bgr: Image, evidence: ViewEvidence) -> Look:
+        return Look(index, azimuth_deg, thumbnail(image_bgr, self.size, self.region), evidence, None, ())
 
 
 class EnrollmentRecord:
@@ -77,6 +83,7 @@ class EnrollmentRecord:
         self.planned = 0
         self.conditions: Mapping[str, Any] = {}
         self.result: Enrolled | None = None
+        self.insight: Insight | None = None
         self._looks = _Looks(TILE, region)
 
     @property
@@ -96,6 +103,18 @@ class EnrollmentRecord:
             self.name, self.planned, self.conditions = event.name or "", event.views, event.conditions
         elif isinstance(event, Enrolled):
             self.result = event
+        elif isinstance(event, Insight):
+            self.insight = event
+
+    def complete(self, stored: Iterable[tuple[ViewRecord, Image]]) -> None:
+        """Add the stored views that were not taken under these eyes: those of the sittings before."""
+        seen = {view.index for view in self.views}
+        for record, image_bgr in stored:
+            if record.index not in seen:
+                evidence = built(ViewEvidence, record.evidence)
+                self._looks.views.append(self._looks.look(record.index, record.azimuth_deg, image_bgr, evidence))
+        self._looks.views.sort(key=lambda view: view.index)
+        self.planned = max(self.planned, len(self.views))
 
 
 @dataclass(frozen=True, slots=True)

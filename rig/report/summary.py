@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from statistics import fmean, median
 from typing import NamedTuple
 
-from rig.plans.words import counted, listed
+from rig.plans.events import Insight
+from rig.plans.words import counted, listed, resemblance_words
 from rig.report.records import EnrollmentRecord, IdentificationRecord
 
 
@@ -77,9 +78,22 @@ def enrollment_facts(record: EnrollmentRecord) -> list[Fact]:
                 "encoder against gyro", f"{max(gaps):.2f}°", f"largest difference; {agree} of {len(moves)} moves agree"
             )
         )
+    if record.insight:
+        facts.append(_symmetry(record.insight))
+        similar = [resemblance_words(one).removeprefix("looks like ") for one in record.insight.lookalikes]
+        facts.append(Fact("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
     if record.result:
         facts.append(Fact("bench time", f"{record.result.seconds:.0f} s"))
     return facts
+
+
+def _symmetry(insight: Insight) -> Fact:
+    if insight.period_deg is None or insight.neighbours is None or insight.alike is None:
+        return Fact("symmetry", "–", "too few views to tell")
+    note = f"similarity {insight.alike:.3f}, of neighbouring views {insight.neighbours:.3f}"
+    if insight.period_deg == 360:
+        return Fact("symmetry", "none", note)
+    return Fact("symmetry", f"every {insight.period_deg:g}°" if insight.period_deg else "alike from everywhere", note)
 
 
 def _answer_facts(record: IdentificationRecord) -> list[Fact]:
