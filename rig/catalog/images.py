@@ -94,6 +94,11 @@ def decode(content: bytes) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
+def suffix(content: bytes) -> str:
+    """Return the suffix of a file name for an image that `decode` takes."""
+    return ".png" if content.startswith(_PNG) else ".jpg"
+
+
 def _png_size(content: bytes) -> tuple[int, int] | None:
     if content[12:16] != b"IHDR" or len(content) < 24:
         return None

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sqlalchemy import Connection, delete, select, update
+from sqlalchemy import Connection, delete, null, select, update
 
 from hbr.descriptors import descriptor, names
 from rig.catalog import audit, images
@@ -200,28 +200,39 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
             described.setdefault(row.view_id, []).append(
                 (row.name, row.version, json.dumps(row.settings, sort_keys=True), row.packed)
             )
-        of_object = select(objects.c.name.label("object_name")).join(enrollments)
         items = [
-            _Item(
-                row.id, None, row.object_name, row.enrollment_id, row.image, row.image_sha256, row.image_bytes
-            )._replace(described=tuple(described.get(row.id, ())))
+            _Item._make((*row, tuple(described.get(row.id, ()))))
             for row in connection.execute(
-                of_object.join(views, views.c.enrollment_id == enrollments.c.id).add_columns(views).order_by(views.c.id)
+                select(
+                    views.c.id,
+                    null(),
+                    objects.c.name,
+                    enrollments.c.id,
+                    views.c.image,
+                    views.c.image_sha256,
+                    views.c.image_bytes,
+                )
+                .select_from(objects)
+                .join(enrollments)
+                .join(views, views.c.enrollment_id == enrollments.c.id)
+                .order_by(views.c.id)
             )
         ]
         items += [
-            _Item(
-                None,
-                row.id,
-                row.object_name,
-                row.enrollment_id,
-                row.reference_image,
-                row.reference_image_sha256,
-                row.reference_image_bytes,
-            )
+            _Item._make((*row, ()))
             for row in connection.execute(
-                of_object.join(sittings, sittings.c.enrollment_id == enrollments.c.id)
-                .add_columns(sittings)
+                select(
+                    null(),
+                    sittings.c.id,
+                    objects.c.name,
+                    enrollments.c.id,
+                    sittings.c.reference_image,
+                    sittings.c.reference_image_sha256,
+                    sittings.c.reference_image_bytes,
+                )
+                .select_from(objects)
+                .join(enrollments)
+                .join(sittings, sittings.c.enrollment_id == enrollments.c.id)
                 .where(sittings.c.reference_image.is_not(None))
             )
         ]
@@ -293,11 +304,11 @@ def _judge_images(state: _State, looked: dict[_Item, _Looked]) -> None:
     # all are read before any is written: two images may have changed places
     contents = {item: path.read_bytes() for item, path in copies.items()} if state.repair else {}
     for item, found in looked.items():
-        where = _where(item)
         if item in wrong:
             missing = found.sha256 is None
             problem = Problem.MISSING_IMAGE if missing else Problem.CHANGED_IMAGE
-            what = f"{where}: {item.image} {'is missing' if missing else 'is not what was stored'} ({found.reason})"
+            state_of_it = "is missing" if missing else "is not what was stored"
+            what = f"{item.object_name!r}: {item.image} {state_of_it} ({found.reason})"
             mended = None
             if item in contents:
                 make_folder((root / item.image).parent, within=root)
@@ -306,12 +317,12 @@ def _judge_images(state: _State, looked: dict[_Item, _Looked]) -> None:
                 write(root / item.image, contents[item])
                 mended = f"it was put back from {copies[item].relative_to(root)}"
             elif item in copies:
-                what += f"; {copies[item].relative_to(root)} holds it"
+                what += f"; {copies[item].relative_to(root)} has it: --repair puts it back"
             else:
                 what += "; restore it from a backup, or enroll the object again with --replace"
             state.findings.append(_finding(problem, what, item, mended))
         elif found.reason:
-            what = f"{where}: {item.image} cannot be decoded: {found.reason}"
+            what = f"{item.object_name!r}: {item.image} cannot be decoded: {found.reason}"
             state.findings.append(_finding(Problem.UNREADABLE_IMAGE, what, item))
 
 
@@ -323,7 +334,7 @@ def _judge_sizes(state: _State, looked: dict[_Item, _Looked]) -> None:
         size = first.setdefault(item.enrollment_id, found.size)
         if found.size != size:
             what = (
-                f"{_where(item)}: {item.image} has {found.size[0]}x{found.size[1]} pixels, the first view of its "
+                f"{item.object_name!r}: {item.image} has {found.size[0]}x{found.size[1]} pixels, the first view of its "
                 f"enrollment {size[0]}x{size[1]}; enroll the object again with --replace"
             )
             state.findings.append(_finding(Problem.SIZES_DIFFER, what, item))
@@ -345,10 +356,10 @@ def _judge_descriptors(state: _State, looked: dict[_Item, _Looked]) -> None:
                         .values(packed=packed)
                     )
                 mended = "it was described anew"
-            what = f"{_where(item)}: what {name} says of it is not what its image says"
+            what = f"{item.object_name!r}: what {name} says of {item.image} is not what it shows"
             state.findings.append(_finding(Problem.DESCRIPTOR_DIFFERS, what, item, mended))
         if item.view_id is not None and not item.described:
-            what = f"{_where(item)} is not described: rig catalog redescribe"
+            what = f"{item.object_name!r}: {item.image} is not described: rig catalog redescribe"
             state.findings.append(_finding(Problem.NOT_DESCRIBED, what, item))
 
 
@@ -374,10 +385,6 @@ def _set_aside(root: Path, name: str) -> str:
         number += 1
     (root / name).rename(target)
     return target.relative_to(root).as_posix()
-
-
-def _where(item: _Item) -> str:
-    return f"{item.object_name!r}, view {item.view_id}" if item.view_id is not None else f"{item.object_name!r}"
 
 
 def _finding(problem: Problem, what: str, item: _Item, mended: str | None = None) -> Finding:

@@ -1,0 +1,205 @@
+"""Views as rows: a CSV file with the images beside it, and Parquet."""
+
+import csv
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from hbr.angles import wrap360
+from hbr.descriptors import descriptor
+from rig.catalog.exchange.bundle import checked, new_file
+from rig.catalog.exchange.new_folder import new_folder
+from rig.catalog.exchange.package import (
+    Enrollment,
+    Object,
+    Package,
+    Photograph,
+    Refused,
+    View,
+    assemble,
+    parse_region,
+    region_of_view,
+    region_words,
+)
+from rig.catalog.records import EnrollmentStatus, this_software
+from rig.catalog.schema import DESCRIPTOR
+from rig.errors import ExportFailed, ImportRefused
+
+TABLE: Final = "views.csv"
+_NUMBERS: Final = ("commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
+_NEEDED: Final = ("object", "azimuth_deg", "image")
+_COLUMNS: Final = (
+    *("object", "label", "note", "azimuth_deg", "image"),
+    *_NUMBERS,
+    *("captured_utc", "bench", "software", "image_sha256", "region", "descriptor", "descriptor_version", "packed"),
+)
+_MAX_BYTES: Final = 1_000_000_000
+
+
+def read_table(path: Path, *, now: datetime) -> Package:
+    """Read a CSV file with a row a view: ``object``, ``azimuth_deg``, ``image`` (a path beside it) and more.
+
+    Columns of other names are left alone.
+
+    Raises
+    ------
+    ImportRefused
+        It is no such file; a row that cannot be used is refused by itself.
+    """
+    folder = path.parent.resolve()
+    photographs, refused = [], []
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ImportRefused(f"{path} is absurdly large", next_step="split it")
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file, strict=True)
+            if lacking := [name for name in _NEEDED if name not in (rows.fieldnames or ())]:
+                raise ImportRefused(
+                    f"{path} has no column {' nor '.join(lacking)}",
+                    next_step=f"name the columns in the first line: {', '.join(_NEEDED)}",
+                    evidence={"columns": list(rows.fieldnames or ())},
+                )
+            for row in rows:
+                try:
+                    photographs.append(_photograph(row, folder))
+                except ValueError as error:
+                    refused.append(Refused(f"{path.name}, line {rows.line_num}", str(error)))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportRefused(f"{path} cannot be read: {error}", next_step="save it as CSV in UTF-8") from error
+    if not photographs:
+        raise ImportRefused(
+            f"{path} has no row that can be used",
+            next_step="mend the rows listed" if refused else "add a row a view",
+            evidence={"refused": [f"{file.path}: {file.reason}" for file in refused[:5]]},
+        )
+    return assemble(str(path), photographs, refused, now, this_software())
+
+
+def write_table(folder: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) -> int:
+    """Write the views that objects are retrieved by as ``views.csv``, with their images beside it, to the byte.
+
+    Raises
+    ------
+    ExportFailed
+        The folder is not empty or cannot be written, or an image is not the one that was stored.
+    """
+    count = 0
+    with new_folder(folder) as made, (made / TABLE).open("w", encoding="utf-8", newline="") as file:
+        rows = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
+        rows.writeheader()
+        for item, files in objects:
+            count += 1
+            for row, view in _rows(item):
+                target = made / view.image
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(checked(files[view.image], view.image_sha256))
+                rows.writerow({key: "" if value is None else value for key, value in row.items() if key in _COLUMNS})
+    return count
+
+
+def write_parquet(path: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) -> int:
+    """Write the views that objects are retrieved by as a Parquet table, with their levels, without their images.
+
+    Raises
+    ------
+    ExportFailed
+        The file is there already or cannot be written, or pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as error:
+        raise ExportFailed(
+            "Parquet needs pyarrow, which is not installed", next_step="install it: pip install 'hbr-rig[parquet]'"
+        ) from error
+    text, number = pa.string(), pa.float64()
+    schema = pa.schema(
+        [
+            *((name, text) for name in ("object", "label", "note")),
+            *((name, number) for name in ("azimuth_deg", *_NUMBERS)),
+            ("captured_utc", pa.timestamp("us", "UTC")),
+            *((name, text) for name in ("bench", "software", "devices", "conditions", "evidence", "image")),
+            ("image_sha256", text),
+            ("descriptor", text),
+            ("descriptor_version", pa.int32()),
+            ("levels", pa.list_(pa.uint8())),
+        ]
+    )
+    count = 0
+    with new_file(path) as file, pq.ParquetWriter(file, schema) as writer:
+        for item, _ in objects:
+            count += 1
+            rows = [row for row, _ in _rows(item)]
+            if rows:
+                writer.write_table(pa.Table.from_pylist([{n: row[n] for n in schema.names} for row in rows], schema))
+    return count
+
+
+def _rows(item: Object) -> Iterator[tuple[dict[str, Any], View]]:
+    for enrollment in item.enrollments:
+        if enrollment.status == EnrollmentStatus.COMPLETE:
+            for view in enrollment.views:
+                yield _row(item, enrollment, view), view
+
+
+def _row(item: Object, enrollment: Enrollment, view: View) -> dict[str, Any]:
+    sitting = enrollment.sittings[view.sitting]
+    kind = descriptor(DESCRIPTOR)
+    levels = next((d for d in view.descriptors if (d.name, d.version) == (kind.name, kind.version)), None)
+    return {
+        "object": item.name,
+        "label": item.label,
+        "note": item.note,
+        **{name: getattr(view, name) for name in ("azimuth_deg", *_NUMBERS, "captured_utc", "image", "image_sha256")},
+        "bench": sitting.bench,
+        "software": sitting.software,
+        "devices": json.dumps(sitting.devices, ensure_ascii=False),
+        "conditions": json.dumps(sitting.conditions, ensure_ascii=False),
+        "evidence": json.dumps(view.evidence, ensure_ascii=False),
+        "region": region_words(region_of_view(view)),
+        "descriptor": levels.name if levels else None,
+        "descriptor_version": levels.version if levels else None,
+        "packed": levels.packed if levels else None,
+        "levels": kind.unpack(bytes.fromhex(levels.packed)).tolist() if levels else None,
+    }
+
+
+def _photograph(row: Mapping[str, str | None], folder: Path) -> Photograph:
+    """Raises ValueError in words where the row cannot be used."""
+    texts = {key: value.strip() for key, value in row.items() if isinstance(key, str) and isinstance(value, str)}
+    lacking = [name for name in _NEEDED if not texts.get(name)]
+    if lacking:
+        raise ValueError(f"{' and '.join(lacking)} not given")
+    path = folder / texts["image"]
+    if not path.resolve().is_relative_to(folder):
+        raise ValueError(f"the image {texts['image']} is not beside the table")
+    if not path.is_file():
+        raise ValueError(f"there is no image {texts['image']}")
+    values: dict[str, Any] = {name: _number(texts[name], name) for name in _NUMBERS if texts.get(name)}
+    if (values.get("imu_deg") is None) != (values.get("imu_sigma_deg") is None):
+        raise ValueError("imu_deg and imu_sigma_deg: both or none")
+    if texts.get("captured_utc"):
+        values["captured_utc"] = datetime.fromisoformat(texts["captured_utc"])
+        if values["captured_utc"].tzinfo is None:
+            raise ValueError(f"captured_utc {texts['captured_utc']} without a zone")
+    azimuth_deg = _number(texts["azimuth_deg"], "azimuth_deg")
+    return Photograph(
+        path,
+        texts["object"],
+        float(wrap360(azimuth_deg)),
+        values,
+        **{key: texts.get(key, "") for key in ("label", "note", "bench", "software")},
+        region=parse_region(texts.get("region", "")),
+    )
+
+
+def _number(text: str, name: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not abs(number) < 1e9:
+        raise ValueError(f"{name} is {text!r}, not an angle in degrees")
+    return number
