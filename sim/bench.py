@@ -156,7 +156,10 @@ def open_sim_bench(
             state=operator.state,
         )
         if operator.state.load().table is None and bench.safety.fault is None:
-            bench.safety.declare_turns(0)
+            if bench.servo.turn_deg < 360.0:  # behind a gear somebody has to look at the table
+                bench.safety.declare(world.table_deg())
+            else:
+                bench.safety.declare_turns(0)
         bench.wires = wires.pop_all()
     bench.operator = operator
     bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
