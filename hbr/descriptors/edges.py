@@ -99,11 +99,13 @@ class _Cosine:
         self._unit = unit
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
-        return np.minimum(_unit(queries) @ self._unit.T, 1, dtype=np.float64)
+        similar: FloatArray = np.minimum(_unit(queries) @ self._unit.T, 1, dtype=np.float64)
+        return similar
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         part = self._unit[rows]
-        return np.minimum(part @ part.transpose(0, 2, 1), 1, dtype=np.float64)
+        similar: FloatArray = np.minimum(part @ part.transpose(0, 2, 1), 1, dtype=np.float64)
+        return similar
 
 
 def _unit(levels: LevelArray) -> NDArray[np.float32]:

@@ -1,0 +1,243 @@
+"""The dense Hough filter: how much every object, seen from every azimuth, is supported by all views so far.
+
+Beside the paper's voting (`hbr.retrieve`), which follows the few views on its lists, this one keeps a score for every
+hypothesis (j, φ): object j, with azimuth φ at the first query. A query i, turned by r_i since the first, adds
+
+    s_i(j, φ + r_i) = max_k [T(q_i, c_jk) - ω · max(0, |φ + r_i - o_jk| - h) / 360]
+
+where k runs over all views of the object and h, half the spacing of its views, is a dead zone: an azimuth between two
+enrolled views is as good as one on a view.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hbr.angles import wrap180, wrap360
+from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.descriptors import descriptor
+from hbr.views import Views
+
+#: Azimuths at the first query that are told apart.
+BINS: Final = 72
+_BIN_DEG: Final = 360 / BINS
+#: Objects that are kept after the first view.
+KEPT: Final = 500
+#: Objects that are scored at a time: what a core's own cache holds.
+_CHUNK: Final = 64
+
+Floats = NDArray[np.float32]
+
+
+class DenseIndex:
+    """Enrolled views, made ready for the dense filter.
+
+    Parameters
+    ----------
+    views : Views
+        Of any descriptor. Objects without views are left out.
+    omega : float
+        Weight ω of the orientation, a turn.
+    """
+
+    def __init__(self, views: Views, *, omega: float = 2.0) -> None:
+        if not (np.isfinite(omega) and omega >= 0):
+            raise ValueError(f"omega is {omega}; a finite weight of at least 0 is needed, 2 by default")
+        if not len(views):
+            raise ValueError("there are no views; enroll at least one object first")
+        self.views = views
+        self.omega = omega
+        self.object_index: IndexArray = np.unique(views.object_index)
+        self.compared = descriptor(views.descriptor).prepared(views.descriptors)
+        rows, begin = views.of_each(self.object_index)
+        count = np.diff(begin, append=len(rows))
+        inside = np.arange(count.max()) < count[:, None]
+        #: Rows of each object's views, padded by the first of them.
+        self.rows = np.repeat(rows[begin][:, None], count.max(), axis=1)
+        self.rows[inside] = rows
+        self._padded = ~inside
+        self.azimuth_deg: FloatArray = views.azimuth_deg[self.rows]
+        self._dead_deg = np.array([_spacing(own[ok]) / 2 for own, ok in zip(self.azimuth_deg, inside, strict=True)])
+
+    def __len__(self) -> int:
+        return len(self.object_index)
+
+    def support(self, similar: FloatArray, places: IndexArray, turned_deg: float) -> Floats:
+        """Return what one query adds to every hypothesis of some objects.
+
+        Parameters
+        ----------
+        similar : float array (n,)
+            Similarity of the query to every view.
+        places : integer array (k,)
+            Positions of the objects in `object_index`.
+        turned_deg : float
+            Orientation since the first query, counter-clockwise.
+
+        Returns
+        -------
+        float32 array (k, 72)
+            For azimuths 0, 5, 10, ... at the first query.
+        """
+        own = similar.astype(np.float32)[self.rows[places]]
+        own[self._padded[places]] = -np.inf
+        out = np.empty((len(places), BINS), np.float32)
+        seen_deg = (np.arange(BINS) * _BIN_DEG + turned_deg)[None, :, None]
+        slope = np.float32(self.omega / 360)
+        for start in range(0, len(places), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            chunk = places[part]
+            away = (seen_deg - self.azimuth_deg[chunk][:, None]).astype(np.float32)
+            # degrees to the nearest whole turn, in place: this is the filter's whole time
+            away -= np.float32(360) * np.rint(away * np.float32(1 / 360))
+            np.abs(away, out=away)
+            away -= self._dead_deg[chunk].astype(np.float32)[:, None, None]
+            np.maximum(away, 0, out=away)
+            away *= -slope
+            away += own[part][:, None]
+            away.max(axis=2, out=out[part])
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What all views so far say about every object from every azimuth.
+
+    Attributes
+    ----------
+    index : DenseIndex
+        The enrolled views.
+    places : integer array (k,)
+        Positions of the objects that are still considered, in `index.object_index`, ascending.
+    support : float32 array (k, 72)
+        A, the sum of what each query adds, at most their number; for azimuths 0, 5, ... at the first query.
+    orientation_deg : float64 array (n,)
+        Orientations of the camera around the object at the queries, from any zero.
+    """
+
+    index: DenseIndex
+    places: IndexArray
+    support: Floats
+    orientation_deg: FloatArray
+
+    @property
+    def queries(self) -> int:
+        return len(self.orientation_deg)
+
+    @property
+    def turned_deg(self) -> float:
+        """Orientation of the last query, from the first."""
+        return float(self.orientation_deg[-1] - self.orientation_deg[0])
+
+    def scores(self) -> FloatArray:
+        """Score of every object considered: the best azimuth's support, a query; at most 1."""
+        best: FloatArray = self.support.max(axis=1).astype(np.float64) / self.queries
+        return best
+
+    def ranking(self) -> "DenseRanking":
+        """The objects considered, best first."""
+        scores = self.scores()
+        order = np.argsort(-scores, kind="stable")
+        azimuth_deg = self.support[order].argmax(axis=1) * _BIN_DEG + self.turned_deg
+        return DenseRanking(self.index.object_index[self.places[order]], scores[order], wrap360(azimuth_deg))
+
+    def posterior(self, beta: float) -> FloatArray:
+        """Probability of every hypothesis, (k, 72): proportional to exp(β A / √n).
+
+        The root tempers it: views of one object are not independent, and none says as much as the one before.
+        """
+        exponent = self.support.astype(np.float64) * (beta / np.sqrt(self.queries))
+        weights = np.exp(exponent - exponent.max())
+        probability: FloatArray = weights / weights.sum()
+        return probability
+
+
+@dataclass(frozen=True, eq=False)
+class DenseRanking:
+    """The objects that the filter considers, best first.
+
+    Attributes
+    ----------
+    object_index : integer array (k,)
+        Equal scores by lower index.
+    scores : float64 array (k,)
+        Support of the best azimuth, a query: at most 1.
+    pose_deg : float64 array (k,)
+        Orientation of the camera around each object at the last query, in [0, 360).
+    """
+
+    object_index: IndexArray
+    scores: FloatArray
+    pose_deg: FloatArray
+
+
+def believe(
+    query: LevelArray,
+    orientation_deg: float,
+    index: DenseIndex,
+    *,
+    before: Belief | None = None,
+    kept: int = KEPT,
+) -> Belief:
+    """Add a query to what is believed.
+
+    Parameters
+    ----------
+    query : uint8 array (length,)
+        The view, described as the enrolled ones are.
+    orientation_deg : float
+        Orientation of the camera around the object, counter-clockwise, from any zero that all queries share.
+    index : DenseIndex
+        The enrolled views.
+    before : Belief, optional
+        After the queries so far; none for the first.
+    kept : int
+        Objects that are considered further after the first query: those with the most similar views.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The query is no view of the index's descriptor, the orientation is not finite, or `kept` is below 1.
+    """
+    query = np.asarray(query)
+    length = index.views.descriptors.shape[1]
+    if query.dtype != np.uint8 or query.shape != (length,):
+        raise ValueError(
+            f"the query is {query.dtype} of shape {query.shape}; {index.views.descriptor} has uint8 of ({length},)"
+        )
+    if not np.isfinite(orientation_deg):
+        raise ValueError(f"orientation_deg is {orientation_deg}; a finite angle is needed")
+    if kept < 1:
+        raise ValueError(f"kept is {kept}; at least 1 object is needed")
+    similar = index.compared.similarity(query[None])[0]
+    if before is None:
+        places = np.arange(len(index))
+        if len(places) > kept:
+            best = similar[index.rows].max(axis=1)
+            places = np.sort(np.argsort(-best, kind="stable")[:kept])
+        support = index.support(similar, places, 0.0)
+        return Belief(index, places, support, np.array([orientation_deg], np.float64))
+    turned_deg = float(wrap180(orientation_deg - before.orientation_deg[0]))
+    support = before.support + index.support(similar, before.places, turned_deg)
+    return Belief(index, before.places, support, np.append(before.orientation_deg, orientation_deg))
+
+
+def believe_all(queries: Sequence[LevelArray] | LevelArray, orientation_deg: ArrayLike, index: DenseIndex) -> Belief:
+    """Return what is believed after all these queries, in their order: (n, length) and (n,), n at least 1."""
+    orientations = np.asarray(orientation_deg, np.float64)
+    if len(queries) < 1 or orientations.shape != (len(queries),):
+        raise ValueError(f"{len(queries)} queries and orientations of shape {orientations.shape}; one each is needed")
+    belief: Belief | None = None
+    for query, angle_deg in zip(queries, orientations.tolist(), strict=True):
+        belief = believe(query, angle_deg, index, before=belief)
+    assert belief is not None
+    return belief
+
+
+def _spacing(azimuth_deg: FloatArray) -> float:
+    """The usual step between neighbouring views; 360 of a single one."""
+    ring = np.sort(azimuth_deg)
+    return float(np.median(np.diff(ring, append=ring[0] + 360)))
