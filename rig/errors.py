@@ -96,6 +96,13 @@ class DeviceFault(RigError):
     title = "device fault"
 
 
+class SeveralServos(DeviceMismatch):
+    """More than one servo is on a bus where there may be only one."""
+
+    code = 405
+    title = "several servos"
+
+
 class FirmwareMismatch(DeviceMismatch):
     """The rig head's firmware and this program speak different versions of their protocol."""
 
@@ -248,6 +255,13 @@ class ViewRejected(RigError):
 
     code = 600
     title = "view rejected"
+
+
+class ObjectMoved(RigError):
+    """The object does not stand any more as it stood for its first view."""
+
+    code = 601
+    title = "object moved"
 
 
 class ReplayMismatch(RigError):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import catalog, config, doctor, enroll, evaluate, find, identify, runs, safety, table
+from rig.cli import catalog, config, doctor, enroll, evaluate, find, identify, runs, safety, servo, table
 from rig.cli.command import (
     BenchOption,
     ConfigOption,
@@ -69,6 +69,7 @@ app.command("doctor")(doctor.doctor)
 app.command("find")(find.find)
 app.add_typer(catalog.app, name="catalog")
 app.add_typer(config.app, name="config")
+app.add_typer(servo.app, name="servo")
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
     try:
         _plugin = _point.load()

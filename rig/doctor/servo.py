@@ -34,7 +34,7 @@ def servo(case: Case) -> Iterator[Finding]:
             return
         opened.callback(wire.close)
         try:
-            found = open_servo(wire, config, case.host.clock)
+            found = open_servo(wire, config, case.host.clock, case.config.table.mode)
         except DeviceNotFound:
             yield from _elsewhere(case, wire)
             return

@@ -1,0 +1,172 @@
+"""A servo's id and baud rate: changed only while it is alone on its bus, its torque off, and verified afterwards."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import serial
+
+from rig.devices.dynamixel.bus import DynamixelBus
+from rig.devices.dynamixel.port import ClockedPort, Wire
+from rig.devices.dynamixel.registers import ControlTable, control_table
+from rig.doctor.case import Case
+from rig.doctor.register_words import baud_codes
+from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, scan_servos
+from rig.errors import DeviceMismatch, DeviceNotFound, DeviceRefused, DeviceSilent, SeveralServos, UsageError
+
+MAX_ID = 252
+_SETTLE_S = 0.05
+"""How long a servo may take to speak at a new rate."""
+
+
+class LoneServo:
+    """The one servo on a bus, found at whatever id and baud rate it has.
+
+    Raises
+    ------
+    DeviceNotFound
+        No servo answers at any baud rate.
+    SeveralServos
+        More than one does, or two with one id.
+    DeviceMismatch
+        It is of a model that has no control table.
+    """
+
+    def __init__(self, case: Case, wire: Wire, say: Callable[[str], None] = lambda _: None) -> None:
+        self._wire = wire
+        self._clock = case.host.clock
+        self.found = _the_only_one(case, wire, say)
+        if self.found.model is None:
+            raise DeviceMismatch(
+                f"There is no control table for this servo: model number {self.found.model_number}.",
+                next_step="Use another servo, or set this one up with its maker's program.",
+                evidence={"model_number": self.found.model_number},
+            )
+        wire.baudrate = self.found.baud
+        self.bus = DynamixelBus(ClockedPort(wire, self._clock), protocol=self.found.protocol)
+        self.table: ControlTable = control_table(self.found.model, self.found.firmware)
+
+    def read(self) -> dict[str, int]:
+        """Return every register by name, in the order of their addresses; those of indirect addressing are left out."""
+        registers = sorted(
+            {r.address: r for r in self.table.values() if not r.name.startswith("Indirect")}.values(),
+            key=lambda register: register.address,
+        )
+        return {register.name: self.bus.read(self.found.bus_id, register) for register in registers}
+
+    def set_id(self, new: int) -> None:
+        """Give the servo another id.
+
+        Raises
+        ------
+        UsageError
+            There is no such id.
+        DeviceRefused
+            It did not take the id; it answers to the old one.
+        """
+        if not 0 <= new <= MAX_ID:
+            raise UsageError(f"No servo has the id {new}.", next_step=f"Choose an id from 0 to {MAX_ID}.")
+        old = self.found.bus_id
+        self._torque_off()
+        self.bus.write(old, self.table["ID"], new, answered=self._answered())
+        self._verify(new, "ID", new, f"the id {new}")
+
+    def set_baud(self, rate: int) -> None:
+        """Give the servo another baud rate; the port follows.
+
+        Raises
+        ------
+        UsageError
+            The model, or the adapter, has no such rate.
+        DeviceRefused
+            It did not take the rate; it answers at the old one.
+        """
+        codes = baud_codes(self.table)
+        if rate not in codes:
+            known = ", ".join(map(str, sorted(codes)))
+            raise UsageError(f"This servo has no baud rate {rate}.", next_step=f"Choose one of {known}.")
+        old = self.found.baud
+        try:
+            self._wire.baudrate = rate
+            self._wire.baudrate = old
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise UsageError(
+                f"The serial adapter has no baud rate {rate}.",
+                next_step="Choose a lower one.",
+                evidence={"reason": str(error)},
+            ) from error
+        self._torque_off()
+        self.bus.write(self.found.bus_id, self.table["Baud Rate"], codes[rate], answered=self._answered())
+        self.bus.port.setBaudRate(rate)
+        self._clock.sleep(_SETTLE_S)
+        try:
+            self._verify(self.found.bus_id, "Baud Rate", codes[rate], f"{rate} baud")
+        except DeviceRefused:
+            self.bus.port.setBaudRate(old)
+            raise
+
+    def _torque_off(self) -> None:
+        self.bus.write(self.found.bus_id, self.table["Torque Enable"], 0, answered=self._answered())
+        if self.bus.read(self.found.bus_id, self.table["Torque Enable"]):
+            raise DeviceRefused(
+                f"Servo {self.found.bus_id} keeps its torque on.",
+                next_step="Switch its supply off and on, then try again.",
+            )
+
+    def _answered(self) -> bool:
+        """Return whether the servo answers a write; it may have been told to answer reads alone."""
+        return self.bus.read(self.found.bus_id, self.table["Status Return Level"]) == 2
+
+    def _verify(self, bus_id: int, name: str, value: int, words: str) -> None:
+        self._clock.sleep(_SETTLE_S)
+        try:
+            kept = self.bus.read(bus_id, self.table[name]) == value
+        except DeviceSilent:
+            kept = False
+        if not kept:
+            raise DeviceRefused(
+                f"The servo did not take {words}.",
+                next_step="Switch its supply off and on, then look with `rig find`.",
+                evidence={"register": name, "wrote": value, "id": bus_id},
+            )
+
+
+@contextmanager
+def lone_servo(case: Case, say: Callable[[str], None] = lambda _: None) -> Iterator[LoneServo]:
+    """Yield the one servo on the configured port, its port open for this program alone; see `LoneServo`."""
+    case.require_free()
+    wire = case.host.open_wire(case.config.servo.port, case.config.servo.baud)
+    try:
+        yield LoneServo(case, wire, say)
+    finally:
+        wire.close()
+
+
+def _the_only_one(case: Case, wire: Wire, say: Callable[[str], None]) -> FoundServo:
+    """Look at all baud rates: a second servo at another one would answer as soon as their rates are the same."""
+    found: list[FoundServo] = []
+    for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
+        if protocol == 1 and found:
+            break
+        for rate in rates:
+            say(f"{case.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
+            for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
+                found += heard.servos
+                if heard.doubtful:
+                    raise SeveralServos(
+                        f"Two servos answer at once to id {', '.join(map(str, heard.doubtful))} at {rate} baud.",
+                        next_step="Unplug all servos but the one that is meant, then try again.",
+                        evidence={"ids": list(heard.doubtful), "baud": rate},
+                    )
+    if not found:
+        raise DeviceNotFound(
+            f"No servo answers on {case.config.servo.port} at any baud rate.",
+            next_step="Check the servo's cable and switch on its supply (its LED blinks once), then try again.",
+            evidence={"port": case.config.servo.port},
+        )
+    if len(found) > 1:
+        raise SeveralServos(
+            f"There are {len(found)} servos on {case.config.servo.port}.",
+            next_step="Unplug all servos but the one that is meant, then try again.",
+            evidence={"servos": list(map(str, found))},
+        )
+    return found[0]

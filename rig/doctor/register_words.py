@@ -1,0 +1,155 @@
+"""The registers of a servo in words and units, as the e-manual has them."""
+
+from rig.devices.dynamixel.register_servo import hardware_errors
+from rig.devices.dynamixel.registers import ControlTable
+
+BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
+"""Values of Baud Rate, Protocol 2.0."""
+AX_BAUD = 2_000_000
+"""Protocol 1.0: Baud Rate is this by the rate, less one."""
+
+_OPERATING_MODES = {
+    0: "current",
+    1: "velocity",
+    3: "position, within one turn",
+    4: "extended position, many turns",
+    5: "current-based position",
+    16: "PWM",
+}
+_DRIVE_BITS = ((0x01, "reversed direction"), (0x04, "time-based profile"), (0x08, "torque on by goal"))
+_STARTUP_BITS = ((0x01, "torque on at power-up"), (0x02, "RAM restored at power-up"))
+_RETURN_LEVELS = {0: "answers to ping only", 1: "answers to ping and read", 2: "answers to everything"}
+_AX_ERRORS = {
+    0: "input voltage",
+    1: "angle limit",
+    2: "overheating",
+    3: "range",
+    4: "checksum",
+    5: "overload",
+    6: "instruction",
+}
+
+_SWITCHES = frozenset(
+    {"Torque Enable", "LED", "Moving", "Registered Instruction", "Backup Ready", "Lock", "Registered"}
+)
+_DEGREES = frozenset(
+    {
+        "Homing Offset",
+        "Max Position Limit",
+        "Min Position Limit",
+        "Goal Position",
+        "Present Position",
+        "Position Trajectory",
+        "CW Angle Limit",
+        "CCW Angle Limit",
+    }
+)
+_VELOCITIES = frozenset(
+    {
+        "Moving Threshold",
+        "Velocity Limit",
+        "Goal Velocity",
+        "Profile Velocity",
+        "Present Velocity",
+        "Velocity Trajectory",
+    }
+)
+_CURRENTS = frozenset({"Current Limit", "Goal Current", "Present Current"})
+_MILLIAMPERES = {"xl330": 1.0, "xc330": 1.0, "xm430": 2.69, "xh430": 2.69, "xd430": 2.69, "xm540": 2.69, "xh540": 2.69}
+"""Unit of the currents by the first part of the model's name; of others the e-manual page is not known here."""
+
+
+def baud_codes(table: ControlTable) -> dict[int, int]:
+    """Return the baud rates that a model can be set to, each with its register value."""
+    if table.ram_start != 64:
+        return {
+            rate: round(AX_BAUD / rate) - 1
+            for rate in (9_600, 19_200, 57_600, 115_200, 200_000, 250_000, 500_000, 1_000_000)
+        }
+    fastest = 4_000_000 if table.model.startswith(("xl330", "xc330")) else 4_500_000
+    return {rate: code for rate, code in BAUD_CODES.items() if rate <= fastest}
+
+
+def words(table: ControlTable, name: str, value: int) -> str:
+    """Return what a register's value means; empty where the number says it all."""
+    if table.ram_start != 64:
+        return _words_of_ax(name, value)
+    match name:
+        case "Baud Rate":
+            return next((f"{rate} bit/s" for rate, code in BAUD_CODES.items() if code == value), "unknown rate")
+        case "Return Delay Time":
+            return f"{2 * value} µs"
+        case "Drive Mode":
+            return _bits(value, _DRIVE_BITS, "normal direction, velocity-based profile")
+        case "Operating Mode":
+            return _OPERATING_MODES.get(value, "unknown mode")
+        case "Secondary ID":
+            return "off" if value > 252 else "obeys this id, too"
+        case "Protocol Type":
+            return f"protocol {value}.0"
+        case "Temperature Limit" | "Present Temperature":
+            return f"{value} °C"
+        case "Max Voltage Limit" | "Min Voltage Limit" | "Present Input Voltage":
+            return f"{0.1 * value:.1f} V"
+        case "PWM Limit" | "Goal PWM" | "Present PWM":
+            return f"{0.113 * value:.1f} %"
+        case "Startup Configuration":
+            return _bits(value, _STARTUP_BITS, "nothing at power-up")
+        case "Shutdown":
+            return ", ".join(hardware_errors(value)) or "nothing takes the torque away"
+        case "Hardware Error Status":
+            return ", ".join(hardware_errors(value)) or "none"
+        case "Status Return Level":
+            return _RETURN_LEVELS.get(value, "unknown level")
+        case "Bus Watchdog":
+            return "off" if value == 0 else "tripped" if value in (0xFF, -1) else f"{20 * value} ms"
+        case "Profile Acceleration":
+            return "as fast as it can" if value == 0 else f"{value * 214.577 * 6 / 60:.1f} °/s²"
+        case "Profile Velocity" if value == 0:
+            return "as fast as it can"
+        case "Realtime Tick":
+            return f"{value} ms"
+        case "Moving Status":
+            return "arrived" if value & 1 else "not arrived"
+        case "Present Load":
+            return f"{0.1 * value:.1f} %"
+    if name in _SWITCHES:
+        return "on" if value else "off"
+    if name in _DEGREES:
+        return f"{value * 360 / 4096:.2f}°"
+    if name in _VELOCITIES:
+        return f"{value * 0.229 * 6:.2f} °/s"
+    if name in _CURRENTS and (unit := _MILLIAMPERES.get(table.model.partition("_")[0])):
+        return f"{value * unit:.0f} mA"
+    return ""
+
+
+def _words_of_ax(name: str, value: int) -> str:
+    match name:
+        case "Baud Rate":
+            return f"{AX_BAUD / (value + 1):.0f} bit/s"
+        case "Return Delay Time":
+            return f"{2 * value} µs"
+        case "Temperature Limit" | "Present Temperature":
+            return f"{value} °C"
+        case "Max Voltage Limit" | "Min Voltage Limit" | "Present Voltage":
+            return f"{0.1 * value:.1f} V"
+        case "Max Torque" | "Torque Limit":
+            return f"{value / 10.23:.0f} %"
+        case "Status Return Level":
+            return _RETURN_LEVELS.get(value, "unknown level")
+        case "Alarm LED" | "Shutdown":
+            return ", ".join(text for bit, text in _AX_ERRORS.items() if value >> bit & 1) or "nothing"
+        case "Moving Speed" if value == 0:
+            return "as fast as it can"
+        case "Moving Speed" | "Present Speed":
+            return f"{(value & 0x3FF) * 0.111 * 6:.1f} °/s{' clockwise' if value & 0x400 else ''}"
+        case "Present Load":
+            return f"{(value & 0x3FF) / 10.23:.0f} %{' clockwise' if value & 0x400 else ''}"
+    if name in _SWITCHES:
+        return "on" if value else "off"
+    return f"{value * 300 / 1023:.1f}°" if name in _DEGREES else ""
+
+
+def _bits(value: int, names: tuple[tuple[int, str], ...], none: str) -> str:
+    return ", ".join(text for bit, text in names if value & bit) or none
