@@ -294,7 +294,9 @@ class IdentifyView(LiveView):
 
     @property
     def _leading(self) -> str:
-        return f"{self._ranked.candidates[0].name} leads by {signed(self._ranked.margin, 3)}." if self._ranked else ""
+        if self._ranked is None:
+            return ""
+        return f"{self._ranked.candidates[0].name} in the lead ({signed(self._ranked.margin, 3)})"
 
     def render(self) -> RenderableType:
         table = Table(box=None, pad_edge=False, expand=False)
