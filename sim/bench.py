@@ -1,5 +1,6 @@
 """The simulated bench: one world, and the real drivers on simulated wires."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields
@@ -31,7 +32,11 @@ class SimOptions(Section):
     """The section ``[bench.sim]``."""
 
     objects: Path | None = Field(None, description="folder of photographs obj{N}__{A}.png; none: the built-in objects")
-    object: str | None = Field(None, description="what stands on the table to be identified; none: drawn by the seed")
+    object: str | list[str] | None = Field(
+        None,
+        description="what stands on the table to be identified; of several, one after the other and round again; "
+        "none: drawn by the seed",
+    )
     yaw_deg: float | None = Field(None, ge=-360, le=360, description="how it stands; none: drawn by the seed")
     noise: dict[str, float] = Field(default_factory=dict, description="values of the noise model that differ")
 
@@ -64,7 +69,8 @@ class ShelfOperator:
 
     Every placement misses the table's axis by a little, as hands do. Once a bench is open, ``parts`` is what it is made
     of, and ``faults`` what goes wrong with that. ``state`` is what benches in this world remember of the table; whoever
-    sets a new one up looks at its cable, and says that it hangs free.
+    sets a new one up looks at its cable, and says that it hangs free. The things in ``queue`` are put up to be
+    identified one after the other, and round again.
     """
 
     def __init__(
@@ -74,6 +80,7 @@ class ShelfOperator:
         self.things = things
         self.next_object = next_object
         self.yaw_deg = yaw_deg
+        self.queue: deque[str] = deque()
         self.parts: SimParts | None = None
         self.faults: Faults | None = None
         self.state: StateStore = MemoryStore()
@@ -91,6 +98,9 @@ class ShelfOperator:
         yaw_deg = 0.0
         if name is None:
             drawn, drawn_deg = str(self._rng.choice(sorted(self.things))), float(self._rng.uniform(0.0, 360.0))
+            if self.queue:
+                self.next_object = self.queue[0]
+                self.queue.rotate(-1)
             name = self.next_object or drawn
             yaw_deg = drawn_deg if self.yaw_deg is None else self.yaw_deg
         if name not in self.things:
@@ -177,7 +187,10 @@ class SimBenchKind:
         with ExitStack() as held:
             state = _state(config, held)
             world = _world(options, seed, _stands_at_deg(config, state))
-            operator = ShelfOperator(world, things, next_object=options.object, yaw_deg=options.yaw_deg)
+            several = options.object if isinstance(options.object, list) else []
+        single = options.object if isinstance(options.object, str) else None
+        operator = ShelfOperator(world, things, next_object=single, yaw_deg=options.yaw_deg)
+        operator.queue.extend(several)
             operator.state = state
             bench = open_sim_bench(config, operator, faults=read_faults(options.faults))
             bench.wires.enter_context(held.pop_all())
