@@ -15,6 +15,12 @@ from rig.heading import Stillness
 
 DARK_LEVEL = 8
 """Grey levels below this carry no detail in an 8-bit frame."""
+NOISE_GAIN = 20
+"""What the Laplacian (-4 and four times 1) makes of the variance of independent pixels."""
+MAX_NOISE = 0.3
+"""Largest share of such variance in a picture; half a frame of random bytes has more."""
+LIKENESS_PX = 4
+"""Side of the squares that `likeness` averages over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +67,17 @@ def region(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """What the region of a frame looks like; see `ViewEvidence`."""
+    """What the region of a frame looks like; see `ViewEvidence`.
+
+    ``noise_share`` compares neighbouring pixels with distant ones: 1 where they have nothing in common, below 0.05 in
+    pictures.
+    """
 
     sharpness: float
     mean_level: float
     dark_share: float
     saturated_share: float
+    noise_share: float
 
     def reasons(self, config: ViewConfig) -> list[str]:
         """Return why a frame that looks so is not taken."""
@@ -77,18 +88,41 @@ class Looks:
             reasons.append(f"overexposed ({self.saturated_share:.0%} saturated)")
         if self.sharpness < config.min_sharpness:
             reasons.append(f"blurred (sharpness {self.sharpness:.1f} < {config.min_sharpness:g})")
+        elif self.noise_share > MAX_NOISE:
+            reasons.append(f"noise instead of a picture ({self.noise_share:.0%} of its variance)")
         return reasons
 
 
 def looks(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Looks:
     """Measure the region of interest of a frame, uint8 (H, W, 3)."""
     grey = cv2.cvtColor(region(image_bgr, config), cv2.COLOR_BGR2GRAY)
+    sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).var())
     return Looks(
-        sharpness=float(cv2.Laplacian(grey, cv2.CV_16S).var()),
+        sharpness=sharpness,
         mean_level=float(grey.mean()),
         dark_share=float(np.count_nonzero(grey < DARK_LEVEL) / grey.size),
         saturated_share=float(np.count_nonzero(grey == 255) / grey.size),
+        noise_share=sharpness / (NOISE_GAIN * max(float(grey.var()), 1.0)),
     )
+
+
+def likeness(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8], config: ViewConfig) -> float:
+    """Return how much two frames show the same in their region of interest: 1 for the same, whatever the light.
+
+    It is the correlation of their grey levels, averaged over a few pixels: noise and a tenth of a degree cost less
+    than 0.01, an object that was taken away leaves less than 0.7.
+    """
+    small = [
+        cv2.resize(
+            cv2.cvtColor(region(image, config), cv2.COLOR_BGR2GRAY),
+            None,
+            fx=1 / LIKENESS_PX,
+            fy=1 / LIKENESS_PX,
+            interpolation=cv2.INTER_AREA,
+        )
+        for image in (image_bgr, other_bgr)
+    ]
+    return float(cv2.matchTemplate(small[0], small[1], cv2.TM_CCOEFF_NORMED)[0, 0])
 
 
 def describe(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8]:

@@ -275,6 +275,14 @@ class OpenCvCamera:
                 f"{self._identity.name} delivers {image.dtype} images of shape {image.shape}, not 8-bit colour",
                 next_step="choose a colour format that OpenCV converts (v4l2-ctl --list-formats)",
             )
+        expected, got = (self._identity.width, self._identity.height), (image.shape[1], image.shape[0])
+        if got != expected and all(expected):
+            raise DeviceFault(
+                f"{self._identity.name} delivers frames of {got[0]}x{got[1]} pixels, it was opened with "
+                f"{expected[0]}x{expected[1]}",
+                next_step="open the bench again; a camera that loses its mode was reset: try another cable or USB port",
+                evidence={"got": list(got), "expected": list(expected)},
+            )
         return np.asarray(image, dtype=np.uint8)
 
 

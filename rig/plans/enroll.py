@@ -2,16 +2,22 @@
 
 from collections.abc import Generator, Mapping
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hbr.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.clock import seconds_between
-from rig.errors import RigError, RotationDisagreement
+from rig.errors import ObjectMoved, RigError, RotationDisagreement
 from rig.plans.capture import announced, capture, moved
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.plans.events import Accepted, Enrolled, Event, Started, plain
 from rig.turntable import Move, Turntable
-from rig.view import Viewer
+from rig.view import Viewer, likeness
+
+SAME_LIKENESS = 0.97
+"""Two frames of an object at one angle are more alike; one that was shifted by a centimetre, or taken away, is less."""
 
 
 def enroll(
@@ -38,6 +44,8 @@ def enroll(
     RotationDisagreement
         Encoder and gyro differ by more than their uncertainty, or the gyro lost the rotation: no view is stored at an
         angle in doubt.
+    ObjectMoved
+        The object does not stand as it stood for the first view of this sitting: the enrollment is abandoned.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.view` and `rig.turntable`; views stored so far stay.
     """
@@ -90,6 +98,7 @@ def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, f
     viewer = Viewer(bench.camera, bench.config.view)
     retakes = 0
     imu = _ImuAngle()
+    first: tuple[int, float, NDArray[np.uint8]] | None = None
     with Turntable(bench) as table:
         for index, angle_deg in angles_deg.items():
             move = yield from announced(index, table, angle_deg)
@@ -116,9 +125,43 @@ def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, f
             )
             enrollment.add(record, shot.image_bgr)
             yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr)
+            first = first or (index, angle_deg, shot.image_bgr)
+        if first and first[0] != index:
+            yield from _look_again(bench, enrollment, table, viewer, *first)
         # The servo forgets whole turns without its supply; a cable left wound up would be wound further the next time.
-        yield from announced(index, table, 0.0)
+        if first is None or first[0] == index or first[1] != 0.0:
+            yield from announced(index, table, 0.0)
     return retakes
+
+
+def _look_again(
+    bench: Bench,
+    enrollment: Enrollment,
+    table: Turntable,
+    viewer: Viewer,
+    index: int,
+    angle_deg: float,
+    image_bgr: NDArray[np.uint8],
+) -> Generator[Event, None, None]:
+    """Go back to where view ``index`` was taken, and see that the object stands as it stood.
+
+    Raises
+    ------
+    ObjectMoved
+        It fell, was pushed, or has crept: which views it still stood for, nobody knows, and so they are abandoned.
+    """
+    move = yield from announced(index, table, angle_deg)
+    again = yield from capture(index, viewer, table, move.settled_ns)
+    alike = likeness(image_bgr, again.image_bgr, bench.config.view)
+    if alike < SAME_LIKENESS:
+        enrollment.abandon()
+        raise ObjectMoved(
+            f"{enrollment.object_name} does not stand as it stood for view {index}: it fell, was pushed, or creeps "
+            "on the platter.",
+            next_step="Put it back on its mark, with something that holds it, and enroll it anew with --replace; "
+            "the views taken are abandoned.",
+            evidence={"likeness": round(alike, 3), "smallest_likeness": SAME_LIKENESS, "table_deg": angle_deg},
+        )
 
 
 class _ImuAngle:
