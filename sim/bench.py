@@ -187,10 +187,9 @@ class SimBenchKind:
         with ExitStack() as held:
             state = _state(config, held)
             world = _world(options, seed, _stands_at_deg(config, state))
-            several = options.object if isinstance(options.object, list) else []
-        single = options.object if isinstance(options.object, str) else None
-        operator = ShelfOperator(world, things, next_object=single, yaw_deg=options.yaw_deg)
-        operator.queue.extend(several)
+            single = options.object if isinstance(options.object, str) else None
+            operator = ShelfOperator(world, things, next_object=single, yaw_deg=options.yaw_deg)
+            operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
             bench = open_sim_bench(config, operator, faults=read_faults(options.faults))
             bench.wires.enter_context(held.pop_all())
