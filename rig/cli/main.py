@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import catalog, config, doctor, enroll, evaluate, find, identify, runs, safety, servo, table
+from rig.cli import catalog, config, doctor, enroll, evaluate, find, identify, runs, safety, servo, setup, table
 from rig.cli.command import (
     BenchOption,
     ConfigOption,
@@ -67,6 +67,7 @@ app.command("stop")(safety.stop)
 app.command("acknowledge")(safety.acknowledge)
 app.command("doctor")(doctor.doctor)
 app.command("find")(find.find)
+app.command("setup")(setup.setup)
 app.add_typer(catalog.app, name="catalog")
 app.add_typer(config.app, name="config")
 app.add_typer(servo.app, name="servo")

@@ -1,12 +1,11 @@
 """`rig servo ...`."""
 
-import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.ask import agreed
 from rig.cli.command import Settings, command
-from rig.errors import UsageError
 
 if TYPE_CHECKING:
     from rig.doctor.case import Case
@@ -83,7 +82,7 @@ def settings_(
         if not settings.json:
             print(servo.found)
             print("\n".join(f"  {difference}" for difference in differences) or "  as the rig needs it")
-        written = bool(differences) and write and (yes or settings.json or _agreed("Write these settings?"))
+        written = bool(differences) and write and (yes or settings.json or agreed("Write these settings?"))
         if written:
             write_settings(servo.bus, servo.found.bus_id, servo.table, differences)
     if settings.json:
@@ -136,8 +135,9 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
         if not settings.json:
             print(servo.found)
         if old != new:
-            if not (yes or settings.json or _agreed(f"Change its {what} from {old} to {new}, with its torque off?")):
-                raise typer.Exit(1)
+            if not (yes or settings.json or agreed(f"Change its {what} from {old} to {new}, with its torque off?")):
+                print("Nothing was changed.")
+                return
             if what == "id":
                 servo.set_id(new)
             else:
@@ -176,13 +176,3 @@ def _identity(servo: "LoneServo") -> dict[str, Any]:
         "baud": found.baud,
         "protocol": found.protocol,
     }
-
-
-def _agreed(question: str) -> bool:
-    """Ask; where nobody can answer, say so instead of waiting."""
-    try:
-        return typer.confirm(question, err=True)
-    except typer.Abort:
-        if sys.stdin.isatty():
-            raise
-        raise UsageError("Nobody answered the question.", next_step="Give --yes, or run it in a terminal.") from None

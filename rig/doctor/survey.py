@@ -178,7 +178,8 @@ def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:
 def imu_settings(found: FoundImu) -> dict[Key, Any]:
     """Return the keys of the configuration that mean this IMU."""
     number = found.bus.removeprefix("/dev/i2c-")
-    return {("imu", "bus"): int(number) if number.isdigit() else found.bus, ("imu", "address"): found.address}
+    bus = int(number) if number.isdigit() else found.bus
+    return {("imu", "model"): found.driver, ("imu", "bus"): bus, ("imu", "address"): found.address}
 
 
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:
