@@ -4,17 +4,15 @@ Registers: RM-MPU-6000A rev 4.2; noise and scales: PS-MPU-6000A rev 3.4. The gyr
 own clock and wait in its FIFO, so that a late reader loses no rotation.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from smbus2 import SMBus, i2c_msg
 
 from rig.clock import Clock
+from rig.devices.i2c import I2cRegisters, I2cStatistics
 from rig.devices.imu import ImuIdentity, ImuSamples
-from rig.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
 _USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W, _WHO_AM_I = 0x6A, 0x6B, 0x72, 0x74, 0x75
@@ -28,7 +26,6 @@ _RESET_S, _START_S = 0.1, 0.05
 _FRAME, _FIFO_FULL = 6, 1018
 """A frame of three words, and the last count at which another frame still fits into the 1024 bytes."""
 
-_ATTEMPTS, _RETRY_PAUSE_S = 3, 0.002
 NOISE_DPS_RTHZ = 0.005
 LSB_PER_G = 16384.0
 LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
@@ -45,17 +42,6 @@ OTHERS = {
     0x00: "nothing that drives the bus: SDA held low, or a missing ground",
     0xFF: "nothing that drives the bus: SDA is not connected",
 }
-
-_T = TypeVar("_T")
-
-
-@dataclass(slots=True)
-class Mpu6050Statistics:
-    """What the bus has been through since it was opened."""
-
-    transfers: int = 0
-    retries: int = 0
-    overflows: int = 0
 
 
 class Mpu6050:
@@ -103,18 +89,20 @@ class Mpu6050:
         self._clock = clock
         self._address = address
         self._range_dps = range_dps
-        self._bus_name = bus if isinstance(bus, str) else f"/dev/i2c-{bus}"
         self._settings = settings(range_dps, rate_hz, bandwidth_hz)
         self._period_ns = 1_000_000 * (1 + self._settings[SMPLRT_DIV][0])
         self._newest_ns = clock.now_ns()
-        self.statistics = Mpu6050Statistics()
-        self._bus = _open(self._bus_name)
+        self._wire = I2cRegisters(bus, address, clock)
         try:
             self.identity = self._identify()
             self._set_up()
         except BaseException:
             self.close()
             raise
+
+    @property
+    def statistics(self) -> I2cStatistics:
+        return self._wire.statistics
 
     @property
     def rate_hz(self) -> float:
@@ -125,7 +113,7 @@ class Mpu6050:
         return 32767 / LSB_PER_DPS[self._range_dps]
 
     def close(self) -> None:
-        self._bus.close()
+        self._wire.close()
 
     def read_samples(self) -> ImuSamples:
         """Return what the FIFO holds.
@@ -144,7 +132,7 @@ class Mpu6050:
         before_ns = self._clock.now_ns()
         count = self._fifo_count()
         after_ns = self._clock.now_ns()
-        if count > _FIFO_FULL or (count % _FRAME and (count := self._fifo_count()) % _FRAME):
+        if count > _FIFO_FULL or (self._odd(count, after_ns) and self._odd(count := self._fifo_count(), after_ns)):
             return self._start_over()  # twice a broken frame: not one that was just being written
         samples, missing = count // _FRAME, 0
         due = (before_ns - self._newest_ns) / self._period_ns
@@ -166,30 +154,24 @@ class Mpu6050:
     def read_gravity_g(self) -> NDArray[np.float64]:
         """Return one accelerometer reading (3,), in g; raises as `read_samples` does."""
         self._check_settings()
-        return np.frombuffer(self._read(_ACCEL_XOUT_H, 6), ">i2") / LSB_PER_G
+        return np.frombuffer(self._wire.read(_ACCEL_XOUT_H, 6), ">i2") / LSB_PER_G
 
     def temperature_c(self) -> float:
         """Return the temperature of the sensor's die (register 65); raises as `read_samples` does."""
         self._check_settings()
-        return int.from_bytes(self._read(_TEMP_OUT_H, 2), "big", signed=True) / 340 + 36.53
+        return int.from_bytes(self._wire.read(_TEMP_OUT_H, 2), "big", signed=True) / 340 + 36.53
 
     # -- setting up -----------------------------------------------------------------------------------------------
 
     def _identify(self) -> ImuIdentity:
         try:
-            got = self._read(_WHO_AM_I, 1)[0]
+            got = self._wire.read(_WHO_AM_I, 1)[0]
         except DeviceSilent as silent:
-            raise DeviceNotFound(
-                f"nobody answers at I2C address {self._address:#04x} of {self._bus_name}",
-                next_step="Check the sensor's supply, SDA, SCL and ground, and the AD0 pin (low 0x68, high 0x69); "
-                f"`i2cdetect -y {self._bus_name.removeprefix('/dev/i2c-')}` shows who is there (UU: a kernel driver "
-                "holds the address).",
-                evidence=silent.evidence,
-            ) from silent
+            raise self._wire.nobody(silent, "AD0 pin (low 0x68, high 0x69)") from silent
         if got != EXPECTED_ID:
             likely = OTHERS.get(got, "another chip; address 0x68 is also that of the clocks DS1307 and DS3231")
             raise DeviceMismatch(
-                f"WHO_AM_I at I2C address {self._address:#04x} of {self._bus_name} is {got:#04x}, "
+                f"WHO_AM_I at I2C address {self._address:#04x} of {self._wire.name} is {got:#04x}, "
                 f"expected {EXPECTED_ID:#04x} (MPU-6050): probably {likely}",
                 next_step="Check the wiring, or give the address of the MPU-6050; another chip needs its own driver.",
                 evidence={"got": got, "expected": EXPECTED_ID},
@@ -197,18 +179,18 @@ class Mpu6050:
         return ImuIdentity("MPU-6050", self._address, got, NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
-        self._write(_PWR_MGMT_1, _DEVICE_RESET)
+        self._wire.write(_PWR_MGMT_1, _DEVICE_RESET)
         self._clock.sleep(_RESET_S)
-        self._write(_PWR_MGMT_1, _CLOCK_PLL_GYRO_X)
+        self._wire.write(_PWR_MGMT_1, _CLOCK_PLL_GYRO_X)
         self._clock.sleep(_START_S)
         for register, values in self._settings.items():
-            self._write(register, *values)
+            self._wire.write(register, *values)
         self._empty_fifo()
         self._check_settings()
 
     def _check_settings(self) -> None:
         """Raise DeviceFault unless the sensor is awake with the settings it was given."""
-        got = {register: self._read(register, len(values)) for register, values in self._settings.items()}
+        got = {register: self._wire.read(register, len(values)) for register, values in self._settings.items()}
         if got == self._settings:
             return
         asleep = got[_USER_CTRL][1] & _ASLEEP
@@ -230,14 +212,19 @@ class Mpu6050:
         return ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), lost)
 
     def _empty_fifo(self) -> None:
-        self._write(_USER_CTRL, _FIFO_RESET)  # works only while FIFO_EN is 0 (register 106)
-        self._write(_USER_CTRL, _FIFO_ENABLE)
+        self._wire.write(_USER_CTRL, _FIFO_RESET)  # works only while FIFO_EN is 0 (register 106)
+        self._wire.write(_USER_CTRL, _FIFO_ENABLE)
         self._newest_ns = self._clock.now_ns() - self._period_ns // 2  # the next sample comes within a period
+
+    def _odd(self, count: int, now_ns: int) -> bool:
+        """Return whether the FIFO cannot hold so many bytes: a broken frame, or more than was sampled (a misread)."""
+        due = (now_ns - self._newest_ns) / self._period_ns
+        return bool(count % _FRAME) or count > _FRAME * (1.1 * due + 3)
 
     # -- the bus --------------------------------------------------------------------------------------------------
 
     def _fifo_count(self) -> int:
-        return int.from_bytes(self._read(_FIFO_COUNTH, 2), "big")
+        return int.from_bytes(self._wire.read(_FIFO_COUNTH, 2), "big")
 
     def _pop(self, count: int) -> bytes | None:
         """Read ``count`` bytes of the FIFO; None when a broken transfer took some of them along."""
@@ -248,34 +235,9 @@ class Mpu6050:
             if repeated and self._fifo_count() < count:
                 return None
             repeated = True
-            answer = i2c_msg.read(self._address, count)
-            self._bus.i2c_rdwr(i2c_msg.write(self._address, [_FIFO_R_W]), answer)
-            return bytes(answer)
+            return self._wire.read_once(_FIFO_R_W, count)
 
-        return self._transfer(pop)
-
-    def _read(self, register: int, count: int) -> bytes:
-        return self._transfer(lambda: bytes(self._bus.read_i2c_block_data(self._address, register, count)))
-
-    def _write(self, register: int, *values: int) -> None:
-        self._transfer(lambda: self._bus.write_i2c_block_data(self._address, register, list(values)))
-
-    def _transfer(self, transfer: Callable[[], _T]) -> _T:
-        """Return what ``transfer`` does, and try again when the bus fails."""
-        for attempt in range(_ATTEMPTS):
-            if attempt:
-                self.statistics.retries += 1
-                self._clock.sleep(_RETRY_PAUSE_S)
-            self.statistics.transfers += 1
-            try:
-                return transfer()
-            except OSError as error:
-                failure = error
-        raise DeviceSilent(
-            f"the sensor at I2C address {self._address:#04x} of {self._bus_name} stopped answering: {failure.strerror}",
-            next_step="Check its plug and supply, then open the bench again.",
-            evidence={"errno": failure.errno, "attempts": _ATTEMPTS, "retries_so_far": self.statistics.retries},
-        ) from failure
+        return self._wire.transfer(pop)
 
 
 def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:
@@ -300,24 +262,3 @@ def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, byt
         _FIFO_EN: bytes([_FIFO_GYRO_XYZ]),
         _USER_CTRL: bytes([_FIFO_ENABLE, _CLOCK_PLL_GYRO_X]),  # and PWR_MGMT_1
     }
-
-
-def _open(path: str) -> SMBus:
-    bus = SMBus()
-    try:
-        bus.open(path)
-    except OSError as error:
-        bus.close()
-        match error:
-            case FileNotFoundError():
-                next_step = "Enable I2C (on a Raspberry Pi: `raspi-config`); `i2cdetect -l` lists the buses there are."
-            case PermissionError():
-                next_step = "Join the group i2c (`sudo usermod -aG i2c $USER`), then log in again."
-            case _:
-                next_step = "Give the device file of an I2C bus; `i2cdetect -l` lists them."
-        raise DeviceNotFound(
-            f"the I2C bus {path} cannot be opened: {error.strerror}",
-            next_step=next_step,
-            evidence={"errno": error.errno},
-        ) from error
-    return bus

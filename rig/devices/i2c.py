@@ -1,0 +1,137 @@
+"""The registers of one sensor on an I2C bus of the computer, through smbus2, with retries and words for what fails."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from errno import EAGAIN, EBUSY, EIO, ENXIO, EREMOTEIO, ETIMEDOUT
+from typing import TypeVar
+
+from smbus2 import SMBus, i2c_msg
+
+from rig.clock import Clock
+from rig.errors import DeviceNotFound, DeviceSilent
+
+ATTEMPTS, RETRY_PAUSE_S = 3, 0.002
+
+_SMBUS_BLOCK = 32
+_REASONS = {
+    **dict.fromkeys((ENXIO, EREMOTEIO), "it does not acknowledge"),
+    **dict.fromkeys((ETIMEDOUT, EBUSY, EAGAIN), "the bus is stuck: something holds SDA or SCL low"),
+    EIO: "a transfer broke off",
+}
+_STUCK = (ETIMEDOUT, EBUSY, EAGAIN)
+
+_T = TypeVar("_T")
+
+
+@dataclass(slots=True)
+class I2cStatistics:
+    """What the bus has been through since it was opened; ``overflows`` counts the times that samples were lost."""
+
+    transfers: int = 0
+    retries: int = 0
+    overflows: int = 0
+
+    def as_dict(self) -> dict[str, int]:
+        return asdict(self)
+
+
+class I2cRegisters:
+    """Registers of the device at ``address``.
+
+    Parameters
+    ----------
+    bus
+        Number of the I2C bus, or the path of its device file.
+    address
+        Of the device, 7 bits.
+    clock
+        The bench's clock.
+
+    Raises
+    ------
+    DeviceNotFound
+        The bus cannot be opened.
+    """
+
+    def __init__(self, bus: int | str, address: int, clock: Clock) -> None:
+        self.name = bus if isinstance(bus, str) else f"/dev/i2c-{bus}"
+        self.address = address
+        self.statistics = I2cStatistics()
+        self._clock = clock
+        self._bus = _open(self.name)
+
+    def close(self) -> None:
+        self._bus.close()
+
+    def read(self, register: int, count: int) -> bytes:
+        """Return ``count`` bytes from ``register`` on, in one transfer; raises `DeviceSilent` as `transfer` does."""
+        return self.transfer(lambda: self.read_once(register, count))
+
+    def read_once(self, register: int, count: int) -> bytes:
+        """Return ``count`` bytes from ``register`` on; OSError where the bus fails."""
+        if count <= _SMBUS_BLOCK:
+            return bytes(self._bus.read_i2c_block_data(self.address, register, count))
+        answer = i2c_msg.read(self.address, count)
+        self._bus.i2c_rdwr(i2c_msg.write(self.address, [register]), answer)
+        return bytes(answer)
+
+    def write(self, register: int, *values: int) -> None:
+        self.transfer(lambda: self._bus.write_i2c_block_data(self.address, register, list(values)))
+
+    def transfer(self, transfer: Callable[[], _T]) -> _T:
+        """Return what ``transfer`` does, and try again when the bus fails.
+
+        Raises
+        ------
+        DeviceSilent
+            Every attempt failed.
+        """
+        for attempt in range(ATTEMPTS):
+            if attempt:
+                self.statistics.retries += 1
+                self._clock.sleep(RETRY_PAUSE_S)
+            self.statistics.transfers += 1
+            try:
+                return transfer()
+            except OSError as error:
+                failure = error
+        reason = _REASONS.get(failure.errno or 0, failure.strerror)
+        raise DeviceSilent(
+            f"the sensor at I2C address {self.address:#04x} of {self.name} stopped answering: {reason}",
+            next_step="Take the supply from all sensors of this bus for a moment, and look for a short at SDA and SCL; "
+            "then open the bench again."
+            if failure.errno in _STUCK
+            else "Check its plug and supply, then open the bench again.",
+            evidence={"errno": failure.errno, "attempts": ATTEMPTS, "retries_so_far": self.statistics.retries},
+        ) from failure
+
+    def nobody(self, silent: DeviceSilent, pin: str) -> DeviceNotFound:
+        """Return the error for a sensor that never answered; ``pin`` says which pin sets its address, and how."""
+        return DeviceNotFound(
+            f"nobody answers at I2C address {self.address:#04x} of {self.name}",
+            next_step=f"Check the sensor's supply, SDA, SCL and ground, and the {pin}; "
+            f"`i2cdetect -y {self.name.removeprefix('/dev/i2c-')}` shows who is there (UU: a kernel driver "
+            "holds the address).",
+            evidence=silent.evidence,
+        )
+
+
+def _open(path: str) -> SMBus:
+    bus = SMBus()
+    try:
+        bus.open(path)
+    except OSError as error:
+        bus.close()
+        match error:
+            case FileNotFoundError():
+                next_step = "Enable I2C (on a Raspberry Pi: `raspi-config`); `i2cdetect -l` lists the buses there are."
+            case PermissionError():
+                next_step = "Join the group i2c (`sudo usermod -aG i2c $USER`), then log in again."
+            case _:
+                next_step = "Give the device file of an I2C bus; `i2cdetect -l` lists them."
+        raise DeviceNotFound(
+            f"the I2C bus {path} cannot be opened: {error.strerror}",
+            next_step=next_step,
+            evidence={"errno": error.errno},
+        ) from error
+    return bus
