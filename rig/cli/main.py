@@ -7,7 +7,22 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import catalog, config, doctor, enroll, evaluate, find, identify, runs, safety, servo, setup, table
+from rig.cli import (
+    catalog,
+    config,
+    doctor,
+    enroll,
+    evaluate,
+    exchange,
+    find,
+    identify,
+    runs,
+    safety,
+    servo,
+    setup,
+    table,
+    upkeep,
+)
 from rig.cli.command import (
     BenchOption,
     ConfigOption,
@@ -68,6 +83,9 @@ app.command("acknowledge")(safety.acknowledge)
 app.command("doctor")(doctor.doctor)
 app.command("find")(find.find)
 app.command("setup")(setup.setup)
+app.command("import")(exchange.import_)
+app.command("export")(exchange.export)
+app.command("log")(upkeep.log)
 app.add_typer(catalog.app, name="catalog")
 app.add_typer(config.app, name="config")
 app.add_typer(servo.app, name="servo")

@@ -153,5 +153,9 @@ class Progress:
     def advance(self) -> None:
         self._bar.advance(self._task)
 
+    def at(self, done: int) -> None:
+        """Show that so many are done."""
+        self._bar.update(self._task, completed=done)
+
     def note(self, text: str) -> None:
         self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,9 +1,9 @@
 """Catalogs in open formats: what leaves one, and what comes into one."""
 
 from rig.catalog.exchange.bundle import open_bundle, write_bundle
-from rig.catalog.exchange.collect import collect
+from rig.catalog.exchange.collect import collect, package_of
 from rig.catalog.exchange.folder import DEFAULT_PATTERN, read_folder, write_folder
-from rig.catalog.exchange.intake import Conflict, Imported, Plan, bring_in, plan_import
+from rig.catalog.exchange.intake import Conflict, Imported, Plan, bring_in, plan_import, rehearse
 from rig.catalog.exchange.package import Gap, Package, Refused
 from rig.catalog.exchange.table import read_table, write_parquet, write_table
 
@@ -18,9 +18,11 @@ __all__ = [
     "bring_in",
     "collect",
     "open_bundle",
+    "package_of",
     "plan_import",
     "read_folder",
     "read_table",
+    "rehearse",
     "write_bundle",
     "write_folder",
     "write_parquet",

@@ -86,16 +86,18 @@ class _Staged(NamedTuple):
     reason: str = ""
 
 
-def plan_import(catalog: Catalog, package: Package, conflict: Conflict = Conflict.REFUSE) -> Plan:
-    """Look which objects of a package are in the catalog already.
+def plan_import(catalog: Catalog | None, package: Package, conflict: Conflict = Conflict.REFUSE) -> Plan:
+    """Look which objects of a package are in the catalog already; None is a catalog that is yet to be made.
 
     Raises
     ------
     ObjectExists
         Some are, and conflicts are refused.
     """
-    with catalog.database.read() as connection:
-        known = set(connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_(None))))
+    known: set[str] = set()
+    if catalog is not None:
+        with catalog.database.read() as connection:
+            known = set(connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_(None))))
     return _plan(package, conflict, known)
 
 
@@ -172,6 +174,38 @@ def bring_in(
     )
 
 
+def rehearse(plan: Plan, *, strict: bool = False, jobs: int | None = None) -> Generator[Progressed, None, Imported]:
+    """Look at every image that `bring_in` would take, and return what it would; nothing is written.
+
+    Raises
+    ------
+    ImportRefused
+        An image was refused and all are wanted.
+    """
+    package = plan.package
+    refused = list(package.refused)
+    items = list(_items(plan))
+    size = done = 0
+    yield Progressed(0, len(items))
+    for portion, found in over_processes(partial(_stage, None), portions(items), processes(jobs, len(items))):
+        for item, one in zip(portion, found, strict=True):
+            size += one.size
+            if one.reason:
+                refused.append(Refused(item.image, one.reason))
+        done += len(portion)
+        yield Progressed(done, len(items))
+    if refused and (strict or package.strict):
+        raise _not_whole(package, refused)
+    spoiled = {file.path for file in refused}
+    left = [
+        sum(view.image not in spoiled for enrollment in item.enrollments for view in enrollment.views)
+        for item in plan.wanted
+    ]
+    return Imported(
+        sum(count > 0 for count in left), sum(left), size, plan.skipped, plan.replaced, tuple(refused), package.gaps
+    )
+
+
 def _not_whole(package: Package, refused: list[Refused]) -> ImportRefused:
     return ImportRefused(
         f"{package.origin} is not taken: {len(refused)} of its files cannot be used; nothing was imported",
@@ -201,11 +235,11 @@ def _items(plan: Plan) -> Iterator[_Item]:
                     yield _Item(image, sources[image], sha256, folder, f"empty-{k:03d}")
 
 
-def _stage(root: Path, portion: tuple[_Item, ...]) -> list[_Staged]:
+def _stage(root: Path | None, portion: tuple[_Item, ...]) -> list[_Staged]:
     return [_stage_one(root, item) for item in portion]
 
 
-def _stage_one(root: Path, item: _Item) -> _Staged:
+def _stage_one(root: Path | None, item: _Item) -> _Staged:
     try:
         content = _read(item.source)
         image = images.decode(content)
@@ -216,6 +250,8 @@ def _stage_one(root: Path, item: _Item) -> _Staged:
     sha256 = images.digest(content)
     if item.sha256 is not None and sha256 != item.sha256:
         return _Staged("", reason="is not the image that was stored")
+    if root is None:
+        return _Staged("", sha256, len(content))
     packed = None
     if item.describe:
         kind = known_descriptor(DESCRIPTOR)

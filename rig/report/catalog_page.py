@@ -1,0 +1,136 @@
+"""A catalog to look at: contact sheets, and a page that shows them with what is known of each object."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from rig.catalog.exchange.bundle import checked
+from rig.catalog.exchange.new_folder import new_folder
+from rig.catalog.exchange.package import Enrollment, Object, Sitting, region_of_view
+from rig.catalog.images import decode
+from rig.catalog.records import EnrollmentStatus
+from rig.errors import ExportFailed
+from rig.plans.words import counted
+from rig.report.contact_sheet import Image, contact_sheet, thumbnail
+from rig.report.page import JPEG_QUALITY
+from rig.report.records import TILE
+
+Collected = Iterable[tuple[Object, dict[str, Path]]]
+SHEETS: Final = "sheets"
+_STAMP: Final = (56, 56)
+
+
+class _Shown(NamedTuple):
+    item: Object
+    sheet: str
+    stamp: str
+    views: int
+    enrolled: str
+    facts: list[tuple[str, str]]
+
+
+def write_sheets(folder: Path, objects: Collected) -> int:
+    """Write a contact sheet of every object, ``0001-mug-white.jpg``, and return how many there are.
+
+    Raises
+    ------
+    ExportFailed
+        The folder is not empty or cannot be written, or an image is not the one that was stored.
+    """
+    with new_folder(folder) as made:
+        return sum(1 for _ in _shown(made, made, objects))
+
+
+def write_catalog_page(folder: Path, objects: Collected) -> int:
+    """Write ``index.html`` with the contact sheets beside it, and return how many objects there are.
+
+    Raises
+    ------
+    ExportFailed
+        As `write_sheets`.
+    """
+    with new_folder(folder) as made:
+        (made / SHEETS).mkdir()
+        shown = list(_shown(made / SHEETS, made, objects))
+        environment = Environment(
+            loader=PackageLoader("rig.report", "."),
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+            keep_trailing_newline=True,
+        )
+        page = environment.get_template("catalog.html.j2").render(
+            objects=shown, views=sum(one.views for one in shown), labels=sorted({o.item.label for o in shown} - {""})
+        )
+        (made / "index.html").write_text(page, encoding="utf-8", newline="\n")
+    return len(shown)
+
+
+def _shown(folder: Path, above: Path, objects: Collected) -> Iterator[_Shown]:
+    for number, (item, files) in enumerate(objects, start=1):
+        complete = [e for e in item.enrollments if e.status == EnrollmentStatus.COMPLETE]
+        if not complete:
+            continue
+        (enrollment,) = complete
+        pictures = list(_pictures(enrollment, files))
+        slug = Path(enrollment.views[0].image).parts[1].split("-", 1)[-1]
+        sheet = folder / f"{number:04d}-{slug}.jpg"
+        stamp = folder / f"{number:04d}-{slug}-small.jpg"
+        _write(sheet, contact_sheet(pictures, [view.azimuth_deg for view in enrollment.views], tile=TILE))
+        if folder != above:
+            _write(stamp, thumbnail(pictures[0], _STAMP))
+        enrolled = f"{enrollment.finished_utc:%Y-%m-%d %H:%M} UTC" if enrollment.finished_utc else "–"
+        yield _Shown(
+            item,
+            sheet.relative_to(above).as_posix(),
+            stamp.relative_to(above).as_posix(),
+            len(enrollment.views),
+            enrolled,
+            list(_facts(item, enrollment)),
+        )
+
+
+def _pictures(enrollment: Enrollment, files: dict[str, Path]) -> Iterator[Image]:
+    for view in enrollment.views:
+        image = decode(checked(files[view.image], view.image_sha256))
+        yield thumbnail(image, TILE, region_of_view(view))
+
+
+def _write(path: Path, image: Image) -> None:
+    encoded, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not encoded:
+        raise ExportFailed(f"the picture {path.name} cannot be encoded", next_step="export fewer views an object")
+    path.write_bytes(jpeg.tobytes())
+
+
+def _facts(item: Object, enrollment: Enrollment) -> Iterator[tuple[str, str]]:
+    if item.note:
+        yield "note", item.note
+    yield "views", counted(len(enrollment.views), "view")
+    earlier = len(item.enrollments) - 1
+    if earlier:
+        yield "other enrollments", str(earlier)
+    sharpness = [view.evidence["sharpness"] for view in enrollment.views if "sharpness" in view.evidence]
+    if sharpness:
+        yield "sharpness", f"median {median(sharpness):.0f}; {min(sharpness):.0f} to {max(sharpness):.0f}"
+    for sitting in enrollment.sittings:
+        yield "taken", _taken(sitting)
+
+
+def _taken(sitting: Sitting) -> str:
+    devices = ", ".join(f"{name} {_identity(identity)}" for name, identity in sitting.devices.items())
+    where = f"bench {sitting.bench}" if sitting.bench else ""
+    words = (f"{sitting.started_utc:%Y-%m-%d %H:%M} UTC", where, sitting.software, devices)
+    return "; ".join(word for word in words if word)
+
+
+def _identity(identity: Any) -> str:
+    if isinstance(identity, dict):
+        return " ".join(str(value) for value in identity.values() if value not in (None, ""))
+    return str(identity)
