@@ -43,8 +43,10 @@ def watch(
     """
     with Turntable(bench) as table:
         home_deg = table.rest_deg
+    begun = False
     while True:
-        yield Waiting("the next object")
+        yield Waiting("the next object" if begun else "the first object, on the empty table")
+        begun = True
         try:
             answer = yield from identify(bench, model(), strategy=strategy, seed=seed, top=top)
             views = answer.views

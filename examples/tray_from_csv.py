@@ -1,0 +1,38 @@
+"""Enroll the objects of a CSV list; what is enrolled already is skipped, what was interrupted goes on."""
+
+import argparse
+from pathlib import Path
+
+from rig import Catalog, open_bench
+from rig.config import load_config
+from rig.plans.events import Enrolled, Item, Rejected
+from rig.plans.tray import enroll_tray, read_tray
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tray", type=Path, help="CSV with the columns name, label, note, views")
+    parser.add_argument("--bench", default="sim")
+    parser.add_argument("--catalog", type=Path, required=True, help="folder of the catalog")
+    parser.add_argument("--views", type=int, default=72)
+    arguments = parser.parse_args()
+
+    items = read_tray(arguments.tray)  # every mistake at once, with its line
+    with (
+        open_bench(arguments.bench, load_config()) as bench,
+        Catalog.open(arguments.catalog, clock=bench.clock) as catalog,
+    ):
+        for event in enroll_tray(bench, catalog, items, views=arguments.views):
+            match event:
+                case Item():
+                    print(f"{event.number}/{event.of} {event.name}: {event.action} {event.why}".rstrip())
+                case Rejected():
+                    print(f"  view {event.index + 1} again: {'; '.join(event.reasons)}")
+                case Enrolled():
+                    print(f"  {event.views} views in {event.seconds:.0f} s of the bench")
+                case _:
+                    pass
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""Identify one object after the other, and write every event as a line of JSON; errors too, as the last line."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import hbr
+from rig import Catalog, open_bench
+from rig.bench import ObjectStandsThere
+from rig.clock import SystemClock
+from rig.config import load_config
+from rig.errors import RigError
+from rig.plans.events import Identified, event_dict
+from rig.plans.watch import watch
+from rig.presence import TableWatcher
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bench", default="sim")
+    parser.add_argument("--catalog", type=Path, required=True, help="folder of the catalog")
+    parser.add_argument("--answers", type=int, help="end after so many; endless otherwise")
+    arguments = parser.parse_args()
+
+    with Catalog.open(arguments.catalog, clock=SystemClock(), read_only=True) as catalog:
+        try:
+            with open_bench(arguments.bench, load_config()) as bench:
+                if isinstance(bench.operator, ObjectStandsThere):  # nobody presses a key: the camera sees what comes
+                    bench.operator = TableWatcher(bench)
+                answers = 0
+                # The model is loaded before each search: what was enrolled meanwhile is found.
+                for event in watch(bench, lambda: hbr.ViewIndex(catalog.views().views)):
+                    print(json.dumps(event_dict(event)), flush=True)
+                    answers += isinstance(event, Identified)
+                    if answers == arguments.answers:
+                        break
+        except RigError as error:
+            print(json.dumps(error.as_dict(), default=str), flush=True)
+            return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

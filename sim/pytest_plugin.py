@@ -1,0 +1,58 @@
+"""Fixtures for the tests of programs that use the rig: a simulated bench, its world, and a catalog.
+
+Installed with the package; nothing heavy is imported until a test asks for a fixture. See docs/testing.md.
+"""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rig.bench import Bench
+    from rig.catalog import Catalog
+    from sim.world import World
+
+MARK = "sim(*settings, seed=0, noise=None): settings KEY=VALUE, seed and noise model of the simulated bench"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the marker known."""
+    config.addinivalue_line("markers", MARK)
+
+
+@pytest.fixture
+def sim_world(request: pytest.FixtureRequest) -> "World":
+    """What is really there: true angle, light, and what stands on the table; tests set it."""
+    from sim.world import World
+
+    mark = request.node.get_closest_marker("sim")
+    options = dict(mark.kwargs) if mark else {}
+    return World(noise=options.get("noise"), seed=options.get("seed", 0))
+
+
+@pytest.fixture
+def sim_bench(request: pytest.FixtureRequest, sim_world: "World") -> "Iterator[Bench]":
+    """An open bench in `sim_world`: real drivers on simulated wires, on a virtual clock.
+
+    `sim_bench.operator` puts objects on the table: `next_object` and `yaw_deg` say which, and how.
+    """
+    from rig.config import RigConfig, load_config
+    from sim.bench import ShelfOperator, open_sim_bench
+    from sim.objects.shelf import shelf
+
+    mark = request.node.get_closest_marker("sim")
+    config: RigConfig = load_config(None, mark.args if mark else ())
+    with open_sim_bench(config, ShelfOperator(sim_world, shelf())) as bench:
+        yield bench
+
+
+@pytest.fixture
+def sim_catalog(sim_bench: "Bench", tmp_path: "Path") -> "Iterator[Catalog]":
+    """An empty catalog in the test's own folder, on the clock of `sim_bench`."""
+    from rig.catalog import Catalog
+
+    with Catalog.open(tmp_path / "catalog", clock=sim_bench.clock) as catalog:
+        yield catalog
