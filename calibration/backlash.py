@@ -13,12 +13,11 @@ and neighbouring legs share one.
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from math import sqrt
 from typing import Any
 
 import numpy as np
 
-from calibration.gyro_scale import Leg
+from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
 from rig.errors import LimitExceeded, UsageError
 from rig.facts import Estimate, Fact
@@ -31,8 +30,6 @@ VALID_DAYS = 90
 
 SHORT_DEG, LONG_DEG = 6.0, 60.0
 MIN_REVERSALS = 6
-COVERAGE = 4.0
-"""Residuals beyond this many standard uncertainties are no chance (1 in 16 000)."""
 RATIO = (0.9, 1.1)
 """What a sound gyro and a right gear ratio can show (see `calibration.gyro_scale.PLAUSIBLE`)."""
 MAX_BACKLASH_DEG = 2.0
@@ -114,17 +111,10 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
     else:
         encoder = np.array([leg.encoder_deg for leg in used])
         gyro = np.array([leg.gyro_deg for leg in used])
-        design = np.column_stack([gyro, np.sign(encoder)])
-        covariance = _covariance(used, resolution_deg)
-        whitened = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([design, encoder]))
-        (ratio, play), *_ = np.linalg.lstsq(whitened[:, :2], whitened[:, 2], rcond=None)
-        spread = np.linalg.inv(whitened[:, :2].T @ whitened[:, :2])
-        residuals = encoder - design @ (ratio, play)
-        scatter = whitened[:, 2] - whitened[:, :2] @ (ratio, play)
-        birge = max(float((scatter**2).sum()) / (len(used) - 2), 1.0)
-        ratio_sigma, play_sigma = np.sqrt(np.diag(spread) * birge)
-        worst = int(np.argmax(np.abs(residuals)))
-        residual, limit = abs(float(residuals[worst])), COVERAGE * sqrt(float(covariance[worst, worst]))
+        fitted = fit(used, np.column_stack([gyro, np.sign(encoder)]), resolution_deg)
+        (ratio, play), (ratio_sigma, play_sigma), worst = fitted.values, fitted.sigma, fitted.worst
+        residual = abs(float(fitted.residuals_deg[worst]))
+        limit = COVERAGE * float(fitted.residual_sigma_deg[worst])
         estimates = {
             "backlash": Estimate(float(play), float(play_sigma), "°"),
             "ratio": Estimate(float(ratio), float(ratio_sigma), "° of the encoder per ° read"),
@@ -157,15 +147,6 @@ def plain_approach(bench: Bench) -> Generator[None, None, None]:
         yield
     finally:
         bench.config = before
-
-
-def _covariance(legs: Sequence[Leg], resolution_deg: float) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
-    """Return the covariance of E − s·G: the gyro's noise, and rests within a count that neighbours share."""
-    count = resolution_deg**2 / 12
-    n = len(legs)
-    gyro = np.diag([leg.sigma_deg**2 for leg in legs])
-    shared = np.diag(np.full(n, 2 * count)) - count * (np.eye(n, k=1) + np.eye(n, k=-1))
-    return np.asarray(gyro + shared, dtype=np.float64)
 
 
 def _judge(estimates: Mapping[str, Estimate], residual: float, limit: float, worst: int) -> list[str]:

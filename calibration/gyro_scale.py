@@ -11,7 +11,6 @@ every leg looks like a scale: no whole turns can tell the two apart.
 """
 
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from math import ceil, floor, hypot, sqrt
 from typing import Any
@@ -19,14 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.legs import COVERAGE, Leg
 from rig.bench import Bench
-from rig.config import ImuConfig
 from rig.errors import LimitExceeded, UsageError
 from rig.facts import Estimate, Fact
 from rig.heading import DRAIN_S, MEMORY_S
 from rig.plans.capture import moved
 from rig.plans.events import Moved, plain
-from rig.turntable import Move, Turntable
+from rig.turntable import Turntable
 
 NAME = "imu.scale"
 
@@ -34,36 +33,12 @@ MIN_LEGS = 2
 """Legs each way: fewer cannot contradict each other."""
 MAX_LEG_TURNS = 2
 """Longer legs gain nothing: what the rest before says about the bias gets old."""
-COVERAGE = 4.0
-"""Residuals and differences beyond this many standard uncertainties are no chance (1 in 16 000)."""
 PLAUSIBLE = (0.9, 1.1)
 """±3 % from part to part, ±2 % over temperature (PS-MPU-6000A, 6.1), a mounting tilted by up to 15°."""
 VALID_DAYS = 180
 """The scale ages by mounting and temperature, not by use; half a year finds a sensor that came loose."""
 MAX_UNCERTAINTY = 0.001
 """What a rotation by 90° needs to be known to a tenth of a degree."""
-
-
-@dataclass(frozen=True, slots=True)
-class Leg:
-    """Whole turns between two rests, in degrees: by the encoder, and by the gyro as it reads (scale 1).
-
-    ``sigma_deg`` is the gyro's, of noise and bias alone; ``trouble`` why the gyro's rotation is not valid.
-    """
-
-    encoder_deg: float
-    gyro_deg: float
-    sigma_deg: float
-    trouble: str = ""
-
-    @classmethod
-    def of(cls, move: Move, imu: ImuConfig) -> "Leg":
-        """Return what ``move`` measured, without the scale in force and without its uncertainty."""
-        gyro = move.gyro
-        noise = gyro.sigma_deg**2 - (imu.scale_uncertainty * gyro.angle_deg) ** 2
-        return cls(
-            move.rotation_encoder_deg, gyro.angle_deg / imu.scale, sqrt(max(noise, 0.0)) / imu.scale, gyro.reason
-        )
 
 
 def live(bench: Bench, *, turns: int = 8) -> Generator[Moved | Fact, None, Fact]:

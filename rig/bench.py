@@ -199,6 +199,7 @@ def calibrate(bench: Bench, store: FactStore) -> None:
     standings = store.standings(bench.apparatus(), bench.clock.utc())
     facts = [standing.fact for standing in standings if standing.state is State.IN_FORCE]
     bench.config, told = put_in_force(bench.config, facts)
+    bench.safety.reference.calibrate(bench.config.table)
     bench.conditions = {**bench.conditions, CALIBRATIONS: [fact.id for fact in facts]}
     bench.findings += told + tuple(error.what for error in store.unreadable)
     bench.findings += tuple(

@@ -75,6 +75,11 @@ class TableConfig(Section):
         description="every stop is approached upwards from at least this far below: takes up the gears' play",
     )
     tolerance_deg: float = Field(0.6, gt=0, le=5, description="largest distance from the goal that counts as arrived")
+    encoder_harmonics_deg: tuple[Degrees, Degrees, Degrees, Degrees] = Field(
+        (0.0, 0.0, 0.0, 0.0),
+        description="what the encoder reads too much over its turn: cosine and sine of the first and of the second "
+        "harmonic, by calibration",
+    )
     backlash_deg: float = Field(
         0.5, ge=0, le=10, description="largest play between encoder and platter that is no fault"
     )

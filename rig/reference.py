@@ -1,6 +1,7 @@
 """Where the table stands: the servo counts its own turns, but only as long as it has its supply."""
 
 from dataclasses import dataclass
+from math import cos, radians, sin
 
 from hbr.angles import wrap180
 from rig.config import TableConfig
@@ -27,19 +28,35 @@ class Judgement:
 class Reference:
     """Converts between the servo's positions and the table's angles.
 
-    The table's angle is ``direction · (position + shift − zero)``, degrees, unwrapped; the shift is what the servo
-    forgot (whole turns) or a person declared (`declare`).
+    The table's angle is ``direction · (position − error + shift − zero)``, degrees, unwrapped; the error is what the
+    encoder reads too much at that position of its turn, by calibration, the shift what the servo forgot (whole turns)
+    or a person declared (`declare`). ``turn_deg`` is the table's angle of one turn of the encoder.
     """
 
-    def __init__(self, config: TableConfig, shift_deg: float = 0.0) -> None:
+    def __init__(self, config: TableConfig, shift_deg: float = 0.0, turn_deg: float = 360.0) -> None:
         self._config = config
+        self._turn_deg = turn_deg
         self.shift_deg = shift_deg
 
+    def calibrate(self, config: TableConfig) -> None:
+        """Take over what a calibration says about the encoder; what a person declared stays."""
+        self._config = self._config.model_copy(update={"encoder_harmonics_deg": config.encoder_harmonics_deg})
+
     def to_table(self, position_deg: float) -> float:
-        return self._config.direction * (position_deg + self.shift_deg - self._config.zero_deg)
+        true_deg = position_deg - self._error_deg(position_deg)
+        return self._config.direction * (true_deg + self.shift_deg - self._config.zero_deg)
 
     def to_servo(self, table_deg: float) -> float:
-        return self._config.direction * table_deg + self._config.zero_deg - self.shift_deg
+        true_deg = self._config.direction * table_deg + self._config.zero_deg - self.shift_deg
+        position_deg = true_deg
+        for _ in range(3):  # the error changes by a hundredth of the angle at most
+            position_deg = true_deg + self._error_deg(position_deg)
+        return position_deg
+
+    def _error_deg(self, position_deg: float) -> float:
+        a1, b1, a2, b2 = self._config.encoder_harmonics_deg
+        turn = radians(position_deg * 360.0 / self._turn_deg)
+        return a1 * cos(turn) + b1 * sin(turn) + a2 * cos(2 * turn) + b2 * sin(2 * turn)
 
     def declare(self, position_deg: float, table_deg: float) -> None:
         """Take it from a person that the table stands at ``table_deg`` where the servo reads ``position_deg``."""

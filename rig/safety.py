@@ -136,7 +136,9 @@ class Safety:
         self._state = State.FAULT if self._kept.fault else State.DISCONNECTED
         self._doubt = ""
         self._findings: list[str] = []
-        self.reference = Reference(config.table, self._kept.table.shift_deg if self._kept.table else 0.0)
+        self.reference = Reference(
+            config.table, self._kept.table.shift_deg if self._kept.table else 0.0, servo.turn_deg
+        )
         self.checks: list[Callable[[], object]] = []
         """Called before a fault is acknowledged; each raises a `RigError` where its device is not well."""
 

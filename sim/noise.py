@@ -17,6 +17,9 @@ class NoiseModel:
     """Free play between shaft and platter, full width."""
     encoder_noise_deg: float = 0.02
     """Standard deviation of one encoder reading before its quantisation to 0.088°."""
+    encoder_harmonic_deg: float = 0.0
+    """Standard deviation, from part to part, of the encoder's error over a turn: cosine and sine of its first two
+    harmonics (the e-manual states none; a magnet off the axis gives some tenths of a degree)."""
     structure_hz: float = 11.0
     """Natural frequency of platter and object on the shaft: they ring after each change of acceleration."""
     structure_damping: float = 0.15

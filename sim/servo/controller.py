@@ -1,6 +1,7 @@
 """The servo's motion control: registers in, trajectories out, and the registers that report how it goes."""
 
 from enum import IntEnum
+from math import cos, radians, sin
 
 from sim.servo.control_table import Memory
 from sim.servo.models import (
@@ -50,7 +51,8 @@ class Controller:
 
     Position registers count steps of `DEG_PER_COUNT` from the encoder's zero, in the direction of Drive Mode; the turns
     count until they are forgotten where the e-manual says so (`wrap_position`). Gains, PWM and current limits are kept
-    but do not act.
+    but do not act. What the encoder reads too much over a turn are the `harmonics_deg`: cosine and sine of the first,
+    and of the second.
     """
 
     def __init__(self, world: Shaft, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
@@ -60,6 +62,9 @@ class Controller:
         self._model = model
         self._center = center_counts
         self._rng = world.rng(f"servo-{memory['ID']}")
+        part = world.rng(f"servo-{memory['ID']}-part")
+        drawn = world.noise.encoder_harmonic_deg * part.standard_normal((2, 2))
+        self.harmonics_deg = [(float(a), float(b)) for a, b in drawn]
         self._turns_counts = 0
         self._profile = Profile.STEP
         self._started_ns = 0
@@ -207,11 +212,25 @@ class Controller:
 
     def _counts(self, angle_deg: float) -> int:
         """Return the value of a position register at a shaft angle."""
-        return self._sign * round(angle_deg / DEG_PER_COUNT + self._center) - self._turns_counts + self._homing
+        read_deg = angle_deg + self._encoder_error_deg(angle_deg)
+        return self._sign * round(read_deg / DEG_PER_COUNT + self._center) - self._turns_counts + self._homing
 
     def _degrees(self, counts: int) -> float:
-        """Return the shaft angle of a position register's value."""
-        return (self._sign * (counts - self._homing + self._turns_counts) - self._center) * DEG_PER_COUNT
+        """Return the shaft angle at which a position register reads ``counts``."""
+        read_deg = (self._sign * (counts - self._homing + self._turns_counts) - self._center) * DEG_PER_COUNT
+        angle_deg = read_deg
+        for _ in range(3):  # the error changes by a hundredth of the angle at most
+            angle_deg = read_deg - self._encoder_error_deg(angle_deg)
+        return angle_deg
+
+    def _encoder_error_deg(self, angle_deg: float) -> float:
+        """Return what the encoder reads too much at a shaft angle: its magnet sits a little off the axis."""
+        if not self._world.noise.encoder_harmonic_deg:
+            return 0.0
+        turn = radians(angle_deg)
+        return sum(
+            a * cos(order * turn) + b * sin(order * turn) for order, (a, b) in enumerate(self.harmonics_deg, start=1)
+        )
 
     def _present_position(self) -> int:
         noise_deg = self._world.noise.encoder_noise_deg

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.backlash import from_data, live
-from calibration.gyro_scale import Leg
+from calibration.legs import Leg
 from rig.errors import LimitExceeded, UsageError
 from rig.facts import Fact
 from rig.plans.events import Moved

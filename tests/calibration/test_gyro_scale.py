@@ -6,7 +6,8 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from calibration.gyro_scale import Leg, from_data, live
+from calibration.gyro_scale import from_data, live
+from calibration.legs import Leg
 from rig.errors import DeviceSilent, LimitExceeded, UsageError
 from rig.facts import Fact
 from rig.plans.events import Moved

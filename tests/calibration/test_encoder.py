@@ -1,0 +1,115 @@
+"""The encoder's error over its turn: found within what is stated, put in force, and all else refused."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from calibration.encoder import Step, from_data, live
+from calibration.legs import Leg
+from rig.bench import calibrate
+from rig.errors import LimitExceeded, UsageError
+from rig.facts import Fact, FactStore
+from rig.turntable import Turntable
+from sim.noise import NoiseModel
+
+COUNT_DEG = 360 / 4096
+NAMES = ("cos1", "sin1", "cos2", "sin2")
+
+
+def error_deg(harmonics, position_deg):
+    turn = np.radians(position_deg)
+    a1, b1, a2, b2 = harmonics
+    return a1 * np.cos(turn) + b1 * np.sin(turn) + a2 * np.cos(2 * turn) + b2 * np.sin(2 * turn)
+
+
+def drawn(rng: np.random.Generator, harmonics, *, direction: int = 1, turns: int = 2) -> list[Step]:
+    true = np.arange(12 * turns + 1) * 30.0 + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, 12 * turns + 1)
+    shaft = direction * true
+    read = np.round((shaft + error_deg(harmonics, shaft)) / COUNT_DEG) * COUNT_DEG
+    gyro = np.diff(true) / 1.01 + rng.normal(0.0, 0.01, 12 * turns)
+    return [
+        Step(float(a), float(b), Leg(direction * float(b - a), float(g), 0.01))
+        for a, b, g in zip(read[:-1], read[1:], gyro, strict=True)
+    ]
+
+
+def fit(steps: list[Step], direction: int = 1) -> Fact:
+    return from_data(
+        steps,
+        direction=direction,
+        turn_deg=360.0,
+        resolution_deg=COUNT_DEG,
+        when_utc=datetime(2026, 3, 1, tzinfo=UTC),
+        device={},
+    )
+
+
+def test_the_truth_lies_within_the_stated_uncertainty():
+    rng = np.random.default_rng(1)
+    z = []
+    for _ in range(100):
+        harmonics, direction = rng.normal(0.0, 0.2, 4), int(rng.choice([-1, 1]))
+        found = fit(drawn(rng, harmonics, direction=direction), direction).estimates
+        z += [(found[name].value - true) / found[name].uncertainty for name, true in zip(NAMES, harmonics, strict=True)]
+    assert 0.8 < np.std(z) < 1.15
+    assert abs(np.mean(z)) < 0.15
+
+
+def test_put_in_force_the_table_stands_where_it_is_told(simulated, tmp_path):
+    s = simulated(noise=NoiseModel(encoder_harmonic_deg=0.3, backlash_deg=0.0), seed=11)
+
+    def errors() -> list[float]:
+        with Turntable(s.bench) as table:
+            return [table.goto(angle).encoder_deg - s.world.table_deg() for angle in (10.0, 100.0, 190.0, 280.0)]
+
+    before = np.ptp(errors())
+    *_, fact = live(s.bench)
+    assert fact.passed, fact.refusals
+    FactStore(tmp_path).keep(fact)
+    calibrate(s.bench, FactStore(tmp_path))
+    after = np.ptp(errors())
+    assert before > 0.3
+    assert after < 0.15
+    *_, again = live(s.bench)  # what is in force is not measured away
+    for name in NAMES:
+        difference = again.estimates[name].value - fact.estimates[name].value
+        assert abs(difference) < 4 * fact.estimates[name].uncertainty
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda step: Step(step.from_deg, step.to_deg, Leg(step.leg.encoder_deg, step.leg.gyro_deg, 0.5)), "--turns"),
+        (
+            lambda step: Step(step.from_deg, step.to_deg, Leg(step.leg.encoder_deg, 30.0, 0.01, "lost 3 samples")),
+            "lost 3 samples",
+        ),
+    ],
+)
+def test_what_cannot_be_trusted_is_refused(change, reason):
+    fact = fit([change(step) for step in drawn(np.random.default_rng(3), (0.1, 0.1, 0.0, 0.0))])
+    assert any(reason in refusal for refusal in fact.refusals), fact.refusals
+    assert not fact.settings
+
+
+def test_an_error_that_no_encoder_has_and_a_slip_are_refused():
+    far = fit(drawn(np.random.default_rng(4), (3.0, 0.0, 0.0, 0.0)))
+    assert any("no sound one is" in refusal for refusal in far.refusals)
+    steps = drawn(np.random.default_rng(5), (0.1, 0.0, 0.0, 0.0))
+    slipped = steps[7]
+    steps[7] = Step(
+        slipped.from_deg,
+        slipped.to_deg,
+        Leg(slipped.leg.encoder_deg, slipped.leg.gyro_deg + 1.0, slipped.leg.sigma_deg),
+    )
+    assert any("Step 8 is off" in refusal for refusal in fit(steps).refusals)
+
+
+def test_a_short_cable_and_no_turn_are_told_before_anything_moves(simulated):
+    s = simulated('table.mode="pan"', "table.limits_deg=[-90, 90]")
+    with pytest.raises(LimitExceeded):
+        next(live(s.bench))
+    with pytest.raises(UsageError):
+        next(live(s.bench, turns=0))
