@@ -23,7 +23,7 @@ from rig.errors import (
     WatchdogTripped,
 )
 from rig.heading import Agreement, GyroHeading, Rotation, Stillness, compare, finite
-from rig.watch import SlipWatch, Watch, unfit
+from rig.watch import SlipWatch, Watch, incredible, unfit
 
 QUIET_COUNTS = 3
 """Encoder counts that readings at rest may differ by: one of quantisation, the rest of its noise."""
@@ -393,6 +393,9 @@ class Turntable(AbstractContextManager["Turntable"]):
         """
         try:
             state = self._servo.read_state()
+            if incredible(state):  # where the table is, nobody knows: it runs out
+                self._servo.torque_off()
+                return True
             ramp_dps2 = self._profile.acceleration_dps2 if self._profile else self._config.acceleration_dps2
             ahead_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
             self._servo.move_to(state.position_deg + ahead_deg)

@@ -6,7 +6,7 @@ Each limit lies before the servo's own shutdown, so that the table is stopped in
 from collections import deque
 
 from rig.clock import seconds_between
-from rig.config import SafetyConfig
+from rig.config import MAX_LIMIT_DEG, SafetyConfig
 from rig.devices.servo import ServoLimits, ServoState
 from rig.errors import (
     DeviceFault,
@@ -29,6 +29,18 @@ COOLER_C = 5.0
 """How much cooler than its limit a servo must be before it may work again."""
 
 
+def incredible(state: ServoState) -> list[str]:
+    """Return the readings that no servo can have; such a reading is no ground for any command."""
+    ranges = {
+        "position": (state.position_deg, "°", MAX_LIMIT_DEG),
+        "speed": (state.velocity_dps, "°/s", 3000.0),
+        "load": (state.load_percent, "%", 500.0),
+        "supply": (state.voltage_v, "V", 60.0),
+        "temperature": (state.temperature_c, "°C", 150.0),
+    }
+    return [f"{name} {value:.0f} {unit}" for name, (value, unit, most) in ranges.items() if abs(value) > most]
+
+
 def unfit(state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again: bool = False) -> RigError | None:
     """Return why a servo must not work, whether it turns or not: hardware errors, heat, supply; None if it may.
 
@@ -44,6 +56,12 @@ def unfit(state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again
         "voltage_limits_v": [round(v, 1) for v in limits.voltage_v],
         "load_percent": round(state.load_percent, 1),
     }
+    if nonsense := incredible(state):
+        return DeviceFault(
+            f"The servo's readings cannot be true: {', '.join(nonsense)}.",
+            next_step="Check its cable, then `rig acknowledge --reboot`; a servo that goes on like this is broken.",
+            evidence={"readings": nonsense},
+        )
     if state.hardware_errors:
         return DeviceFault(
             f"The servo reports a hardware error: {', '.join(state.hardware_errors)}.",
