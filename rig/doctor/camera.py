@@ -14,9 +14,12 @@ from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.errors import DeviceNotFound
 from rig.view import looks
 
-FRAMES = 6
-MAX_AGE_S = 0.5
+QUICK, SPACED, SPACING_S = 5, 6, 0.17
+"""Frames taken one after the other, which tell the rate, and frames spread over a second, which tell of the light."""
+MAX_AGE_S = 0.25
 """From the start of an exposure until the program has the frame; the table stands still for as long, each view."""
+MAX_FLICKER = 0.05
+"""Largest spread of the mean level of frames of one scene."""
 
 
 def camera(case: Case) -> Iterator[Finding]:
@@ -69,31 +72,44 @@ def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
 
 def _frames(case: Case, source: Camera) -> Iterator[Finding]:
     clock = case.host.clock
-    ages, images = [], []
-    start_ns = clock.now_ns()
-    after_ns = start_ns
-    for _ in range(FRAMES):
+    again = "Unplug the camera, plug it in again, then: " + case.rig("doctor")
+    frames = []
+    ages = []
+    after_ns = start_ns = clock.now_ns()
+    rate = 0.0
+    for number in range(QUICK + SPACED):
         frame = source.capture(after_ns)
         ages.append(seconds_between(frame.exposed_ns, clock.now_ns()))
-        images.append(frame.image_bgr)
-        after_ns = frame.exposed_ns + 1
-    rate = FRAMES / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
-    age = max(ages)
-    text = f"frames are {1e3 * age:.0f} ms old when they come, {rate:.3g} a second"
-    evidence: dict[str, Any] = {"frame_age_s": age, "frames_per_s": rate}
-    if all(np.array_equal(images[0], image) for image in images[1:]):
-        mend = "Unplug the camera, plug it in again, then: " + case.rig("doctor")
-        yield bad("camera", f"frozen: {FRAMES} frames are the same to the pixel", mend, **evidence)
-    elif age > MAX_AGE_S:
-        yield warning(
-            "camera", f"{text}: slow", "Try another USB port, or a smaller camera.width and height", **evidence
-        )
+        frames.append(frame.image_bgr)
+        if number == QUICK - 1:
+            rate = QUICK / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
+        after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
+    seen = [looks(frame, case.config.view) for frame in frames]
+    levels = [each.mean_level for each in seen]
+    text = f"frames are {1e3 * max(ages):.0f} ms old when they come, {rate:.3g} a second"
+    evidence: dict[str, Any] = {"frame_age_s": max(ages), "frames_per_s": rate, "mean_levels": levels}
+    if max(levels) < case.config.view.min_mean:
+        mend = "Take the lens cap off and switch the light on, then: " + case.rig("doctor")
+        yield bad("camera", f"black: mean level {max(levels):.1f} of 255", mend, **evidence)
+        return
+    if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
+        yield bad("camera", f"frozen: {len(frames)} frames are the same to the pixel", again, **evidence)
+        return
+    if max(ages) > MAX_AGE_S:
+        yield warning("camera", f"{text}: old", "Try another USB port, or a smaller camera.width", **evidence)
+    elif rate < 0.6 * source.identity.fps:
+        mend = "Try another USB port, a shorter camera.exposure_us, or a lower camera.fps"
+        yield warning("camera", f"{text}, not {source.identity.fps:.3g}", mend, **evidence)
     else:
         yield fine("camera", text, **evidence)
-    seen = looks(images[-1], case.config.view)
-    words = f"mean level {seen.mean_level:.0f}, sharpness {seen.sharpness:.0f}, {seen.saturated_share:.1%} saturated"
-    reasons = seen.reasons(case.config.view)
-    if reasons:
+    spread = (max(levels) - min(levels)) / max(levels)
+    if spread > MAX_FLICKER:
+        mend = "Use a lamp that does not flicker, keep daylight and shadows away, then: " + case.rig("doctor")
+        yield warning(
+            "camera", f"the light changes by {spread:.0%} within {SPACED * SPACING_S:.0f} s", mend, **evidence
+        )
+    words = f"mean level {levels[-1]:.0f}, sharpness {seen[-1].sharpness:.0f}, {seen[-1].saturated_share:.1%} saturated"
+    if reasons := seen[-1].reasons(case.config.view):
         mend = "Look at light, exposure and focus; an empty table may look blurred: " + case.rig("config show view")
         yield warning("camera", f"a frame as it is would not be taken: {'; '.join(reasons)}", mend)
     else:

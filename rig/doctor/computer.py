@@ -33,7 +33,12 @@ def bench_state(case: Case) -> Iterator[Finding]:
         yield warning("bench", text, case.rig("stop"), pid=case.holder.pid)
     state = FileStore(path).load()
     if state.damage:
-        yield bad("bench", state.damage, case.rig("home --set"), exit_code=5)
+        yield bad(
+            "bench",
+            state.damage,
+            "Look how far the cable is wound up, then: " + case.rig("home --turns N"),
+            exit_code=5,
+        )
     if state.fault is not None:
         fault = state.fault
         text = f"fault {fault.code} ({fault.title}) is latched since {fault.utc}: {fault.what}"

@@ -87,7 +87,7 @@ def _rest(case: Case, sensor: Imu, samples: ImuSamples) -> Iterator[Finding]:
     if (np.abs(rates) >= sensor.range_dps * 0.999).any():
         mend = "Check the sensor's supply and cable, then: " + case.rig("doctor")
         yield bad("imu", f"saturated at {sensor.range_dps:.0f} °/s although nothing moves", mend, **evidence)
-    elif not spread.any():
+    elif (rates == rates[0]).all():
         mend = "Switch the sensor's supply off and on, then: " + case.rig("doctor")
         yield bad("imu", "frozen: every sample is the same, not even noise", mend, **evidence)
     elif spread.max() > NOISY * expected:

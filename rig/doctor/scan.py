@@ -23,6 +23,7 @@ BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9
 
 _ANSWER_1_S = 0.02
 """How long a servo of Protocol 1.0 and its adapter take to answer; each id is asked by itself there."""
+_LISTEN_S = 0.05
 _STATUS_READS = 8
 _STATUS = (120, 27)
 """Realtime Tick to Present Temperature: two servos with one id do not agree on these for long."""
@@ -109,6 +110,8 @@ def _heard_2(port: ClockedPort, baud: int) -> Heard:
     finally:
         port.is_using = False
     port.drain()
+    if _unasked(port):
+        return Heard(baud, 2, noise=True)
     servos = [_servo(bus_id, baud, 2, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
     bus = DynamixelBus(port, retries=0)
     doubtful = [servo.bus_id for servo in servos if spoiled_reads(bus, servo.bus_id) > _STATUS_READS // 2]
@@ -118,6 +121,8 @@ def _heard_2(port: ClockedPort, baud: int) -> Heard:
 
 
 def _heard_1(port: ClockedPort, baud: int) -> Heard:
+    if _unasked(port):
+        return Heard(baud, 1, noise=True)
     servos = []
     doubtful = []
     bus = DynamixelBus(_Hasty(port), retries=0, protocol=1)
@@ -132,7 +137,16 @@ def _heard_1(port: ClockedPort, baud: int) -> Heard:
                 doubtful.append(bus_id)
             continue
         servos.append(_servo(bus_id, baud, 1, int.from_bytes(head[:2], "little"), head[2]))
-    return Heard(baud, 1, tuple(servos), tuple(doubtful), len(doubtful) == 253)
+    return Heard(baud, 1, tuple(servos), tuple(doubtful))
+
+
+def _unasked(port: ClockedPort) -> bool:
+    """Return whether bytes come although nobody was asked: with them every id would seem to answer."""
+    end_ns = port.clock.now_ns() + round(_LISTEN_S * 1e9)
+    while port.clock.now_ns() < end_ns:
+        if port.ser.read(1):
+            return True
+    return False
 
 
 class _Hasty(ClockedPort):

@@ -8,15 +8,18 @@ from rig.config import ServoConfig
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import Wire
 from rig.devices.dynamixel.register_servo import RegisterServo
-from rig.devices.dynamixel.registers import protocol_of
+from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos
 from rig.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 
-READS = 50
+READS = 100
+REPEATED = 2
+"""How many of them a good line may spoil."""
 SLOW = 1 / 3
 """Share of the control loop's period that a reading may take; where it takes more it mostly is the latency timer."""
+IMPOSSIBLE_C = 150
 POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then: "
 
 
@@ -152,6 +155,10 @@ def _condition(case: Case, found: RegisterServo) -> Iterator[Finding]:
     if condition.torque:
         yield warning("servo", "its torque is on although nobody works with it", case.rig("stop"))
     low, high = limits.voltage_v
+    if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
+        text = f"tells what cannot be: {state.voltage_v:.1f} V and {state.temperature_c:.0f} °C"
+        yield bad("servo", text, "Replace the servo, or its cable if another one tells the same")
+        return
     margin = safety.voltage_margin_v
     text = f"supply {state.voltage_v:.1f} V (the servo shuts down outside {low:.1f}..{high:.1f} V)"
     if not low <= state.voltage_v <= high:
@@ -171,14 +178,19 @@ def _condition(case: Case, found: RegisterServo) -> Iterator[Finding]:
 def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
     clock = case.host.clock
     before = found.line
+    ticks = _ticks(found)
     start_ns = clock.now_ns()
     for _ in range(READS):
         found.read_state()
     each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
     after = found.line
+    if ticks is not None and ticks == _ticks(found):
+        text = f"frozen: its own clock stood at {ticks} ms during {READS} readings, so no reading of it can be believed"
+        yield bad("servo", text, "Switch the servo's supply off and on, then: " + case.rig("doctor"), tick_ms=ticks)
+        return
     again = after["retries"] - before["retries"]
-    text = f"{READS} readings of {each_ms:.1f} ms each, {again} repeated"
-    if again > READS // 10:
+    text = f"{READS} readings of {each_ms:.1f} ms each, {again} of them repeated"
+    if again > REPEATED:
         yield warning("servo", text, "Check the plugs of the servo's cable", retries=again, reading_ms=each_ms)
     elif each_ms > SLOW * 1e3 * case.config.table.poll_s:
         port = next((p for p in case.host.serial_ports() if case.host.same_file(p.path, case.config.servo.port)), None)
@@ -187,3 +199,11 @@ def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
         yield warning("servo", text + ": slow", mend, retries=again, reading_ms=each_ms)
     else:
         yield fine("servo", text, retries=again, reading_ms=each_ms)
+
+
+def _ticks(found: RegisterServo) -> int | None:
+    """Return the servo's own clock, in milliseconds; None for a model without."""
+    table = control_table(found.identity.model, found.identity.firmware)
+    if "Realtime Tick" not in table:
+        return None
+    return found.bus.read(found.identity.bus_id, table["Realtime Tick"])
