@@ -220,6 +220,11 @@ static void run(struct imu *imu, struct counters *counters) {
 
 /* -- sampling ---------------------------------------------------------------------------------------------------- */
 
+static void fetch(struct imu *imu) {
+    read_registers(imu, MPU_FIFO_R_W, MPU_FRAME);
+    imu->phase = MPU_FETCHED;
+}
+
 /* The FIFO's count is known: date what it holds. The newest sample belongs to the last edge if none came meanwhile. */
 static void look(struct imu *imu, struct counters *counters) {
     uint32_t now = hal_micros(), edge_us;
@@ -269,7 +274,7 @@ static void look(struct imu *imu, struct counters *counters) {
     imu->edges = edges;
     imu->frames = frames;
     imu->due_us = now + (imu->edges_come ? LOOK_US : imu->period_us / 2);
-    imu->phase = MPU_FETCH;
+    fetch(imu);
 }
 
 static void mpu_sample(struct imu *imu, struct imu_sample *sample) {
@@ -282,7 +287,10 @@ static void mpu_sample(struct imu *imu, struct imu_sample *sample) {
     }
     imu->last_us = sample->time_us;
     imu->sampled = true;
-    imu->phase = imu->frames ? MPU_FETCH : MPU_RUN;
+    imu->phase = MPU_RUN;
+    if (imu->frames) {
+        fetch(imu);
+    }
 }
 
 static void bno_sample(struct imu *imu, struct imu_sample *sample) {
@@ -360,8 +368,7 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
         }
         break;
     case MPU_FETCH:
-        read_registers(imu, MPU_FIFO_R_W, MPU_FRAME);
-        imu->phase = MPU_FETCHED;
+        fetch(imu);
         break;
     case MPU_FETCHED:
         if (ended(imu, counters, MPU_FETCH)) {

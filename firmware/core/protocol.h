@@ -11,8 +11,8 @@
 #define MAX_BODY 24
 
 #define BAUD 250000UL /* bits per second; exact on 16 MHz */
-#define TICK_US 250 /* period of the safety tick */
-#define ESTOP_TICKS 4 /* ticks that the e-stop loop must be open before it counts: 1 ms */
+#define TICK_US 200 /* period of the safety tick */
+#define ESTOP_TICKS 5 /* ticks that the e-stop loop must be open before it counts: 1 ms */
 #define DEADMAN_MIN_MS 50 /* shortest deadman */
 #define DEADMAN_DEFAULT_MS 250 /* deadman before the first beat says otherwise */
 #define DEADMAN_MAX_MS 2000 /* longest deadman */

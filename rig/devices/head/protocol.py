@@ -11,9 +11,9 @@ FIRMWARE = (1, 0, 0)
 MAX_BODY = 24
 BAUD = 250_000
 """Bits per second; exact on 16 MHz."""
-TICK_US = 250
+TICK_US = 200
 """Period of the safety tick."""
-ESTOP_TICKS = 4
+ESTOP_TICKS = 5
 """Ticks that the e-stop loop must be open before it counts: 1 ms."""
 DEADMAN_MIN_MS = 50
 """Shortest deadman."""

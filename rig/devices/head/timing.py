@@ -19,6 +19,8 @@ STEP_SIGMA_NS = 4_000.0
 """Of one beat that was not held up: the head's clock ticks in whole microseconds, in steps of 4 on some boards."""
 MEMORY = 48
 """Beats that the estimate looks back on: a few seconds, in which a resonator does not warm up."""
+LINE_TOLERANCE = 0.95
+"""Baud rates differ by up to 5 % between the two ends of a line that works."""
 _WRAP = 1 << 32
 
 
@@ -60,7 +62,7 @@ class HeadClock:
     @property
     def drift_ppm(self) -> float:
         """How much too fast the head's clock runs, in parts per million."""
-        return float(-self._fit[1]) * 1e6
+        return float(1 / (1 + self._fit[1]) - 1) * 1e6
 
     @property
     def uncertainty_ns(self) -> float:
@@ -92,9 +94,9 @@ class HeadClock:
         self._covariance = np.linalg.inv(information)
         self._fit = self._covariance @ np.array([weight @ y, weight @ (x * y)])
         # What the shortest round trip took beyond the line itself may have been all on one way. A line that is faster
-        # than its baud rate says is none that bytes pass one by one (USB, a pseudo-terminal): then nothing is known.
-        beyond_ns = shortest - self._line_ns
-        self._asymmetry_ns = (beyond_ns if beyond_ns >= 0 else shortest) / 2
+        # than its baud rate says is none that bytes pass one by one (a pseudo-terminal): then nothing is known.
+        by_bytes = shortest >= LINE_TOLERANCE * self._line_ns
+        self._asymmetry_ns = (max(shortest - self._line_ns, 0.0) if by_bytes else shortest) / 2
 
     def to_host(self, head_us: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
         """Return the bench's times (ns) of unwrapped times of the head, and their largest standard uncertainty (ns)."""

@@ -1,0 +1,376 @@
+"""A rig head in the world: the firmware, what hangs on its pins, and its line to the host.
+
+The board is run up to the virtual clock's time whenever somebody looks, and every few milliseconds by itself. What it
+asks of the world meanwhile (a register over I2C) is answered as of the board's own time, so that nothing depends on how
+often it was run.
+"""
+
+import ctypes
+from collections import deque
+from collections.abc import Callable
+from ctypes import CFUNCTYPE, POINTER, Structure, c_bool, c_int32, c_uint8, c_uint32, c_uint64, c_void_p
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from rig.devices.head.protocol import BAUD, Reset
+from sim.clock import VirtualClock
+from sim.head import build
+from sim.i2c import I2cDevice
+from sim.world import World
+
+BYTE_NS = 10 * 1_000_000_000 // BAUD
+QUANTUM_S = 0.005
+"""How far the board may lag behind the clock while nobody looks: bounds how late the world feels its outputs."""
+RECEIVER_BYTES = 4096
+"""What the host's operating system keeps of what arrives (N_TTY); later bytes are lost."""
+ABI = 1
+_NEVER = 2**64 - 1
+_ROOM = 1024
+
+_START_WRITE, _START_READ, _WRITE, _READ, _STOP = range(5)
+_BYTE, _LIGHT, _RELAY, _TRIGGER, _RESET = range(5)
+_OUTPUT = np.dtype([("ns", np.uint64), ("event", np.int32), ("value", np.int32)])
+
+_I2c = CFUNCTYPE(c_int32, c_uint64, c_int32, POINTER(c_uint8), c_int32)
+_Edge = CFUNCTYPE(c_uint64, c_uint64)
+
+
+class _Outside(Structure):
+    _fields_ = (("i2c", _I2c), ("edge", _Edge))
+
+
+class EdgeSource(Protocol):
+    """A device with an interrupt pin, which is wired to the head's data-ready input."""
+
+    def next_edge_ns(self, after_ns: int) -> int | None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class PinChange:
+    """An output changed: ``pin`` is light (duty, 0 to 1), relay or trigger (0 or 1)."""
+
+    time_ns: int
+    pin: str
+    value: float
+
+
+class _ThenClock:
+    """The virtual clock as the board sees it: its own time."""
+
+    def __init__(self, head: "SimHead") -> None:
+        self._head = head
+
+    def now_ns(self) -> int:
+        return self._head.now_ns
+
+
+class _WorldThen:
+    """The world at the board's time; everything else is the world's."""
+
+    def __init__(self, head: "SimHead", world: World) -> None:
+        self.clock = _ThenClock(head)
+        self._world = world
+
+    def table_deg(self, time_ns: int | None = None) -> float:
+        return self._world.table_deg(self.clock.now_ns() if time_ns is None else time_ns)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
+
+
+class SimHead:
+    """A simulated rig head.
+
+    Bus side: `sim.head.wire.HeadSerial` is its line, devices are attached to its I2C bus. World side: `estop_open`,
+    `stuck`, `nack`, `attach`, `detach`, `reset`, `hang`, the outputs and their history, and the tampers.
+
+    Parameters
+    ----------
+    world
+        In which it stands.
+    kind
+        ``memory``: the portable core, on this computer; ``avr``: the binary that is flashed, in an emulated ATmega328P.
+    clock_error
+        How much too fast its clock runs, relatively.
+    serial
+        The number it was given when it was flashed.
+    image
+        Flash to run instead of the built one (``avr``).
+
+    Attributes
+    ----------
+    world_then
+        The world at the board's own time: what its sensors are made in.
+    tampers
+        Each is given a byte on the line (``to_head``, the byte) and returns what arrives, or None to lose it.
+    listeners
+        Called with each `PinChange`.
+
+    Raises
+    ------
+    ConfigError
+        This machine cannot build the firmware.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        kind: str = "memory",
+        *,
+        clock_error: float = 0.0,
+        serial: int = 1,
+        image: bytes | None = None,
+        library: Path | None = None,
+    ) -> None:
+        self.clock: VirtualClock = world.clock
+        self.kind = kind
+        self.world_then = cast(World, _WorldThen(self, world))
+        self.light = 0.0
+        self.relay_closed = False
+        self.trigger_on = False
+        self.changes: deque[PinChange] = deque(maxlen=10_000)
+        self.tampers: list[Callable[[bool, int], int | None]] = []
+        self.listeners: list[Callable[[PinChange], None]] = []
+        self.resets: list[Reset] = []
+        self._devices: dict[int, I2cDevice] = {}
+        self._addressed: I2cDevice | None = None
+        self._nacks = 0
+        self._estop_open = False
+        self._stuck = 0
+        self._born_ns = self.now_ns = self.clock.now_ns()
+        self._error_ppb = round(clock_error * 1e9)
+        self._line_free_ns = 0
+        self._coming: deque[tuple[int, int]] = deque()
+        self._failure: BaseException | None = None
+        self._running = False
+
+        self._library = _load(library or (build.avr_library() if kind == "avr" else build.host_library()))
+        flash = image if image is not None else build.avr_image() if kind == "avr" else b""
+        self._outside = _Outside(_I2c(self._i2c), _Edge(self._edge))
+        self._outputs = ctypes.create_string_buffer(_ROOM * _OUTPUT.itemsize)
+        self._board = self._library.board_open(self._outside, flash, len(flash), serial)
+        if not self._board:
+            raise MemoryError("no board")
+        self._cancel = self.clock.every(QUANTUM_S, self.catch_up)
+
+    def close(self) -> None:
+        """Take the board away; a second call does nothing."""
+        self._cancel()
+        board, self._board = self._board, None
+        if board:
+            self._library.board_close(board)
+
+    # -- world side -------------------------------------------------------------------------------------------------
+
+    def attach(self, address: int, device: I2cDevice) -> None:
+        """Put a device on the head's I2C bus; its data-ready pin, if it has one, is wired."""
+        self._devices[address] = device
+
+    def detach(self, address: int) -> I2cDevice:
+        """Unplug the device at ``address`` and return it."""
+        self.catch_up()
+        return self._devices.pop(address)
+
+    def nack(self, count: int = 1) -> None:
+        """Let nobody acknowledge the next ``count`` addresses."""
+        self.catch_up()
+        self._nacks = count
+
+    @property
+    def estop_open(self) -> bool:
+        return self._estop_open
+
+    @estop_open.setter
+    def estop_open(self, is_open: bool) -> None:
+        self.catch_up()
+        self._estop_open = is_open
+        self._library.board_set_estop(self._board, is_open)
+
+    @property
+    def stuck(self) -> int:
+        """How often SCL must be clocked until the sensor lets SDA go; 255: for ever; 0: the bus is free."""
+        return self._stuck
+
+    @stuck.setter
+    def stuck(self, clocks: int) -> None:
+        self.catch_up()
+        self._stuck = clocks
+        self._library.board_set_stuck(self._board, clocks)
+
+    def reset(self, cause: Reset) -> None:
+        """Restart the board: a brown-out, its button, its supply."""
+        self.catch_up()
+        self._library.board_reset(self._board, cause)
+        self._drain()
+
+    def hang(self, hangs: bool = True) -> None:
+        """Let the firmware's main loop stand still; its interrupts go on."""
+        self.catch_up()
+        self._library.board_hang(self._board, hangs)
+
+    def pulses(self, pin: str) -> list[tuple[int, float]]:
+        """Return the history of ``pin``: times (ns, virtual clock) and values, oldest first."""
+        self.catch_up()
+        return [(c.time_ns, c.value) for c in self.changes if c.pin == pin]
+
+    # -- the line ---------------------------------------------------------------------------------------------------
+
+    def send(self, data: bytes) -> int:
+        """Put the host's bytes on the line; return when the last of them has arrived (ns)."""
+        self.catch_up()
+        at_ns = max(self.clock.now_ns(), self._line_free_ns)
+        for byte in data:
+            at_ns += BYTE_NS
+            if (arriving := self._tampered(True, byte)) is not None:
+                self._library.board_receive(self._board, self._to_board(at_ns), arriving)
+        self._line_free_ns = at_ns
+        return at_ns
+
+    def take(self, until_ns: int) -> bytes:
+        """Return the bytes that have arrived at the host by ``until_ns``."""
+        arrived = bytearray()
+        while self._coming and self._coming[0][0] <= until_ns:
+            arrived.append(self._coming.popleft()[1])
+        return bytes(arrived)
+
+    def next_arrival_ns(self) -> int | None:
+        """Return when the next byte known of arrives; a byte is known of when its first bit leaves."""
+        return self._coming[0][0] if self._coming else None
+
+    # -- time -------------------------------------------------------------------------------------------------------
+
+    def catch_up(self) -> None:
+        """Run the board up to now."""
+        now_ns = self.clock.now_ns()
+        if self._running or self._board is None or now_ns == self.now_ns:
+            return
+        self._running = True
+        try:
+            self._library.board_run(self._board, self._to_board(now_ns))
+        finally:
+            self._running = False
+            self.now_ns = now_ns
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+        self._drain()
+
+    def _to_board(self, world_ns: int) -> int:
+        elapsed = world_ns - self._born_ns
+        return max(elapsed + elapsed * self._error_ppb // 1_000_000_000, 0)
+
+    def _to_world(self, board_ns: int) -> int:
+        return self._born_ns + board_ns - board_ns * self._error_ppb // (1_000_000_000 + self._error_ppb)
+
+    # -- what the board asks and tells --------------------------------------------------------------------------------
+
+    def _i2c(self, board_ns: int, operation: int, data: Any, length: int) -> int:
+        try:
+            self.now_ns = self._to_world(board_ns)
+            return self._transfer(operation, data, length)
+        except BaseException as error:  # a C function calls this: keep it until that one returns
+            self._failure = error
+            return 0
+
+    def _transfer(self, operation: int, data: Any, length: int) -> int:
+        device = self._addressed
+        if operation in (_START_WRITE, _START_READ):
+            self._addressed = device = self._devices.get(data[0])
+            if device is None or self._nacks:
+                self._nacks = max(self._nacks - 1, 0)
+                self._addressed = None
+                return 0
+            device.start(operation == _START_READ)
+            return 1
+        if device is None:
+            return 0
+        if operation == _WRITE:
+            return device.write(bytes(data[:length]))
+        if operation == _READ:
+            answer = device.read(length)
+            ctypes.memmove(data, answer, length)
+            return length
+        device.stop()
+        self._addressed = None
+        return 0
+
+    def _edge(self, board_ns: int) -> int:
+        try:
+            after_ns = self._to_world(board_ns)
+            edges = [e for d in self._devices.values() if (e := getattr(d, "next_edge_ns", None)) is not None]
+            self.now_ns = after_ns
+            times = [t for edge in edges if (t := edge(after_ns)) is not None]
+            return max(self._to_board(min(times)), board_ns + 1) if times else _NEVER
+        except BaseException as error:
+            self._failure = error
+            return _NEVER
+
+    def _drain(self) -> None:
+        """Take what has left the board: bytes on their way to the host, and changes of its pins."""
+        while taken := self._library.board_take(self._board, self._outputs, _ROOM):
+            outputs = np.frombuffer(self._outputs, _OUTPUT, taken)
+            ns = outputs["ns"].astype(np.int64)
+            if self._error_ppb:
+                ns -= np.array([t * self._error_ppb // (1_000_000_000 + self._error_ppb) for t in ns.tolist()])
+            times = (ns + self._born_ns).tolist()
+            for time_ns, event, value in zip(times, outputs["event"].tolist(), outputs["value"].tolist(), strict=True):
+                if event == _BYTE:
+                    arriving = self._tampered(False, value) if self.tampers else value
+                    if arriving is not None:
+                        self._coming.append((time_ns, arriving))
+                else:
+                    self._output(time_ns, event, value)
+
+    def _output(self, time_ns: int, event: int, value: int) -> None:
+        if event == _RESET:
+            self.resets.append(Reset(value))
+            while self._coming and self._coming[-1][0] > time_ns:
+                self._coming.pop()
+        elif event == _LIGHT:
+            self.light = value / 255
+            self._changed(PinChange(time_ns, "light", self.light))
+        elif event == _RELAY:
+            self.relay_closed = bool(value)
+            self._changed(PinChange(time_ns, "relay", value))
+        else:
+            self.trigger_on = bool(value)
+            self._changed(PinChange(time_ns, "trigger", value))
+
+    def _changed(self, change: PinChange) -> None:
+        self.changes.append(change)
+        for listener in self.listeners:
+            listener(change)
+
+    def _tampered(self, to_head: bool, byte: int) -> int | None:
+        passing: int | None = byte
+        for tamper in self.tampers:
+            if passing is None:
+                return None
+            passing = tamper(to_head, passing)
+        return passing
+
+
+def _load(path: Path) -> Any:
+    library = ctypes.CDLL(str(path))
+    board = c_void_p
+    library.board_abi.restype = c_uint32
+    library.board_open.argtypes = [_Outside, ctypes.c_char_p, c_uint32, c_uint32]
+    library.board_open.restype = board
+    library.board_run.argtypes = [board, c_uint64]
+    library.board_take.argtypes = [board, ctypes.c_char_p, c_uint32]
+    library.board_take.restype = c_uint32
+    library.board_receive.argtypes = [board, c_uint64, c_uint8]
+    library.board_set_estop.argtypes = [board, c_bool]
+    library.board_set_stuck.argtypes = [board, c_uint8]
+    library.board_reset.argtypes = [board, c_uint8]
+    library.board_hang.argtypes = [board, c_bool]
+    library.board_close.argtypes = [board]
+    for name in ("board_run", "board_receive", "board_set_estop", "board_set_stuck", "board_reset", "board_hang"):
+        getattr(library, name).restype = None
+    library.board_close.restype = None
+    if library.board_abi() != ABI:
+        raise RuntimeError(f"{path} has another interface than {ABI}")
+    return library

@@ -1,0 +1,121 @@
+"""Builds the firmware for simulation, once for each state of its sources, into the user's cache."""
+
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+
+import platformdirs
+
+from rig.config import APP
+from rig.errors import ConfigError
+
+HERE = Path(__file__).resolve().parent
+FIRMWARE = HERE.parent.parent / "firmware"
+EMULATOR_HEADERS = (Path("/usr/include/simavr"), Path("/usr/local/include/simavr"))
+
+COMPILE_S = 120
+
+
+def missing(kind: str) -> str:
+    """Return what this machine lacks for a ``memory`` or ``avr`` head, and how to get it; empty where it has all."""
+    if not (FIRMWARE / "Makefile").is_file():
+        return "the firmware's sources are not installed: use a clone of the repository"
+    if not (shutil.which("make") and _compiler()):
+        return "a C compiler and make are not installed: apt-get install gcc make"
+    if kind == "avr":
+        if not shutil.which("avr-gcc"):
+            return "the AVR compiler is not installed: apt-get install gcc-avr avr-libc"
+        if not any(path.is_dir() for path in EMULATOR_HEADERS):
+            return "the AVR emulator is not installed: apt-get install simavr libsimavr-dev"
+    return ""
+
+
+def host_library(flags: str = "") -> Path:
+    """Return the portable core as a shared library (``boards/host``), compiled with further ``flags``."""
+    return _built("memory", "libhead.so", flags)
+
+
+def pty_program() -> Path:
+    """Return the program that plays a head on a pseudo-terminal."""
+    return _built("memory", "head-pty")
+
+
+def avr_image() -> bytes:
+    """Return the flash of an ATmega328P: the very bytes that `make flash` writes."""
+    return _built("avr", "head.bin").read_bytes()
+
+
+def avr_library() -> Path:
+    """Return the emulated microcontroller, with the interface of ``boards/host/board.h``."""
+    _require("avr")
+    source = HERE / "avr.c"
+    key = _key([source, FIRMWARE / "boards" / "host" / "board.h"], "")
+    headers = next(path for path in EMULATOR_HEADERS if path.is_dir())
+
+    def compile_to(folder: Path) -> list[str]:
+        out = folder / "libavrhead.so"
+        warnings = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-O2", "-fPIC", "-shared"]
+        places = ["-isystem", str(headers), "-I", str(FIRMWARE / "boards" / "host"), "-I", str(FIRMWARE / "core")]
+        return [_compiler(), *warnings, *places, "-o", str(out), str(source), "-lsimavr"]
+
+    return _cached(key, "libavrhead.so", compile_to)
+
+
+def _built(kind: str, product: str, flags: str = "") -> Path:
+    _require(kind)
+    sources = [p for p in sorted(FIRMWARE.rglob("*")) if p.suffix in (".c", ".h") or p.name == "Makefile"]
+
+    def make(folder: Path) -> list[str]:
+        return ["make", "-s", "-C", str(FIRMWARE), f"OUT={folder}", f"HOST_FLAGS={flags}", str(folder / product)]
+
+    return _cached(_key(sources, f"{product} {flags}"), product, make)
+
+
+def _require(kind: str) -> None:
+    if lacking := missing(kind):
+        raise ConfigError(
+            f"The simulated rig head cannot be built: {lacking.partition(':')[0]}.",
+            next_step=f"{lacking.partition(': ')[2][:1].upper()}{lacking.partition(': ')[2][1:]}; or leave the head "
+            "out: --set imu.driver=mpu6050.",
+        )
+
+
+def _compiler() -> str:
+    return os.environ.get("CC") or next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), "")
+
+
+def _key(sources: list[Path], how: str) -> str:
+    digest = sha256(f"{_compiler()} {how}".encode())
+    for source in sources:
+        digest.update(source.name.encode() + b"\0" + source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cached(key: str, product: str, command_for: Callable[[Path], list[str]]) -> Path:
+    """Return the product of a build that was made once; several programs may want it at the same time."""
+    root = Path(platformdirs.user_cache_dir(APP)) / "head"
+    done = root / key / product
+    if done.is_file():
+        return done
+    root.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=root))
+    try:
+        run = subprocess.run(command_for(folder), capture_output=True, text=True, timeout=COMPILE_S, check=False)
+        if run.returncode:
+            raise ConfigError(
+                "The firmware does not compile.",
+                next_step="Mend the error below, or restore the sources.",
+                evidence={"compiler": (run.stderr or run.stdout)[-2000:]},
+            )
+        try:
+            folder.rename(root / key)
+        except OSError:  # somebody else was faster
+            shutil.rmtree(folder)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return done

@@ -1,0 +1,79 @@
+"""The host's end of a simulated rig head's line: pyserial's interface on the virtual clock."""
+
+import errno
+
+import serial
+
+from rig.devices.head.protocol import BAUD
+from sim.head.board import BYTE_NS, RECEIVER_BYTES, SimHead
+
+
+class HeadSerial:
+    """Looks like an open `serial.Serial`; who reads waits on the virtual clock.
+
+    ``timeout`` is in seconds; `unplug` pulls its cable out of the computer: the head goes on alone.
+
+    Raises
+    ------
+    serial.SerialException
+        Another port is open on this head.
+    """
+
+    def __init__(self, head: SimHead, baudrate: int = BAUD, timeout: float = 0.002, port: str = "sim-head") -> None:
+        self.port = self.name = port
+        self.baudrate = baudrate
+        self.timeout = timeout
+        self.is_open = True
+        self._head = head
+        self._unplugged = False
+        self._received = bytearray()
+        head.catch_up()
+        head.take(head.clock.now_ns())  # what came while nobody had the port open
+
+    def close(self) -> None:
+        self.is_open = False
+
+    def unplug(self) -> None:
+        self._unplugged = True
+
+    @property
+    def in_waiting(self) -> int:
+        self._collect()
+        return len(self._received)
+
+    def read(self, size: int = 1) -> bytes:
+        """Return up to ``size`` bytes: all as soon as they are there, fewer at the timeout."""
+        clock = self._head.clock
+        deadline_ns = clock.now_ns() + round(self.timeout * 1e9)
+        self._collect()
+        while len(self._received) < size and clock.now_ns() < deadline_ns:
+            # A byte is known of when it begins to arrive: steps of a byte's length miss none.
+            arrival_ns = self._head.next_arrival_ns() or clock.now_ns() + BYTE_NS
+            clock.advance_to(min(arrival_ns, deadline_ns))
+            self._collect()
+        data = bytes(self._received[:size])
+        del self._received[:size]
+        return data
+
+    def write(self, data: bytes, /) -> int:
+        self._require_open()
+        if self.baudrate == BAUD:  # at another rate the head reads something else, without end or sum
+            self._head.send(bytes(data))
+        return len(data)
+
+    def reset_input_buffer(self) -> None:
+        self._collect()
+        self._received.clear()
+
+    def _collect(self) -> None:
+        self._require_open()
+        self._head.catch_up()
+        arrived = self._head.take(self._head.clock.now_ns())
+        if self.baudrate == BAUD:
+            self._received += arrived[: RECEIVER_BYTES - len(self._received)]
+
+    def _require_open(self) -> None:
+        if self._unplugged:
+            raise serial.SerialException(errno.EIO, f"device {self.port} disconnected")
+        if not self.is_open:
+            raise serial.PortNotOpenError()
