@@ -23,21 +23,23 @@ def main() -> int:
     parser.add_argument("--answers", type=int, help="end after so many; endless otherwise")
     arguments = parser.parse_args()
 
-    with Catalog.open(arguments.catalog, clock=SystemClock(), read_only=True) as catalog:
-        try:
-            with open_bench(arguments.bench, load_config()) as bench:
-                if isinstance(bench.operator, ObjectStandsThere):  # nobody presses a key: the camera sees what comes
-                    bench.operator = TableWatcher(bench)
-                answers = 0
-                # The model is loaded before each search: what was enrolled meanwhile is found.
-                for event in watch(bench, lambda: hbr.ViewIndex(catalog.views().views)):
-                    print(json.dumps(event_dict(event)), flush=True)
-                    answers += isinstance(event, Identified)
-                    if answers == arguments.answers:
-                        break
-        except RigError as error:
-            print(json.dumps(error.as_dict(), default=str), flush=True)
-            return error.exit_code
+    try:
+        with (
+            Catalog.open(arguments.catalog, clock=SystemClock(), read_only=True) as catalog,
+            open_bench(arguments.bench, load_config()) as bench,
+        ):
+            if isinstance(bench.operator, ObjectStandsThere):  # nobody presses a key: the camera sees what comes
+                bench.operator = TableWatcher(bench)
+            answers = 0
+            # The model is loaded before each search: what was enrolled meanwhile is found.
+            for event in watch(bench, lambda: hbr.ViewIndex(catalog.views().views)):
+                print(json.dumps(event_dict(event)), flush=True)
+                answers += isinstance(event, Identified)
+                if answers == arguments.answers:
+                    break
+    except RigError as error:
+        print(json.dumps(error.as_dict(), default=str), flush=True)
+        return error.exit_code
     return 0
 
 

@@ -1,0 +1,68 @@
+"""The example scripts run as they are documented."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], cwd=cwd, capture_output=True, text=True)
+
+
+def commands() -> list[list[str]]:
+    """Return the arguments of the documented commands, without the program and the redirection."""
+    text = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    return [shlex.split(line.partition(">>")[0]) for line in re.findall(r"^ +\.venv/bin/python (.*)$", text, re.M)]
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory):
+    """Return a folder that has the examples in it, and a catalog of the example tray."""
+    folder = tmp_path_factory.mktemp("workshop")
+    (folder / "examples").symlink_to(EXAMPLES)
+    tray, *_ = commands()
+    done = run(*tray, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def test_every_script_is_documented_with_a_command():
+    assert sorted(f"examples/{path.name}" for path in EXAMPLES.glob("*.py")) == sorted(words[0] for words in commands())
+
+
+def test_the_tray_is_enrolled_and_skipped_the_next_time(workshop):
+    folder, first = workshop
+    assert re.findall(r"\d/3 (\S+): (\w+)", first) == [("lamp", "enroll"), ("toy-car", "enroll"), ("dice", "enroll")]
+    again = run(*commands()[0], cwd=folder)
+    assert re.findall(r"\d/3 (\S+): (\w+)", again.stdout) == [("lamp", "skip"), ("toy-car", "skip"), ("dice", "skip")]
+
+
+def test_the_loop_writes_json_lines_and_ends_after_its_answers(workshop):
+    folder, _ = workshop
+    done = run(*commands()[1], cwd=folder)
+    assert done.returncode == 0, done.stderr
+    events = [json.loads(line)["event"] for line in done.stdout.splitlines()]
+    assert events.count("identified") == 3
+    assert events.count("waiting") == 3
+    assert events[-1] == "identified"
+
+
+def test_the_loop_tells_an_error_as_its_last_line(tmp_path):
+    done = run(str(EXAMPLES / "unattended_loop.py"), "--catalog", "nowhere", cwd=tmp_path)
+    assert done.returncode == 7
+    assert json.loads(done.stdout.splitlines()[-1])["next_step"]
+
+
+def test_the_strategy_finds_the_objects_beside_the_others(tmp_path):
+    done = run(str(EXAMPLES / "custom_strategy.py"), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = re.findall(r"^(\w+) +(\S+) +found as (\S+) +(\d) views", done.stdout, re.M)
+    assert [strategy for strategy, *_ in found] == ["ahbr"] * 3 + ["sweep"] * 3 + ["golden"] * 3
+    assert all(shown == answer for _, shown, answer, _ in found), done.stdout

@@ -1,0 +1,53 @@
+"""The pytest plug-in, as another project meets it: in a folder of its own, in a process of its own."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
+
+
+def run(folder: Path, *arguments: str, code: str) -> subprocess.CompletedProcess[str]:
+    (folder / "test_theirs.py").write_text(code, encoding="utf-8")
+    (folder / "pytest.ini").write_text("[pytest]\naddopts = --strict-markers\n", encoding="utf-8")
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments, "test_theirs.py"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_the_documented_tests_pass_elsewhere(tmp_path):
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
+    done = run(tmp_path, code=code)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 passed" in done.stdout
+
+
+def test_the_marker_sets_the_seed_and_the_noise(tmp_path):
+    code = (
+        "import pytest\n"
+        "from sim.noise import NoiseModel\n"
+        "@pytest.mark.sim('identify.max_views=3', seed=5, noise=NoiseModel.none())\n"
+        "def test_marked(sim_bench, sim_world):\n"
+        "    assert sim_bench.config.identify.max_views == 3\n"
+        "    assert (sim_world.seed, sim_world.noise) == (5, NoiseModel.none())\n"
+        "    assert sim_bench.clock is sim_world.clock\n"
+        "def test_plain(sim_world):\n"
+        "    assert (sim_world.seed, sim_world.noise) == (0, NoiseModel())\n"
+    )
+    done = run(tmp_path, code=code)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_it_costs_nothing_where_nobody_asks(tmp_path):
+    code = (
+        "import sys\n"
+        "def test_light(request):\n"
+        "    assert request.config.pluginmanager.has_plugin('rig-sim')\n"
+        "    assert not {'numpy', 'cv2', 'sqlalchemy', 'pydantic'} & set(sys.modules)\n"
+    )
+    done = run(tmp_path, "-p", "no:hypothesispytest", "-p", "no:xdist", code=code)
+    assert done.returncode == 0, done.stdout + done.stderr
