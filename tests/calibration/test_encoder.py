@@ -1,6 +1,5 @@
 """The encoder's error over its turn: found within what is stated, put in force, and all else refused."""
 
-from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np

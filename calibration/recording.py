@@ -1,0 +1,67 @@
+"""What the devices of a bench deliver while a procedure moves it, kept for the fit."""
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench import Bench
+from rig.devices.imu import Imu, ImuSamples
+from rig.devices.servo import Servo, ServoState
+
+
+@dataclass(slots=True)
+class Recording:
+    """Everything that was read, in order."""
+
+    states: list[ServoState] = field(default_factory=list)
+    samples: list[ImuSamples] = field(default_factory=list)
+
+    def clear(self) -> None:
+        self.states.clear()
+        self.samples.clear()
+
+    def gyro(self) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
+        """Return the samples' times (n,), the rates (n, 3) in °/s, and how many samples were lost between them."""
+        if not self.samples:
+            return np.empty(0, np.int64), np.empty((0, 3)), 0
+        return (
+            np.concatenate([part.time_ns for part in self.samples]),
+            np.concatenate([part.gyro_dps for part in self.samples]),
+            sum(part.lost for part in self.samples),
+        )
+
+
+class _Tapped:
+    """A device that keeps what one of its readings returns."""
+
+    def __init__(self, device: Any, reading: str, kept: list[Any]) -> None:
+        self._device, self._reading, self._kept = device, reading, kept
+
+    def __getattr__(self, name: str) -> Any:
+        attribute = getattr(self._device, name)
+        if name != self._reading:
+            return attribute
+
+        def read() -> Any:
+            value = attribute()
+            self._kept.append(value)
+            return value
+
+        return read
+
+
+@contextmanager
+def recording(bench: Bench) -> Generator[Recording, None, None]:
+    """Keep what servo and IMU deliver for the length of a ``with`` block; enter it before the table is taken."""
+    kept = Recording()
+    servo, imu = bench.servo, bench.imu
+    bench.servo = cast(Servo, _Tapped(servo, "read_state", kept.states))
+    bench.imu = cast(Imu, _Tapped(imu, "read_samples", kept.samples))
+    try:
+        yield kept
+    finally:
+        bench.servo, bench.imu = servo, imu

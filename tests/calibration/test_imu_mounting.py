@@ -1,0 +1,100 @@
+"""Tilt, levels and delay of the IMU on the platter."""
+
+from datetime import UTC, datetime
+from math import degrees
+
+import numpy as np
+import pytest
+
+from calibration.imu_mounting import Level, Turn, from_data, live
+from rig.errors import LimitExceeded
+from rig.facts import Fact
+
+AXIS = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
+
+
+def measured(axis=AXIS, *, zero_g=(0.01, -0.02, 0.03), table_axis_deg=(0.0, 0.0)) -> tuple[list[Turn], list[Level]]:
+    """Return what a bench without noise measures."""
+    rate = np.linspace(10.0, 90.0, 20)
+    turns = [Turn(45.0, 45.0 * axis, 0.01, 0.002 * rate, rate) for _ in range(8)]
+    levels = []
+    for angle in np.arange(8) * 45.0:
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        x, y = np.radians(table_axis_deg)
+        levels.append(Level(float(angle), axis + zero_g + np.array([c * x + s * y, -s * x + c * y, 0.0]), 1e-4))
+    return turns, levels
+
+
+def fit(turns, levels, *, column=2, sign=1) -> Fact:
+    when = datetime(2026, 3, 1, tzinfo=UTC)
+    return from_data(turns, levels, column=column, sign=sign, when_utc=when, device={})
+
+
+def test_everything_is_found_where_nothing_is_noise():
+    estimates = fit(*measured(table_axis_deg=(1.0, -0.5))).estimates
+    for name, true in {
+        "tilt_x": degrees(AXIS[0]),
+        "tilt_y": degrees(AXIS[1]),
+        "accel_zero_x": 0.01,
+        "accel_zero_y": -0.02,
+        "accel_zero_z": 0.03,
+        "axis_x": 1.0,
+        "axis_y": -0.5,
+        "delay": 0.002,
+    }.items():
+        assert estimates[name].value == pytest.approx(true, abs=1e-6), name
+
+
+def test_the_simulated_part_is_found_within_the_stated_uncertainty(simulated):
+    z = []
+    for seed in range(5):
+        s = simulated(seed=seed)
+        *_, fact = live(s.bench)
+        assert fact.passed, fact.refusals
+        part, found = s.operator.parts.imu.inertial, fact.estimates
+        for i, name in enumerate("xyz"):
+            z.append(
+                (found[f"accel_zero_{name}"].value - part.accel_bias_g[i]) / found[f"accel_zero_{name}"].uncertainty
+            )
+        for i, name in enumerate("xy"):
+            z.append((found[f"tilt_{name}"].value - degrees(part.up[i])) / found[f"tilt_{name}"].uncertainty)
+            z.append(found[f"axis_{name}"].value / found[f"axis_{name}"].uncertainty)
+        # The servo reads its encoder 2.0 ms before the middle of a transaction at 57,600 baud; the low-pass of 42 Hz
+        # and the dating by whole samples make the gyro 2.8 ms late.
+        assert found["delay"].value == pytest.approx(0.8e-3, abs=3 * found["delay"].uncertainty)
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
+    assert (np.abs(z) < 1.96).mean() >= 0.85
+
+
+@pytest.mark.parametrize(
+    ("axis", "reason"),
+    [
+        ((0.0, 0.3, 0.95), "tilted by 17.5°"),
+        ((0.0, 0.0, -1.0), 'imu.axis = "z" and imu.sign = -1'),
+        ((-1.0, 0.0, 0.05), 'imu.axis = "x" and imu.sign = -1'),
+    ],
+)
+def test_a_wrong_mounting_is_refused_with_what_to_set(axis, reason):
+    axis = np.array(axis) / np.linalg.norm(axis)
+    assert any(reason in refusal for refusal in fit(*measured(axis)).refusals)
+
+
+def test_a_slanting_table_and_lost_samples_are_refused():
+    turns, levels = measured(table_axis_deg=(7.0, 0.0))
+    assert "7.0° off the vertical" in fit(turns, levels).refusals[0]
+    assert "Only 3 of 8" in fit(turns[:3], levels).refusals[0]
+
+
+def test_a_cable_too_short_for_a_turn_is_told_before_anything_moves(simulated):
+    with pytest.raises(LimitExceeded):
+        next(live(simulated('table.mode="pan"', "table.limits_deg=[-90, 90]").bench))
+
+
+def test_the_bench_gets_its_devices_back(simulated):
+    s = simulated(seed=1)
+    servo, imu = s.bench.servo, s.bench.imu
+    events = live(s.bench)
+    next(events)
+    assert s.bench.servo is not servo
+    events.close()
+    assert (s.bench.servo, s.bench.imu) == (servo, imu)
