@@ -12,7 +12,7 @@ from rig.config import RigConfig, Section
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import Wire, open_serial
 from rig.devices.dynamixel.register_servo import prepare_servo
-from rig.devices.mpu6050 import Mpu6050
+from rig.devices.open_imu import open_imu
 from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
 from rig.devices.servo import Servo
 from rig.errors import ConfigError
@@ -85,9 +85,7 @@ def assemble(
     findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
     _check_reach(config, servo)
     with ExitStack() as opened:
-        imu = Mpu6050(
-            i2c_bus, address=config.imu.address, clock=clock, range_dps=config.imu.range_dps, rate_hz=config.imu.rate_hz
-        )
+        imu = open_imu(config.imu, i2c_bus, clock)
         opened.callback(imu.close)
         camera = OpenCvCamera(
             capture,

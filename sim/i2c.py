@@ -32,7 +32,10 @@ _MAX_MESSAGE_LENGTH = 8192
 
 
 class I2cDevice(Protocol):
-    """A device on the bus as its pins see the traffic."""
+    """A device on the bus as its pins see the traffic.
+
+    One that does not always acknowledge its address has a property ``answers``.
+    """
 
     def start(self, reading: bool) -> None:
         """Take notice of a (repeated) start with this device's address."""
@@ -210,7 +213,12 @@ class SimI2cBus:
     def _start(self, address: int, reading: bool) -> I2cDevice:
         self._pass(1)
         device = self._devices.get(address)
-        if device is None or self._nacks or any(refuses(address) for refuses in self.refusals):
+        if (
+            device is None
+            or self._nacks
+            or not getattr(device, "answers", True)
+            or any(refuses(address) for refuses in self.refusals)
+        ):
             self._nacks = max(self._nacks - 1, 0)
             raise _os_error(ENXIO)
         device.start(reading)

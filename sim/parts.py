@@ -13,12 +13,14 @@ from rig.devices.dynamixel.registers import protocol_of
 from rig.errors import ConfigError, DeviceNotFound
 from sim.camera import SimCapture
 from sim.i2c import SimI2cBus
+from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
 from sim.servo import Ax12Servo, Geared, ServoBus, SimSerial, XSeriesServo
 from sim.servo.shaft import Shaft
 from sim.world import World
 
 SimulatedServo = XSeriesServo | Ax12Servo
+SimulatedImu = SimMpu6050 | SimBno055
 
 
 @dataclass
@@ -33,7 +35,7 @@ class SimParts(AbstractContextManager["SimParts"]):
     servo: SimulatedServo
     adapter: SimSerial
     i2c: SimI2cBus
-    imu: SimMpu6050
+    imu: SimulatedImu
     camera: SimCapture
 
     def __exit__(
@@ -53,7 +55,11 @@ class SimParts(AbstractContextManager["SimParts"]):
         servo = _servo(world, config)
         servo_bus = ServoBus(world.clock)
         servo_bus.attach(servo)
-        imu = SimMpu6050(world, ad0=config.imu.address == 0x69)
+        imu: SimulatedImu
+        if config.imu.model == "bno055":
+            imu = SimBno055(world, adr=config.imu.address == 0x29)
+        else:
+            imu = SimMpu6050(world, ad0=config.imu.address == 0x69)
         i2c = SimI2cBus(world.clock)
         i2c.attach(config.imu.address, imu)
         adapter = SimSerial(servo_bus, config.servo.baud, READ_SLICE_S)

@@ -29,6 +29,8 @@ class InertialModel:
         Gives the motion, the noise model, and the streams ``name-part`` (drawn once) and ``name-noise``.
     name
         Of the sensor.
+    gyro_noisier
+        Its gyro's noise density over that of the noise model.
 
     Attributes
     ----------
@@ -39,7 +41,7 @@ class InertialModel:
         degree of warmth.
     """
 
-    def __init__(self, world: World, name: str) -> None:
+    def __init__(self, world: World, name: str, gyro_noisier: float = 1.0) -> None:
         noise, part = world.noise, world.rng(f"{name}-part")
         self._world = world
         self._rng = world.rng(f"{name}-noise")
@@ -50,7 +52,7 @@ class InertialModel:
         self.up: Floats = np.array([-sin(pitch), sin(roll) * cos(pitch), cos(roll) * cos(pitch)])
         self.gyro_slope_dps_c: Floats = noise.gyro_bias_slope_dps_c * part.standard_normal(3)
         self._powered_ns = world.clock.now_ns()
-        self._density: Floats = np.repeat([noise.gyro_noise_dps_rthz, noise.accel_noise_g_rthz], 3)
+        self._density: Floats = np.repeat([gyro_noisier * noise.gyro_noise_dps_rthz, noise.accel_noise_g_rthz], 3)
         self.restart()
 
     def restart(self) -> None:

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from rig.devices.bno055 import Bno055
 from rig.devices.imu import Imu
 from rig.devices.mpu6050 import Mpu6050
 from rig.errors import DeviceSilent
 from sim.i2c import SimI2cBus
+from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
 from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
@@ -19,12 +21,16 @@ from sim.world import World
 
 @dataclass
 class Sensor:
-    """An opened IMU in its world; `unplug` pulls its cable; its z axis points up, ``latency_s`` is its filter's lag."""
+    """An opened IMU in its world; `unplug` pulls its cable; its z axis points up, ``latency_s`` is its filter's lag.
+
+    ``buffer_s`` says how seldom it may be read for each sample to be one that was taken.
+    """
 
     imu: Imu
     world: World
     unplug: Callable[[], None]
     latency_s: float
+    buffer_s: float
 
 
 @contextmanager
@@ -34,12 +40,24 @@ def mpu6050(noise: NoiseModel) -> Iterator[Sensor]:
         bus.attach(0x68, SimMpu6050(world))
         imu = Mpu6050(bus.path, clock=world.clock)
         try:
-            yield Sensor(imu, world, lambda: bus.detach(0x68) and None, 0.005)
+            yield Sensor(imu, world, lambda: bus.detach(0x68) and None, 0.005, 0.3)
         finally:
             imu.close()
 
 
-SENSORS: dict[str, Callable[[NoiseModel], AbstractContextManager[Sensor]]] = {"mpu6050": mpu6050}
+@contextmanager
+def bno055(noise: NoiseModel) -> Iterator[Sensor]:
+    world = World(noise=noise, seed=1)
+    with SimI2cBus(world.clock) as bus:
+        bus.attach(0x28, SimBno055(world))
+        imu = Bno055(bus.path, clock=world.clock)
+        try:
+            yield Sensor(imu, world, lambda: bus.detach(0x28) and None, 0.02, 0.01)
+        finally:
+            imu.close()
+
+
+SENSORS: dict[str, Callable[[NoiseModel], AbstractContextManager[Sensor]]] = {"mpu6050": mpu6050, "bno055": bno055}
 
 
 @pytest.fixture(params=SENSORS)
@@ -136,8 +154,8 @@ def test_noise_stays_below_what_the_identity_states(
 ) -> None:
     with open_sensor(NoiseModel()) as sensor:
         rates = []
-        for _ in range(20):
-            sensor.world.clock.sleep(0.3)
+        for _ in range(round(6.0 / sensor.buffer_s)):
+            sensor.world.clock.sleep(sensor.buffer_s)
             rates.append(sensor.imu.read_samples().gyro_dps)
         sigma = np.concatenate(rates).std(axis=0)
         white = sensor.imu.identity.gyro_noise_dps_rthz * np.sqrt(sensor.imu.rate_hz / 2)

@@ -1,0 +1,27 @@
+"""The inertial sensor that the configuration names, on an I2C bus."""
+
+from rig.clock import Clock
+from rig.config import ImuConfig
+from rig.devices.bno055 import Bno055
+from rig.devices.imu import Imu
+from rig.devices.mpu6050 import Mpu6050
+
+
+def open_imu(config: ImuConfig, bus: int | str, clock: Clock) -> Imu:
+    """Open the sensor at ``config.address`` of ``bus`` (a number, or the path of a device file).
+
+    Raises
+    ------
+    ConfigError, DeviceNotFound, DeviceMismatch, DeviceFault, DeviceSilent
+        As the driver of the model does.
+    """
+    if config.model == "bno055":
+        return Bno055(bus, clock=clock, address=config.address)
+    return Mpu6050(
+        bus,
+        clock=clock,
+        address=config.address,
+        range_dps=config.range_dps,
+        rate_hz=config.rate_hz,
+        bandwidth_hz=config.bandwidth_hz,
+    )

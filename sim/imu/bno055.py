@@ -1,0 +1,237 @@
+"""A register-true BNO055 for the simulated I2C bus: fusion, calibration status, start-up and mode switch times.
+
+Behaviour follows the data sheet BST-BNO055-DS000. Register names and numbers are written down here once more, not
+shared with the driver, so that an error in one does not hide in the other.
+
+Not simulated: the magnetometer (its modes run as the IMU mode does, without north), page 1, interrupts, axis
+remapping, self test, low-power modes, UART, and stretching of the clock. The fusion is the integral of the gyro about
+the vertical, the tilt kept; its bias is learned at rest, as the device does.
+"""
+
+from collections.abc import Callable
+from math import cos, pi, radians, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.imu.inertial import InertialModel
+from sim.imu.mpu6050 import Words
+from sim.motion import Floats
+from sim.world import World
+
+CHIP_ID, PAGE_ID, ACC_DATA, GYR_DATA, EUL_DATA, QUA_DATA, LIA_DATA, GRV_DATA = (
+    0x00,
+    0x07,
+    0x08,
+    0x14,
+    0x1A,
+    0x20,
+    0x28,
+    0x2E,
+)
+TEMP, CALIB_STAT, ST_RESULT, SYS_STATUS, SYS_ERR, UNIT_SEL = 0x34, 0x35, 0x36, 0x39, 0x3A, 0x3B
+OPR_MODE, PWR_MODE, SYS_TRIGGER = 0x3D, 0x3E, 0x3F
+
+CONFIG_MODE, IMU_MODE, NDOF_MODE = 0x00, 0x08, 0x0C
+FUSION_MODES = frozenset({IMU_MODE, 0x09, 0x0A, 0x0B, NDOF_MODE})
+IDLE, SYSTEM_ERROR, FUSION_RUNNING = 0, 1, 5  # values of SYS_STATUS
+RST_SYS = 0x20
+
+SILENT_S = 0.65
+"""From reset or power-up until it answers again."""
+TO_CONFIG_S, FROM_CONFIG_S = 0.019, 0.007
+TICK_NS = 10_000_000
+"""The fusion's period."""
+GYRO_BANDWIDTH_HZ = 32.0
+GYRO_NOISIER, GYRO_TRUER = 2.8, 0.2
+"""Its gyro's noise, 0.014 °/s/√Hz, and zero rate, ±1 °/s, over those of the bench's noise model."""
+REST_TICKS, JUDGE_TICKS = 100, 20
+"""How long it must be still to learn its bias, and how often it looks."""
+REST_DPS, REST_SPREAD_DPS = 3.0, 0.5
+
+_IDENTITY = {CHIP_ID: 0xA0, 0x01: 0xFB, 0x02: 0x32, 0x03: 0x0F, 0x04: 0x11, 0x05: 0x03, 0x06: 0x15}
+_WRITABLE = {PAGE_ID: 0x01, UNIT_SEL: 0x97, PWR_MODE: 0x03, OPR_MODE: 0x0F}
+_ONLY_IN_CONFIG = frozenset({UNIT_SEL, PWR_MODE})
+_G = 9.80665
+
+
+class SimBno055:
+    """The sensor on the platter; an `sim.i2c.I2cDevice`.
+
+    World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `chip_id`, `power_cycle`,
+    `run_clock`, `fail` (the fusion stops with an error), and `distortions`, each of which is given words as those of
+    the MPU-6050, int16 (n, 7), and returns those that the fusion works with.
+    """
+
+    def __init__(self, world: World, *, adr: bool = False, chip_id: int = 0xA0) -> None:
+        self.address = 0x29 if adr else 0x28
+        self.inertial = InertialModel(world, f"imu-{self.address:02x}", gyro_noisier=GYRO_NOISIER)
+        self.inertial.gyro_bias_dps *= GYRO_TRUER
+        self.temperature_c = 25.0
+        self.chip_id = chip_id
+        self.clock_error = 0.0
+        self.distortions: list[Callable[[Words], Words]] = []
+        self._clock = world.clock
+        self.power_cycle()
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples a second, by a true clock."""
+        return 1e9 / self._tick_ns
+
+    def run_clock(self, error: float) -> None:
+        """Let its clock run wrong by ``error``, relatively, from now on; it does not know."""
+        self._catch_up()
+        self.clock_error = error
+        self._epoch_ns, self._ticks = self._clock.now_ns(), 0
+        self.inertial.restart()
+
+    def power_cycle(self) -> None:
+        """Lose everything: what a brown-out or a reset leaves behind."""
+        self._registers = bytearray(0x80)
+        self._registers[UNIT_SEL] = 0x80
+        self._silent_until_ns = self._clock.now_ns() + round(SILENT_S * 1e9)
+        self._pointer, self._pointed = 0, True
+        self._switching_until_ns = 0
+        self._yaw_deg = 0.0
+        self._bias_dps: Floats = np.zeros(3)
+        self._recent: Floats = np.empty((0, 3))
+        self._begin()
+
+    def fail(self, error: int = 0x0A) -> None:
+        """Stop the fusion with a system error, as a part does whose configuration broke."""
+        self._catch_up()
+        self._registers[SYS_STATUS], self._registers[SYS_ERR] = SYSTEM_ERROR, error
+
+    # -- bus side ---------------------------------------------------------------------------------------------------
+
+    @property
+    def answers(self) -> bool:
+        """Whether it acknowledges its address: not while it starts up."""
+        return self._clock.now_ns() >= self._silent_until_ns
+
+    def start(self, reading: bool) -> None:
+        self._pointed = reading
+
+    def write(self, data: bytes) -> int:
+        acknowledged = len(data)
+        if data and not self._pointed:
+            self._pointer, self._pointed = data[0] & 0x7F, True
+            data = data[1:]
+        for byte in data:
+            self._set(self._pointer, byte)
+            self._pointer = (self._pointer + 1) & 0x7F
+        return acknowledged
+
+    def read(self, count: int) -> bytes:
+        self._catch_up()
+        answer = bytearray()
+        for _ in range(count):
+            answer.append(self._get(self._pointer))
+            self._pointer = (self._pointer + 1) & 0x7F
+        return bytes(answer)
+
+    def stop(self) -> None: ...
+
+    def _get(self, register: int) -> int:
+        if register == CHIP_ID:
+            return self.chip_id
+        return _IDENTITY.get(register, self._registers[register])
+
+    def _set(self, register: int, value: int) -> None:
+        if register == SYS_TRIGGER:
+            if value & RST_SYS:
+                self.power_cycle()
+            return
+        mode = self._registers[OPR_MODE]
+        switching = self._clock.now_ns() < self._switching_until_ns
+        if register not in _WRITABLE or switching or (register in _ONLY_IN_CONFIG and mode != CONFIG_MODE):
+            return  # lost, without a word
+        self._catch_up()
+        self._registers[register] = value & _WRITABLE[register]
+        if register == OPR_MODE and value != mode:
+            taken_s = TO_CONFIG_S if value == CONFIG_MODE else FROM_CONFIG_S
+            self._switching_until_ns = self._clock.now_ns() + round(taken_s * 1e9)
+            self._begin()
+
+    # -- fusion -------------------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        """Start (or stop) what the operating mode asks for, once the switch is over."""
+        self._registers[ACC_DATA:TEMP] = bytes(TEMP - ACC_DATA)
+        self._registers[CALIB_STAT] = 0
+        self._registers[SYS_STATUS], self._registers[SYS_ERR] = IDLE, 0
+        self._epoch_ns = max(self._clock.now_ns(), self._switching_until_ns, self._silent_until_ns)
+        self._ticks = 0
+        self._recent = np.empty((0, 3))
+        self._bias_dps = np.zeros(3)
+        self.inertial.restart()
+
+    def _catch_up(self) -> None:
+        """Take the samples that fell due since somebody last looked."""
+        registers, now_ns = self._registers, self._clock.now_ns()
+        if registers[OPR_MODE] not in FUSION_MODES or registers[SYS_STATUS] == SYSTEM_ERROR:
+            return
+        due = (now_ns - self._epoch_ns) // self._tick_ns
+        if due <= self._ticks:
+            return
+        times: NDArray[np.int64] = self._epoch_ns + self._tick_ns * np.arange(self._ticks + 1, due + 1)
+        self._ticks = due
+        gyro, accel = self._distorted(*self.inertial.sample(times, 1e9 / TICK_NS, GYRO_BANDWIDTH_HZ))
+        up = self.inertial.up
+        begun = due - len(gyro)
+        cuts = range(begun - begun % JUDGE_TICKS + JUDGE_TICKS, due + 1, JUDGE_TICKS)
+        parts = np.split(gyro, [cut - begun for cut in cuts])
+        for i, part in enumerate(parts):
+            self._yaw_deg += float(((part - self._bias_dps) @ up).sum()) * TICK_NS * 1e-9
+            self._recent = np.concatenate([self._recent, part])[-REST_TICKS:]
+            if i < len(cuts):
+                self._learn_bias()
+        registers[SYS_STATUS] = FUSION_RUNNING
+        self._show(gyro[-1] - self._bias_dps, accel[-1])
+
+    @property
+    def _tick_ns(self) -> int:
+        return round(TICK_NS / (1 + self.clock_error))
+
+    def _distorted(self, gyro: Floats, accel: Floats) -> tuple[Floats, Floats]:
+        if not self.distortions:
+            return gyro, accel
+        values = np.zeros((len(gyro), 7))
+        values[:, :3], values[:, 4:] = accel * 1000.0, gyro * 16.0
+        words: Words = np.clip(np.rint(values), -32768, 32767).astype(">i2")
+        for distort in self.distortions:
+            words = distort(words)
+        return words[:, 4:] / 16.0, words[:, :3] / 1000.0
+
+    def _learn_bias(self) -> None:
+        if len(self._recent) < REST_TICKS:
+            return
+        recent = self._recent
+        if np.abs(recent.mean(axis=0)).max() < REST_DPS and np.ptp(recent, axis=0).max() < 2 * REST_SPREAD_DPS:
+            self._bias_dps = recent.mean(axis=0)
+            self._registers[CALIB_STAT] = 0x30  # the gyro's part; in the IMU mode the others stay where they are
+
+    def _show(self, rate_dps: Floats, accel_g: Floats) -> None:
+        """Fill in the data registers; all units but degrees are bits of UNIT_SEL."""
+        units = self._registers[UNIT_SEL]
+        force = accel_g * (1000.0 if units & 0x01 else _G * 100.0)
+        gravity = self.inertial.up * (1000.0 if units & 0x01 else _G * 100.0)
+        rate = rate_dps * (radians(1.0) * 900.0 if units & 0x02 else 16.0)
+        angle = 900.0 * radians(1.0) if units & 0x04 else 16.0
+        heading_deg = -self._yaw_deg % 360.0  # turning clockwise increases it
+        words = np.zeros(22)
+        words[0:3], words[6:9], words[9] = force, rate, heading_deg * angle
+        words[12:16] = self._quaternion() * 2**14
+        words[16:19], words[19:22] = force - gravity, gravity
+        self._registers[ACC_DATA:TEMP] = np.clip(np.rint(words), -32768, 32767).astype("<i2").tobytes()
+        self._registers[TEMP] = round(self.temperature_c) & 0xFF
+
+    def _quaternion(self) -> Floats:
+        """Return the orientation as w, x, y, z: the tilt of this part, then the yaw about the vertical."""
+        x, y, z = self.inertial.up
+        half = np.array([1.0 + z, y, -x, 0.0])  # turns the sensor's vertical to the world's
+        tilt = half / np.linalg.norm(half)
+        c, s = cos(self._yaw_deg * pi / 360), sin(self._yaw_deg * pi / 360)
+        w, i, j, k = tilt
+        return np.array([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w])
