@@ -10,6 +10,7 @@ enrolled views is as good as one on a view.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Final
 
@@ -58,12 +59,21 @@ class DenseIndex:
         #: Rows of each object's views, padded by the first of them.
         self.rows = np.repeat(rows[begin][:, None], count.max(), axis=1)
         self.rows[inside] = rows
-        self._padded = ~inside
+        #: Where `rows` is padding, or a view that was left out.
+        self.left_out = ~inside
         self.azimuth_deg: FloatArray = views.azimuth_deg[self.rows]
         self._dead_deg = np.array([_spacing(own[ok]) / 2 for own, ok in zip(self.azimuth_deg, inside, strict=True)])
 
     def __len__(self) -> int:
         return len(self.object_index)
+
+    def without(self, views: IndexArray) -> "DenseIndex":
+        """Return an index that leaves out some views; each object must keep at least one."""
+        fewer = copy(self)
+        fewer.left_out = self.left_out | np.isin(self.rows, views)
+        if fewer.left_out.all(axis=1).any():
+            raise ValueError("an object would be left without any view; leave out fewer")
+        return fewer
 
     def support(self, similar: FloatArray, places: IndexArray, turned_deg: float) -> Floats:
         """Return what one query adds to every hypothesis of some objects.
@@ -83,7 +93,7 @@ class DenseIndex:
             For azimuths 0, 5, 10, ... at the first query.
         """
         own = similar.astype(np.float32)[self.rows[places]]
-        own[self._padded[places]] = -np.inf
+        own[self.left_out[places]] = -np.inf
         out = np.empty((len(places), BINS), np.float32)
         seen_deg = (np.arange(BINS) * _BIN_DEG + turned_deg)[None, :, None]
         slope = np.float32(self.omega / 360)

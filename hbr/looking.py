@@ -124,6 +124,28 @@ def next_look(
     return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, words)
 
 
+def most_informative_turn(belief: Belief, *, beta: float, rotations_deg: ArrayLike | None = None) -> float:
+    """Choose the turn whose view is expected to leave the least entropy of the object: a baseline for `next_look`.
+
+    If hypothesis h is true, the view after a turn is the one that was enrolled there, and hypothesis h' is then as
+    likely as exp(β T(view_h, view_h')) says.
+
+    Parameters
+    ----------
+    belief, beta, rotations_deg
+        As for `next_look`.
+    """
+    turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    probability, place, bin_of = _strongest(belief.posterior(beta))
+    similar = _expected(belief, place, bin_of, turns_deg)
+    weights = probability * np.exp(beta / np.sqrt(belief.queries + 1) * (similar - 1))
+    weights /= weights.sum(axis=2, keepdims=True)
+    objects = (place[:, None] == np.unique(place)).astype(np.float64)
+    shares = weights @ objects
+    entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=2)
+    return float(turns_deg[int((entropy @ probability).argmin())])
+
+
 def _all_turns() -> FloatArray:
     steps: FloatArray = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1)
     return steps * (360 / BINS)
@@ -156,5 +178,6 @@ def _expected(belief: Belief, place: IndexArray, bin_of: IndexArray, turns_deg: 
     places = belief.places[place]
     seen_deg = bin_of * (360.0 / BINS) + belief.turned_deg + turns_deg[:, None]
     own_deg = index.azimuth_deg[places]
-    nearest = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None])).argmin(axis=2)
+    away_deg = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None]))
+    nearest = np.where(index.left_out[places], np.inf, away_deg).argmin(axis=2)
     return index.compared.among(index.rows[places[None], nearest])

@@ -1,21 +1,32 @@
 """How queries are photographed, compared with the enrolled views."""
 
 from dataclasses import dataclass, field
-from typing import Final, Literal, TypeVar, get_args
+from functools import cache
+from typing import Final, Literal, NamedTuple, TypeVar, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hbr.arrays import ImageArray
+from hbr.descriptors import descriptor
 from hbr.evaluation.noise import Noise
+from hbr.evaluation.perturb import Perturbations
+from hbr.evaluation.scenes import Picture, other_bench, plain_bench
 
-Background = Literal["same", "uniform", "textured"]
+Background = Literal["same", "uniform", "textured", "bench", "other-bench"]
 _T = TypeVar("_T", np.uint8, np.float32)
 
 #: COIL's black background has sensor noise and the glow of its surroundings up to about here.
 _DARK: Final = 45
 _TEXTURE_OCTAVES: Final = (4, 8, 16, 32)
+
+
+class Shot(NamedTuple):
+    """An image, and the empty bench in the same light where there is one."""
+
+    image: ImageArray
+    empty: ImageArray | None = None
 
 
 @dataclass(frozen=True)
@@ -30,10 +41,16 @@ class Condition:
         Of the queries, applied at that size.
     rotation_deg : float
         Queries are turned in the image plane by a random angle up to this much to either side.
-    background : {"same", "uniform", "textured"}
-        What is behind a query's object instead of the dark surroundings.
+    background : {"same", "uniform", "textured", "bench", "other-bench"}
+        What is behind a query's object instead of the dark surroundings. ``bench`` puts enrolled objects and queries on
+        one plain bench, ``other-bench`` the queries on one of several others with patterns and clutter; both come with
+        a picture of the empty bench.
     prefilter_px : float
         Standard deviation of a Gaussian blur of all images, enrolled ones too, before they are described; 0 for none.
+    perturbations : Perturbations
+        Of the queries.
+    descriptor : str
+        What enrolled views and queries are described by.
     """
 
     size_px: int | None = None
@@ -41,6 +58,8 @@ class Condition:
     rotation_deg: float = 0.0
     background: Background = "same"
     prefilter_px: float = 0.0
+    perturbations: Perturbations = field(default_factory=Perturbations)
+    descriptor: str = "cedd"
 
     def __post_init__(self) -> None:
         if self.size_px is not None and self.size_px < 2:
@@ -51,14 +70,36 @@ class Condition:
             raise ValueError(f"a prefilter of {self.prefilter_px} pixels; at least 0 is needed")
         if self.background not in get_args(Background):
             raise ValueError(f"background {self.background!r} is unknown; use one of {', '.join(get_args(Background))}")
+        if (self.on_bench or self.perturbations) and (self.rotation_deg or self.background in ("uniform", "textured")):
+            raise ValueError(
+                "neither a rotation in the plane nor a uniform or textured background goes with perturbations or a "
+                "bench; leave one of them away"
+            )
+        descriptor(self.descriptor)
 
-    def enrolled(self, image_bgr: ImageArray) -> ImageArray:
-        """The image as it is enrolled."""
-        return self._prefiltered(self._sized(image_bgr))
+    @property
+    def on_bench(self) -> bool:
+        """Whether objects stand on a drawn bench."""
+        return self.background in ("bench", "other-bench")
 
-    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> ImageArray:
-        """The image as a query sees it; the same draws for the same generator state."""
+    def enrolled(self, image_bgr: ImageArray) -> Shot:
+        """The image as it is enrolled, and the empty bench."""
         image = self._sized(image_bgr)
+        empty: ImageArray | None = None
+        if self.on_bench:
+            image, empty = Perturbations().photograph(
+                image, object_mask(image), np.random.default_rng(0), _benches()[0]
+            )
+        return Shot(self._prefiltered(image), empty)
+
+    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> Shot:
+        """The image as a query sees it, and the empty bench; the same draws for the same generator state."""
+        image = self._sized(image_bgr)
+        if self.on_bench or self.perturbations:
+            first, *others = _benches()
+            bench = {"bench": first, "other-bench": others[int(rng.integers(len(others)))]}.get(self.background)
+            image, empty = self.perturbations.photograph(image, object_mask(image), rng, bench)
+            return Shot(self._prefiltered(self.noise.apply(image, rng)), empty)
         if self.rotation_deg or self.background != "same":
             mask = object_mask(image).astype(np.float32)
             if self.rotation_deg:
@@ -68,7 +109,7 @@ class Condition:
                 behind = _uniform(image, rng) if self.background == "uniform" else _textured(image, rng)
                 share = mask[:, :, None]
                 image = np.rint(share * image + (1 - share) * behind).astype(np.uint8)
-        return self._prefiltered(self.noise.apply(image, rng))
+        return Shot(self._prefiltered(self.noise.apply(image, rng)))
 
     def _sized(self, image_bgr: ImageArray) -> ImageArray:
         height, width = image_bgr.shape[:2]
@@ -94,6 +135,13 @@ def object_mask(image_bgr: ImageArray) -> NDArray[np.bool_]:
     labels = cv2.connectedComponents(cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1))[1]
     outside: NDArray[np.bool_] = labels[1:-1, 1:-1] == labels[0, 0]
     return ~outside
+
+
+@cache
+def _benches() -> tuple[Picture, ...]:
+    """The plain bench, and eight others."""
+    rng = np.random.default_rng(801)
+    return (plain_bench(rng), *(other_bench(rng) for _ in range(8)))
 
 
 def _turned(image: NDArray[_T], angle_deg: float) -> NDArray[_T]:

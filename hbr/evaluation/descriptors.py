@@ -5,32 +5,32 @@ from collections.abc import Iterator
 import numpy as np
 
 from hbr.arrays import ImageArray, LevelArray
-from hbr.cedd import describe
+from hbr.describing import describe
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, read_photograph
 from hbr.evaluation.draws import generator
 
 
 def enrolled_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int]) -> LevelArray:
-    """Descriptors of all views of object `j` as they are enrolled, uint8 (n, 144).
+    """Descriptors of all views of object `j` as they are enrolled, uint8 (n, length).
 
     Raises
     ------
     DatasetError
         A photograph cannot be used; `size` is the width and height that all must have.
     """
-    return np.stack([describe(condition.enrolled(image)) for image in _images(dataset, j, size)])
+    shots = (condition.enrolled(image) for image in _images(dataset, j, size))
+    return np.stack([describe(image, descriptor=condition.descriptor, reference=empty) for image, empty in shots])
 
 
 def query_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int) -> LevelArray:
-    """Descriptors of all views of object `j` as queries, uint8 (n, 144); each photograph has noise of its own."""
+    """Descriptors of all views of object `j` as queries, uint8 (n, length); each photograph has noise of its own."""
     name = dataset.objects[j].name
-    return np.stack(
-        [
-            describe(condition.query(image, generator(seed, name, "photograph", i)))
-            for i, image in enumerate(_images(dataset, j, size))
-        ]
+    shots = (
+        condition.query(image, generator(seed, name, "photograph", i))
+        for i, image in enumerate(_images(dataset, j, size))
     )
+    return np.stack([describe(image, descriptor=condition.descriptor, reference=empty) for image, empty in shots])
 
 
 def _images(dataset: Dataset, j: int, size: tuple[int, int]) -> Iterator[ImageArray]:

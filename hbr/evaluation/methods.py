@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 from hbr.hough import Extension
 
-Walk = Literal["random", "sweep-45", "sweep-90", "ahbr", "ahbr-90", "coin"]
+Walk = Literal["random", "sweep-45", "sweep-90", "ahbr", "ahbr-90", "coin", "look", "look-coin", "mutual", "oracle"]
 
 
 @dataclass(frozen=True)
@@ -19,13 +19,18 @@ class Method:
         By which it is asked for.
     label : str
         For tables and figures.
-    walk : {"random", "sweep-45", "sweep-90", "ahbr", "ahbr-90", "coin"}
-        How the next view is chosen: at random, at fixed steps, by Eq. 5-7, or by a coin with the step of Eq. 5-7.
-        These need two views: the second is a random one, or, of ``ahbr-90``, 90 degrees to the left as on the rig.
+    walk : str
+        How the next view is chosen. ``random``; ``sweep-45`` and ``sweep-90``: at fixed steps; ``ahbr``: by Eq. 5-7;
+        ``coin``: by a coin with the step of Eq. 5-7. These two need two views: the second is a random one, or, of
+        ``ahbr-90``, 90 degrees to the left as on the rig. Of the dense filter alone: ``look``, by `hbr.next_look`;
+        ``look-coin``: its turn to a side by a coin; ``mutual``: by mutual information; ``oracle``: the photograph after
+        which the true object, which it is told, leads most.
     omega, list_length, extension
-        As for `hbr.retrieve`.
+        As for `hbr.retrieve`, or for `hbr.DenseIndex`.
     views : int or None
         So many are looked at, whatever is allowed; None for no limit of its own.
+    dense : bool
+        Judged by the dense filter instead of the paper's voting.
     """
 
     name: str
@@ -35,6 +40,7 @@ class Method:
     list_length: int = 10
     extension: Extension = "orient_all"
     views: int | None = None
+    dense: bool = False
 
     @property
     def active(self) -> bool:
@@ -55,14 +61,25 @@ _LISTED: Final = (
     Method("sweep-45", "sweep 45°", walk="sweep-45"),
     Method("sweep-90", "sweep 90°", walk="sweep-90"),
 )
+_OMEGA: Final = 2.0
+_DENSE: Final = (
+    Method("dense", "dense filter, next look", "look", _OMEGA, dense=True),
+    Method("dense-coin", "dense filter, coin flip", "look-coin", _OMEGA, dense=True),
+    Method("dense-random", "dense filter, random", "random", _OMEGA, dense=True),
+    Method("dense-45", "dense filter, sweep 45°", "sweep-45", _OMEGA, dense=True),
+    Method("dense-90", "dense filter, sweep 90°", "sweep-90", _OMEGA, dense=True),
+    Method("dense-mutual", "dense filter, mutual information", "mutual", _OMEGA, dense=True),
+    Method("dense-oracle", "dense filter, oracle", "oracle", _OMEGA, dense=True),
+)
 _OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _LENGTHS: Final = (1, 2, 5, 10, 20, 50, 100)
 _OMEGA_SWEEP: Final = tuple(Method(f"omega-{omega:g}", f"HBR ω = {omega:g}", omega=omega) for omega in _OMEGAS)
 _LIST_SWEEP: Final = tuple(Method(f"list-{n}", f"HBR lists of {n}", list_length=n) for n in _LENGTHS)
 
-METHODS: Final = {method.name: method for method in (*_LISTED, *_OMEGA_SWEEP, *_LIST_SWEEP)}
+METHODS: Final = {method.name: method for method in (*_LISTED, *_DENSE, *_OMEGA_SWEEP, *_LIST_SWEEP)}
 GROUPS: Final[dict[str, tuple[Method, ...]]] = {
     "all": _LISTED,
+    "beyond": _DENSE,
     "omega-sweep": _OMEGA_SWEEP,
     "list-sweep": _LIST_SWEEP,
 }
@@ -83,7 +100,7 @@ def choose_methods(names: Iterable[str]) -> tuple[Method, ...]:
         elif name in METHODS:
             chosen[name] = METHODS[name]
         else:
-            listed = ", ".join([*GROUPS, *(method.name for method in _LISTED)])
+            listed = ", ".join([*GROUPS, *(method.name for method in (*_LISTED, *_DENSE))])
             raise ValueError(f"method {name!r} is unknown; use some of {listed}")
     if not chosen:
         raise ValueError("no method was asked for; use all for the whole comparison")

@@ -14,14 +14,18 @@ from numpy.typing import NDArray
 from hbr.active import Side, next_view
 from hbr.angles import wrap180
 from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.dense import Belief, DenseIndex, believe
+from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
 from hbr.hough import Ranking, retrieve
 from hbr.index import ViewIndex
-from hbr.tanimoto import tanimoto
+from hbr.looking import most_informative_turn, next_look
 from hbr.views import Views
 
 Removal = Literal["near", "paper79", "queries"]
+#: As for `Belief.posterior`.
+BETA: Final = 60.0
 _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
 
@@ -46,6 +50,9 @@ class Protocol:
         What the measured orientation gains with each view.
     seed : int
         Of all that is random.
+    enrolled : int or None
+        Of each object so many views stay enrolled, at equal distances, and queries are taken from the others; None for
+        all views, queries among them.
     """
 
     trials: int = 10
@@ -55,6 +62,7 @@ class Protocol:
     sigma_deg: float = 2.0
     drift_deg: float = 0.0
     seed: int = 0
+    enrolled: int | None = None
 
     def __post_init__(self) -> None:
         if self.trials < 1 or self.max_views < 1:
@@ -68,6 +76,8 @@ class Protocol:
             )
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; a whole number of at least 0 is needed")
+        if self.enrolled is not None and self.enrolled < 1:
+            raise ValueError(f"{self.enrolled} enrolled views; at least 1 is needed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +93,11 @@ class Runs:
     alike_error_deg : float64
         The same to the nearest orientation from which the object looks as it does from the true one.
     lead : float64
-        `hbr.lead` of the best object, a view.
+        `hbr.lead` of the best object, a view; nan of the dense filter.
+    score : float64
+        Score of the best object, a view.
+    posterior : float64
+        Probability of the best object by the dense filter; nan of the paper's voting.
     travelled_deg : float64
         Degrees turned since the first view, to either side.
     step_ns : int64
@@ -94,6 +108,8 @@ class Runs:
     pose_error_deg: FloatArray
     alike_error_deg: FloatArray
     lead: FloatArray
+    score: FloatArray
+    posterior: FloatArray
     travelled_deg: FloatArray
     step_ns: NDArray[np.int64]
 
@@ -101,8 +117,10 @@ class Runs:
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
         """Nothing looked at yet."""
         shape = (methods, objects, trials, views)
-        errors, alike, lead, travelled = np.full((4, *shape), np.nan)
-        return cls(np.full(shape, -1, np.int32), errors, alike, lead, travelled, np.zeros(shape, np.int64))
+        errors, alike, lead, score, posterior, travelled = np.full((6, *shape), np.nan)
+        return cls(
+            np.full(shape, -1, np.int32), errors, alike, lead, score, posterior, travelled, np.zeros(shape, np.int64)
+        )
 
     @classmethod
     def concatenate(cls, parts: Sequence["Runs"]) -> "Runs":
@@ -174,17 +192,23 @@ class _Trials:
         self._rows = views.of(object_index)
         self._azimuth_deg = views.azimuth_deg[self._rows]
         name = views.object_names[object_index]
+        self._enrolled = _enrolled(views, protocol.enrolled)
+        self._free = np.flatnonzero(~self._enrolled[self._rows]) if protocol.enrolled else np.arange(len(self._rows))
+        self._index: DenseIndex | None = None
         if len(queries) != len(self._rows):
             raise ValueError(f"{len(queries)} queries for the {len(self._rows)} views of {name}; one each is needed")
-        if len(self._rows) <= protocol.max_views:
+        if len(self._free) <= protocol.max_views:
             raise ValueError(
-                f"{name} has {len(self._rows)} views; for {protocol.max_views} queries it needs more than that"
+                f"{name} has {len(self._free)} views; for {protocol.max_views} queries it needs more that are free"
             )
         self._ring = np.argsort(self._azimuth_deg, kind="stable")
         own = views.descriptors[self._rows]
-        self._alike = _looks_alike(own, self._ring)
-        self._own_similar = tanimoto(queries, own)
-        similar = tanimoto(queries, views.descriptors)
+        compared = descriptor(views.descriptor)
+        self._alike = _looks_alike(compared.similarity(own, own), self._ring)
+        similar = compared.similarity(queries, views.descriptors)
+        similar[:, ~self._enrolled] = -np.inf
+        self._similar = similar
+        self._own_similar = similar[:, self._rows]
         objects = range(len(views.object_names))
         self._reach = np.stack([similar[:, views.of(j)].max(axis=1, initial=-np.inf) for j in objects])
 
@@ -192,7 +216,7 @@ class _Trials:
         rng = generator(self._protocol.seed, self._views.object_names[self._object], "trial", trial)
         count = self._protocol.max_views
         return _Draws(
-            order=rng.permutation(len(self._rows))[:count],
+            order=rng.permutation(self._free)[:count],
             error_deg=rng.normal(0, self._protocol.sigma_deg, count) + self._protocol.drift_deg * np.arange(count),
             coins=rng.random(count) < 0.5,
         )
@@ -201,6 +225,9 @@ class _Trials:
         self, method: Method, draws: _Draws, models: dict[bytes, Views], runs: Runs, at: tuple[int, int, int]
     ) -> None:
         """Fill in the results of one trial by one method."""
+        if method.dense:
+            self._run_dense(method, draws, runs, at)
+            return
         seen = [int(draws.order[0])]
         travelled_deg = 0.0
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
@@ -223,14 +250,67 @@ class _Trials:
             )
             following = self._next(method, draws, seen, ranking) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
-            self._judge(ranking, seen, keep, runs, (*at, n))
+            self._judge(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            self._judge_lead(ranking, seen, keep, runs, (*at, n))
             runs.travelled_deg[*at, n] = travelled_deg
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
 
+    def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
+        if self._index is None or self._index.omega != method.omega:
+            self._index = DenseIndex(self._views.select(self._enrolled), omega=method.omega)
+        seen = [int(draws.order[0])]
+        travelled_deg = 0.0
+        last = min(self._protocol.max_views, method.views or self._protocol.max_views)
+        for n in range(last):
+            keep = self._keep(np.array(seen))
+            index = self._index if self._protocol.enrolled else self._index.without(self._rows[~keep])
+            measured_deg = (self._azimuth_deg[seen] + draws.error_deg[: n + 1]).tolist()
+            # the views near to the newest query left the model for the queries before, too
+            belief: Belief | None = None
+            for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
+                belief = believe(self._queries[i], angle_deg, index, before=belief)
+            start_ns = self._now_ns()
+            belief = believe(self._queries[seen[-1]], measured_deg[-1], index, before=belief)
+            following = self._next_dense(method, draws, seen, belief) if n + 1 < last else seen[-1]
+            runs.step_ns[*at, n] = self._now_ns() - start_ns
+            ranking = belief.ranking()
+            self._judge(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            runs.score[*at, n] = ranking.scores[0]
+            runs.posterior[*at, n] = belief.posterior(BETA).sum(axis=1).max()
+            runs.travelled_deg[*at, n] = travelled_deg
+            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
+            seen.append(following)
+
+    def _next_dense(self, method: Method, draws: _Draws, seen: list[int], belief: Belief) -> int:
+        match method.walk:
+            case "look":
+                return self._nearest(seen, next_look(belief, beta=BETA).rotation_deg)
+            case "look-coin":
+                turn_deg = abs(next_look(belief, beta=BETA).rotation_deg)
+                return self._nearest(seen, turn_deg if draws.coins[len(seen)] else -turn_deg)
+            case "mutual":
+                return self._nearest(seen, most_informative_turn(belief, beta=BETA))
+            case "oracle":
+                return self._told(seen, belief)
+            case _:
+                if method.walk in _STEP_DEG:
+                    return self._nearest(seen, _STEP_DEG[method.walk])
+                return int(draws.order[len(seen)])
+
+    def _told(self, seen: list[int], belief: Belief) -> int:
+        """The photograph after which the true object leads most, of every third."""
+        left = np.setdiff1d(self._free, seen)[::3]
+        leads = []
+        for i in left.tolist():
+            scores = believe(self._queries[i], float(self._azimuth_deg[i]), belief.index, before=belief).scores()
+            own = belief.index.object_index[belief.places] == self._object
+            leads.append(scores[own].max(initial=-np.inf) - scores[~own].max(initial=-np.inf))
+        return int(left[int(np.argmax(leads))])
+
     def _keep(self, seen: IndexArray) -> NDArray[np.bool_]:
         """Which of the object's views stay enrolled after these queries."""
-        keep = np.ones(len(self._rows), np.bool_)
+        keep = self._enrolled[self._rows].copy()
         keep[seen] = False
         match self._protocol.removal:
             case "near":
@@ -249,7 +329,7 @@ class _Trials:
         return keep
 
     def _without(self, keep: NDArray[np.bool_]) -> Views:
-        mask = np.ones(len(self._views), np.bool_)
+        mask = self._enrolled.copy()
         mask[self._rows] = keep
         return self._views.select(mask)
 
@@ -262,11 +342,26 @@ class _Trials:
             turn_deg = _STEP_DEG[method.walk]
         else:
             return int(draws.order[len(seen)])
-        away_deg = np.abs(wrap180(self._azimuth_deg - (self._azimuth_deg[seen[-1]] + turn_deg)))
+        return self._nearest(seen, turn_deg)
+
+    def _nearest(self, seen: list[int], turn_deg: float) -> int:
+        """The photograph nearest to a turn from the last one, of those not yet looked at nor enrolled for good."""
+        away_deg = np.full(len(self._rows), np.inf)
+        away_deg[self._free] = np.abs(wrap180(self._azimuth_deg[self._free] - (self._azimuth_deg[seen[-1]] + turn_deg)))
         away_deg[seen] = np.inf
         return int(away_deg.argmin())
 
     def _judge(
+        self, objects: IndexArray, pose_deg: FloatArray, seen: list[int], runs: Runs, at: tuple[int, int, int, int]
+    ) -> None:
+        place = np.flatnonzero(objects == self._object)
+        runs.rank[at] = place[0] + 1 if len(place) else 0
+        if len(place):
+            away_deg = np.abs(wrap180(pose_deg[place[0]] - self._azimuth_deg))
+            runs.pose_error_deg[at] = away_deg[seen[-1]]
+            runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
+
+    def _judge_lead(
         self,
         ranking: Ranking,
         seen: list[int],
@@ -274,12 +369,7 @@ class _Trials:
         runs: Runs,
         at: tuple[int, int, int, int],
     ) -> None:
-        place = np.flatnonzero(ranking.object_index == self._object)
-        runs.rank[at] = place[0] + 1 if len(place) else 0
-        if len(place):
-            away_deg = np.abs(wrap180(ranking.pose_deg[place[0]] - self._azimuth_deg))
-            runs.pose_error_deg[at] = away_deg[seen[-1]]
-            runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
+        runs.score[at] = ranking.scores[0] / len(seen)
         # hbr.lead, of similarities computed once for all trials
         reach = self._reach[:, seen].sum(axis=1)
         reach[self._object] = self._own_similar[seen][:, keep].max(axis=1).sum()
@@ -287,9 +377,23 @@ class _Trials:
         runs.lead[at] = (ranking.scores[0] - reach.max()) / len(seen)
 
 
-def _looks_alike(own: LevelArray, ring: IndexArray) -> NDArray[np.bool_]:
+def _enrolled(views: Views, count: int | None) -> NDArray[np.bool_]:
+    """The views nearest to `count` equally spaced azimuths of every object; all without a count."""
+    mask = np.ones(len(views), np.bool_)
+    if count is None:
+        return mask
+    mask[:] = False
+    wanted_deg = np.arange(count) * 360 / count
+    for j in range(len(views.object_names)):
+        rows = views.of(j)
+        away_deg = np.abs(wrap180(views.azimuth_deg[rows][:, None] - wanted_deg))
+        if len(rows):
+            mask[rows[away_deg.argmin(axis=0)]] = True
+    return mask
+
+
+def _looks_alike(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
     """Of each view, the views that are as similar to it as the less similar of its neighbours on the ring, (n, n)."""
-    similar = tanimoto(own, own)
     before, after = np.empty_like(ring), np.empty_like(ring)
     before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)
     rows = np.arange(len(ring))

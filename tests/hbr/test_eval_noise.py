@@ -86,7 +86,7 @@ def test_the_mask_is_the_object_with_its_dark_parts() -> None:
 @pytest.mark.parametrize("background", ["uniform", "textured"])
 def test_a_background_changes_what_is_behind_the_object_alone(background: str) -> None:
     image = ball()
-    query = Condition(background=background).query(image, np.random.default_rng(2))  # type: ignore[arg-type]
+    query = Condition(background=background).query(image, np.random.default_rng(2)).image  # type: ignore[arg-type]
     mask = object_mask(image)
     np.testing.assert_array_equal(query[mask], image[mask])
     behind = query[~mask].astype(float)
@@ -97,7 +97,7 @@ def test_a_background_changes_what_is_behind_the_object_alone(background: str) -
 def test_a_turned_query_shows_the_object_turned() -> None:
     image = np.zeros((65, 65, 3), np.uint8)
     image[28:37, 10:55] = 200
-    query = Condition(rotation_deg=180).query(image, np.random.default_rng(3))
+    query = Condition(rotation_deg=180).query(image, np.random.default_rng(3)).image
     y, x = np.nonzero(query[:, :, 0] > 100)
     spread = np.linalg.eigvalsh(np.cov(x, y)) ** 0.5
     np.testing.assert_allclose(spread, [9 / 12**0.5, 45 / 12**0.5], rtol=0.06)
@@ -108,9 +108,9 @@ def test_a_turned_query_shows_the_object_turned() -> None:
 def test_sizes_and_prefilter_are_of_both_sides_and_noise_of_queries_alone() -> None:
     condition = Condition(size_px=96, noise=Noise.parse("gn"), prefilter_px=2.0)
     image = ball()
-    enrolled, query = condition.enrolled(image), condition.query(image, np.random.default_rng(0))
+    enrolled, query = condition.enrolled(image).image, condition.query(image, np.random.default_rng(0)).image
     assert enrolled.shape == query.shape == (96, 96, 3)
-    rough = Condition(size_px=96).enrolled(image)
+    rough = Condition(size_px=96).enrolled(image).image
     assert np.abs(np.diff(enrolled.astype(int), axis=0)).max() < np.abs(np.diff(rough.astype(int), axis=0)).max() / 2
     assert (enrolled != query).any()
 
