@@ -58,7 +58,7 @@ def unfit(state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again
     }
     if nonsense := incredible(state):
         return DeviceFault(
-            f"The servo's readings cannot be true: {', '.join(nonsense)}.",
+            f"The servo's readings cannot be true: {nonsense[0]}.",
             next_step="Check its cable, then `rig acknowledge --reboot`; a servo that goes on like this is broken.",
             evidence={"readings": nonsense},
         )

@@ -17,6 +17,7 @@ from rig.bench import Bench
 from rig.catalog import Catalog, StoredView
 from rig.catalog.queries import stored_views
 from rig.catalog.schema import enrollments, views
+from rig.clock import seconds_between
 from rig.config import load_config
 from rig.errors import RigError
 from rig.plans.enroll import enroll
@@ -93,7 +94,7 @@ def new_rig(folder: Path, *settings: str, seed: int = 7) -> Iterator[Rig]:
 
 @dataclass
 class Outcome:
-    """How a plan ended: with an answer or an error; ``found_s`` is how long after the first fault it ended."""
+    """How a plan ended: with an answer or an error; ``found_s`` is from the first fault to the end, torque off."""
 
     events: list[Event] = field(default_factory=list)
     error: RigError | None = None
@@ -109,33 +110,32 @@ class Outcome:
         return {event.index for event in self.events if isinstance(event, Accepted)}
 
 
-def enrollment(rig: Rig, *faults: str, resume: bool = False, replace: bool = False, views: int = VIEWS) -> Outcome:
+@contextmanager
+def _judged(rig: Rig) -> Iterator[Outcome]:
+    """Yield the outcome to be filled in, and take an error for what it is: one."""
     outcome = Outcome()
     try:
-        with rig.opened(*faults) as (bench, catalog):
-            plan = enroll(bench, catalog, NAME, views=None if resume else views, resume=resume, replace=replace)
-            outcome.events.extend(plan)
+        yield outcome
     except RigError as error:
         outcome.error = error
-    _time(rig, outcome)
+    began_ns = next((occurrence.time_ns for occurrence in rig.faults.history if occurrence.began), None)
+    if began_ns is not None:
+        outcome.found_s = seconds_between(began_ns, rig.world.clock.now_ns())
+
+
+def enrollment(rig: Rig, *faults: str, resume: bool = False, replace: bool = False, views: int = VIEWS) -> Outcome:
+    with _judged(rig) as outcome, rig.opened(*faults) as (bench, catalog):
+        outcome.events.extend(
+            enroll(bench, catalog, NAME, views=None if resume else views, resume=resume, replace=replace)
+        )
     return outcome
 
 
 def identification(rig: Rig, *faults: str, yaw_deg: float = 77.0) -> Outcome:
     rig.operator.next_object, rig.operator.yaw_deg = NAME, yaw_deg
-    outcome = Outcome()
-    try:
-        with rig.opened(*faults) as (bench, _):
-            outcome.events.extend(identify(bench, known_views()))
-    except RigError as error:
-        outcome.error = error
-    _time(rig, outcome)
+    with _judged(rig) as outcome, rig.opened(*faults) as (bench, _):
+        outcome.events.extend(identify(bench, known_views()))
     return outcome
-
-
-def _time(rig: Rig, outcome: Outcome) -> None:
-    began = [occurrence.time_ns for occurrence in rig.faults.history if occurrence.began]
-    outcome.found_s = (rig.world.clock.now_ns() - began[0]) * 1e-9 if began else 0.0
 
 
 @cache
@@ -149,11 +149,17 @@ def known_views() -> hbr.ViewIndex:
 
 
 def check_stored(
-    rig: Rig, expected: set[int], *, tolerance_deg: float, planned: int = VIEWS, offset: bool = False
+    rig: Rig,
+    expected: set[int],
+    *,
+    tolerance_deg: float,
+    planned: int = VIEWS,
+    offset: bool = False,
+    shown: bool = True,
 ) -> None:
     """Check that exactly the expected views are stored, each whole, and each at the angle that its picture carries.
 
-    With ``offset``, all of them may be off by the same angle.
+    With ``offset``, all of them may be off by the same angle; with ``shown`` false, pictures may show no angle.
     """
     with Catalog.open(rig.folder, clock=rig.world.clock) as catalog:
         stored = newest_views(catalog)
@@ -162,8 +168,8 @@ def check_stored(
         for view in stored:
             image = catalog.read_image(view)
             true_deg = coded_deg(image)
-            assert true_deg is not None, f"view {view.record.index} shows no object"
-            off_deg = float(wrap180(view.record.azimuth_deg + true_deg - zero_deg))
+            assert true_deg is not None or not shown, f"view {view.record.index} shows no object"
+            off_deg = 0.0 if true_deg is None else float(wrap180(view.record.azimuth_deg + true_deg - zero_deg))
             if offset and view is stored[0]:
                 zero_deg, off_deg = off_deg, 0.0
             assert abs(off_deg) <= tolerance_deg, f"view {view.record.index} is {off_deg:+.2f}° off"

@@ -52,6 +52,8 @@ class Scenario:
         What the operator does first, in words.
     step
         Without which nothing moves afterwards.
+    shown
+        Whether the stored pictures show the object, and so its angle.
     torque
         Whether the servo must be left holding the shaft: it cannot be told anything.
     """
@@ -64,6 +66,7 @@ class Scenario:
     answer: int | str | None = FOUND
     then: str = ""
     step: Step | None = None
+    shown: bool = True
     torque: bool = False
 
     @property
@@ -205,6 +208,7 @@ SCENARIOS: dict[str, Scenario] = {
             "put the object back",
             after=After.REPLACE,
             answer=FOUND,
+            shown=False,
         ),
         stopped("disk_full@move20", 700, "the write that is to be durable", "free some space", answer=FOUND),
         survived(

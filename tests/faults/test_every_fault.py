@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from document import SLACK_S, documented, goes_on, identification_cell, masked, message, sentence
 from fault_runs import (
     NAME,
     VIEWS,
@@ -23,12 +24,17 @@ from sim.faults import kinds
 
 TOLERANCE_DEG = 0.5
 """Half the play, the encoder's noise, and a slip too small to be told from the gyro's error over 5°."""
+UPDATE = "docs/faults.md is not what is: look at the difference, then python tests/faults/document.py"
 VIEWS_AGAIN = 12
 """Of an object that is enrolled anew."""
 
 
-def test_there_is_a_scenario_for_every_fault() -> None:
+def test_there_is_a_scenario_and_a_row_of_the_page_for_every_fault() -> None:
     assert set(SCENARIOS) == set(kinds())
+    assert list(documented()) == list(kinds())
+    for name, cells in documented().items():
+        assert cells[1:3] == (kinds()[name].what, sentence(SCENARIOS[name].found)), UPDATE
+        assert cells[5] == goes_on(SCENARIOS[name]), UPDATE
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -37,11 +43,15 @@ def test_an_enrollment_is_completed_or_stopped_with_nothing_lost_and_no_wrong_an
     with new_rig(tmp_path) as rig:
         outcome = enrollment(rig, scenario.fault)
         assert outcome.code == scenario.code, outcome.error
+        cells = documented()[name]
+        assert masked(cells[4]) == masked(message(outcome)), UPDATE
+        if scenario.code is not None:
+            assert outcome.found_s <= float(cells[3].removesuffix(" s")) + SLACK_S, UPDATE
         assert enrolled(outcome) == (scenario.code is None)
         assert rig.torque == scenario.torque
         check_stands(rig)
         if outcome.stored:
-            check_stored(rig, outcome.stored, tolerance_deg=TOLERANCE_DEG)
+            check_stored(rig, outcome.stored, tolerance_deg=TOLERANCE_DEG, shown=scenario.shown)
         if scenario.code is None:
             assert outcome.stored == set(range(VIEWS))
             return
@@ -79,6 +89,7 @@ def test_an_identification_names_the_object_or_is_stopped(tmp_path: Path, name: 
     with new_rig(tmp_path) as rig:
         outcome = identification(rig, scenario.of_identification)
         assert rig.faults.history, "the fault did not happen"
+        assert documented()[name][6] == identification_cell(outcome), UPDATE
         identified = answer(outcome)
         if isinstance(scenario.answer, int):
             assert outcome.code == scenario.answer, outcome.error
