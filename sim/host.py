@@ -46,7 +46,7 @@ class Computer:
         """Add a process with device files open."""
         self.write(f"proc/{pid}/cmdline", command.replace(" ", "\0") + "\0")
         for number, path in enumerate(holds, start=3):
-            self.link(f"proc/{pid}/fd/{number}", self.root / path.lstrip("/"))
+            self.link(f"proc/{pid}/fd/{number}", (self.root / path.lstrip("/")).resolve())
 
     def serial_port(
         self,

@@ -8,7 +8,7 @@ import numpy as np
 
 from rig.config import ImuConfig
 from rig.devices.imu import Imu, ImuSamples
-from rig.devices.mpu6050 import Mpu6050
+from rig.devices.open_imu import open_imu
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, warning
 from rig.doctor.scan import FoundImu, scan_imus
@@ -37,15 +37,7 @@ def imu(case: Case) -> Iterator[Finding]:
     if here is None or here.driver is None:
         yield _wrong(case, config, here, there)
         return
-    with closing(
-        Mpu6050(
-            case.host.i2c_path(config.bus),
-            address=config.address,
-            clock=case.host.clock,
-            range_dps=config.range_dps,
-            rate_hz=config.rate_hz,
-        )
-    ) as sensor:
+    with closing(open_imu(config, case.host.i2c_path(config.bus), case.host.clock)) as sensor:
         identity = sensor.identity
         case.identities["imu"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         bus = case.host.i2c_name(config.bus)

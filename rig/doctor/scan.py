@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from errno import EBUSY, ENXIO, EREMOTEIO
 
 import serial
-from dynamixel_sdk import COMM_RX_CORRUPT, Protocol2PacketHandler
+from dynamixel_sdk import Protocol2PacketHandler
 from smbus2 import SMBus
 
 from rig.clock import Clock
@@ -23,6 +23,7 @@ BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9
 
 _ANSWER_1_S = 0.02
 """How long a servo of Protocol 1.0 and its adapter take to answer; each id is asked by itself there."""
+_PING_ANSWER = 14
 _LISTEN_S = 0.05
 _STATUS_READS = 8
 _STATUS = (120, 27)
@@ -103,21 +104,51 @@ def spoiled_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) ->
 
 
 def _heard_2(port: ClockedPort, baud: int) -> Heard:
+    listening = _Recording(port)
     try:
-        answers, result = Protocol2PacketHandler().broadcastPing(port)
+        answers, _ = Protocol2PacketHandler().broadcastPing(listening)
     except LineBabble:
         return Heard(baud, 2, noise=True)
-    finally:
-        port.is_using = False
     port.drain()
     if _unasked(port):
         return Heard(baud, 2, noise=True)
     servos = [_servo(bus_id, baud, 2, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
     bus = DynamixelBus(port, retries=0)
     doubtful = [servo.bus_id for servo in servos if spoiled_reads(bus, servo.bus_id) > _STATUS_READS // 2]
-    if result == COMM_RX_CORRUPT:  # the answers of servos with one id fall into each other: each id is asked by itself
-        doubtful += [bus_id for bus_id in range(253) if bus_id not in answers and _spoils(bus, bus_id)]
-    return Heard(baud, 2, tuple(servos), tuple(sorted(doubtful)), result == COMM_RX_CORRUPT and not doubtful)
+    # The SDK leaves out what it cannot read, and calls that a success. The answers of servos with one id fall into each
+    # other: where more bytes came than belong to whole answers, each id is asked by itself.
+    rest = len(listening.answered) - _PING_ANSWER * len(answers)
+    for bus_id in (bus_id for bus_id in range(253) if rest and bus_id not in answers):
+        try:
+            head = bus.read_block(bus_id, 0, 7)
+        except (DeviceRefused, DeviceSilent):
+            doubtful += [bus_id] if _spoils(bus, bus_id) else []
+        else:  # its answer to all was spoiled, that to the question of its own is not
+            servos.append(_servo(bus_id, baud, 2, int.from_bytes(head[:2], "little"), head[6]))
+    sound = tuple(servo for servo in servos if servo.bus_id not in doubtful)
+    return Heard(baud, 2, sound, tuple(sorted(doubtful)), bool(rest) and not doubtful and not sound)
+
+
+class _Recording(ClockedPort):
+    """A port that keeps what came, but for the instruction itself, which some adapters echo."""
+
+    def __init__(self, port: ClockedPort) -> None:
+        super().__init__(port.ser, port.clock)
+        self._heard = bytearray()
+        self._sent = b""
+
+    @property
+    def answered(self) -> bytes:
+        return bytes(self._heard).removeprefix(self._sent)
+
+    def writePort(self, packet: list[int]) -> int:  # noqa: N802 - the SDK's names
+        self._sent = bytes(packet)
+        return super().writePort(packet)
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        data = super().readPort(length)
+        self._heard += data
+        return data
 
 
 def _heard_1(port: ClockedPort, baud: int) -> Heard:
