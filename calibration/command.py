@@ -8,6 +8,8 @@ import typer
 from rig.cli.command import Settings, command
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rig.bench import Bench
     from rig.facts import Fact
 
@@ -16,54 +18,105 @@ EXIT_QUALITY = 6
 app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 
 
+@app.command("servo")
+@command
+def servo(
+    settings: Settings,
+    reversals: Annotated[int, typer.Option(min=6, help="Reversals by which the play is measured.")] = 24,
+    turns: Annotated[int, typer.Option(min=1, help="Turns over which the encoder is compared.")] = 2,
+    rounds: Annotated[int, typer.Option(min=2, help="Rounds of timed moves.")] = 3,
+) -> None:
+    """Calibrate sense and ratio, play, encoder and motion of the servo; some minutes, exit code 6 if one fails.
+
+    Example: rig calibrate servo --bench sim
+    """
+    from calibration import backlash, encoder, motion_model
+
+    run(
+        settings,
+        lambda bench: backlash.live(bench, reversals=reversals),
+        lambda bench: encoder.live(bench, turns=turns),
+        lambda bench: motion_model.live(bench, rounds=rounds),
+    )
+
+
 @app.command("imu")
 @command
 def imu(
     settings: Settings,
     turns: Annotated[int, typer.Option(min=4, help="Whole turns at least, both ways together.")] = 8,
+    minutes: Annotated[float, typer.Option(min=3.0, help="How long the gyro is listened to at rest.")] = 20.0,
 ) -> None:
-    """Calibrate the gyro's scale by whole turns of the table; takes about a minute, exit code 6 if it fails.
+    """Calibrate the gyro's scale, its mounting, and its noise at rest; half an hour, exit code 6 if one fails.
 
     Example: rig calibrate imu --bench sim --turns 12
     """
-    from calibration.gyro_scale import live
+    from calibration import gyro_noise, gyro_scale, imu_mounting
 
-    run(settings, lambda bench: live(bench, turns=turns))
+    run(
+        settings,
+        lambda bench: gyro_scale.live(bench, turns=turns),
+        imu_mounting.live,
+        lambda bench: gyro_noise.live(bench, minutes=minutes),
+    )
 
 
-def run(settings: Settings, procedure: "Callable[[Bench], Generator[Any, None, Fact]]") -> None:
-    """Run one calibration on the bench, keep its fact, passed or not, and say how it went.
+def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None, Fact]]") -> None:
+    """Run calibrations on the bench one after the other, keep each fact, passed or not, and say how it went.
+
+    What passed is in force for the next one. The first that does not pass ends the row.
 
     Raises
     ------
     typer.Exit
-        With code 6 when the calibration did not pass.
+        With code 6 when a calibration did not pass.
     """
-    from rig.cli.present import line
-    from rig.facts import Fact, FactStore
-    from rig.plans.events import event_dict, plain
+    from rig.bench import calibrate
+    from rig.facts import FactStore
 
     with settings.open_bench() as bench:
         store = FactStore(bench.config.calibration_path(bench.name))
-        events = procedure(bench)
-        try:
-            for event in events:
-                if isinstance(event, Fact):
-                    fact = event
-                elif settings.json:
-                    settings.print_json(event_dict(event))
-                else:
-                    print(line(event), flush=True)
-        finally:
-            events.close()
-    path = store.keep(fact)
-    if settings.json:
-        settings.print_json({"event": "calibrated", "passed": fact.passed, "file": str(path), **plain(fact)})
-    else:
-        print(verdict(fact))
-        print(f"Kept in {path}" + (", in force from now on." if fact.passed else "; what was in force stays so."))
-    if not fact.passed:
-        raise typer.Exit(EXIT_QUALITY)
+        for procedure in procedures:
+            fact = _told(settings, procedure(bench))
+            path = store.keep(fact)
+            if settings.json:
+                _print_json(settings, fact, path)
+            else:
+                print(verdict(fact))
+                print(
+                    f"Kept in {path}" + (", in force from now on." if fact.passed else "; what was in force stays so.")
+                )
+            if not fact.passed:
+                raise typer.Exit(EXIT_QUALITY)
+            calibrate(bench, store)
+
+
+def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Fact":
+    """Tell the events of a procedure as they come, and return its fact."""
+    from calibration.events import Progress
+    from rig.cli.present import line
+    from rig.facts import Fact
+    from rig.plans.events import event_dict
+
+    fact: Fact | None = None
+    try:
+        for event in events:
+            if isinstance(event, Fact):
+                fact = event
+            elif settings.json:
+                settings.print_json(event_dict(event))
+            else:
+                print(event.words if isinstance(event, Progress) else line(event), flush=True)
+    finally:
+        events.close()
+    assert fact is not None, "a procedure ends with its fact"
+    return fact
+
+
+def _print_json(settings: Settings, fact: "Fact", path: "Path") -> None:
+    from rig.plans.events import plain
+
+    settings.print_json({"event": "calibrated", "passed": fact.passed, "id": fact.id, "file": str(path), **plain(fact)})
 
 
 def verdict(fact: "Fact") -> str:

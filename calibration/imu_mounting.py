@@ -202,7 +202,9 @@ def _judge_tilt(tilt_deg: float, axis: NDArray[np.float64], column: int) -> list
     ]
 
 
-def _levels(levels: Sequence[Level], axis: NDArray[np.float64], tilt_sigma: Mapping[int, float]) -> dict[str, Estimate]:
+def _levels(
+    levels: Sequence[Level], axis: NDArray[np.float64], column: int, tilt_sigma: Mapping[int, float]
+) -> dict[str, Estimate]:
     """Return the accelerometer's zero errors (g), and the table's axis out of the vertical (°)."""
     turn = np.radians([level.table_deg for level in levels])
     readings = np.array([level.mean_g for level in levels])

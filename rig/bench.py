@@ -64,6 +64,7 @@ class Bench(AbstractContextManager["Bench"]):
     wires: ExitStack = field(default_factory=ExitStack, repr=False)
     safety: Safety = field(init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)
+    _as_opened: tuple[RigConfig, tuple[str, ...]] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.safety = Safety(self.servo, self.config, self.clock, self.state)
@@ -191,21 +192,29 @@ def open_servo(name: str | None = None, config: RigConfig | None = None, *, seed
 def calibrate(bench: Bench, store: FactStore) -> None:
     """Put the bench's calibrations in force; what has expired or belongs to other devices becomes a finding.
 
+    A second call takes what was calibrated meanwhile.
+
     Raises
     ------
     ConfigError
         A calibration sets what the configuration does not take.
     """
+    bench._as_opened = bench._as_opened or (bench.config, bench.findings)
+    config, findings = bench._as_opened
     standings = store.standings(bench.apparatus(), bench.clock.utc())
     facts = [standing.fact for standing in standings if standing.state is State.IN_FORCE]
-    bench.config, told = put_in_force(bench.config, facts)
+    bench.config, told = put_in_force(config, facts)
     bench.safety.reference.calibrate(bench.config.table)
     bench.conditions = {**bench.conditions, CALIBRATIONS: [fact.id for fact in facts]}
-    bench.findings += told + tuple(error.what for error in store.unreadable)
-    bench.findings += tuple(
-        f"{standing.words}; calibrate again with `{standing.command}`"
-        for standing in standings
-        if standing.state is not State.IN_FORCE
+    bench.findings = (
+        *findings,
+        *told,
+        *(error.what for error in store.unreadable),
+        *(
+            f"{standing.words}; calibrate again with `{standing.command}`"
+            for standing in standings
+            if standing.state is not State.IN_FORCE
+        ),
     )
 
 

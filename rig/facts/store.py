@@ -68,20 +68,25 @@ class FactStore:
                 next_step="Set calibration_dir to a folder that you may write to.",
                 evidence={"reason": error.strerror or str(error)},
             ) from error
-        path = self.folder / f"{fact.when_utc:%Y%m%dT%H%M%S.%fZ}-{fact.name}.json"
+        # Numbered in the order in which they were kept: a clock may be set back, and a simulated one runs ahead.
+        number = 1 + max((int(path.name.partition("-")[0]) for path in self._files()), default=0)
+        path = self.folder / f"{number:05d}-{fact.name}-{fact.when_utc:%Y%m%dT%H%M%SZ}.json"
         fact.to_file(path)
         return path
 
     def history(self, name: str | None = None) -> list[Fact]:
-        """Return all facts, of all kinds or one, oldest first."""
+        """Return all facts, of all kinds or one, in the order in which they were kept."""
         self.unreadable = []
         facts = []
-        for path in sorted(self.folder.glob("*.json")):
+        for path in self._files():
             try:
                 facts.append(Fact.from_file(path))
             except ConfigError as error:
                 self.unreadable.append(error)
-        return sorted((f for f in facts if name in (None, f.name)), key=lambda f: f.when_utc)
+        return [fact for fact in facts if name in (None, fact.name)]
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("[0-9]*-*.json"))
 
     def standings(self, device: Mapping[str, Any], now_utc: datetime) -> list[Standing]:
         """Return how the bench with these devices stands with each kind of calibration, by name.

@@ -26,13 +26,15 @@ def test_the_help_has_an_example_and_the_group_lists_the_procedure(rig):
 
 
 def test_what_passed_is_kept_and_in_force_from_then_on(rig, tmp_path):
-    done = rig("calibrate", "imu", "--turns", "4", "--seed", "6")
+    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--seed", "6")
     assert done.exit_code == 0, done.output
-    assert done.stdout.count("by the gyro") == 5
-    assert "PASS imu.scale" in done.stdout
-    (path,) = (tmp_path / "facts" / "sim").iterdir()
-    assert path.name in "".join(done.stdout.split())
-    assert Fact.from_file(path).device["imu"]["range_dps"] == 250
+    paths = sorted((tmp_path / "facts" / "sim").iterdir())
+    facts = [Fact.from_file(path) for path in paths]
+    assert [fact.name for fact in facts] == ["imu.scale", "imu.mounting", "imu.noise"]
+    for path, fact in zip(paths, facts, strict=True):
+        assert f"PASS {fact.name}" in done.stdout
+        assert path.name in "".join(done.stdout.split())
+    assert facts[0].device["imu"]["range_dps"] == 250
     told = json.loads(rig("goto", "90", "--seed", "6", "--json").stdout)
     assert told["agrees"] is True
     assert told["bound_deg"] < 1.5
@@ -41,23 +43,35 @@ def test_what_passed_is_kept_and_in_force_from_then_on(rig, tmp_path):
 
 
 def test_json_is_one_object_a_line_and_ends_with_the_fact(rig):
-    done = rig("calibrate", "imu", "--turns", "4", "--seed", "6", "--json")
-    *moves, fact = [json.loads(line) for line in done.stdout.splitlines()]
-    assert {event["event"] for event in moves} == {"moved"}
-    assert (fact["event"], fact["passed"], fact["refusals"]) == ("calibrated", True, [])
-    assert fact["estimates"]["scale"]["uncertainty"] < 1.5e-4
+    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--seed", "6", "--json")
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert {event["event"] for event in events} == {"moved", "progress", "calibrated"}
+    scale, *_, noise = [event for event in events if event["event"] == "calibrated"]
+    assert (scale["passed"], scale["refusals"]) == (True, [])
+    assert scale["estimates"]["scale"]["uncertainty"] < 1.5e-4
+    assert noise == events[-1]
 
 
 def test_a_failure_says_why_ends_with_6_and_leaves_what_is_in_force(rig, tmp_path):
-    assert rig("calibrate", "imu", "--turns", "4").exit_code == 0
+    assert rig("calibrate", "imu", "--turns", "4", "--minutes", "3").exit_code == 0
     done = rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert done.exit_code == 6
     assert "FAIL imu.scale" in done.stdout
     assert "imu.axis" in done.stdout
     passed = [Fact.from_file(path).passed for path in sorted((tmp_path / "facts" / "sim").iterdir())]
-    assert passed == [True, False]
+    assert passed == [True, True, True, False]
     assert json.loads(rig("goto", "90", "--json").stdout)["bound_deg"] < 1.5
 
 
 def test_too_few_turns_are_a_mistake_of_usage(rig):
     assert rig("calibrate", "imu", "--turns", "3").exit_code == 2
+
+
+def test_the_servo_is_calibrated_in_a_row_and_each_result_counts_for_the_next(rig, tmp_path):
+    done = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
+    assert done.exit_code == 0, done.output
+    facts = [Fact.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
+    assert [fact.name for fact in facts] == ["servo.backlash", "servo.encoder", "servo.motion"]
+    again = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
+    assert again.exit_code == 0, "a newer result takes the place of an older one"
+    assert "of the configuration wins" not in again.output

@@ -107,10 +107,10 @@ def test_the_newest_fact_that_passed_on_these_devices_counts(tmp_path):
     assert store.standings(HERE, NOW) == []
     days = [timedelta(days=n) for n in range(4)]
     elsewhere = {"bench": "sim", "imu": {"model": "BNO055"}}
+    store.keep(FACT)
     store.keep(replace(FACT, when_utc=FACT.when_utc + days[1]))
     store.keep(replace(FACT, when_utc=FACT.when_utc + days[2], device=elsewhere))
     store.keep(replace(FACT, when_utc=FACT.when_utc + days[3], refusals=("the platter slipped",)))
-    store.keep(FACT)
     (standing,) = store.standings(HERE, NOW)
     assert standing.state is State.IN_FORCE
     assert standing.fact.when_utc == FACT.when_utc + days[1]
@@ -135,11 +135,11 @@ def test_age_another_device_and_failure_are_told(tmp_path):
 def test_a_torn_file_in_the_folder_is_told_and_left_out(tmp_path):
     store = FactStore(tmp_path)
     store.keep(FACT)
-    (tmp_path / "torn.json").write_text("{", encoding="utf-8")
+    (tmp_path / "00002-torn.json").write_text("{", encoding="utf-8")
     assert store.history() == [FACT]
     assert "torn.json" in store.unreadable[0].what
     with pytest.raises(UsageError, match="Cannot keep"):
-        FactStore(tmp_path / "torn.json" / "facts").keep(FACT)
+        FactStore(tmp_path / "00002-torn.json" / "facts").keep(FACT)
 
 
 def test_a_fact_sets_what_the_configuration_leaves_open():
