@@ -9,16 +9,22 @@ image, rename, sync of the folder, commit; then those of the next view).
 import os
 import signal
 import sys
+from collections.abc import Generator
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Engine, event
 
+import hbr
 from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.catalog.describing import within
+from rig.catalog.jobs import Progressed
 from rig.clock import SystemClock
+
+_T = TypeVar("_T")
 
 PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, {"noise": "defaults"})
 
@@ -48,6 +54,31 @@ def fill(catalog: Catalog, name: str, views: int, **begin: Any) -> None:
     for index in range(views):
         enrollment.add(record(index), image(index))
     enrollment.finish()
+
+
+def described(index: int, seed: int, region: tuple[int, int, int, int] | None = None, **changes: Any) -> ViewRecord:
+    """A view whose descriptor is that of ``image(seed)``."""
+    levels = hbr.describe(within(image(seed), region))
+    return record(index, descriptor=levels, region=region, **changes)
+
+
+def true_fill(
+    catalog: Catalog, name: str, views: int, seed: int, region: tuple[int, int, int, int] | None = None, **begin: Any
+) -> None:
+    """Enroll an object whose descriptors and images belong together."""
+    enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **begin)
+    for index in range(views):
+        enrollment.add(described(index, seed + index, region), image(seed + index))
+    enrollment.finish()
+
+
+def finished(job: Generator[Progressed, None, _T]) -> _T:
+    """Carry a job of the catalog out and return its result."""
+    while True:
+        try:
+            next(job)
+        except StopIteration as end:
+            return cast(_T, end.value)
 
 
 def main() -> None:
