@@ -389,7 +389,7 @@ class Turntable(AbstractContextManager["Turntable"]):
     def _stop(self) -> bool:
         """Bring the table to a stop along its ramp; return False where the servo hears nothing: its watchdog stops it.
 
-        The servo's own goal would be behind the table before it could stop there, and it would come back to it.
+        A goal where the table is now would be behind it before it could stop, and it would come back.
         """
         try:
             state = self._servo.read_state()
@@ -397,8 +397,9 @@ class Turntable(AbstractContextManager["Turntable"]):
                 self._servo.torque_off()
                 return True
             ramp_dps2 = self._profile.acceleration_dps2 if self._profile else self._config.acceleration_dps2
-            ahead_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
-            self._servo.move_to(state.position_deg + ahead_deg)
+            ramp_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
+            on_the_bus_s = 2 * seconds_between(state.time_ns, self._clock.now_ns())  # the answer's way, and the goal's
+            self._servo.move_to(state.position_deg + ramp_deg + state.velocity_dps * on_the_bus_s)
             give_up_ns = self._clock.now_ns() + round((abs(state.velocity_dps) / ramp_dps2 + STOP_ALLOWANCE_S) * 1e9)
             while state.moving and self._clock.now_ns() < give_up_ns:
                 self._clock.sleep(self._config.poll_s)

@@ -1,6 +1,6 @@
 """Real drivers on simulated wires, put together for the tests of the motion layer (no camera needed)."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +12,7 @@ from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
 from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
+from rig.state import MemoryStore, StateStore
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
@@ -57,15 +58,39 @@ def open_servo(wires: Wires, **options: Any) -> DynamixelServo:
 
 @contextmanager
 def motion_bench(*settings: str, noise: NoiseModel | None = None, seed: int = 0) -> Iterator[tuple[Bench, Wires]]:
-    """Yield a bench of servo and IMU, and its wires."""
-    wires = servo_wires(noise, seed)
-    with SimI2cBus(wires.world.clock) as i2c:
-        i2c.attach(0x68, SimMpu6050(wires.world))
-        servo = open_servo(wires)
-        imu = Mpu6050(i2c.path, clock=wires.world.clock)
-        config = load_config(overrides=settings)
-        bench = Bench("test", config, wires.world.clock, servo, imu, camera=None)  # type: ignore[arg-type]
-        bench.safety.connect()
+    """Yield a bench of servo and IMU, whose cable hangs free, and its wires."""
+    with sensor(servo_wires(noise, seed)) as (wires, i2c), program(wires, i2c, MemoryStore(), *settings) as bench:
         bench.safety.declare_turns(0)
         yield bench, wires
-        imu.close()
+
+
+@contextmanager
+def sensor(wires: Wires) -> Iterator[tuple[Wires, SimI2cBus]]:
+    """Put an IMU beside the servo."""
+    with SimI2cBus(wires.world.clock) as i2c:
+        i2c.attach(0x68, SimMpu6050(wires.world))
+        yield wires, i2c
+
+
+@contextmanager
+def program(wires: Wires, i2c: SimI2cBus, state: StateStore, *settings: str) -> Iterator[Bench]:
+    """Yield the bench as one program opens it; the next program finds the devices as this one leaves them."""
+    if not wires.serial.is_open:
+        wires.serial.open()
+    servo = open_servo(wires)
+    imu = Mpu6050(i2c.path, clock=wires.world.clock)
+    config = load_config(overrides=settings)
+    bench = Bench("test", config, wires.world.clock, servo, imu, camera=None, state=state)  # type: ignore[arg-type]
+    bench.safety.connect()
+    bench.findings = bench.safety.findings
+    yield bench
+    imu.close()
+
+
+def kill(wires: Wires, motion: Generator[Any, None, None] | None = None) -> None:
+    """Have the program die as SIGKILL does: none of its exits runs, the kernel closes its port, the servo goes on."""
+    _dead.append(motion)  # a generator that is forgotten would be closed, and its exits run
+    wires.serial.close()
+
+
+_dead: list[Any] = []

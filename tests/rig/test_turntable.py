@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from bench_parts import motion_bench
 from hypothesis import given, settings
@@ -72,6 +73,29 @@ def test_torque_is_off_after_an_exception_in_the_middle_of_a_motion():
         wires.world.clock.sleep(1.0)
         assert abs(wires.world.shaft()[0]) < 100.0
         assert wires.world.shaft()[1] == 0.0
+
+
+def test_a_stop_runs_out_along_the_ramp_and_does_not_come_back():
+    with motion_bench() as (bench, wires):
+        speeds = []
+
+        def look() -> None:
+            speeds.append(wires.world.shaft()[1])
+            wires.world.clock.call_at(wires.world.clock.now_ns() + 10_000_000, look)
+
+        def interrupt() -> None:
+            raise KeyboardInterrupt
+
+        wires.world.clock.call_at(0, look)
+        wires.world.clock.call_at(wires.world.clock.now_ns() + 1_900_000_000, interrupt)
+        with pytest.raises(KeyboardInterrupt), Turntable(bench) as table:
+            table.goto(300.0)
+        assert max(speeds) == pytest.approx(bench.config.table.velocity_dps, abs=1)
+        assert min(speeds) > -5
+        slowing = -np.diff(speeds).min() / 0.01
+        assert slowing < 1.5 * bench.config.table.acceleration_dps2
+        assert speeds[-1] == 0
+        assert bench.safety.state is State.STOPPED
 
 
 def test_a_target_beyond_the_cable_is_refused_before_anything_moves():

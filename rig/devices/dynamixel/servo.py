@@ -74,7 +74,9 @@ class DynamixelServo(RegisterServo):
 
     def torque_on(self) -> None:
         self._refuse_hardware_errors()
-        self._write("Bus Watchdog", 0)  # tripped, or still armed by a host that was killed
+        # Left on by a host that was killed: the old goal must not go on when its watchdog is cleared.
+        self._write("Torque Enable", 0)
+        self._write("Bus Watchdog", 0)
         self._write("Goal Position", self._read("Present Position"))
         self._write("Torque Enable", 1)
 
