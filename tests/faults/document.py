@@ -41,8 +41,8 @@ fault that begins during move 20. A dash: the work goes on, and nobody needs to 
 
 Faults happen on any simulated bench: `rig demo --fault jam@move3+2s`, `rig demo --faults FILE`, or
 `faults = ["jam@move3+2s"]` under `[bench.sim]` in `rig.toml`. `rig faults` lists their parameters. Such a fault is
-written `NAME:PARAMETER=VALUE@TIME`, where the time is `12s`, `move3` or `view10`, and `+2s` behind it is how long; moves
-and views count from 0.
+written `NAME:PARAMETER=VALUE@TIME`, where the time is `12s`, `move3` or `view10`, and `+2s` behind it is how long;
+moves and views count from 0.
 
 This page is written by `python tests/faults/document.py`; a test holds it against what is measured.
 

@@ -1,0 +1,261 @@
+"""The faults themselves: how they are written, when they happen, that they are over, and that the devices feel them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig import files
+from rig.catalog import Catalog
+from rig.config import load_config
+from rig.errors import DeviceMismatch, UsageError
+from rig.plans.enroll import enroll
+from rig.plans.events import Accepted, Moved
+from sim.bench import SIM, ShelfOperator, SimOptions, open_sim_bench
+from sim.faults import Fault, Faults, kinds, load_faults
+from sim.faults.injector import DURING_S
+from sim.faults.schedule import Trigger
+from sim.objects.shelf import shelf
+from sim.parts import SimParts
+from sim.world import World
+
+VOCABULARY = {
+    *(f"{d}.{w}" for d in ("servo", "imu", "camera") for w in ("off", "stuck", "garbage", "wrong", "slow", "delayed")),
+    *(f"{d}.intermittent" for d in ("servo", "imu", "camera")),
+    *("crc_flip", "late_reply", "babble", "echo", "unplug", "brownout", "overload", "overheat", "watchdog_trip"),
+    *("duplicate_id", "wrong_model", "backlash", "slip", "jam", "object_falls", "i2c_nack", "i2c_stuck"),
+    *("imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker", "disk_full"),
+    "clock_jump",
+}
+
+
+@pytest.fixture
+def parts():
+    with SimParts.connected(load_config(), World(seed=3)) as parts:
+        yield parts
+
+
+def test_the_vocabulary_is_the_promised_one():
+    assert set(kinds()) == VOCABULARY
+
+
+# -- how they are written -----------------------------------------------------------------------------------------
+
+
+@st.composite
+def faults(draw):
+    kind = draw(st.sampled_from(list(kinds().values())))
+    values = {}
+    for name, parameter in kind.parameters.items():
+        low, high = max(parameter.low, -1e6), min(parameter.high, 1e6)
+        values[name] = float(f"{draw(st.floats(low, high)):g}")
+        values[name] = min(max(values[name], parameter.low), parameter.high)
+    trigger = draw(st.sampled_from(Trigger))
+    mark = float(draw(st.integers(0, 999)))
+    for_s = draw(st.none() | st.sampled_from((0.5, 2.0, 31.0)))
+    return Fault(kind, values, trigger, mark, for_s)
+
+
+@given(faults())
+def test_what_is_written_is_read_as_it_was(fault):
+    assert Fault.parse(str(fault)) == fault
+
+
+@given(
+    st.text(max_size=30) | st.from_regex(r"[a-z_.]{1,8}(:[a-z]{1,5}=[0-9.e-]{0,4})?(@[a-z0-9+.]{0,8})?", fullmatch=True)
+)
+def test_whatever_is_written_is_read_or_refused_with_a_next_step(text):
+    refusal = None
+    try:
+        fault = Fault.parse(text)
+    except UsageError as refused:
+        refusal = refused
+    assert refusal.next_step if refusal else fault.kind.name in text
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "next_step"),
+    [
+        ("jim", "no fault 'jim'", "mean"),
+        ("off", "no fault 'off'", "servo.off or imu.off or camera.off"),
+        ("nonsense", "no fault", "rig faults"),
+        ("jam@", "Cannot read", "NAME"),
+        ("jam@3", "Cannot read", "12s, move3 or view10"),
+        ("jam@move", "Cannot read", "move3"),
+        ("jam@move1.5", "Cannot read", "move3"),
+        ("jam:tight", "Cannot read", "PARAMETER=VALUE"),
+        ("jam:for_s=3", "Cannot read", "+2s"),
+        ("jam:tight=3", "no parameter 'tight'", "Leave it out"),
+        ("slip:angel=3", "no parameter 'angel'", "angle, seconds"),
+        ("slip:angle=far", "angle = 'far'", "number"),
+        ("slip:angle=nan", "angle = 'nan'", "number"),
+        ("crc_flip:rate=2", "rate = 2 is out of range", "0 to 1"),
+        ("jam@3s+0s", "negative", "from 0"),
+    ],
+)
+def test_mistakes_are_named_with_what_to_write_instead(text, what, next_step):
+    with pytest.raises(UsageError) as refused:
+        Fault.parse(text)
+    assert what in refused.value.what
+    assert next_step in refused.value.next_step
+
+
+def test_a_file_holds_texts_and_tables(tmp_path: Path):
+    path = tmp_path / "faults.toml"
+    path.write_text(
+        '[[faults]]\nname = "slip"\nangle = 4\nduring_move = 3\n[[faults]]\nname = "unplug"\nat_s = 12\nfor_s = 3\n'
+    )
+    assert [str(fault) for fault in load_faults(path)] == ["slip:angle=4@move3", "unplug@12s+3s"]
+    path.write_text('faults = ["slip:angle=4@move3", {name = "blur", after_view = 10}]')
+    assert [str(fault) for fault in load_faults(path)] == ["slip:angle=4@move3", "blur@view10"]
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ("faults = 3", "not a list of faults"),
+        ("", "not a list of faults"),
+        ('jam = 1\nfaults = ["jam"]', "not a list of faults"),
+        ("faults = [", "not a TOML file"),
+        ('faults = ["jam", "jim"]', "Fault 2 in .*: There is no fault 'jim'"),
+        ("faults = [3]", "Fault 1 in .*: Cannot read"),
+        ("[[faults]]\nat_s = 3", "has no name"),
+        ('[[faults]]\nname = "jam"\nat_s = 3\nduring_move = 1', "more than one time"),
+        ('[[faults]]\nname = "jam"\nat_s = -3', "negative"),
+        ('[[faults]]\nname = "jam"\nduring_move = 1.5', "during_move = 1.5"),
+        ('[[faults]]\nname = "jam"\nat_s = true', "at_s = True"),
+    ],
+)
+def test_mistakes_in_a_file_are_named_with_their_place(tmp_path, content, what):
+    path = tmp_path / "faults.toml"
+    path.write_text(content)
+    with pytest.raises(UsageError, match=what) as refused:
+        load_faults(path)
+    assert refused.value.next_step
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path):
+    with pytest.raises(UsageError, match="Cannot read the faults"):
+        load_faults(tmp_path / "none.toml")
+
+
+def test_a_configuration_with_a_mistaken_fault_is_refused():
+    with pytest.raises(ValueError, match="Did you mean"):
+        SimOptions(faults=["jamm"])
+    config = load_config(overrides=['bench.sim.faults=["wrong_model"]'])
+    with pytest.raises(DeviceMismatch, match="another model"):
+        SIM.open(config, SimOptions(**config.bench["sim"]), 0)
+
+
+# -- when they happen -----------------------------------------------------------------------------------------------
+
+
+def test_a_fault_comes_and_goes_at_its_time(parts):
+    faults = Faults(parts)
+    heard = []
+    faults.listeners.append(lambda occurrence: heard.append((occurrence.began, occurrence.time_ns * 1e-9)))
+    faults.schedule(Fault.parse("i2c_stuck@2s+3s"))
+    parts.world.clock.sleep(1.999)
+    assert not parts.i2c.stuck
+    parts.world.clock.sleep(0.001)
+    assert parts.i2c.stuck
+    assert [fault.kind.name for fault in faults.active] == ["i2c_stuck"]
+    parts.world.clock.sleep(3.0)
+    assert not parts.i2c.stuck
+    assert heard == [(True, 2.0), (False, 5.0)]
+
+
+def test_what_is_cleared_is_over_and_does_not_come_any_more(parts):
+    faults = Faults(parts)
+    faults.schedule(Fault.parse("i2c_stuck"), Fault.parse("unplug@2s"), Fault.parse("blur@view0"))
+    assert parts.i2c.stuck
+    faults.clear()
+    parts.world.clock.sleep(3.0)
+    assert not parts.i2c.stuck
+    assert parts.adapter.is_open
+    assert not faults.active
+
+
+@pytest.mark.parametrize("name", sorted(VOCABULARY))
+def test_a_fault_that_is_over_leaves_no_hook_behind(parts, name):
+    before = _hooks(parts)
+    faults = Faults(parts)
+    faults.schedule(Fault.parse(name))
+    parts.world.clock.sleep(0.3)
+    faults.clear()
+    parts.world.clock.sleep(0.5)  # a servo boots
+    assert _hooks(parts) == before
+    assert parts.world.clock.next_event_ns() is None  # nothing goes on by itself
+
+
+def _hooks(parts):
+    return [
+        *(len(hooks) for hooks in (parts.servo_bus.tampers, parts.servo.distortions, parts.imu.distortions)),
+        *(len(hooks) for hooks in (parts.i2c.refusals, parts.camera.tampers, parts.camera.falters)),
+        len(parts.servo_bus._devices),
+        *(parts.servo_bus.echo, parts.servo_bus.deaf, parts.i2c.stuck, parts.camera.hangs),
+        *(parts.camera.every, parts.camera.latency_ns, parts.camera.blur_px, parts.world.noise),
+        *(parts.servo.powered, parts.servo.memory["Model Number"], parts.world.scene.light, parts.world.scene.thing),
+    ]
+
+
+def test_moves_and_views_are_counted_as_the_plan_counts_them(tmp_path):
+    """Also where a move goes a way below first, and where a frame is taken again."""
+    world = World(seed=5)
+    operator = ShelfOperator(world, shelf())
+    planned = [Fault.parse(text) for text in ("clock_jump@move0", "clock_jump@move2", "black_frame@view2+0.3s")]
+    begun = {}
+    with (
+        open_sim_bench(load_config(), operator, faults=planned) as bench,
+        Catalog.open(tmp_path, clock=bench.clock) as c,
+    ):
+        assert operator.faults is not None
+        operator.faults.listeners.append(lambda o: begun.setdefault((o.fault.trigger, o.fault.mark), o.time_ns))
+        moves, views = {}, {}
+        for event in enroll(bench, c, "dice", views=6):
+            if isinstance(event, Moved):
+                moves[event.index] = (world.clock.now_ns() - round(event.seconds * 1e9), world.clock.now_ns())
+            if isinstance(event, Accepted):
+                views[event.index] = event.evidence.exposed_ns
+    for index in (0, 2):
+        set_off_ns, arrived_ns = moves[index]
+        assert set_off_ns + DURING_S * 1e9 <= begun[Trigger.MOVE, index] <= arrived_ns
+    assert views[2] < begun[Trigger.VIEW, 2] < moves[3][1]
+
+
+# -- that the devices feel them ---------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_fault():
+    def noise(seed: int) -> bytes:
+        with SimParts.connected(load_config(), World(seed=seed)) as parts:
+            Faults(parts).schedule(Fault.parse("camera.garbage"))
+            parts.camera.grab()
+            return bytes(np.asarray(parts.camera.retrieve()[1])[:4])
+
+    assert noise(1) == noise(1)
+    assert noise(1) != noise(2)
+
+
+def test_a_full_disk_is_full_for_everybody_and_free_again(parts, tmp_path):
+    faults = Faults(parts)
+    faults.schedule(Fault.parse("disk_full"))
+    with pytest.raises(OSError, match="No space left"):
+        files.write(tmp_path / "a", b"a")
+    faults.clear()
+    files.write(tmp_path / "a", b"a")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_civil_time_jumps_and_the_monotonic_clock_does_not(parts):
+    before, before_ns = parts.world.clock.utc(), parts.world.clock.now_ns()
+    Faults(parts).schedule(Fault.parse("clock_jump:seconds=60"))
+    assert (parts.world.clock.utc() - before).total_seconds() == 60
+    assert parts.world.clock.now_ns() == before_ns
+
+
+def test_a_fault_from_the_start_keeps_the_bench_from_opening():
+    with pytest.raises(DeviceMismatch, match="another model"):
+        open_sim_bench(load_config(), ShelfOperator(World(), shelf()), faults=[Fault.parse("wrong_model")])
