@@ -1,6 +1,5 @@
 """What the shell offers on Tab; reads no more than it must, and says nothing where something is wrong."""
 
-import sqlite3
 from contextlib import closing, suppress
 from importlib.metadata import entry_points
 
@@ -9,6 +8,8 @@ import typer
 
 def object_names(ctx: typer.Context, incomplete: str) -> list[str]:
     """Return the names of the enrolled objects that begin with what was typed."""
+    import sqlite3
+
     from rig.cli.command import Settings
 
     # a line that is being typed may hold anything: an unknown bench, a file that is no configuration

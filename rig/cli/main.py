@@ -70,25 +70,27 @@ def common(
 
 common.__doc__ = None  # the help of the program is the app's
 
-app.command("enroll")(enroll.enroll)
-app.command("identify")(identify.identify)
-app.command("replay")(runs.replay)
-app.command("report")(runs.report)
-app.command("eval")(evaluate.evaluate)
-app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)
-app.command("home")(table.home)
-app.command("status")(table.status)
-app.command("stop")(safety.stop)
-app.command("acknowledge")(safety.acknowledge)
-app.command("doctor")(doctor.doctor)
-app.command("find")(find.find)
-app.command("setup")(setup.setup)
-app.command("import")(exchange.import_)
-app.command("export")(exchange.export)
-app.command("log")(upkeep.log)
-app.add_typer(catalog.app, name="catalog")
-app.add_typer(config.app, name="config")
-app.add_typer(servo.app, name="servo")
+OBJECTS, BENCH, MORE = "Objects", "Bench", "More"  # headings of the help
+
+app.command("enroll", rich_help_panel=OBJECTS)(enroll.enroll)
+app.command("identify", rich_help_panel=OBJECTS)(identify.identify)
+app.command("replay", rich_help_panel=OBJECTS)(runs.replay)
+app.command("report", rich_help_panel=OBJECTS)(runs.report)
+app.command("goto", rich_help_panel=BENCH, context_settings={"ignore_unknown_options": True})(table.goto)
+app.command("home", rich_help_panel=BENCH)(table.home)
+app.command("status", rich_help_panel=BENCH)(table.status)
+app.command("stop", rich_help_panel=BENCH)(safety.stop)
+app.command("acknowledge", rich_help_panel=BENCH)(safety.acknowledge)
+app.command("doctor", rich_help_panel=BENCH)(doctor.doctor)
+app.command("find", rich_help_panel=BENCH)(find.find)
+app.command("setup", rich_help_panel=BENCH)(setup.setup)
+app.command("import", rich_help_panel=OBJECTS)(exchange.import_)
+app.command("export", rich_help_panel=OBJECTS)(exchange.export)
+app.command("log", rich_help_panel=OBJECTS)(upkeep.log)
+app.add_typer(catalog.app, name="catalog", rich_help_panel=OBJECTS)
+app.add_typer(config.app, name="config", rich_help_panel=BENCH)
+app.add_typer(servo.app, name="servo", rich_help_panel=BENCH)
+app.command("eval", rich_help_panel=MORE)(evaluate.evaluate)
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
     try:
         _plugin = _point.load()
@@ -96,9 +98,9 @@ for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         print(f"The command {_point.name} of {_point.value} is left out: {_broken}", file=sys.stderr)
         continue
     if isinstance(_plugin, typer.Typer):
-        app.add_typer(_plugin, name=_point.name)
+        app.add_typer(_plugin, name=_point.name, rich_help_panel=MORE)
     else:
-        app.command(_point.name)(_plugin)
+        app.command(_point.name, rich_help_panel=MORE)(_plugin)
 
 
 def main() -> None:
