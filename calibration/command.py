@@ -1,5 +1,6 @@
 """`rig calibrate ...`."""
 
+import sys
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -59,6 +60,65 @@ def imu(
         imu_mounting.live,
         lambda bench: gyro_noise.live(bench, minutes=minutes),
     )
+
+
+@app.command("show")
+@command
+def show(settings: Settings) -> None:
+    """Show what is in force on the bench, what has expired, and what belongs to other devices; nothing moves.
+
+    Example: rig calibrate show --bench sim
+    """
+    from rig.facts import FactStore, State
+    from rig.plans.events import plain
+
+    with settings.open_bench() as bench:
+        store = FactStore(bench.config.calibration_path(bench.name))
+        standings = store.standings(bench.apparatus(), bench.clock.utc())
+        if settings.json:
+            settings.print_json(
+                {
+                    "folder": str(store.folder),
+                    "calibrations": [{"state": s.state, "words": s.words, **plain(s.fact)} for s in standings],
+                }
+            )
+            return
+        for finding in bench.findings:
+            print(f"! {finding}")
+        for standing in standings:
+            if standing.state is State.IN_FORCE:
+                print(f"✓ {standing.words}")
+                print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.fact.estimates.items()))
+        if not standings:
+            print(f"Nothing is calibrated yet in {store.folder}: run `rig calibrate all`.")
+
+
+@app.command("history")
+@command
+def history(
+    settings: Settings,
+    name: Annotated[str | None, typer.Argument(help="One kind, e.g. imu.scale; all where none is given.")] = None,
+) -> None:
+    """List every calibration that was kept, oldest first, passed or not.
+
+    Example: rig calibrate history servo.backlash --bench sim
+    """
+    from rig.facts import FactStore
+    from rig.plans.events import plain
+
+    store = FactStore(settings.load().calibration_path(settings.bench_name))
+    facts = store.history(name)
+    for error in store.unreadable:
+        print(f"! {error.what}", file=sys.stderr)
+    if settings.json:
+        settings.print_json({"folder": str(store.folder), "calibrations": [plain(fact) for fact in facts]})
+        return
+    for fact in facts:
+        values = ", ".join(f"{key} {estimate}" for key, estimate in fact.estimates.items())
+        told = values if fact.passed else f"FAIL: {fact.refusals[0]}"
+        print(f"{fact.when_utc:%Y-%m-%d %H:%M}  {fact.name:<16} {told}")
+    if not facts:
+        print(f"No calibration{f' of {name}' if name else ''} was kept in {store.folder}.")
 
 
 def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None, Fact]]") -> None:

@@ -1,7 +1,11 @@
 """Everything that is imperfect about the simulated bench, in one place."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
+from math import sqrt
 from typing import Self
+
+from rig.facts import Fact
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,3 +86,45 @@ class NoiseModel:
     def with_values(self, **values: float) -> Self:
         """Return a copy with some values changed."""
         return replace(self, **values)
+
+
+def from_calibration(facts: Iterable[Fact], base: NoiseModel | None = None) -> NoiseModel:
+    """Return the noise model of the bench on which ``facts`` were calibrated, for the simulated bench beside it.
+
+    A value that differs from part to part becomes a spread as wide as the part's own error: worlds of other seeds are
+    other parts as good as that one. What no fact tells is as in ``base``.
+    """
+    values: dict[str, float] = {}
+    for fact in facts:
+        if not fact.passed:
+            continue
+        found = {name: estimate.value for name, estimate in fact.estimates.items()}
+        match fact.name:
+            case "servo.backlash":
+                values["backlash_deg"] = max(found["backlash"], 0.0)
+            case "servo.encoder":
+                values["encoder_harmonic_deg"] = _spread(found.values())
+            case "imu.scale":
+                values["gyro_scale_error"] = abs(1 / found["scale"] - 1)
+            case "imu.noise":
+                values["gyro_noise_dps_rthz"] = found["angle_random_walk"] * sqrt(2)
+                values["gyro_bias_walk_dps_rts"] = found["rate_random_walk"]
+                values["gyro_bias_dps"] = abs(found["bias"])
+                if "bias_slope" in found:
+                    values["gyro_bias_slope_dps_c"] = abs(found["bias_slope"])
+            case "imu.mounting":
+                values["imu_tilt_deg"] = _spread(v for name, v in found.items() if name.startswith("tilt_"))
+                values["accel_bias_g"] = _spread(v for name, v in found.items() if name.startswith("accel_zero_"))
+            case "camera.noise":
+                values |= {name: found[name] for name in ("full_well_e", "read_noise_e") if name in found}
+            case "camera.flat_field":
+                values["vignetting"] = found["vignetting"]
+            case "camera.drift":
+                values["light_flicker"] = found["flicker"]
+    return (base or NoiseModel()).with_values(**values)
+
+
+def _spread(errors: Iterable[float]) -> float:
+    """Return the standard deviation about zero."""
+    squares = [error**2 for error in errors]
+    return sqrt(sum(squares) / len(squares))

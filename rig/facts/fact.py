@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
+from math import floor, log10
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -22,7 +23,11 @@ class Estimate:
     unit: str
 
     def __str__(self) -> str:
-        return f"{self.value:.6g} ± {self.uncertainty:.2g} {self.unit}".rstrip()
+        """Return value and uncertainty to two digits of the uncertainty."""
+        if not self.uncertainty > 0:
+            return f"{self.value:.6g} ± {self.uncertainty:g} {self.unit}".rstrip()
+        decimals = max(1 - floor(log10(self.uncertainty)), 0)
+        return f"{self.value:.{decimals}f} ± {self.uncertainty:.{decimals}f} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -75,3 +75,18 @@ def test_the_servo_is_calibrated_in_a_row_and_each_result_counts_for_the_next(ri
     again = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
     assert again.exit_code == 0, "a newer result takes the place of an older one"
     assert "of the configuration wins" not in again.output
+
+
+def test_what_is_in_force_and_what_was_kept_can_be_looked_up(rig):
+    assert "Nothing is calibrated yet" in rig("calibrate", "show").output
+    assert "No calibration of imu.scale was kept" in rig("calibrate", "history", "imu.scale").output
+    rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
+    assert "imu.scale never passed" in rig("calibrate", "show").output
+    rig("calibrate", "imu", "--turns", "4", "--minutes", "3")
+    assert "✓ imu.scale was calibrated 0 days ago" in rig("calibrate", "show").output
+    assert "conditions.seed was 0, is 9" in rig("calibrate", "show", "--seed", "9").output
+    failed, passed = rig("calibrate", "history", "imu.scale").output.splitlines()
+    assert "FAIL" in failed
+    assert "scale " in passed
+    told = json.loads(rig("calibrate", "history", "--json").stdout)
+    assert [fact["name"] for fact in told["calibrations"]] == ["imu.scale", "imu.scale", "imu.mounting", "imu.noise"]
