@@ -81,7 +81,7 @@ class Computer:
         self.write(f"sys/class/video4linux/video{number}/name", f"{name}\n")
         self.write(f"sys/class/video4linux/video{number}/index", f"{index}\n")
         self.write(f"dev/video{number}").chmod(mode)
-        self.link(f"dev/v4l/by-id/usb-{name.replace(' ', '_')}-video-index{number}", self.root / f"dev/video{number}")
+        self.link(f"dev/v4l/by-id/usb-{name.replace(' ', '_')}-video-index{index}", self.root / f"dev/video{number}")
 
     def keeps_time(self, synchronised: bool = True) -> None:
         """Run a service that asks time servers."""

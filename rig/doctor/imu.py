@@ -16,6 +16,7 @@ from rig.doctor.scan import FoundImu, scan_imus
 SECONDS, DRAIN_S = 1.5, 0.25
 NOISY = 4.0
 """How many times the datasheet's noise is more than a quiet table shows."""
+NO_REST_DPS = 20.0
 MAX_BIAS_DPS = 20.0
 """Zero-rate output of the MPU-6050's datasheet; more is a rotation, or a broken sensor."""
 UPRIGHT = 0.94
@@ -82,6 +83,9 @@ def _rest(case: Case, sensor: Imu, samples: ImuSamples) -> Iterator[Finding]:
     elif (rates == rates[0]).all():
         mend = "Switch the sensor's supply off and on, then: " + case.rig("doctor")
         yield bad("imu", "frozen: every sample is the same, not even noise", mend, **evidence)
+    elif spread.max() > NO_REST_DPS:
+        mend = "Check the sensor's supply, ground and cable, then: " + case.rig("doctor")
+        yield bad("imu", f"{text}: no table at rest shakes so, and no motor runs", mend, **evidence)
     elif spread.max() > NOISY * expected:
         mend = "Keep hands and vibration off the bench, then: " + case.rig("doctor")
         yield warning("imu", f"{text}: restless, {expected:.3f} °/s is usual", mend, **evidence)

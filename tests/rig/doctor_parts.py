@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,6 +13,7 @@ from rig.doctor.checks import CHECKS
 from rig.doctor.examination import examine
 from rig.doctor.finding import Finding, Level
 from rig.host import User
+from sim.clock import VirtualClock
 from sim.host import Computer, SimHost
 from sim.noise import NoiseModel
 from sim.parts import SimParts
@@ -75,7 +77,7 @@ def unopened(
         if servo_at is not None:
             there = config.servo.model_copy(update={"id": servo_at[0], "baud": servo_at[1]})
             built = config.model_copy(update={"servo": there})
-        world = World(noise=noise)
+        world = World(noise=noise, clock=VirtualClock(start_utc=datetime(2026, 5, 1, tzinfo=UTC)))
         with SimParts.connected(built, world) as parts:
             computer = Computer(Path(folder))
             if plugged:
