@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rig.catalog import Catalog
     from sim.world import World
 
-MARK = "sim(*settings, seed=0, noise=None): settings KEY=VALUE, seed and noise model of the simulated bench"
+MARK = "sim(*settings, seed=0, noise=None, faults=()): settings KEY=VALUE, seed, noise model and faults of the bench"
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -37,15 +37,18 @@ def sim_world(request: pytest.FixtureRequest) -> "World":
 def sim_bench(request: pytest.FixtureRequest, sim_world: "World") -> "Iterator[Bench]":
     """An open bench in `sim_world`: real drivers on simulated wires, on a virtual clock.
 
-    `sim_bench.operator` puts objects on the table: `next_object` and `yaw_deg` say which, and how.
+    `sim_bench.operator` puts objects on the table: `next_object` and `yaw_deg` say which, and how. The marker's
+    `faults`, such as "jam@move3", happen to it.
     """
     from rig.config import RigConfig, load_config
     from sim.bench import ShelfOperator, open_sim_bench
+    from sim.faults import Fault
     from sim.objects.shelf import shelf
 
     mark = request.node.get_closest_marker("sim")
     config: RigConfig = load_config(None, mark.args if mark else ())
-    with open_sim_bench(config, ShelfOperator(sim_world, shelf())) as bench:
+    faults = [Fault.parse(text) for text in mark.kwargs.get("faults", ())] if mark else []
+    with open_sim_bench(config, ShelfOperator(sim_world, shelf()), faults=faults) as bench:
         yield bench
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from sim.faults.kind import Delay, End, Parameter, kind, repeatedly, share
-from sim.parts import SimParts
-from sim.servo import Frame, XSeriesServo
+from sim.parts import SimParts, SimulatedServo
+from sim.servo import Ax12Servo, Frame, XSeriesServo
 from sim.servo.control_table import Memory
 from sim.servo.device import OVERLOAD_ERROR
 from sim.world import World
@@ -145,7 +145,11 @@ def _unplug(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
 def _duplicate_id(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
     there = parts.servo
     elsewhere = World(noise=parts.world.noise, seed=parts.world.seed + 1, clock=parts.world.clock)
-    twin = XSeriesServo(elsewhere, there.model.name, bus_id=there.bus_id, baudrate=there.baudrate)
+    twin: SimulatedServo
+    if isinstance(there, XSeriesServo):
+        twin = XSeriesServo(elsewhere, there.model.name, bus_id=there.bus_id, baudrate=there.baudrate)
+    else:
+        twin = Ax12Servo(elsewhere, bus_id=there.bus_id, baudrate=there.baudrate)
     parts.servo_bus.attach(twin)
     return lambda: parts.servo_bus.detach(twin)
 

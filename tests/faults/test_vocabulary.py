@@ -4,13 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fault_runs import NOISE
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rig import files
 from rig.catalog import Catalog
 from rig.config import load_config
-from rig.errors import DeviceMismatch, UsageError
+from rig.errors import DeviceMismatch, DeviceSilent, UsageError
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted, Moved
 from sim.bench import SIM, ShelfOperator, SimOptions, open_sim_bench
@@ -33,7 +34,7 @@ VOCABULARY = {
 
 @pytest.fixture
 def parts():
-    with SimParts.connected(load_config(), World(seed=3)) as parts:
+    with SimParts.connected(load_config(), World(noise=NOISE)) as parts:
         yield parts
 
 
@@ -259,3 +260,26 @@ def test_civil_time_jumps_and_the_monotonic_clock_does_not(parts):
 def test_a_fault_from_the_start_keeps_the_bench_from_opening():
     with pytest.raises(DeviceMismatch, match="another model"):
         open_sim_bench(load_config(), ShelfOperator(World(), shelf()), faults=[Fault.parse("wrong_model")])
+
+
+@pytest.mark.parametrize("servo", ["xl430_w250", "xm430_w350", "xl330_m288", "mx_28", "ax_12a"])
+@pytest.mark.parametrize("imu", [("mpu6050", 0x68), ("bno055", 0x28)])
+def test_every_simulated_device_can_suffer_every_fault(servo, imu):
+    settings = (f"servo.model={servo}", "servo.baud=1000000", f"imu.model={imu[0]}", f"imu.address={imu[1]}")
+    for name in kinds():
+        with SimParts.connected(load_config(None, settings), World(noise=NOISE)) as parts:
+            faults = Faults(parts)
+            faults.schedule(Fault.parse(name))
+            parts.world.clock.sleep(0.3)
+            faults.clear()
+
+
+@pytest.mark.sim(seed=2, faults=["camera.off@view1", "clock_jump@2s"])
+def test_the_fixtures_for_other_peoples_tests_take_faults(sim_bench, sim_catalog):
+    with pytest.raises(DeviceSilent):
+        list(enroll(sim_bench, sim_catalog, "dice", views=4))
+    assert sim_catalog.resumable("dice").present == (0, 1)
+    assert [occurrence.fault.kind.name for occurrence in sim_bench.operator.faults.history] == [
+        "clock_jump",
+        "camera.off",
+    ]

@@ -1,0 +1,75 @@
+"""`rig faults`, and faults given to `rig demo` and to any simulated bench."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+from sim.faults import Fault, kinds
+
+SMALL = ("--count", "2", "--set", "enroll.views=4", "--set", "identify.max_views=2")
+
+
+def rig(*arguments: str):
+    return CliRunner().invoke(app, list(arguments))
+
+
+def test_the_vocabulary_is_listed_with_parameters():
+    text = rig("faults").stdout
+    for kind in kinds().values():
+        assert f"{kind.name} " in text
+        assert kind.what in text
+        for name, parameter in kind.parameters.items():
+            assert f"{name}={parameter.default:g}  {parameter.meaning}" in text
+    assert "rig demo --fault" in text
+
+
+def test_the_vocabulary_as_json():
+    listed = [json.loads(line) for line in rig("faults", "--json").stdout.splitlines()]
+    assert [entry["fault"] for entry in listed] == list(kinds())
+    for entry in listed:
+        given = "".join(f":{name}={value['default']}" for name, value in entry["parameters"].items())
+        assert Fault.parse(entry["fault"] + given).kind.what == entry["what"]
+
+
+def test_a_fault_ends_the_demo_with_its_code_and_next_step(tmp_path):
+    done = rig("demo", *SMALL, "--fault", "jam@move2", "--out", str(tmp_path))
+    assert done.exit_code == 5
+    assert "fault begins: jam" in done.stderr
+    assert "Next step:" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_faults_of_a_file_and_of_the_command_line_come_and_go(tmp_path):
+    (tmp_path / "faults.toml").write_text('faults = ["crc_flip@1s+3s"]')
+    done = rig(
+        *("demo", *SMALL, "--faults", str(tmp_path / "faults.toml"), "--fault", "camera.slow@2s+1s"),
+        *("--set", 'bench.sim.faults=["i2c_nack@3s+1s"]', "--out", str(tmp_path / "out")),
+    )
+    assert done.exit_code in (0, 6)
+    for name in ("crc_flip", "camera.slow", "i2c_nack"):
+        assert f"fault begins: {name}" in done.stderr
+        assert f"fault ends: {name}" in done.stderr
+
+
+def test_any_command_on_a_simulated_bench_meets_the_configurations_faults(tmp_path):
+    done = rig("goto", "10", "--bench", "sim", "--set", 'bench.sim.faults=["unplug"]')
+    assert done.exit_code == 4
+    assert "Next step:" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--fault", "jamm"), "Did you mean jam?"),
+        (("--fault", "jam@noon"), "12s, move3 or view10"),
+        (("--faults", "nowhere.toml"), "nowhere.toml"),
+        (("--set", 'bench.sim.faults=["jamm"]'), "Did you mean jam?"),
+    ],
+)
+def test_mistakes_are_told_before_anything_starts(arguments, words, tmp_path):
+    done = rig("demo", *arguments, "--out", str(tmp_path))
+    assert done.exit_code in (2, 3)
+    assert words in done.stderr
+    assert not list(tmp_path.iterdir())
