@@ -7,7 +7,7 @@ from typing import Self
 
 import serial
 
-from rig.config import RigConfig
+from rig.config import RigConfig, ServoConfig
 from rig.devices.dynamixel.port import READ_SLICE_S
 from rig.devices.dynamixel.registers import protocol_of
 from rig.errors import ConfigError, DeviceNotFound
@@ -52,7 +52,7 @@ class SimParts(AbstractContextManager["SimParts"]):
         ConfigError
             There is no simulated servo of that model, or it does not know the baud rate.
         """
-        servo = _servo(world, config)
+        servo = simulated_servo(world, config.servo)
         servo_bus = ServoBus(world.clock)
         servo_bus.attach(servo)
         imu: SimulatedImu
@@ -85,13 +85,19 @@ class SimParts(AbstractContextManager["SimParts"]):
                 ) from error
 
 
-def _servo(world: World, config: RigConfig) -> SimulatedServo:
-    servo = config.servo
-    shaft: Shaft = world if servo.gear_ratio == 1 else Geared(world, servo.gear_ratio)
+def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
+    """Return the servo that ``config`` describes, on the table's shaft or behind its gear, as from the factory.
+
+    Raises
+    ------
+    ConfigError
+        There is no simulated servo of that model, or it does not know the baud rate.
+    """
+    shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
     try:
-        if protocol_of(servo.model) == 1:
-            return Ax12Servo(shaft, bus_id=servo.id, baudrate=servo.baud)
-        return XSeriesServo(shaft, servo.model, bus_id=servo.id, baudrate=servo.baud)
+        if protocol_of(config.model) == 1:
+            return Ax12Servo(shaft, bus_id=config.id, baudrate=config.baud)
+        return XSeriesServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
     except ValueError as error:
         raise ConfigError(
             "The simulated bench has no such servo.",

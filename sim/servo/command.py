@@ -1,0 +1,60 @@
+"""`rig sim-servo`: a servo for programs that want to open a serial port."""
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.command import Settings, command
+
+
+@command
+def sim_servo(
+    settings: Settings,
+    ids: Annotated[list[int] | None, typer.Option("--id", min=0, max=252, help="Another id. Repeatable.")] = None,
+    link: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Also reach the port under this name, while it is there.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="End by itself; else Ctrl+C does.")] = None,
+) -> None:
+    """Simulate servos on a pseudo-terminal in real time, and print the port to connect to.
+
+    Model, id and gear come from the section [servo]. The port takes any baud rate.
+
+    Example: rig sim-servo --set servo.model=xm430_w350 --id 1 --id 2
+    """
+    from rig.clock import SystemClock
+    from rig.errors import UsageError
+    from sim.parts import simulated_servo
+    from sim.servo import ServoBus
+    from sim.servo.terminal import ServoTerminal
+    from sim.world import World
+
+    config = settings.load()
+    wanted = sorted(set(ids or [config.servo.id]))
+    bus: ServoBus | None = None
+    for bus_id in wanted:
+        world = World(seed=(settings.seed or 0) + bus_id, clock=bus.clock if bus else None)
+        bus = bus or ServoBus(world.clock)
+        bus.attach(simulated_servo(world, config.servo.model_copy(update={"id": bus_id})))
+    assert bus is not None
+    with ExitStack() as ends:
+        terminal = ends.enter_context(ServoTerminal(bus, config.servo.baud, SystemClock()))
+        port = terminal.port
+        if link is not None:
+            try:
+                link.symlink_to(port)
+            except OSError as error:
+                raise UsageError(
+                    f"{link} cannot be made: {error.strerror}.", next_step="Give a name that is not in use."
+                ) from error
+            ends.callback(link.unlink, missing_ok=True)
+        if settings.json:
+            settings.print_json({"port": port, "model": config.servo.model, "ids": wanted})
+        else:
+            print(port, flush=True)
+            what = f"{config.servo.model}, id {', '.join(map(str, wanted))}"
+            print(f"{what}; for a rig: --set servo.port={port}. Ctrl+C ends it.", file=sys.stderr)
+        terminal.serve(seconds)
