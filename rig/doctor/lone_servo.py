@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import serial
 
@@ -69,6 +70,7 @@ class LoneServo:
         self._torque_off()
         self.bus.write(old, self.table["ID"], new, answered=self._answered())
         self._verify(new, "ID", new, f"the id {new}")
+        self.found = replace(self.found, bus_id=new)
 
     def set_baud(self, rate: int) -> None:
         """Give the servo another baud rate; the port follows.
@@ -103,6 +105,7 @@ class LoneServo:
         except DeviceRefused:
             self.bus.port.setBaudRate(old)
             raise
+        self.found = replace(self.found, baud=rate)
 
     def _torque_off(self) -> None:
         self.bus.write(self.found.bus_id, self.table["Torque Enable"], 0, answered=self._answered())
