@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+#include "frame.h"
 #include "hal.h"
 
 /* Register numbers: RM-MPU-6000A rev 4.2 and BST-BNO055-DS000. */
@@ -19,16 +20,20 @@
 
 #define BNO_CHIP_ID 0x00
 #define BNO_ACC_DATA 0x08
+#define BNO_GYR_DATA 0x14
 #define BNO_TEMP 0x34
+#define BNO_CALIB_STAT 0x35
 #define BNO_UNIT_SEL 0x3B
 #define BNO_OPR_MODE 0x3D
 #define BNO_SYS_TRIGGER 0x3F
 #define BNO_ID 0xA0
 #define BNO_MODE_IMU 0x08
-#define BNO_BURST 18   /* accelerometer, magnetometer, gyro */
-#define BNO_GYRO 12
-#define BNO_PERIOD_US 10000 /* of its fusion */
-#define BNO_POLLS 100  /* between two looks at temperature and mode */
+#define BNO_BURST 20         /* gyro, Euler angles, quaternion */
+#define BNO_PERIOD_US ((uint32_t)10000) /* of its fusion */
+#define BNO_POLL_US ((uint32_t)8000) /* shorter: none of its samples is missed, and one seen twice is recognised */
+#define BNO_FEEL 10          /* samples between two readings of the accelerometer */
+#define BNO_LOOK 100         /* samples between two looks at temperature and mode */
+#define BNO_LEARN_US ((uint32_t)3000000) /* longest wait for its gyro's calibration: on a table that moves it never comes */
 
 #define ATTEMPTS 3
 #define TRANSFER_US 5000 /* the longest takes 0.6 ms at 400 kHz; a sensor may stretch the clock */
@@ -47,8 +52,11 @@ enum phase {
     MPU_COUNTED,
     MPU_FETCH,
     MPU_FETCHED,
+    BNO_LEARN,
+    BNO_LEARNING,
     BNO_RUN,
     BNO_READ,
+    BNO_FELT,
     BNO_LOOKED,
     LOST,
 };
@@ -198,9 +206,35 @@ static bool settings_kept(const struct imu *imu) {
     return imu->got[0] == imu->divider && imu->got[1] == imu->filter && imu->got[2] == imu->range << 3;
 }
 
+static void look_at_mode(struct imu *imu) {
+    read_registers(imu, BNO_TEMP, BNO_OPR_MODE - BNO_TEMP + 1);
+    imu->phase = BNO_LOOKED;
+}
+
+static void feel(struct imu *imu) {
+    read_registers(imu, BNO_ACC_DATA, 6);
+    imu->phase = BNO_FELT;
+}
+
+/* The BNO055 learns its gyro's zero at rest; until then its rates would jump. Looks again until it has. */
+static bool calibrated(struct imu *imu, uint32_t now) {
+    if (imu->phase == BNO_LEARNING && ((imu->got[BNO_CALIB_STAT - BNO_TEMP] & 0x30) == 0x30 || passed(now, imu->learnt_us))) {
+        return true;
+    }
+    if (imu->phase != BNO_LEARNING) {
+        imu->learnt_us = now + BNO_LEARN_US;
+    }
+    imu->due_us = now + LOOK_US;
+    imu->phase = BNO_LEARN;
+    return false;
+}
+
 /* The sensor runs, for the first time or again: what it did not take meanwhile counts as lost. */
 static void run(struct imu *imu, struct counters *counters) {
     uint32_t now = hal_micros(), edge_us;
+    if (!is_mpu(imu) && !calibrated(imu, now)) {
+        return;
+    }
     if (imu->sampled) {
         imu->newest = (uint16_t)(imu->newest + (now - imu->last_us) / imu->period_us);
         if (imu->status != IMU_STATUS_RUNNING) {
@@ -214,8 +248,13 @@ static void run(struct imu *imu, struct counters *counters) {
     }
     imu->status = IMU_STATUS_RUNNING;
     imu->last_us = now;
-    imu->due_us = now + (is_mpu(imu) ? LOOK_US : imu->period_us);
-    imu->phase = is_mpu(imu) ? MPU_RUN : BNO_RUN;
+    imu->due_us = now + LOOK_US;
+    imu->polls = 0;
+    imu->phase = MPU_RUN;
+    if (!is_mpu(imu)) {
+        imu->due_us = imu->newest_us = now;
+        feel(imu);
+    }
 }
 
 /* -- sampling ---------------------------------------------------------------------------------------------------- */
@@ -293,18 +332,36 @@ static void mpu_sample(struct imu *imu, struct imu_sample *sample) {
     }
 }
 
-static void bno_sample(struct imu *imu, struct imu_sample *sample) {
+/* The fusion tells nobody when it has a new sample, so that it is polled faster than that. What has not changed is the
+ * last sample once more, unless it is overdue: at rest, samples may be alike. */
+static bool bno_sample(struct imu *imu, struct imu_sample *sample) {
+    uint16_t seen = frame_crc(imu->got, BNO_BURST);
+    bool fresh = seen != imu->seen;
+    imu->phase = BNO_RUN;
+    if (!fresh && !passed(imu->began_us, imu->newest_us)) {
+        return false;
+    }
+    uint32_t gap_us = imu->began_us - imu->last_us;
+    if (gap_us > 5 * BNO_PERIOD_US / 2) {
+        imu->newest = (uint16_t)(imu->newest + gap_us / BNO_PERIOD_US - 1); /* the bus was not there for so long */
+    }
+    imu->seen = seen;
+    imu->newest_us = fresh ? imu->began_us + BNO_PERIOD_US + BNO_POLL_US / 4 : imu->newest_us + BNO_PERIOD_US;
     sample->index = ++imu->newest;
-    sample->time_us = imu->began_us;
+    sample->time_us = imu->began_us - BNO_POLL_US / 2;
     sample->flags = 0;
     for (uint8_t i = 0; i < 3; i++) {
-        sample->words[i] = (int16_t)get_u16(imu->got + 2 * i);
-        sample->words[4 + i] = (int16_t)get_u16(imu->got + BNO_GYRO + 2 * i);
+        sample->words[i] = imu->accel[i];
+        sample->words[4 + i] = (int16_t)get_u16(imu->got + 2 * i);
     }
     sample->words[3] = imu->temperature;
     imu->last_us = imu->began_us;
     imu->sampled = true;
-    imu->phase = BNO_RUN;
+    imu->polls = (uint8_t)((imu->polls + 1) % BNO_LOOK);
+    if (imu->polls % BNO_FEEL == 0) {
+        feel(imu);
+    }
+    return true;
 }
 
 bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sample) {
@@ -376,25 +433,35 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
             return true;
         }
         break;
+    case BNO_LEARN:
+        if (passed(now, imu->due_us)) {
+            look_at_mode(imu);
+            imu->phase = BNO_LEARNING;
+        }
+        break;
+    case BNO_LEARNING:
+        if (ended(imu, counters, BNO_LEARN)) {
+            run(imu, counters);
+        }
+        break;
     case BNO_RUN:
         if (passed(now, imu->due_us)) {
-            while (passed(now, imu->due_us += imu->period_us)) {
-                imu->newest++; /* too late for this one */
-            }
-            read_registers(imu, BNO_ACC_DATA, BNO_BURST);
+            imu->due_us = now + BNO_POLL_US;
+            read_registers(imu, BNO_GYR_DATA, BNO_BURST);
             imu->phase = BNO_READ;
         }
         break;
     case BNO_READ:
+        return ended(imu, counters, BNO_RUN) && bno_sample(imu, sample);
+    case BNO_FELT:
         if (ended(imu, counters, BNO_RUN)) {
-            bno_sample(imu, sample);
-            if (imu->polls++ == 0) {
-                read_registers(imu, BNO_TEMP, BNO_OPR_MODE - BNO_TEMP + 1);
-                imu->phase = BNO_LOOKED;
-            } else if (imu->polls == BNO_POLLS) {
-                imu->polls = 0;
+            for (uint8_t i = 0; i < 3; i++) {
+                imu->accel[i] = (int16_t)get_u16(imu->got + 2 * i);
             }
-            return true;
+            imu->phase = BNO_RUN;
+            if (imu->polls == 0) {
+                look_at_mode(imu);
+            }
         }
         break;
     case BNO_LOOKED:

@@ -29,10 +29,12 @@ struct imu {
     bool edges_come;  /* the data-ready line is wired */
     uint8_t frames;   /* still to be read of the FIFO */
     uint8_t polls;    /* MPU-6050: odd counts in a row; BNO055: samples since its mode was looked at */
+    uint16_t seen;    /* BNO055: checksum of the last sample */
+    int16_t accel[3]; /* BNO055: read less often than the gyro */
     uint16_t edges;   /* counted when the FIFO was last looked at */
     uint16_t base;    /* added to the count of edges it makes the index */
     uint16_t newest;  /* index of the newest sample that the sensor took */
-    uint32_t due_us, began_us, newest_us, last_us;
+    uint32_t due_us, began_us, newest_us, last_us, learnt_us;
     int16_t temperature;
     uint8_t sent[6];
     uint8_t got[20];

@@ -279,7 +279,7 @@ class SimHead:
         device = self._addressed
         if operation in (_START_WRITE, _START_READ):
             self._addressed = device = self._devices.get(data[0])
-            if device is None or self._nacks:
+            if device is None or self._nacks or not getattr(device, "answers", True):
                 self._nacks = max(self._nacks - 1, 0)
                 self._addressed = None
                 return 0

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from math import hypot, sqrt
 from threading import Lock
 
 import numpy as np
@@ -42,6 +43,7 @@ from rig.devices.head.protocol import (
     Reset,
     Rest,
     Sample,
+    SampleFlag,
     State,
     Stream,
     Trigger,
@@ -585,6 +587,8 @@ class RigHead:
         lost, self._lost = self._lost, 0
         time_ns, sigma_ns = self._timing.to_host(np.array([time_us for time_us, _ in taken], np.int64))
         gyro = np.array([(s.gyro_x, s.gyro_y, s.gyro_z) for _, s in taken], float).reshape(-1, 3)
+        if not all(s.flags & SampleFlag.EDGE for _, s in taken):
+            sigma_ns = hypot(sigma_ns, 1e9 / self.rate_hz / sqrt(12))  # polled: anywhere within a period
         return ImuSamples(time_ns, gyro / self._sensor.lsb_per_dps, lost, round(sigma_ns))
 
     def _fresh(self) -> Sample:

@@ -54,7 +54,7 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
             temperature_c=float,
             who_am_i=0xA0,
             others={},
-            start_s=2.5,
+            start_s=6.0,
         )
     if kind != "mpu6050":
         raise ConfigError(
