@@ -7,19 +7,17 @@ from typing import Self
 
 import serial
 
-from rig.config import RigConfig, ServoConfig
+from rig.config import RigConfig
 from rig.devices.dynamixel.port import READ_SLICE_S
-from rig.devices.dynamixel.registers import protocol_of
-from rig.errors import ConfigError, DeviceNotFound
+from rig.errors import DeviceNotFound
 from sim.camera import SimCapture
 from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
-from sim.servo import Ax12Servo, Geared, ServoBus, SimSerial, XSeriesServo
-from sim.servo.shaft import Shaft
+from sim.servo import ServoBus, SimSerial
+from sim.servo.configured import SimulatedServo, simulated_servo
 from sim.world import World
 
-SimulatedServo = XSeriesServo | Ax12Servo
 SimulatedImu = SimMpu6050 | SimBno055
 
 
@@ -83,24 +81,3 @@ class SimParts(AbstractContextManager["SimParts"]):
                     next_step="Plug the adapter in.",
                     evidence={"reason": str(error)},
                 ) from error
-
-
-def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
-    """Return the servo that ``config`` describes, on the table's shaft or behind its gear, as from the factory.
-
-    Raises
-    ------
-    ConfigError
-        There is no simulated servo of that model, or it does not know the baud rate.
-    """
-    shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
-    try:
-        if protocol_of(config.model) == 1:
-            return Ax12Servo(shaft, bus_id=config.id, baudrate=config.baud)
-        return XSeriesServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
-    except ValueError as error:
-        raise ConfigError(
-            "The simulated bench has no such servo.",
-            next_step="Mend servo.model or servo.baud.",
-            evidence={"reason": str(error)},
-        ) from error

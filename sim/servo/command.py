@@ -27,8 +27,8 @@ def sim_servo(
     """
     from rig.clock import SystemClock
     from rig.errors import UsageError
-    from sim.parts import simulated_servo
     from sim.servo import ServoBus
+    from sim.servo.configured import simulated_servo
     from sim.servo.terminal import ServoTerminal
     from sim.world import World
 

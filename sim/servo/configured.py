@@ -1,0 +1,32 @@
+"""The simulated servo that a configuration describes."""
+
+from rig.config import ServoConfig
+from rig.devices.dynamixel.registers import protocol_of
+from rig.errors import ConfigError
+from sim.servo.ax12 import Ax12Servo
+from sim.servo.device import XSeriesServo
+from sim.servo.shaft import Geared, Shaft
+from sim.world import World
+
+SimulatedServo = XSeriesServo | Ax12Servo
+
+
+def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
+    """Return the servo that ``config`` describes, on the table's shaft or behind its gear, as from the factory.
+
+    Raises
+    ------
+    ConfigError
+        There is no simulated servo of that model, or it does not know the baud rate.
+    """
+    shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
+    try:
+        if protocol_of(config.model) == 1:
+            return Ax12Servo(shaft, bus_id=config.id, baudrate=config.baud)
+        return XSeriesServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
+    except ValueError as error:
+        raise ConfigError(
+            "The simulated bench has no such servo.",
+            next_step="Mend servo.model or servo.baud.",
+            evidence={"reason": str(error)},
+        ) from error

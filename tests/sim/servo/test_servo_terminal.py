@@ -1,0 +1,110 @@
+"""`rig sim-servo` as other programs see it: a real process, a real (pseudo) terminal, real time."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
+
+from rig.clock import SystemClock
+from rig.config import ServoConfig
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import open_serial
+from rig.devices.dynamixel.register_servo import prepare_servo
+from rig.devices.servo import MotionProfile
+
+START = "from rig.cli.main import main; main()"
+
+
+@pytest.fixture
+def sim_servo(tmp_path: Path) -> Iterator[Callable[..., dict[str, Any]]]:
+    """Return a function that starts `rig sim-servo` and returns what it says about itself."""
+    running: list[subprocess.Popen[str]] = []
+
+    def start(*options: str) -> dict[str, Any]:
+        arguments = [sys.executable, "-c", START, "sim-servo", "--json", "--seconds", "60", *options]
+        process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+        running.append(process)
+        assert process.stdout is not None
+        told: dict[str, Any] = json.loads(process.stdout.readline())
+        return told | {"process": process}
+
+    yield start
+    for process in running:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def test_rustypot_drives_an_xl430(sim_servo: Callable[..., dict[str, Any]]) -> None:
+    rustypot = pytest.importorskip("rustypot")
+    told = sim_servo("--id", "1", "--id", "4")
+    servo = rustypot.Xl430PyController(told["port"], 1_000_000, 0.5)
+    assert [servo.ping(i) for i in (1, 4)] == [True, True]
+    assert servo.read_model_number(1) in (1060, [1060])
+    servo.write_operating_mode(1, 4)
+    servo.write_torque_enable(1, 1)
+    servo.write_goal_position(1, 2700)
+    clock, positions = SystemClock(), [0, 0]
+    for _ in range(200):
+        positions = servo.sync_read_present_position([1, 4])
+        if abs(positions[0] - 2700) < 4:
+            break
+        clock.sleep(0.02)
+    assert positions == pytest.approx([2700, 2048], abs=4)
+    servo.close()
+
+
+def test_rustypot_drives_an_ax12(sim_servo: Callable[..., dict[str, Any]]) -> None:
+    rustypot = pytest.importorskip("rustypot")
+    told = sim_servo("--set", "servo.model=ax_12a")
+    servo = rustypot.AxPyController(told["port"], 1_000_000, 0.5)
+    assert servo.ping(1)
+    assert servo.read_model_number(1) in (12, [12])
+    assert servo.read_raw_present_position(1) in (512, [512])
+    servo.close()
+
+
+def test_the_sdks_own_port_and_the_rigs_driver_find_it(
+    sim_servo: Callable[..., dict[str, Any]], tmp_path: Path
+) -> None:
+    """One after the other, through a link of a fixed name; in real time the driver moves it, and sees it move."""
+    sim_servo("--link", str(tmp_path / "servo"))
+    port = PortHandler(str(tmp_path / "servo"))
+    assert port.openPort()
+    assert Protocol2PacketHandler().ping(port, 1) == (1060, COMM_SUCCESS, 0)
+    port.closePort()
+    clock = SystemClock()
+    wire = open_serial(str(tmp_path / "servo"), 57_600)
+    servo = open_servo(wire, ServoConfig(), clock)
+    prepare_servo(servo, write=True)
+    servo.set_profile(MotionProfile(180.0, 2000.0))
+    servo.torque_on()
+    start_deg = servo.read_state().position_deg
+    servo.arm_watchdog(0.5)
+    servo.move_to(start_deg + 60.0)
+    seen = []
+    while not seen or (not servo.read_state().in_position and len(seen) < 200):
+        clock.sleep(0.02)
+        seen.append(servo.read_state().position_deg - start_deg)
+    assert seen[-1] == pytest.approx(60.0, abs=1.0)
+    assert any(5 < angle < 55 for angle in seen)
+    assert servo.line["retries"] == 0
+    servo.torque_off()
+    servo.close()
+
+
+def test_when_it_is_stopped_its_link_goes_and_readers_learn(
+    sim_servo: Callable[..., dict[str, Any]], tmp_path: Path
+) -> None:
+    told = sim_servo("--link", str(tmp_path / "servo"))
+    told["process"].send_signal(signal.SIGTERM)
+    assert told["process"].wait(10) == 143
+    assert not os.path.lexists(tmp_path / "servo")
