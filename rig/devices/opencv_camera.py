@@ -237,17 +237,24 @@ class OpenCvCamera:
 
     def _grab(self) -> int | None:
         """Take the next frame; return when its exposure began on the bench's clock, or None if that may be long ago."""
-        for _ in range(_RETRIES):
+        first_ns = self._clock.now_ns()
+        attempts, waited_s = 0, 0.0
+        while attempts < _RETRIES and waited_s <= self._timeout_s:  # V4L2 itself waits long for a stream that hangs
+            if attempts:
+                self._clock.sleep(self._period_s)
             asked_ns = self._clock.now_ns()
             if self._capture.grab():
                 return self._exposed_ns(asked_ns)
-            self._clock.sleep(self._period_s)
+            attempts += 1
+            waited_s = seconds_between(first_ns, self._clock.now_ns())
         raise DeviceSilent(
-            f"{self._identity.name} delivers no frames: {_RETRIES} attempts in a row failed",
+            f"{self._identity.name} delivers no frames: {attempts} attempts in a row failed"
+            if attempts > 1
+            else f"{self._identity.name} hangs: no frame in {waited_s:.0f} s",
             next_step="a recording is at its end"
             if self._capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0
             else "check the camera's cable, and that no other program uses it",
-            evidence={"attempts": _RETRIES, "still_open": self._capture.isOpened()},
+            evidence={"attempts": attempts, "still_open": self._capture.isOpened()},
         )
 
     def _exposed_ns(self, asked_ns: int) -> int | None:
