@@ -3,6 +3,10 @@
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
+
+FEW: Final = 100
+"""So many files are waited for one by one: the rest of the computer's traffic is none of theirs."""
 
 
 def write(path: Path, content: bytes) -> None:
@@ -33,6 +37,16 @@ def sync_file(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def sync_tree(folder: Path) -> None:
+    """Return when everything in a folder is on the disk."""
+    paths = [folder, *folder.rglob("*")]
+    if len(paths) > FEW:
+        os.sync()  # of thousands of small files all at once; one by one takes minutes on some disks
+        return
+    for path in paths:
+        sync_file(path)
 
 
 def make_folder(path: Path, *, within: Path) -> None:

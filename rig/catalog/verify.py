@@ -166,6 +166,7 @@ def _check_rows(state: _State) -> None:
         ]
     transaction = state.catalog.database.write if state.repair else state.catalog.database.read
     with transaction() as connection:
+        connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
         # the deletion of an orphan may make others
         while broken := connection.exec_driver_sql("PRAGMA foreign_key_check").all():
             for table, rowid, parent, _ in broken:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from sqlalchemy import Engine, event
 
@@ -27,6 +28,12 @@ from rig.clock import SystemClock
 _T = TypeVar("_T")
 
 PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, {"noise": "defaults"})
+
+
+def without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have nothing but the database wait for the disk; what is durable when is the matter of test_catalog_durability."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    monkeypatch.setattr(os, "sync", lambda: None)
 
 
 def plan(views: int) -> list[float]:

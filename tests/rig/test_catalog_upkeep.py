@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from catalog_samples import PROVENANCE, described, fill, finished, image, plan, record, true_fill
+from catalog_samples import PROVENANCE, described, fill, finished, image, plan, record, true_fill, without_waiting
 
 import hbr
 from hbr.descriptors import descriptor, registry
@@ -21,6 +21,11 @@ from rig.catalog.upkeep import collect_garbage, statistics
 from rig.catalog.verify import Problem, Verification, verify
 from rig.errors import CatalogError, DescriptorOutdated, ObjectExists, ObjectNotFound, UsageError
 from sim.clock import VirtualClock
+
+
+@pytest.fixture(autouse=True)
+def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_waiting(monkeypatch)
 
 
 @pytest.fixture

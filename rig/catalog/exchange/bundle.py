@@ -7,6 +7,7 @@ believed: names stay within it, sizes within limits, and every image has to hash
 import hashlib
 import json
 import stat
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
@@ -126,7 +127,7 @@ def open_bundle(path: Path) -> Package:
         with ZipFile(path) as archive:
             members = _members(path, archive)
             objects = _objects(path, archive, members)
-    except (BadZipFile, OSError, EOFError, NotImplementedError, ValueError, RuntimeError, RecursionError) as error:
+    except (BadZipFile, OSError, EOFError, NotImplementedError, ValueError, RuntimeError, zlib.error) as error:
         raise refuse(path, f"it cannot be read: {error}") from error
     return Package(
         str(path),

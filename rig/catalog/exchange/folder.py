@@ -64,7 +64,8 @@ def read_folder(folder: Path, *, pattern: str = DEFAULT_PATTERN, table_angles: b
         raise ImportRefused(f"there is no folder {folder}", next_step="check the path")
     real = folder.resolve()
     names = _names(folder / NAMES)
-    photographs, refused = [], []
+    photographs: list[tuple[str, Photograph]] = []
+    refused = []
     for path in sorted(folder.glob("/".join("*" * (pattern.count("/") + 1)))):
         if path.suffix.lower() not in SUFFIXES:
             continue
@@ -79,15 +80,15 @@ def read_folder(folder: Path, *, pattern: str = DEFAULT_PATTERN, table_angles: b
             angle_deg = float(found["angle"])
             azimuth_deg = float(wrap360(-angle_deg if table_angles else angle_deg))
             told = names.get(found["object"], {"name": found["object"]})
-            photographs.append(Photograph(path=path, azimuth_deg=azimuth_deg, values={}, **told))
+            photographs.append((found["object"], Photograph(path=path, azimuth_deg=azimuth_deg, values={}, **told)))
     if not photographs:
         raise ImportRefused(
             f"no photograph in {folder} is named like {pattern}.png",
             next_step="say how they are named, e.g. --pattern '{object}/{angle}'",
             evidence={"refused": [f"{file.path} {file.reason}" for file in refused[:5]]},
         )
-    photographs.sort(key=lambda photograph: _natural(photograph.name))
-    return assemble(str(folder), photographs, refused, now, this_software())
+    in_order = [photograph for _, photograph in sorted(photographs, key=lambda pair: _natural(pair[0]))]
+    return assemble(str(folder), in_order, refused, now, this_software())
 
 
 def write_folder(folder: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) -> int:

@@ -1,7 +1,7 @@
 """Into a catalog: images are checked and described aside, then all of it comes in at once."""
 
-import os
 import shutil
+import zlib
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
@@ -23,7 +23,7 @@ from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, si
 from rig.catalog.staging import staging
 from rig.catalog.upkeep import LOST
 from rig.errors import ImportRefused, ObjectExists, UsageError
-from rig.files import make_folder, sync_folder
+from rig.files import make_folder, sync_folder, sync_tree
 from rig.processes import over_processes
 
 
@@ -161,7 +161,7 @@ def bring_in(
         wanted = [kept for kept in (_without(item, staged) for item in plan.wanted) if kept.enrollments]
         if not wanted and items:
             raise _not_whole(package, refused)
-        os.sync()  # of thousands of small files at once; one by one takes minutes on some disks
+        sync_tree(folder)
         _commit(catalog, plan, wanted, staged, folder, label)
     return Imported(
         len(wanted),
@@ -245,7 +245,7 @@ def _stage_one(root: Path | None, item: _Item) -> _Staged:
         image = images.decode(content)
     except images.BadImage as error:
         return _Staged("", reason=str(error))
-    except (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+    except (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
         return _Staged("", reason=f"cannot be read: {error}")
     sha256 = images.digest(content)
     if item.sha256 is not None and sha256 != item.sha256:

@@ -1,6 +1,5 @@
 """A folder that gets its name when all of it is written."""
 
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +7,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 from rig.errors import ExportFailed
+from rig.files import sync_folder, sync_tree
 
 
 @contextmanager
@@ -27,8 +27,9 @@ def new_folder(path: Path) -> Iterator[Path]:
         try:
             yield made
             made.chmod(0o755)
-            os.sync()  # thousands of small files at once; one by one takes minutes on some disks
+            sync_tree(made)
             made.rename(path)
+            sync_folder(path.parent)
         finally:
             shutil.rmtree(made, ignore_errors=True)
     except OSError as error:
