@@ -62,6 +62,25 @@ def imu(
     )
 
 
+@app.command("noise")
+@command
+def noise(
+    settings: Settings,
+    name: Annotated[str, typer.Argument(help="What is put on the table, e.g. the name of an enrolled object.")],
+    placements: Annotated[int, typer.Option(min=2, help="How often it is placed anew, at the same mark.")] = 5,
+    error_rate: Annotated[
+        float, typer.Option(min=0.001, max=0.2, help="Share of known objects that may be taken for unknown.")
+    ] = 0.02,
+) -> None:
+    """Calibrate how alike repeated views are, and from it margin and threshold of identification.
+
+    Example: rig calibrate noise mug-star --bench sim --placements 5
+    """
+    from calibration import repeatability
+
+    run(settings, lambda bench: repeatability.live(bench, name, placements=placements, error_rate=error_rate))
+
+
 @app.command("show")
 @command
 def show(settings: Settings) -> None:

@@ -86,6 +86,10 @@ class TableConfig(Section):
     settle_s: float = Field(
         0.46, gt=0, le=10, description="time from the end of a motion until the table is found at rest, for estimates"
     )
+    orientation: Literal["encoder", "imu"] = Field(
+        "encoder",
+        description="what a view's angle is taken from: the servo's encoder, or the gyro on the platter alone",
+    )
     quiet_dps: float = Field(0.35, gt=0, le=10, description="largest rate that the gyro may see at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
@@ -140,6 +144,9 @@ class SafetyConfig(Section):
 class ImuConfig(Section):
     """Where the IMU is and how it is mounted."""
 
+    connection: Literal["i2c", "head"] = Field(
+        "i2c", description="where the sensor hangs: on the computer's own I2C bus, or on a rig head, see [head]"
+    )
     model: Literal["mpu6050", "bno055"] = Field("mpu6050", description="which sensor rides on the platter")
     bus: int | str = Field(1, description="I2C bus number, or the path of its device")
     address: int = Field(
@@ -166,6 +173,20 @@ class ImuConfig(Section):
     def _address_of_the_model(cls, address: int, others: ValidationInfo) -> int:
         # The default is an MPU-6050's; no BNO055 can have it.
         return 0x28 if others.data.get("model") == "bno055" and address == 0x68 else address
+
+
+class HeadConfig(Section):
+    """The rig head: a small board that samples the IMU and keeps the bench safe (``imu.connection = "head"``)."""
+
+    port: str = Field("/dev/ttyUSB1", description="serial port of the board")
+    deadman_s: float = Field(
+        0.25, ge=0.05, le=2, description="silence of this computer after which the head makes the bench safe"
+    )
+    light: float | None = Field(
+        None, gt=0, le=1, description="duty of the ring light while the bench is open; none: none is wired to the head"
+    )
+    power: bool = Field(False, description="whether the servo's supply goes through the head's relay")
+    power_up_s: float = Field(0.6, ge=0.1, le=5, description="from closing that relay until the servo answers")
 
 
 class CameraConfig(Section):
@@ -222,6 +243,9 @@ class IdentifyConfig(Section):
         "orient_all", description="how missing views are filled in"
     )
     margin: float = Field(0.02, ge=0, le=1, description="stop when the best score surely leads by this much a view")
+    repeatability: float = Field(
+        0.97, ge=0, le=1, description="similarity that the same view of two placings surely keeps, by calibration"
+    )
     min_score: float | None = Field(
         None,
         ge=0,
@@ -252,6 +276,7 @@ class RigConfig(Section):
     table: TableConfig = TableConfig()
     safety: SafetyConfig = SafetyConfig()
     imu: ImuConfig = ImuConfig()
+    head: HeadConfig = HeadConfig()
     camera: CameraConfig = CameraConfig()
     view: ViewConfig = Field(ViewConfig(), validate_default=True)
     catalog: CatalogConfig = CatalogConfig()

@@ -41,7 +41,11 @@ class Search:
     ) -> None:
         if not len(index.views):
             raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
-        self.min_score = hbr.familiar_score(index.views) if config.min_score is None else config.min_score
+        self.min_score = (
+            hbr.familiar_score(index.views, repeatability=config.repeatability)
+            if config.min_score is None
+            else config.min_score
+        )
         self._index = index
         self._config = config
         self._strategy = strategy
