@@ -75,6 +75,7 @@ class DynamixelBus:
     def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
         self.port = port
         self.statistics = BusStatistics()
+        self.protocol = protocol
         self._packets: Packets = Packets1() if protocol == 1 else Packets2()
         self._retries = retries
         self._lock = RLock()
@@ -83,10 +84,6 @@ class DynamixelBus:
         self._owed: list[
             tuple[int, int]
         ] = []  # answers that may still come: their parameters, when they were asked for
-
-    @property
-    def protocol(self) -> int:
-        return self._packets.version
 
     def alert(self, device_id: int) -> int:
         """Return the alert of the device's last status packet, 0 where its hardware is well: see `Reply`."""
@@ -184,7 +181,8 @@ class DynamixelBus:
                     self._unanswered = True
                     replies, result = attempt()
                 except (serial.SerialException, OSError) as unplugged:
-                    raise self._silent(what, device_ids, f"the port failed: {unplugged}") from unplugged
+                    step = "Check the adapter's USB plug, then start again."
+                    raise self._silent(what, device_ids, f"the port failed: {unplugged}", step) from unplugged
                 except (LineBabble, IndexError):
                     # Of some noise the SDK makes a packet that is shorter than the bytes it then looks at.
                     replies, result = {}, COMM_RX_CORRUPT
@@ -200,7 +198,13 @@ class DynamixelBus:
                     return replies
                 self._count(result)
             missing = [device_id for device_id in device_ids if device_id not in replies]
-            raise self._silent(what, missing or device_ids, self._packets.reason(result))
+            step = (
+                "Something answers, but spoiled: two servos with one id, another program at the bus, a bad cable. "
+                "`rig find` shows who is there."
+                if result == COMM_RX_CORRUPT
+                else "Check the servo's cable and its supply (its LED blinks at power-up), then start again."
+            )
+            raise self._silent(what, missing or device_ids, self._packets.reason(result), step)
 
     def _ask(
         self, target: int, instruction: int, parameters: bytes, size: int, answering: Sequence[int] | None = None
@@ -245,6 +249,8 @@ class DynamixelBus:
 
     def _unmistakable(self, address: int, size: int) -> tuple[int, int]:
         """Return start and size of a read that holds ``size`` bytes at ``address`` and whose answer is its own."""
+        if not self._owed and self.protocol != 1:
+            return address, size
         asked = size
         while self._owes(asked) or (self.protocol == 1 and asked == _ECHO_SIZE):
             asked += 1
@@ -256,11 +262,11 @@ class DynamixelBus:
         else:
             self.statistics.timeouts += 1
 
-    def _silent(self, what: str, device_ids: Sequence[int], reason: str) -> DeviceSilent:
+    def _silent(self, what: str, device_ids: Sequence[int], reason: str, next_step: str) -> DeviceSilent:
         ids = ", ".join(map(str, device_ids))
         return DeviceSilent(
             f"Servo {ids} does not answer ({what}).",
-            next_step="Check the servo's cable and its supply (its LED blinks at power-up), then start again.",
+            next_step=next_step,
             evidence={"reason": reason, "attempts": self._retries + 1, "baud": self.port.baudrate},
         )
 
