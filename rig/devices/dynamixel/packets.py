@@ -38,8 +38,6 @@ class Reply:
 class Packets(Protocol):
     """One of the two protocols, on a port."""
 
-    version: ClassVar[int]
-
     refusals: ClassVar[dict[int, str]]
     """What the error of a `Reply` means."""
 
@@ -67,7 +65,6 @@ class Packets(Protocol):
 class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     """Protocol 2.0."""
 
-    version: ClassVar[int] = 2
     refusals: ClassVar[dict[int, str]] = {
         1: "result fail",
         2: "instruction error",
@@ -125,7 +122,6 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
     echoes plays back an instruction that reads two bytes as a valid status packet; `DynamixelBus` never sends one.
     """
 
-    version: ClassVar[int] = 1
     refusals: ClassVar[dict[int, str]] = {
         0x02: "outside the angle limits",
         0x08: "value out of range",

@@ -51,7 +51,7 @@ def open_serial(path: str, baud: int) -> Wire:
         elif reason in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
             step = "Close the other program that uses this port (e.g. Dynamixel Wizard, another rig)."
         else:
-            step = "Check the USB cable and servo.port; `python -m serial.tools.list_ports` lists the ports."
+            step = "Check the USB cable and servo.port; `rig find` lists the ports."
         raise DeviceNotFound(
             f"Cannot open the servo's port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
         ) from error

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from rig.clock import Clock
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.registers import ControlTable, Register, control_table, model_numbers
+from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_numbers
 from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
 from rig.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
@@ -67,7 +67,8 @@ class RegisterServo(ABC):
         self._id = bus_id
         self._mode = mode
         self._gear_ratio = gear_ratio
-        self._blocks: dict[tuple[int, int], list[Register]] = {}
+        self._resolution_deg = self.deg_per_count / gear_ratio
+        self._blocks: dict[tuple[str, str], Block] = {}
         try:
             number = bus.ping(bus_id)
         except DeviceSilent as silent:
@@ -106,7 +107,7 @@ class RegisterServo(ABC):
 
     @property
     def resolution_deg(self) -> float:
-        return self.deg_per_count / self._gear_ratio
+        return self._resolution_deg
 
     @property
     def turn_deg(self) -> float:
@@ -204,15 +205,13 @@ class RegisterServo(ABC):
 
     def _read_registers(self, first: str, last: str) -> tuple[int, dict[str, int]]:
         """Read all registers from ``first`` to ``last`` in one transaction; return when, and their values by name."""
-        start, end = self._table[first].address, self._table[last].address + self._table[last].size
-        begun_ns = self._clock.now_ns()
-        image = self._bus.read_block(self._id, start, end - start)
-        time_ns = (begun_ns + self._clock.now_ns()) // 2
-        block = self._blocks.get((start, end))
+        block = self._blocks.get((first, last))
         if block is None:
-            block = [r for r in self._table.values() if start <= r.address and r.address + r.size <= end]
-            self._blocks[start, end] = block
-        return time_ns, {r.name: r.decode(image[r.address - start : r.address - start + r.size]) for r in block}
+            block = self._blocks[first, last] = Block.of(self._table, first, last)
+        begun_ns = self._clock.now_ns()
+        image = self._bus.read_block(self._id, block.address, block.layout.size)
+        time_ns = (begun_ns + self._clock.now_ns()) // 2
+        return time_ns, block.values(image)
 
 
 def hardware_errors(bits: int) -> tuple[str, ...]:

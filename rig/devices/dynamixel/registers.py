@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from struct import Struct
+from typing import Self
 
 from rig.errors import ConfigError
 
@@ -74,6 +76,9 @@ _AX_12A_TABLE = (
 """No value of it is signed: speed and load carry their direction in bit 10."""
 
 
+_LETTERS = {1: "b", 2: "h", 4: "i"}  # of the module struct, signed
+
+
 @dataclass(frozen=True, slots=True)
 class Register:
     """One entry of a control table."""
@@ -111,6 +116,31 @@ class ControlTable(Mapping[str, Register]):
 
     def __len__(self) -> int:
         return len(self._registers)
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Registers that lie side by side, to be read in one transaction."""
+
+    address: int
+    layout: Struct
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, table: ControlTable, first: str, last: str) -> Self:
+        """Return the registers of ``table`` from ``first`` to ``last``; bytes between them are skipped."""
+        start, end = table[first].address, table[last].address + table[last].size
+        registers = sorted((r for r in table.values() if start <= r.address < end), key=lambda r: r.address)
+        layout, at = "<", start
+        for register in registers:
+            letter = _LETTERS[register.size]
+            layout += f"{register.address - at}x{letter if register.signed else letter.upper()}"
+            at = register.address + register.size
+        return cls(start, Struct(layout), tuple(register.name for register in registers))
+
+    def values(self, image: bytes) -> dict[str, int]:
+        """Return the values in the bytes from `address` on, by register."""
+        return dict(zip(self.names, self.layout.unpack(image), strict=True))
 
 
 def _rows(file_name: str, section: str) -> list[list[str]]:

@@ -28,6 +28,8 @@ class DynamixelServo(RegisterServo):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        self._dps_per_unit = DPS_PER_UNIT / self._gear_ratio
+        self._dps2_per_unit = DPS2_PER_UNIT / self._gear_ratio
         # Present Current shares the unit of Current Limit, so that their ratio needs no unit of the model.
         self._current_limit = self._read("Current Limit") if "Present Current" in self._table else None
 
@@ -41,7 +43,7 @@ class DynamixelServo(RegisterServo):
         time_ns, values = self._read_registers("Moving", "Present Temperature")
         return ServoState(
             time_ns=time_ns,
-            position_deg=values["Present Position"] * self.resolution_deg,
+            position_deg=values["Present Position"] * self._resolution_deg,
             velocity_dps=values["Present Velocity"] * self._dps_per_unit,
             load_percent=self._load_percent(values),
             voltage_v=values["Present Input Voltage"] * 0.1,
@@ -49,7 +51,7 @@ class DynamixelServo(RegisterServo):
             moving=bool(values["Moving"]),
             in_position=bool(values["Moving Status"] & 1),
             hardware_errors=self._hardware_errors() if self._bus.alert(self._id) else (),
-            trajectory_deg=values["Position Trajectory"] * self.resolution_deg,
+            trajectory_deg=values["Position Trajectory"] * self._resolution_deg,
         )
 
     def read_condition(self) -> ServoCondition:
@@ -128,14 +130,6 @@ class DynamixelServo(RegisterServo):
             self._change_mode(self._mode)
 
     # -- inside ---------------------------------------------------------------------------------------------------
-
-    @property
-    def _dps_per_unit(self) -> float:
-        return DPS_PER_UNIT / self._gear_ratio
-
-    @property
-    def _dps2_per_unit(self) -> float:
-        return DPS2_PER_UNIT / self._gear_ratio
 
     def _load_percent(self, values: dict[str, int]) -> float:
         if self._current_limit is not None:

@@ -1,0 +1,101 @@
+"""A servo's status read through the rig's driver, as a ratio to the SDK's bare read of the same registers.
+
+On the in-memory port, where a transaction costs computing and no waiting: with the simulated servo behind it, and
+played back to it from memory, which leaves nothing but driver and SDK. Run: python -m benchmarks.bench_servo
+"""
+
+from collections.abc import Callable
+
+from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
+
+from rig.clock import Clock, SystemClock
+from rig.config import ServoConfig
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
+from rig.devices.dynamixel.register_servo import RegisterServo, prepare_servo
+from rig.devices.dynamixel.registers import control_table
+from sim.noise import NoiseModel
+from sim.servo import Frame, ServoBus, SimSerial, Source, XSeriesServo
+from sim.world import World
+
+BAUD = 1_000_000
+READS, ROUNDS, LOOP_HZ = 200, 15, 50
+LIMIT = 1.5
+
+TABLE = control_table("xl430_w250")
+FIRST, SIZE = TABLE["Moving"].address, TABLE["Present Temperature"].address + 1 - TABLE["Moving"].address
+
+
+class PlayedBack(SimSerial):
+    """A simulated port that after `record` gives the last answer again, whatever is asked."""
+
+    def record(self, answer: bytes) -> None:
+        self._answer, self._left = answer, b""
+        self.read, self.write = self._play, self._again  # type: ignore[method-assign]
+        self.reset_input_buffer = lambda: None  # type: ignore[method-assign]
+
+    def _again(self, data: bytes, /) -> int:
+        self._left = self._answer
+        return len(data)
+
+    def _play(self, size: int = 1) -> bytes:
+        data, self._left = self._left[:size], self._left[size:]
+        return data
+
+
+def best_us(calls: list[Callable[[], object]], clock: Clock) -> list[float]:
+    """Return the time of each call in µs: the best of many rounds in turn, so that all had the same good moments."""
+    best = [float("inf")] * len(calls)
+    for _ in range(ROUNDS):
+        for i, call in enumerate(calls):
+            start_ns = clock.now_ns()
+            for _ in range(READS):
+                call()
+            best[i] = min(best[i], (clock.now_ns() - start_ns) * 1e-3 / READS)
+    return best
+
+
+def opened() -> tuple[RegisterServo, PlayedBack, list[Frame]]:
+    """Return a driver on a simulated servo, its port, and what goes over the line."""
+    world = World(noise=NoiseModel.none())
+    bus = ServoBus(world.clock)
+    bus.attach(XSeriesServo(world, baudrate=BAUD))
+    wire = PlayedBack(bus, BAUD, READ_SLICE_S)
+    servo = open_servo(wire, ServoConfig(baud=BAUD), world.clock)
+    prepare_servo(servo, write=True)
+    frames: list[Frame] = []
+    bus.taps.append(frames.append)
+    servo.read_state()
+    bus.taps.clear()
+    return servo, wire, frames
+
+
+def bare_read(servo: RegisterServo, wire: SimSerial) -> Callable[[], None]:
+    port, sdk = ClockedPort(wire, servo.bus.port.clock), Protocol2PacketHandler()
+
+    def read() -> None:
+        _, result, _ = sdk.readTxRx(port, 1, FIRST, SIZE)
+        assert result == COMM_SUCCESS
+
+    return read
+
+
+def main() -> None:
+    clock = SystemClock()
+    for name, played in (("simulated servo", False), ("answer played back", True)):
+        servo, wire, frames = opened()
+        if played:
+            wire.record(next(frame.data for frame in frames if frame.source is Source.DEVICE))
+        driver_us, bare_us = best_us([servo.read_state, bare_read(servo, wire)], clock)
+        ratio = driver_us / bare_us
+        limit = "" if played else f" (at most {LIMIT})"
+        print(
+            f"status read of {SIZE} bytes, {name}: driver {driver_us:.0f} µs ({1e6 / driver_us:.0f} a second), "
+            f"bare SDK {bare_us:.0f} µs ({1e6 / bare_us:.0f} a second): {ratio:.2f} ×{limit}; "
+            f"at {LOOP_HZ} Hz {1e-4 * LOOP_HZ * driver_us:.2f} % of a processor, bare {1e-4 * LOOP_HZ * bare_us:.2f} %"
+        )
+        assert played or ratio <= LIMIT, f"{ratio:.2f} × the bare SDK's read"
+
+
+if __name__ == "__main__":
+    main()
