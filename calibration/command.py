@@ -41,6 +41,18 @@ def servo(
     )
 
 
+@app.command("cable")
+@command
+def cable(settings: Settings) -> None:
+    """Teach the table's limits by hand, torque off: turn it to either end of the cable's reach.
+
+    Example: rig calibrate cable
+    """
+    from calibration.cable import live
+
+    run(settings, live)
+
+
 @app.command("imu")
 @command
 def imu(
@@ -172,7 +184,7 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
 
 def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Fact":
     """Tell the events of a procedure as they come, and return its fact."""
-    from calibration.events import Progress
+    from calibration.events import Ask, Progress
     from rig.cli.present import line
     from rig.facts import Fact
     from rig.plans.events import event_dict
@@ -182,6 +194,8 @@ def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Fact":
         for event in events:
             if isinstance(event, Fact):
                 fact = event
+            elif isinstance(event, Ask):
+                typer.prompt(f"{event.words}\nThen press Enter", default="", show_default=False, err=settings.json)
             elif settings.json:
                 settings.print_json(event_dict(event))
             else:

@@ -9,3 +9,10 @@ class Progress:
 
     share: float
     words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """Something that a person must do before the procedure goes on; it goes on when the next event is asked for."""
+
+    words: str
