@@ -9,8 +9,9 @@ from typing import Self
 
 from rig.bench import Bench
 from rig.clock import seconds_between
-from rig.devices.servo import MotionProfile
+from rig.devices.servo import MotionProfile, ServoState
 from rig.errors import (
+    DeviceFault,
     DeviceRefused,
     DeviceSilent,
     FollowingError,
@@ -19,6 +20,7 @@ from rig.errors import (
     NoProgress,
     NotReady,
     RigError,
+    RotationDisagreement,
     SupplyLost,
     WatchdogTripped,
 )
@@ -33,6 +35,9 @@ FIRST_REST_S = 0.6
 
 SETTLE_ALLOWANCE_S = 2.5
 """Time for ringing to die down and for a slow bus, on top of the motion's own."""
+
+STANDS_S = 0.01
+"""Between two looks at a table that is to be stopped: does it turn at all?"""
 
 STOP_ALLOWANCE_S = 0.5
 """Time for a stop on top of its ramp; then the torque goes off anyhow."""
@@ -49,6 +54,7 @@ class Move:
     agreement: Agreement | None
     started_ns: int
     settled_ns: int
+    by_gyro: bool = False
 
     @property
     def agrees(self) -> bool:
@@ -57,8 +63,11 @@ class Move:
 
     @property
     def rotation_deg(self) -> float:
-        """The rotation to believe: the encoder's, unless the gyro, which rides on the platter, contradicts it."""
-        return self.rotation_encoder_deg if self.agrees else self.gyro.angle_deg
+        """The rotation to believe: the encoder's, unless the gyro, which rides on the platter, contradicts it.
+
+        The gyro's in any case where ``table.orientation`` says so.
+        """
+        return self.gyro.angle_deg if self.by_gyro or not self.agrees else self.rotation_encoder_deg
 
     @property
     def seconds(self) -> float:
@@ -272,7 +281,16 @@ class Turntable(AbstractContextManager["Turntable"]):
             agreement = compare(
                 rotation_deg, gyro, encoder_sigma_deg=self._servo.resolution_deg, backlash_deg=self._config.backlash_deg
             )
-        return Move(target_deg, self._rest_deg, rotation_deg, gyro, agreement, started_ns, self._clock.now_ns())
+        by_gyro = self._config.orientation == "imu"
+        if by_gyro and not gyro.valid:
+            raise RotationDisagreement(
+                f"How far the platter turned is unknown: {gyro.reason}. By table.orientation the gyro alone tells.",
+                next_step="Check the IMU's cable and range, then start again; an enrollment goes on with --resume.",
+                evidence={"table_deg": round(self._rest_deg, 2)},
+            )
+        return Move(
+            target_deg, self._rest_deg, rotation_deg, gyro, agreement, started_ns, self._clock.now_ns(), by_gyro
+        )
 
     def _approach(self, goal_deg: float, quiet_s: float, slip: SlipWatch | None) -> None:
         """Go to ``goal_deg`` under watch, and return when the table has arrived there and been quiet for so long."""
@@ -331,19 +349,46 @@ class Turntable(AbstractContextManager["Turntable"]):
                 return
             elapsed_s = seconds_between(start_ns, self._clock.now_ns())
             if elapsed_s > allowed_s:
-                raise MotionTimeout(
-                    f"The table did not come to rest at {goal_deg:.1f}° within {allowed_s:.1f} s.",
-                    next_step="Look for what blocks or shakes the table, and for a cable at its end; then start again.",
-                    evidence={
-                        "goal_deg": round(goal_deg, 2),
-                        "encoder_deg": round(angle_deg, 2),
-                        "in_position": state.in_position,
-                        "moving": state.moving,
-                        "peak_rate_dps": finite(self._heading.peak_dps(config.quiet_s)),
-                        "load_percent": round(state.load_percent, 1),
-                        "voltage_v": round(state.voltage_v, 1),
-                    },
-                )
+                raise self._unsettled(goal_deg, allowed_s, state, arrived=arrived)
+
+    def _unsettled(self, goal_deg: float, allowed_s: float, state: ServoState, *, arrived: bool) -> RigError:
+        """Return why the table does not come to rest: it has not arrived, it shakes, or the gyro does not tell."""
+        peak_dps = self._heading.peak_dps(self._config.quiet_s)
+        evidence = {
+            "goal_deg": round(goal_deg, 2),
+            "encoder_deg": round(self._safety.reference.to_table(state.position_deg), 2),
+            "in_position": state.in_position,
+            "moving": state.moving,
+            "peak_rate_dps": finite(peak_dps),
+            "load_percent": round(state.load_percent, 1),
+            "voltage_v": round(state.voltage_v, 1),
+        }
+        if arrived and not isfinite(peak_dps):
+            return DeviceFault(
+                f"The table has arrived at {goal_deg:.1f}°, but samples of the gyro are missing: is it at rest?",
+                next_step="Check the IMU's cable and supply.",
+                evidence=evidence,
+            )
+        if arrived and peak_dps > self._profile_dps():
+            return DeviceFault(
+                f"The table has arrived at {goal_deg:.1f}°, but the gyro tells of {peak_dps:.0f} °/s.",
+                next_step="Check the IMU: no table that stands turns like that.",
+                evidence=evidence,
+            )
+        if arrived:
+            return MotionTimeout(
+                f"The table has arrived at {goal_deg:.1f}° but does not come to rest within {allowed_s:.1f} s.",
+                next_step="Look for what shakes the bench; table.quiet_dps says how much is too much.",
+                evidence=evidence,
+            )
+        return MotionTimeout(
+            f"The table did not arrive at {goal_deg:.1f}° within {allowed_s:.1f} s.",
+            next_step="Look for what slows the table down, and for a cable at its end.",
+            evidence=evidence,
+        )
+
+    def _profile_dps(self) -> float:
+        return self._profile.velocity_dps if self._profile else self._config.velocity_dps
 
     def _look_for_slip(self, slip: SlipWatch, time_ns: int, angle_deg: float) -> None:
         slip.note(time_ns, angle_deg)
@@ -396,6 +441,14 @@ class Turntable(AbstractContextManager["Turntable"]):
             if incredible(state):  # where the table is, nobody knows: it runs out
                 self._servo.torque_off()
                 return True
+            self._clock.sleep(STANDS_S)
+            later = self._servo.read_state()
+            passed_s = seconds_between(state.time_ns, later.time_ns)
+            went_deg = abs(later.position_deg - state.position_deg)
+            if went_deg < max(abs(state.velocity_dps) * passed_s / 4, QUIET_COUNTS * self._servo.resolution_deg):
+                self._servo.torque_off()  # it stands; or its readings do, and a goal by them would turn the table
+                return True
+            state = later
             ramp_dps2 = self._profile.acceleration_dps2 if self._profile else self._config.acceleration_dps2
             ramp_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
             on_the_bus_s = 2 * seconds_between(state.time_ns, self._clock.now_ns())  # the answer's way, and the goal's

@@ -115,7 +115,7 @@ def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, f
                 index=index,
                 commanded_deg=move.commanded_deg,
                 encoder_deg=move.encoder_deg,
-                azimuth_deg=float(wrap360(-move.encoder_deg)),
+                azimuth_deg=float(wrap360(-(imu.angle_deg if move.by_gyro else move.encoder_deg))),
                 descriptor=viewer.describe(shot.image_bgr),
                 captured_ns=shot.evidence.exposed_ns,
                 imu_deg=imu.angle_deg,
@@ -168,15 +168,17 @@ class _ImuAngle:
     """The table's angle by the gyro alone, from where the encoder first was."""
 
     def __init__(self) -> None:
-        self.angle_deg: float | None = None
+        self.angle_deg = 0.0
         self.sigma_deg = 0.0
+        self._begun = False
 
     def add(self, move: Move) -> None:
-        if self.angle_deg is None:
-            self.angle_deg = move.encoder_deg
-        else:
+        if self._begun:
             self.angle_deg += move.gyro.angle_deg
             self.sigma_deg += move.gyro.sigma_deg  # not in squares: bias and scale errors are common to all moves
+        else:
+            self._begun = True
+            self.angle_deg = move.commanded_deg if move.by_gyro else move.encoder_deg
 
 
 def _disagreement(move: Move) -> RotationDisagreement:
