@@ -244,6 +244,10 @@ class Safety:
             heard = False
             try:
                 heard = stop()
+                if not heard:
+                    error.add_note(
+                        "The servo did not hear the stop: its watchdog stops the table, its torque stays on."
+                    )
             finally:
                 if isinstance(error, LATCHING):
                     self.latch(error)

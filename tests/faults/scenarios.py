@@ -118,7 +118,7 @@ SCENARIOS: dict[str, Scenario] = {
         stopped("imu.wrong@move20", 502, "encoder and gyro disagree", "change the sensor, or calibrate it", step=ACK),
         stopped(
             "imu.slow@move20",
-            501,
+            404,
             "samples are missing: the table never counts as at rest",
             "restart the sensor",
             step=ACK,
@@ -187,7 +187,7 @@ SCENARIOS: dict[str, Scenario] = {
         stopped("i2c_stuck@move20", 402, "the kernel's timeout, three times", "power-cycle the sensor"),
         stopped(
             "imu_saturated@move20",
-            501,
+            404,
             "the gyro's rate stands at the end of its range",
             "restart the sensor",
             step=ACK,
