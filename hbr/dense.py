@@ -27,6 +27,8 @@ BINS: Final = 72
 _BIN_DEG: Final = 360 / BINS
 #: Objects that are kept after the first view.
 KEPT: Final = 500
+#: How fast a bin's weight in the mean azimuth falls with its support.
+_POSE_SHARPNESS: Final = 60.0
 #: Objects that are scored at a time: what a core's own cache holds.
 _CHUNK: Final = 64
 
@@ -62,7 +64,10 @@ class DenseIndex:
         #: Where `rows` is padding, or a view that was left out.
         self.left_out = ~inside
         self.azimuth_deg: FloatArray = views.azimuth_deg[self.rows]
-        self._dead_deg = np.array([_spacing(own[ok]) / 2 for own, ok in zip(self.azimuth_deg, inside, strict=True)])
+        #: Half the usual spacing of each object's views.
+        self.dead_deg: FloatArray = np.array(
+            [_spacing(own[ok]) / 2 for own, ok in zip(self.azimuth_deg, inside, strict=True)]
+        )
 
     def __len__(self) -> int:
         return len(self.object_index)
@@ -104,7 +109,7 @@ class DenseIndex:
             # degrees to the nearest whole turn, in place: this is the filter's whole time
             away -= np.float32(360) * np.rint(away * np.float32(1 / 360))
             np.abs(away, out=away)
-            away -= self._dead_deg[chunk].astype(np.float32)[:, None, None]
+            away -= self.dead_deg[chunk].astype(np.float32)[:, None, None]
             np.maximum(away, 0, out=away)
             away *= -slope
             away += own[part][:, None]
@@ -151,8 +156,23 @@ class Belief:
         """The objects considered, best first."""
         scores = self.scores()
         order = np.argsort(-scores, kind="stable")
-        azimuth_deg = self.support[order].argmax(axis=1) * _BIN_DEG + self.turned_deg
+        azimuth_deg = self._azimuth_deg(order) + self.turned_deg
         return DenseRanking(self.index.object_index[self.places[order]], scores[order], wrap360(azimuth_deg))
+
+    def _azimuth_deg(self, which: IndexArray) -> FloatArray:
+        """Azimuth at the first query of these objects: the mean around the best bin, weighted by the support.
+
+        In the dead zone around an enrolled view all bins are equal, and their middle is the best guess.
+        """
+        support = self.support[which].astype(np.float64)
+        best = support.argmax(axis=1)
+        reach = np.maximum(1, np.rint(2.5 * self.index.dead_deg[self.places[which]] / _BIN_DEG)).astype(int)
+        offset = np.arange(-BINS // 2, BINS // 2)
+        near = np.take_along_axis(support, (best[:, None] + offset) % BINS, axis=1)
+        weight = np.exp(_POSE_SHARPNESS * (near - near.max(axis=1, keepdims=True)))
+        weight *= np.abs(offset) <= reach[:, None]
+        mean: FloatArray = (best + (weight * offset).sum(axis=1) / weight.sum(axis=1)) * _BIN_DEG
+        return mean
 
     def posterior(self, beta: float) -> FloatArray:
         """Probability of every hypothesis, (k, 72): proportional to exp(β A / √n).

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hbr.arrays import ImageArray
 from hbr.checks import check_image
 from hbr.frontend.background import Background, Light, shrunk
+from hbr.frontend.guess import guessed
 from hbr.frontend.plain import plain_difference
 from hbr.frontend.silhouette import silhouette
 
@@ -87,7 +88,8 @@ def sight(
     is brought to the reference's, as far as the frame's border shows the same background; and to a plain grey backdrop,
     if the reference shows one. A border that does not look like the reference (the table was changed, the camera was
     moved) is noticed, and the reference is left alone. Without a reference, or where it is refused, the object is what
-    differs from a plain background. Nothing is guessed: what is refused stands in `Sighting.refused`.
+    differs from a plain background, and where there is none, what has other colours than the frame's border: a guess.
+    What was refused, and what is a guess, stands in `Sighting.refused`.
 
     Parameters
     ----------
@@ -142,7 +144,11 @@ def sight(
     if found is None and box is None:
         differs = plain_difference(small)
         if differs is None:
-            refused.append("the silhouette: the background is not plain enough")
+            refused.append("the silhouette: the background is not plain enough; guessed from colours")
+            cut = guessed(small)
+            found = None if cut is None else silhouette(cut, framed=False)
+            if found is None:
+                refused.append("the guess: no part of the frame stands out")
         else:
             found = silhouette(differs, framed=False)
             if found is None:

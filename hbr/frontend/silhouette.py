@@ -15,7 +15,7 @@ Binary = NDArray[np.uint8]
 _LEAST: Final = 0.004
 #: A part beside the largest one belongs to the object if it has this share of its area.
 _PART: Final = 0.08
-#: Radii of the bars that are cut off where something reaches into the frame, in 160ths of the frame.
+#: Radii of the bars that are cut off where something reaches into the frame, in pixels of the small image.
 _BARS: Final = (0, 2, 3, 4, 5)
 
 
