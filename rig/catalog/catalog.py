@@ -24,6 +24,7 @@ from rig.catalog.queries import (
     in_use,
     model_set,
     object_summaries,
+    regions,
     stored_views,
 )
 from rig.catalog.records import (
@@ -32,6 +33,7 @@ from rig.catalog.records import (
     ObjectDetails,
     ObjectSummary,
     Provenance,
+    Region,
     Sitting,
     StoredView,
     check_azimuth,
@@ -276,6 +278,11 @@ class Catalog:
         kind = known_descriptor(descriptor)
         with self._database.read() as connection:
             return ModelSet(*model_set(connection, kind))
+
+    def regions(self, bench: str) -> set[Region | None]:
+        """Return the parts of its images that a bench's views are described within; None is all of an image."""
+        with self._database.read() as connection:
+            return regions(connection, bench)
 
     def rename(self, name: str, new_name: str) -> None:
         """Give an object another name; its images stay where they are.

@@ -1,5 +1,6 @@
 """Reading a catalog: from rows to records."""
 
+import json
 from collections import defaultdict
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Row, and_, func, select
+from sqlalchemy import ColumnElement, Connection, Row, Text, and_, cast, func, select
 
 import hbr
 from hbr.descriptors import Descriptor, descriptor
@@ -17,6 +18,7 @@ from rig.catalog.records import (
     EnrollmentSummary,
     ObjectSummary,
     Provenance,
+    Region,
     Sitting,
     StoredView,
     ViewRecord,
@@ -230,6 +232,21 @@ def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> Desc
         next_step=f"describe the stored images anew: rig catalog redescribe{option}",
         evidence={"objects": len(names), "versions": list(versions), "version": kind.version},
     )
+
+
+def regions(connection: Connection, bench: str) -> set[Region | None]:
+    """Return the regions that the retrieved views of a bench are described within."""
+    rows = connection.scalars(
+        select(cast(descriptors.c.settings, Text))
+        .select_from(objects)
+        .join(enrollments)
+        .join(views, views.c.enrollment_id == enrollments.c.id)
+        .join(sittings, views.c.sitting_id == sittings.c.id)
+        .join(descriptors, described_by(descriptor(DESCRIPTOR)))
+        .where(retrieved(), sittings.c.bench == bench)
+        .distinct()
+    )
+    return {region_of(json.loads(settings)) for settings in rows}
 
 
 def _sitting(row: Row[Any]) -> Sitting:

@@ -1,13 +1,17 @@
 """`rig catalog ...`: the objects of a catalog, one by one."""
 
+import sys
 from fnmatch import fnmatchcase
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rig.cli.command import Settings, command
 from rig.cli.complete import object_names
 from rig.cli.jobs import confirm, print_table, size_words
+
+if TYPE_CHECKING:
+    from rig.catalog import Catalog
 
 app = typer.Typer(help="Look after the enrolled objects.", no_args_is_help=True)
 
@@ -160,10 +164,16 @@ def delete(
 
     Example: rig catalog delete mug-white --yes --bench sim
     """
+    from rig.plans.words import counted
+
     with settings.open_catalog() as catalog:
         found = [catalog.object(name).summary for name in dict.fromkeys(names)]
         views = sum(item.views for item in found)
-        confirm(f"Delete {', '.join(item.name for item in found)} with {views} views?", yes=yes, settings=settings)
+        confirm(
+            f"Delete {', '.join(item.name for item in found)} with {counted(views, 'view')}?",
+            yes=yes,
+            settings=settings,
+        )
         catalog.delete(*names)
     deleted = [item.name for item in found]
     settings.say(f"Deleted: {', '.join(deleted)}. Taken back by rig catalog undelete, until gc.", {"deleted": deleted})
@@ -176,10 +186,12 @@ def undelete(settings: Settings, name: Annotated[str, typer.Argument(metavar="NA
 
     Example: rig catalog undelete mug-white --bench sim
     """
+    from rig.plans.words import counted
+
     with settings.open_catalog() as catalog:
         catalog.undelete(name)
         views = catalog.object(name).summary.views
-    settings.say(f"{name} is back, with {views} views.", {"name": name, "views": views})
+    settings.say(f"{name} is back, with {counted(views, 'view')}.", {"name": name, "views": views})
 
 
 @app.command("stats")
@@ -206,7 +218,10 @@ def stats(settings: Settings) -> None:
     print(f"database     {size_words(found.database_bytes)}; {size_words(found.free_disk_bytes)} free on its disk")
     if found.labels.keys() - {""}:
         print("labels       " + ", ".join(f"{label or '(none)'} {count}" for label, count in found.labels.items()))
-    print("benches      " + (", ".join(f"{bench or '–'} {count}" for bench, count in found.benches.items()) or "none"))
+    print(
+        "benches      "
+        + (", ".join(f"{bench or '(imported)'} {count}" for bench, count in found.benches.items()) or "none")
+    )
     for kind in found.descriptors:
         state = "" if kind.current else ", which this program does not compare"
         print(f"described    {kind.views} views by {kind.name} {kind.version}{state}")
@@ -215,6 +230,20 @@ def stats(settings: Settings) -> None:
         print(
             f"to collect   {size_words(found.deleted_image_bytes)} of deleted objects (rig catalog gc), "
             f"{size_words(found.old_image_bytes)} of earlier enrollments (gc --old)"
+        )
+
+
+def tell_other_regions(settings: Settings, catalog: "Catalog") -> None:
+    """Say on stderr where the bench looks at another part of its images than when the objects were enrolled."""
+    region = settings.load().view.roi
+    others = catalog.regions(settings.bench_name) - {region}
+    if others:
+        seen = " and ".join(sorted("the whole image" if other is None else str(list(other)) for other in others))
+        print(
+            f"Note: objects of this bench are described within {seen}, view.roi is "
+            f"{'the whole image' if region is None else list(region)}. "
+            "If that was changed: rig catalog redescribe --region config.",
+            file=sys.stderr,
         )
 
 

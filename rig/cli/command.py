@@ -112,6 +112,17 @@ class Settings:
         path = self.load().catalog_path(self.bench_name)
         return self.open_catalog(read_only=True) if (path / "catalog.sqlite").exists() else None
 
+    def note(self, action: str, **details: Any) -> None:
+        """Write into the log of the bench's catalog, where there is one, what was done with the bench (`rig log`)."""
+        path = self.load().catalog_path(self.bench_name)
+        if not (path / "catalog.sqlite").exists():
+            return
+        try:
+            with self.open_catalog() as catalog:
+                catalog.note(action, **details)
+        except RigError as error:  # what was done was done
+            print(f"Note: this is not in the log: {error.what}.", file=sys.stderr)
+
     def say(self, text: str, data: Any) -> None:
         """Print ``text`` for people, or ``data`` as one line of JSON."""
         if self.json:

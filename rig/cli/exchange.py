@@ -120,6 +120,8 @@ def _package(source: Path, pattern: str | None, table_angles: bool) -> "Package"
 
 
 def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bool) -> None:
+    from rig.plans.words import counted
+
     if settings.json:
         from rig.plans.events import plain
 
@@ -127,15 +129,15 @@ def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bo
         return
     per_second = f", {done.views / seconds:.0f} images a second" if seconds > 0 and not dry_run else ""
     print(
-        f"{'Would import' if dry_run else 'Imported'} {done.objects} objects with {done.views} views, "
-        f"{size_words(done.bytes)}, in {seconds:.1f} s{per_second}."
+        f"{'Would import' if dry_run else 'Imported'} {counted(done.objects, 'object')} with "
+        f"{counted(done.views, 'view')}, {size_words(done.bytes)}, in {seconds:.1f} s{per_second}."
     )
     if done.replaced:
         print(f"Enrolled anew: {', '.join(done.replaced[:SHOWN])}")
     if done.skipped:
         print(f"Left out, in the catalog already: {', '.join(done.skipped[:SHOWN])}")
     if done.gaps:
-        print(f"{len(done.gaps)} gaps, views that lack in the even spacing of the others:")
+        print(f"{counted(len(done.gaps), 'gap')}, views that lack in the even spacing of the others:")
         by_object: dict[str, list[str]] = {}
         for gap in done.gaps:
             by_object.setdefault(gap.object_name, []).append(f"{gap.azimuth_deg:g}°")
@@ -144,7 +146,7 @@ def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bo
         if len(by_object) > SHOWN:
             print(f"  and {len(by_object) - SHOWN} other objects (--json lists all)")
     if done.refused:
-        print(f"{len(done.refused)} files refused:", file=sys.stderr)
+        print(f"{counted(len(done.refused), 'file')} refused:", file=sys.stderr)
         for file in done.refused[:SHOWN]:
             print(f"  {file.path}: {file.reason}", file=sys.stderr)
         if len(done.refused) > SHOWN:
@@ -170,6 +172,7 @@ def export(
     """
     from rig.catalog.exchange import collect, write_bundle, write_folder, write_parquet, write_table
     from rig.errors import ExportFailed
+    from rig.plans.words import counted
     from rig.report.catalog_page import write_catalog_page, write_sheets
 
     form = format_ or _format(target)
@@ -195,7 +198,8 @@ def export(
             case Format.HTML:
                 count = write_catalog_page(target, objects)
     settings.say(
-        f"Exported {count} objects to {target} ({form}).", {"target": str(target), "format": form, "objects": count}
+        f"Exported {counted(count, 'object')} to {target} ({form}).",
+        {"target": str(target), "format": form, "objects": count},
     )
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.catalog import tell_other_regions
 from rig.cli.command import Settings, command
 from rig.cli.complete import strategy_names
 
@@ -63,6 +64,7 @@ def identify(
     with settings.open_catalog(read_only=True) as catalog:
         model = _Model(catalog)
         index = model()
+        tell_other_regions(settings, catalog)
         with settings.open_bench() as bench, IdentifyView(screen) as view:
             seed = settings.seed or 0
             if watch:

@@ -9,7 +9,6 @@ import typer
 from rig.cli.command import Settings
 
 if TYPE_CHECKING:
-
     from rig.catalog.jobs import Progressed
 
 _T = TypeVar("_T")
@@ -64,9 +63,13 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right:
     for row in rows:
         table.add_row(*(_plain(cell) for cell in row))
     screen: Console = console()
-    if not screen.is_terminal:
-        screen.width = max(screen.width, Measurement.get(screen, screen.options.update(width=10_000), table).maximum)
-    screen.print(table)
+    if screen.is_terminal:
+        screen.print(table)
+        return
+    screen.width = max(screen.width, Measurement.get(screen, screen.options.update(width=10_000), table).maximum)
+    with screen.capture() as lines:
+        screen.print(table)
+    print("\n".join(line.rstrip() for line in lines.get().splitlines()), flush=True)
 
 
 def size_words(size: float) -> str:

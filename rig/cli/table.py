@@ -61,14 +61,20 @@ def home(
 def _turn(settings: Settings, table: "Turntable", angle_deg: float) -> None:
     """Turn the table, and tell what is told of any move."""
     from rig.cli.present import line
+    from rig.errors import RigError
     from rig.plans.capture import announced, moved
     from rig.plans.events import Event, event_dict
 
     def steps() -> Iterator[Event]:
         yield moved(0, (yield from announced(0, table, angle_deg)))
 
-    for event in steps():
-        settings.say(line(event), event_dict(event))
+    try:
+        for event in steps():
+            settings.say(line(event), event_dict(event))
+    except RigError as error:
+        settings.note("moved", to_deg=angle_deg, ended=error.what)
+        raise
+    settings.note("moved", to_deg=angle_deg)
 
 
 @command

@@ -30,6 +30,7 @@ def verify(
     """
     from rig.catalog.verify import verify as job
     from rig.plans.events import plain
+    from rig.plans.words import counted
 
     with settings.open_catalog(read_only=not repair) as catalog:
         found = run_job(
@@ -46,10 +47,11 @@ def verify(
         mended_count = len(found.findings) - len(found.unmended)
         outcome = "everything is as it was stored"
         if found.findings:
-            outcome = f"{len(found.findings)} problems, {mended_count} mended"
+            outcome = f"{counted(len(found.findings), 'problem')}, {mended_count} mended"
             if not repair:
                 outcome += "; rig catalog verify --repair mends what can be mended"
-        print(f"{found.objects} objects, {found.views} views, {size_words(found.image_bytes)} of images: {outcome}")
+        looked = f"{counted(found.objects, 'object')}, {counted(found.views, 'view')}"
+        print(f"{looked}, {size_words(found.image_bytes)} of images: {outcome}")
     if found.unmended:
         raise typer.Exit(EXIT_CATALOG)
 
@@ -111,20 +113,25 @@ def gc(
     """
     from rig.catalog.upkeep import Collected, collect_garbage
     from rig.plans.events import plain
+    from rig.plans.words import counted
 
     def words(found: Collected) -> str:
         names = ", ".join(found.objects[:10]) + (" and others" if len(found.objects) > 10 else "")
         return (
-            f"{len(found.objects)} deleted objects{f' ({names})' if names else ''}, {found.enrollments} enrollments, "
-            f"{found.views} views and {found.files} files, {size_words(found.bytes)}"
+            f"{counted(len(found.objects), 'deleted object')}{f' ({names})' if names else ''}, "
+            f"{counted(found.enrollments, 'enrollment')}, {counted(found.views, 'view')} and "
+            f"{counted(found.files, 'file')}, {size_words(found.bytes)}"
         )
 
     with settings.open_catalog() as catalog:
         found = collect_garbage(catalog, old=old, dry_run=True)
-        if not dry_run and found != Collected((), 0, 0, 0, 0):
-            confirm(f"Remove {words(found)}, for good?", yes=yes, settings=settings)
-            found = collect_garbage(catalog, old=old)
-    settings.say(f"{'Would remove' if dry_run else 'Removed'} {words(found)}.", {"dry_run": dry_run, **plain(found)})
+        nothing = found == Collected((), 0, 0, 0, 0)
+        if not dry_run:
+            if not nothing:
+                confirm(f"Remove {words(found)}, for good?", yes=yes, settings=settings)
+            found = collect_garbage(catalog, old=old)  # levels of earlier versions go unasked: they can be computed
+    text = f"{'Would remove' if dry_run else 'Removed'} {words(found)}."
+    settings.say("There is nothing to remove." if nothing else text, {"dry_run": dry_run, **plain(found)})
 
 
 @app.command("migrate")
