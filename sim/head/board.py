@@ -311,7 +311,7 @@ class SimHead:
     def _drain(self) -> None:
         """Take what has left the board: bytes on their way to the host, and changes of its pins."""
         while taken := self._library.board_take(self._board, self._outputs, _ROOM):
-            outputs = np.frombuffer(self._outputs, _OUTPUT, taken)
+            outputs = np.frombuffer(memoryview(self._outputs), _OUTPUT, taken)
             ns = outputs["ns"].astype(np.int64)
             if self._error_ppb:
                 ns -= np.array([t * self._error_ppb // (1_000_000_000 + self._error_ppb) for t in ns.tolist()])

@@ -33,7 +33,8 @@ class Frame:
 def encode(frame: Frame) -> bytes:
     """Return the frame's bytes on the line, with the zero that closes them."""
     content = bytes([frame.id, frame.sequence]) + frame.body
-    return cobs.encode(content + crc_hqx(content, 0xFFFF).to_bytes(CRC, "big")) + b"\0"
+    line: bytes = cobs.encode(content + crc_hqx(content, 0xFFFF).to_bytes(CRC, "big"))
+    return line + b"\0"
 
 
 def decode(line: bytes) -> Frame:
