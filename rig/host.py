@@ -82,10 +82,11 @@ class User:
 
 @dataclass(frozen=True, slots=True)
 class Disk:
-    """The disk below a folder; ``network`` where it is another computer's."""
+    """The disk below a folder; ``network`` where it is another computer's, ``writable`` where this user may write."""
 
     free_bytes: int
     network: bool
+    writable: bool = True
 
 
 class Host(Protocol):
@@ -96,6 +97,11 @@ class Host(Protocol):
 
     @property
     def user(self) -> User: ...
+
+    @property
+    def model(self) -> str:
+        """What kind of computer it is; empty where it does not say."""
+        ...
 
     def serial_ports(self) -> list[SerialPort]: ...
     def i2c_buses(self) -> list[Node]: ...
@@ -143,6 +149,10 @@ class LinuxHost:
     root: Path = Path("/")
     clock: Clock = field(default_factory=SystemClock)
     user: User = field(default_factory=User.current)
+
+    @property
+    def model(self) -> str:
+        return self._text("/proc/device-tree/model") or self._text("/sys/class/dmi/id/product_name")
 
     def serial_ports(self) -> list[SerialPort]:
         """Return the ports that hang on hardware; the computer's own come last."""
@@ -198,7 +208,7 @@ class LinuxHost:
         mounts = [line.split() for line in self._text("/proc/mounts").splitlines()]
         holding = [m for m in mounts if len(m) > 2 and there.is_relative_to(m[1].replace("\\040", " "))]
         kind = max(holding, key=lambda m: len(m[1]))[2] if holding else ""
-        return Disk(shutil.disk_usage(there).free, kind in _NETWORK_FILE_SYSTEMS)
+        return Disk(shutil.disk_usage(there).free, kind in _NETWORK_FILE_SYSTEMS, os.access(there, os.W_OK))
 
     # -- opening ----------------------------------------------------------------------------------------------------
 

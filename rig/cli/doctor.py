@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.command import Settings, command
-from rig.errors import ConfigError
+from rig.errors import ConfigError, RigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,10 +47,12 @@ def doctor(
 
 def examination(settings: Settings) -> int:
     """Examine the bench, print what is found, and return the exit code."""
+    from rig.cli.find import say
     from rig.cli.present import console
+    from rig.config import RigConfig
     from rig.doctor.checks import CHECKS
     from rig.doctor.examination import examine
-    from rig.doctor.finding import Level, bad, fine
+    from rig.doctor.finding import Level, bad, fine, of_error
 
     screen = console()
     findings: list[Finding] = []
@@ -61,22 +63,25 @@ def examination(settings: Settings) -> int:
             print_finding(screen, finding)
 
     try:
-        config = settings.load()
+        config: RigConfig | None = settings.load()
         tell(fine("config", _config_words(settings)))
     except ConfigError as error:
         mistakes = error.evidence.get("mistakes") or [f"{key}: {value}" for key, value in error.evidence.items()]
         for mistake in mistakes or [error.what]:
             tell(bad("config", f"{error.what.rstrip('.')}: {mistake}", "rig config check", error.exit_code))
         config = None
-    with case_of(settings, default=config is None) as case:
-        for finding in examine(case, CHECKS):
-            tell(finding)
+    try:
+        with case_of(settings, default=config is None) as case:
+            for finding in examine(case, CHECKS, say):
+                tell(finding)
+    except RigError as error:  # there is no such bench, or no such part of it
+        tell(of_error("bench", error))
     counts = {level: sum(finding.level is level for finding in findings) for level in Level}
     code = next((finding.exit_code for finding in findings if finding.level is Level.BAD), 0)
     if settings.json:
         settings.print_json(
             {
-                "bench": case.bench,
+                "bench": settings.bench or (config.default_bench if config else RigConfig().default_bench),
                 "bad": counts[Level.BAD],
                 "warnings": counts[Level.WARNING],
                 "exit_code": code,

@@ -34,10 +34,10 @@ def find(
 
     screen = console()
     findings: list[Finding] = []
-    survey = Survey(both_protocols, say)
+    survey = Survey(both_protocols)
     with case_of(settings) as case:
         case.require_free()
-        for finding in examine(case, survey.checks):
+        for finding in examine(case, survey.checks, say):
             findings.append(finding)
             if not settings.json:
                 print_finding(screen, finding)

@@ -85,13 +85,12 @@ class Dialogue:
 
     def run(self) -> "dict[Key, Any]":
         """Return the keys of the configuration that were found out."""
-        from rig.cli.find import say
         from rig.doctor.survey import Survey, camera_settings, imu_settings, servo_settings
 
-        survey = Survey(say=say)
+        survey = Survey()
         self._survey(survey)
         while not survey.servos and not survey.doubtful and self._again("No servo was found."):
-            survey = Survey(say=say)
+            survey = Survey()
             self._survey(survey)
         host = self.case.host
         servo = self._pick("servo", survey.servos, [f"{p.path}: {s}" for p, s in survey.servos], lambda pair: pair[0])
@@ -116,10 +115,11 @@ class Dialogue:
         from rich.console import Console
 
         from rig.cli.doctor import print_finding
+        from rig.cli.find import say
         from rig.doctor.examination import examine
 
         screen = Console(file=self.out)
-        for finding in examine(self.case, survey.checks):
+        for finding in examine(self.case, survey.checks, say):
             print_finding(screen, finding)
 
     def _again(self, what: str) -> bool:

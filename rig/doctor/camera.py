@@ -47,11 +47,12 @@ def camera(case: Case) -> Iterator[Finding]:
 
 def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
     locks = source.read_locks()
+    device = f" -d {case.config.camera.source}"
     for refused in source.not_taken:
         yield warning(
             "camera",
             f"{refused.setting}: asked for {refused.asked:g}, the camera reports {refused.reported:g}",
-            case.rig("config show camera"),
+            "v4l2-ctl --list-ctrls-menus" + device,
         )
     automatic = [
         name
@@ -63,7 +64,7 @@ def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
     ]
     if automatic:
         text = f"{' and '.join(automatic)} not locked: views of one object may differ from each other"
-        yield warning("camera", text, "v4l2-ctl --list-ctrls")
+        yield warning("camera", text, "v4l2-ctl --list-ctrls-menus" + device)
     elif not source.not_taken:
         exposure = "?" if locks.exposure_us is None else f"{locks.exposure_us / 1e3:.3g} ms"
         balance = "?" if locks.white_balance_k is None else f"{locks.white_balance_k:.0f} K"

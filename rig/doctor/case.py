@@ -78,7 +78,10 @@ def open_case(
     """
     kind = bench_kind(bench)
     chosen = validate(kind.options, config.bench.get(bench, {}), where="the configuration", prefix=f"bench.{bench}")
-    who = holder(config.state_path(bench))
+    try:
+        who = holder(config.state_path(bench))
+    except OSError:  # the folder may not be read: the check of the bench's state tells
+        who = None
     if isinstance(kind, Hosted):
         with kind.host(config, chosen, seed) as host:
             yield Case(host, config, bench, options, file_options, who)

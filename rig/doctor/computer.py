@@ -67,7 +67,7 @@ def ports(case: Case) -> Iterator[Finding]:
         mend = case.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
         yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", mend)
     else:
-        yield bad("port", f"there is no I2C bus {bus}, nor any other", "sudo raspi-config nonint do_i2c 0")
+        yield bad("port", f"there is no I2C bus {bus}, nor any other", i2c_command(case))
     source = case.config.camera.source
     if isinstance(source, str) and not source.isdigit() and not source.startswith("/dev/"):
         return  # a file or a stream
@@ -100,6 +100,9 @@ def disk(case: Case) -> Iterator[Finding]:
         yield warning("disk", text, case.rig("catalog gc"), free_bytes=there.free_bytes)
     else:
         yield fine("disk", text, free_bytes=there.free_bytes)
+    if not there.writable:
+        mend = f"sudo chown -R {case.host.user.name} {path}" if path.exists() else case.set("catalog.path", "FOLDER")
+        yield bad("disk", f"{case.host.user.name} may not write to {path}", mend, exit_code=7)
     if there.network:
         mend = case.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
         yield warning("disk", f"{path} is on a network file system, where locks may not hold", mend)
@@ -162,6 +165,11 @@ def udev_command(case: Case) -> str:
         f"{case.rig('doctor --udev')} | sudo tee {RULES_FILE} && "
         "sudo udevadm control --reload && sudo udevadm trigger --action=add"
     )
+
+
+def i2c_command(case: Case) -> str:
+    """Return the command that makes a computer's I2C buses appear."""
+    return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in case.host.model else "sudo modprobe i2c-dev"
 
 
 def _missing(case: Case, wanted: str, found: list[SerialPort]) -> Finding:

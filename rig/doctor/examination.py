@@ -13,39 +13,47 @@ from rig.errors import RigError
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Something to look at: findings are yielded as they are made, none later than ``deadline_s`` after the last."""
+    """Something to look at.
+
+    ``look`` yields findings as they are made, and now and then what it is about to do, in words; ``deadline_s`` is how
+    long after the last of these the next one may take.
+    """
 
     topic: str
-    look: Callable[[Case], Iterator[Finding]]
+    look: Callable[[Case], Iterator[Finding | str]]
     deadline_s: float = 15.0
     if_it_hangs: str = "Unplug the device, plug it in again, and start over"
 
 
-def examine(case: Case, checks: Iterable[Check]) -> Iterator[Finding]:
+def examine(case: Case, checks: Iterable[Check], say: Callable[[str], None] = lambda _: None) -> Iterator[Finding]:
     """Yield what the checks find, in their order; none of them can stop the others.
 
+    ``say`` is called with what is being done, for those who wait, and with nothing before each finding.
     A check runs in a thread of its own, because a driver in the kernel may never return: after the deadline it is left
     to itself, and ends with the program.
     """
     for check in checks:
-        findings: SimpleQueue[Finding | None] = SimpleQueue()
-        Thread(target=_run, args=(case, check, findings.put), name=check.topic, daemon=True).start()
+        told: SimpleQueue[Finding | str | None] = SimpleQueue()
+        Thread(target=_run, args=(case, check, told.put), name=check.topic, daemon=True).start()
         while True:
             try:
-                finding = findings.get(timeout=check.deadline_s)
+                item = told.get(timeout=check.deadline_s)
             except Empty:
+                say("")
                 text = f"the check did not come to an end within {check.deadline_s:g} s and was given up"
                 yield bad(check.topic, text, check.if_it_hangs, exit_code=9)
                 break
-            if finding is None:
+            say(item if isinstance(item, str) else "")
+            if item is None:
                 break
-            yield finding
+            if isinstance(item, Finding):
+                yield item
 
 
-def _run(case: Case, check: Check, tell: Callable[[Finding | None], None]) -> None:
+def _run(case: Case, check: Check, tell: Callable[[Finding | str | None], None]) -> None:
     try:
-        for finding in check.look(case):
-            tell(finding)
+        for item in check.look(case):
+            tell(item)
     except RigError as error:
         tell(of_error(check.topic, error))
     except OSError as error:  # a device that was pulled out meanwhile, a file that cannot be read

@@ -70,4 +70,6 @@ def bad(topic: str, text: str, mend: str, exit_code: int = 4, **evidence: Any) -
 
 def of_error(topic: str, error: RigError, mend: str = "") -> Finding:
     """Return an error of the registry as a finding."""
-    return Finding(topic, Level.BAD, error.what, mend or error.next_step, error.exit_code, error.evidence)
+    reason = error.evidence.get("reason")
+    text = f"{error.what.rstrip('.')}: {reason}" if reason else error.what
+    return Finding(topic, Level.BAD, text, mend or error.next_step, error.exit_code, error.evidence)

@@ -23,7 +23,7 @@ IMPOSSIBLE_C = 150
 POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then: "
 
 
-def servo(case: Case) -> Iterator[Finding]:
+def servo(case: Case) -> Iterator[Finding | str]:
     """Find the configured servo, whoever else is on its bus, and look at its settings, supply and temperature."""
     if case.holder is not None:
         yield warning("servo", "not asked: the bench is in use", case.rig("stop"))
@@ -54,24 +54,27 @@ def servo(case: Case) -> Iterator[Finding]:
         yield fine(
             "servo", f"{name}, firmware {identity.firmware}, id {config.id} at {config.baud} baud, {config.port}"
         )
-        yield from (warning("servo", remark, case.rig("config show servo")) for remark in found.remarks)
+        for remark in found.remarks:
+            yield warning("servo", remark.removeprefix("servo: "), "Stay beside it, or use a servo of the X series")
         yield from _alone(case, wire)
         yield from _settings(case, found)
         yield from _condition(case, found)
         yield from _line(case, found)
 
 
-def _elsewhere(case: Case, wire: Wire) -> Iterator[Finding]:
+def _elsewhere(case: Case, wire: Wire) -> Iterator[Finding | str]:
     """Nobody answers where the configuration says: look at the other baud rates, and say who is there instead."""
     config = case.config.servo
     protocol = protocol_of(config.model)
     rates = BAUD_RATES if protocol == 2 else BAUD_RATES_1
     there: list[FoundServo] = []
-    for heard in scan_servos(wire, case.host.clock, [config.baud, *(b for b in rates if b != config.baud)]):
-        if heard.doubtful:
-            yield _duplicate(case, heard)
-            return
-        there += heard.servos
+    for rate in [config.baud, *(rate for rate in rates if rate != config.baud)]:
+        yield f"{config.port}: nobody at id {config.id}; asking at {rate} baud ..."
+        for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
+            if heard.doubtful:
+                yield _duplicate(case, heard)
+                return
+            there += heard.servos
     wanted = f"no servo answers at id {config.id}, {config.baud} baud, {config.port}"
     if not there:
         yield bad("servo", f"{wanted}, nor any other at any baud rate", POWER + case.rig("doctor"))
@@ -189,7 +192,7 @@ def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
         yield bad("servo", text, "Switch the servo's supply off and on, then: " + case.rig("doctor"), tick_ms=ticks)
         return
     again = after["retries"] - before["retries"]
-    text = f"{READS} readings of {each_ms:.1f} ms each, {again} of them repeated"
+    text = f"{READS} readings of {each_ms:.1f} ms each, {again or 'none'} repeated"
     if again > REPEATED:
         yield warning("servo", text, "Check the plugs of the servo's cable", retries=again, reading_ms=each_ms)
     elif each_ms > SLOW * 1e3 * case.config.table.poll_s:

@@ -1,7 +1,7 @@
 """What is connected to the computer, and how it would be written into the configuration."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +12,7 @@ import serial
 
 from rig.config_file import Key
 from rig.doctor.case import Case
-from rig.doctor.computer import access
+from rig.doctor.computer import access, i2c_command
 from rig.doctor.examination import Check
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundImu, FoundServo, Heard, scan_imus, scan_servos
@@ -41,12 +41,9 @@ class Survey:
     ----------
     both_protocols
         Ask for servos of Protocol 1.0 even where some of Protocol 2.0 answered.
-    say
-        Called with what is being done, for those who wait.
     """
 
     both_protocols: bool = False
-    say: Callable[[str], None] = lambda _: None
     ports: tuple[str, ...] | None = None
     """Serial ports to ask; all that may be asked where it is None."""
     servos: list[tuple[SerialPort, FoundServo]] = field(default_factory=list)
@@ -63,7 +60,7 @@ class Survey:
             Check("camera", self.look_for_cameras, deadline_s=20.0),
         )
 
-    def look_for_servos(self, case: Case) -> Iterator[Finding]:
+    def look_for_servos(self, case: Case) -> Iterator[Finding | str]:
         known = case.host.serial_ports()
         if self.ports is not None:
             known = [port for port in known if port.path in self.ports]
@@ -74,7 +71,7 @@ class Survey:
         for port in asked:
             yield from self._on_port(case, port)
 
-    def _on_port(self, case: Case, port: SerialPort) -> Iterator[Finding]:
+    def _on_port(self, case: Case, port: SerialPort) -> Iterator[Finding | str]:
         troubles = [finding for finding in access(case, "servo", port, "dialout") if finding.mend]
         if troubles:
             yield from troubles
@@ -86,7 +83,7 @@ class Survey:
                     if protocol == 1 and len(self.servos) > before and not self.both_protocols:
                         break
                     for rate in rates:
-                        self.say(f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ...")
+                        yield (f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ...")
                         for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
                             yield from self._heard(case, port, heard)
         except DeviceNotFound as error:
@@ -112,7 +109,7 @@ class Survey:
             text = f"{port.path}: bytes at {heard.baud} baud that are no servo's"
             yield warning("servo", text, "Take everything but servos off the bus, then: " + case.rig("find"))
 
-    def look_for_imus(self, case: Case) -> Iterator[Finding]:
+    def look_for_imus(self, case: Case) -> Iterator[Finding | str]:
         configured = case.host.i2c_name(case.config.imu.bus)
         asked = 0
         before = len(self.imus)
@@ -124,7 +121,7 @@ class Survey:
             if troubles:
                 yield from troubles
                 continue
-            self.say(f"{node.path}: asking for IMUs ...")
+            yield (f"{node.path}: asking for IMUs ...")
             try:
                 there = scan_imus(case.host, node.path)
             except OSError as error:
@@ -138,12 +135,12 @@ class Survey:
                 else:
                     yield warning("imu", f"{found}: the rig has no driver for it", "Use an MPU-6050 or a BNO055")
         if not asked:
-            yield bad("imu", "no I2C bus", "sudo raspi-config nonint do_i2c 0")
+            yield bad("imu", "no I2C bus", i2c_command(case))
         elif len(self.imus) == before:
             mend = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + case.rig("find")
             yield warning("imu", "no IMU answers on any I2C bus", mend)
 
-    def look_for_cameras(self, case: Case) -> Iterator[Finding]:
+    def look_for_cameras(self, case: Case) -> Iterator[Finding | str]:
         nodes = case.host.cameras()
         if not nodes:
             yield warning("camera", "no camera", "Connect the camera, then: " + case.rig("find"))
@@ -152,7 +149,7 @@ class Survey:
             if troubles:
                 yield from troubles
                 continue
-            self.say(f"{node.path}: opening ...")
+            yield (f"{node.path}: opening ...")
             try:
                 capture = case.host.open_capture(node.path)
             except DeviceNotFound as error:

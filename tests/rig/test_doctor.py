@@ -178,6 +178,14 @@ def test_room_on_the_disk_is_told_in_objects(monkeypatch, free, level):
         assert f"about {int(free / 500_000) // 72} more objects" in finding.text
 
 
+def test_a_folder_that_may_not_be_written_to_is_told(monkeypatch):
+    with unopened() as bench:
+        monkeypatch.setattr(type(bench.case.host), "disk", lambda *_: Disk(10**11, network=False, writable=False))
+        text, mend = one(bench.troubles("disk"))
+        assert "may not write" in text
+        assert mend == "rig config set catalog.path FOLDER"
+
+
 def test_a_catalog_on_another_computer_is_warned_of(monkeypatch):
     with unopened() as bench:
         monkeypatch.setattr(type(bench.case.host), "disk", lambda *_: Disk(10**11, network=True))
@@ -280,6 +288,14 @@ def test_another_model_can_be_made_the_configured_one():
         assert one(bench.troubles("servo"))[1] == "rig config set servo.model xl430_w250"
 
 
+def test_an_ax_12a_says_what_it_lacks():
+    with unopened("servo.model=ax_12a", "table.mode=pan", "servo.baud=1000000") as bench:
+        bench.parts.servo.memory["Return Delay Time"] = 0
+        texts = "\n".join(bench.troubles("servo"))
+        assert "no watchdog" in texts
+        assert "EEPROM" not in texts
+
+
 def test_torque_left_on_and_a_tripped_watchdog_are_told_and_left():
     with unopened() as bench:
         set_up(bench)
@@ -315,7 +331,7 @@ FOUND = {
     "imu_saturated": ("imu", "saturated"),
     "i2c_stuck": ("imu", "does not move"),
     "camera.off": ("camera", "no camera"),
-    "camera.stuck": ("camera", "no frames"),
+    "camera.stuck": ("camera", "no frame"),
     "camera.garbage": ("camera", "noise instead of a picture"),
     "camera.wrong": ("camera", "320x240"),
     "camera.slow": ("camera", "2 a second"),
@@ -353,6 +369,9 @@ def test_an_imu_at_its_other_address_and_on_its_side():
         device = bench.parts.i2c.detach(0x69)
         bench.parts.i2c.attach(0x68, device)
         assert one(bench.troubles("imu"))[1] == "rig config set imu.address 0x68"
+    with unopened("imu.model=bno055") as bench:
+        bench.case.host.clock.sleep(1.0)  # it is silent for a while after power-up
+        assert not bench.troubles("imu")
     with unopened("imu.axis=x") as bench:
         assert one(bench.troubles("imu"))[1] == "rig config set imu.axis z"
 

@@ -34,8 +34,8 @@ class LineBabble(Exception):
     """Bytes keep coming, but no packet: another master, a wrong baud rate, an open line."""
 
 
-def open_serial(path: str, baud: int) -> Wire:
-    """Open a serial port for this process alone.
+def open_serial(path: str, baud: int, device: str = "servo") -> Wire:
+    """Open the serial port of a ``device`` (the section of the configuration) for this process alone.
 
     Raises
     ------
@@ -51,9 +51,9 @@ def open_serial(path: str, baud: int) -> Wire:
         elif reason in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
             step = "Close the other program that uses this port (e.g. Dynamixel Wizard, another rig)."
         else:
-            step = "Check the USB cable and servo.port; `rig find` lists the ports."
+            step = f"Check the USB cable and {device}.port; `rig find` lists the ports."
         raise DeviceNotFound(
-            f"Cannot open the servo's port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
+            f"Cannot open the {device}'s port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
         ) from error
     return wire
 
