@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from rig.clock import Clock
 from rig.config import RigConfig, Values, mistaken, validate
 from rig.devices.camera import Camera
+from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
 from rig.devices.servo import Servo
 from rig.errors import ConfigError, RigError
@@ -48,7 +49,8 @@ class Bench(AbstractContextManager["Bench"]):
 
     ``conditions`` says under which noise model or calibration the bench works, ``findings`` what opening it revealed
     that a person should know; both are kept with every enrollment. ``state`` is where the table's turns and faults
-    outlive the program, ``wires`` what must be closed after the devices.
+    outlive the program, ``head`` the rig head that ``imu`` is on, if it is on one, ``wires`` what must be closed after
+    the devices.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Bench(AbstractContextManager["Bench"]):
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     state: StateStore = field(default_factory=MemoryStore, repr=False)
+    head: RigHead | None = None
     wires: ExitStack = field(default_factory=ExitStack, repr=False)
     safety: Safety = field(init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)

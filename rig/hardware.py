@@ -1,6 +1,6 @@
 """The bench of real devices: servo on a serial port, IMU on I2C, camera through OpenCV."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -12,10 +12,14 @@ from rig.config import RigConfig, Section
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import Wire, open_serial
 from rig.devices.dynamixel.register_servo import prepare_servo
+from rig.devices.head.head import RigHead
+from rig.devices.head.opening import open_head, switch_on
+from rig.devices.head.protocol import BAUD
+from rig.devices.imu import Imu
 from rig.devices.open_imu import open_imu
 from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
 from rig.devices.servo import Servo
-from rig.errors import ConfigError
+from rig.errors import ConfigError, RigError
 from rig.state import BenchLock, FileStore, StateStore
 
 
@@ -45,6 +49,7 @@ class HardwareBench:
                 i2c_bus=config.imu.bus,
                 capture=capture,
                 state=FileStore(state_path),
+                head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
             bench.wires = wires.pop_all()
             return bench
@@ -69,6 +74,7 @@ def assemble(
     i2c_bus: int | str,
     capture: Capture,
     state: StateStore,
+    head_port: Callable[[], Wire] | None = None,
 ) -> Bench:
     """Put the drivers on their wires; a simulated bench is assembled by the same lines as a real one.
 
@@ -81,11 +87,17 @@ def assemble(
     ConfigError
         The servo cannot be what the configuration wants it to be, or does not reach the table's limits.
     """
-    servo = open_servo(wire, config.servo, clock, config.table.mode)
-    findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
-    _check_reach(config, servo)
     with ExitStack() as opened:
-        imu = open_imu(config.imu, i2c_bus, clock)
+        head: RigHead | None = None
+        fault: RigError | None = None
+        if config.imu.connection == "head" and head_port is not None:
+            head = open_head(config, head_port, clock)
+            opened.callback(head.close)
+            fault = switch_on(head, config.head, clock)  # first: the servo's supply may go through it
+        servo = open_servo(wire, config.servo, clock, config.table.mode)
+        findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
+        _check_reach(config, servo)
+        imu: Imu = head or open_imu(config.imu, i2c_bus, clock)
         opened.callback(imu.close)
         camera = OpenCvCamera(
             capture,
@@ -97,8 +109,14 @@ def assemble(
             f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}"
             for n in camera.not_taken
         )
-        bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state)
+        bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
         bench.safety.connect()
+        if head is not None:
+            watched = head
+            bench.safety.watches.append(watched.check)
+            bench.safety.restores.append(lambda: switch_on(watched, config.head, clock))
+        if fault is not None:
+            bench.safety.latch(fault)
         bench.safety.checks.append(imu.read_samples)
         bench.findings += bench.safety.findings
         opened.pop_all()

@@ -24,8 +24,11 @@ from rig.devices.servo import Servo
 from rig.errors import (
     DeviceFault,
     DeviceSilent,
+    EmergencyStop,
     FaultLatched,
     FollowingError,
+    HeadRestarted,
+    HostWasSilent,
     MotionStopped,
     MotionTimeout,
     NoProgress,
@@ -53,6 +56,9 @@ LATCHING = (
     Overheated,
     SupplyOutOfRange,
     NoProgress,
+    EmergencyStop,
+    HostWasSilent,
+    HeadRestarted,
 )
 """Errors that, when they end a motion, leave a fault: something is wrong with the bench and a person must look."""
 
@@ -141,6 +147,10 @@ class Safety:
         )
         self.checks: list[Callable[[], object]] = []
         """Called before a fault is acknowledged; each raises a `RigError` where its device is not well."""
+        self.watches: list[Callable[[], object]] = []
+        """Called in every round of the control loop; each raises a `RigError` where its device has made us stop."""
+        self.restores: list[Callable[[], object]] = []
+        """Called first of all when a fault is acknowledged: give back what a device has switched off."""
 
     # -- what is ------------------------------------------------------------------------------------------------------
 
@@ -240,7 +250,8 @@ class Safety:
             yield motion
             if motion.position_deg is None:
                 raise MotionStopped("The motion was broken off.", next_step="Start it anew.")
-        except BaseException as error:
+        except BaseException as symptom:
+            error = self._guarded_cause(symptom)
             heard = False
             try:
                 heard = stop()
@@ -253,14 +264,26 @@ class Safety:
                     self.latch(error)
                 else:
                     self._go(Happening.STOP if heard else Happening.LOSE)
+            if error is not symptom:
+                raise error from symptom
             raise
         self._go(Happening.ARRIVE)
         self._save(table=self._table(motion.position_deg))
 
     def heed_stop(self) -> None:
-        """Raise `MotionStopped` if somebody asked for a stop; called in every round of the control loop."""
+        """Raise `MotionStopped` if somebody asked for a stop, or what a device that guards the bench has stopped for.
+
+        Called in every round of the control loop.
+        """
         if self._store.stop_requested():
             raise _stopped()
+        for watch in self.watches:
+            try:
+                watch()
+            except LATCHING as fault:
+                if self._state is not State.MOVING:  # a motion latches what breaks it off
+                    self.latch(fault)
+                raise
 
     def released(self) -> None:
         """Take note that the torque is off: where the table rests is kept, and a stop that was asked for is done."""
@@ -300,6 +323,8 @@ class Safety:
         DeviceFault, Overheated, SupplyOutOfRange, DeviceMismatch, DeviceSilent
             The cause is still there; the fault stays.
         """
+        for restore in self.restores:
+            restore()
         if self._state in (State.DISCONNECTED, State.STOPPED):
             self.prepare()
         if reboot:
@@ -350,6 +375,18 @@ class Safety:
         self.declare(self.reference.with_turns(self._servo.read_state().position_deg, turns))
 
     # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _guarded_cause(self, symptom: BaseException) -> BaseException:
+        """Return why a device that guards the bench has stopped it, if it has: the servo then merely falls silent."""
+        if isinstance(symptom, RigError) and not isinstance(symptom, LATCHING):
+            for watch in self.watches:
+                try:
+                    watch()
+                except LATCHING as cause:
+                    return cause
+                except RigError:
+                    continue  # it has nothing to tell: the symptom stands
+        return symptom
 
     def _go(self, happening: Happening) -> None:
         following = TRANSITIONS[self._state].get(happening)

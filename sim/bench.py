@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field, field_validator
 
@@ -39,6 +39,11 @@ class SimOptions(Section):
     )
     yaw_deg: float | None = Field(None, ge=-360, le=360, description="how it stands; none: drawn by the seed")
     noise: dict[str, float] = Field(default_factory=dict, description="values of the noise model that differ")
+    head: Literal["memory", "avr"] = Field(
+        "memory",
+        description="the rig head of imu.connection = head: the firmware built for this computer, or the AVR binary in "
+        "an emulated ATmega328P",
+    )
 
     faults: list[Any] = Field(
         default_factory=list, description='what goes wrong, e.g. ["jam@move3+2s"]; rig faults lists what can'
@@ -164,6 +169,7 @@ def open_sim_bench(
             i2c_bus=parts.i2c.path,
             capture=parts.camera,
             state=operator.state,
+            head_port=parts.head_port,
         )
         if operator.state.load().table is None and bench.safety.fault is None:
             if bench.servo.turn_deg < 360.0:  # behind a gear somebody has to look at the table
@@ -225,7 +231,11 @@ def _state(config: RigConfig, held: ExitStack) -> StateStore:
 def _stands_at_deg(config: RigConfig, state: StateStore) -> float:
     """Return where the last simulated run left the table: as on a real bench, only the supply was off meanwhile."""
     table = state.load().table
-    return table.position_deg + table.shift_deg - 180.0 / config.servo.gear_ratio if table else 0.0
+    if table is None:
+        return 0.0
+    turn_deg = 360.0 / config.servo.gear_ratio
+    turns = round(table.shift_deg / turn_deg)  # the rest of the shift is a zero that a person declared
+    return table.position_deg + (turns - 0.5) * turn_deg
 
 
 SIM: BenchKind = SimBenchKind()

@@ -51,6 +51,9 @@ class NoiseModel:
     imu_tilt_deg: float = 1.0
     """Standard deviation of the mounting tilt about each horizontal axis."""
 
+    head_clock_error: float = 0.0015
+    """Standard deviation of the relative error of a rig head's clock (a ceramic resonator: within ±0.5 %)."""
+
     # Camera: a 1/3" USB sensor at gain 1 (EMVA 1288 terms).
     full_well_e: float = 10000.0
     """Electrons of a saturated pixel: sets the shot noise; 0 switches it off."""

@@ -11,6 +11,8 @@ from rig.config import RigConfig
 from rig.devices.dynamixel.port import READ_SLICE_S
 from rig.errors import DeviceNotFound
 from sim.camera import SimCapture
+from sim.head.board import PinChange, SimHead
+from sim.head.wire import HeadSerial
 from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
@@ -32,9 +34,10 @@ class SimParts(AbstractContextManager["SimParts"]):
     servo_bus: ServoBus
     servo: SimulatedServo
     adapter: SimSerial
-    i2c: SimI2cBus
+    i2c: SimI2cBus | SimHead
     imu: SimulatedImu
     camera: SimCapture
+    head: SimHead | None = None
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -53,15 +56,29 @@ class SimParts(AbstractContextManager["SimParts"]):
         servo = simulated_servo(world, config.servo)
         servo_bus = ServoBus(world.clock)
         servo_bus.attach(servo)
+        head = _head(config, world, servo) if config.imu.connection == "head" else None
+        around = head.world_then if head else world
         imu: SimulatedImu
         if config.imu.model == "bno055":
-            imu = SimBno055(world, adr=config.imu.address == 0x29)
+            imu = SimBno055(around, adr=config.imu.address == 0x29)
         else:
-            imu = SimMpu6050(world, ad0=config.imu.address == 0x69)
-        i2c = SimI2cBus(world.clock)
+            imu = SimMpu6050(around, ad0=config.imu.address == 0x69)
+        i2c = head or SimI2cBus(world.clock)
         i2c.attach(config.imu.address, imu)
         adapter = SimSerial(servo_bus, config.servo.baud, READ_SLICE_S)
-        return cls(world, servo_bus, servo, adapter, i2c, imu, SimCapture(world))
+        return cls(world, servo_bus, servo, adapter, i2c, imu, SimCapture(world), head)
+
+    def head_port(self) -> HeadSerial:
+        """Open the head's line, as often as it is plugged in.
+
+        Raises
+        ------
+        DeviceNotFound
+            There is no head, or it is not plugged in.
+        """
+        if self.head is None or self.head.unplugged:
+            raise DeviceNotFound("There is no rig head at this port.", next_step="Plug its USB cable in.")
+        return HeadSerial(self.head)
 
     def open_wires(self) -> None:
         """Open what a closed bench has let go of: the port, and the camera's stream if the camera is there.
@@ -81,3 +98,30 @@ class SimParts(AbstractContextManager["SimParts"]):
                     next_step="Plug the adapter in.",
                     evidence={"reason": str(error)},
                 ) from error
+
+
+def _head(config: RigConfig, world: World, servo: SimulatedServo) -> SimHead:
+    """Return a head whose outputs act on the world: its ring light is all the light, its relay feeds the servo.
+
+    Raises
+    ------
+    ConfigError
+        This machine cannot build the firmware.
+    """
+    kind = str(config.bench.get("sim", {}).get("head", "memory"))
+    error = world.noise.head_clock_error * float(world.rng("head").standard_normal())
+    head = SimHead(world, kind, clock_error=error)
+    level = config.head.light
+
+    def act(change: PinChange) -> None:
+        if change.pin == "light" and level is not None:
+            world.change(light=(change.value / level,) * 3)
+        elif change.pin == "relay" and config.head.power:
+            servo.power_on() if change.value else servo.power_off()
+
+    head.listeners.append(act)
+    if level is not None:
+        world.change(light=(0.0, 0.0, 0.0))
+    if config.head.power:
+        servo.power_off()
+    return head

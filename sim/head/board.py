@@ -85,7 +85,8 @@ class SimHead:
     """A simulated rig head.
 
     Bus side: `sim.head.wire.HeadSerial` is its line, devices are attached to its I2C bus. World side: `estop_open`,
-    `stuck`, `nack`, `attach`, `detach`, `reset`, `hang`, the outputs and their history, and the tampers.
+    `stuck`, `nack`, `refusals`, `attach`, `detach` (as of `sim.i2c.SimI2cBus`), `reset`, `hang`, `unplugged` (its cable
+    is out of the computer; it goes on alone), the outputs and their history, and the tampers.
 
     Parameters
     ----------
@@ -115,6 +116,9 @@ class SimHead:
         This machine cannot build the firmware.
     """
 
+    path = ""
+    """Its bus has none: it is not the computer's."""
+
     def __init__(
         self,
         world: World,
@@ -135,6 +139,8 @@ class SimHead:
         self.tampers: list[Callable[[bool, int], int | None]] = []
         self.listeners: list[Callable[[PinChange], None]] = []
         self.resets: list[Reset] = []
+        self.refusals: list[Callable[[int], bool]] = []
+        self.unplugged = False
         self._devices: dict[int, I2cDevice] = {}
         self._addressed: I2cDevice | None = None
         self._nacks = 0
@@ -191,12 +197,13 @@ class SimHead:
 
     @property
     def stuck(self) -> int:
-        """How often SCL must be clocked until the sensor lets SDA go; 255: for ever; 0: the bus is free."""
+        """How often SCL must be clocked until the sensor lets SDA go; 255 or True: for ever; 0: the bus is free."""
         return self._stuck
 
     @stuck.setter
     def stuck(self, clocks: int) -> None:
         self.catch_up()
+        clocks = 255 if clocks is True else int(clocks)
         self._stuck = clocks
         self._library.board_set_stuck(self._board, clocks)
 
@@ -279,7 +286,12 @@ class SimHead:
         device = self._addressed
         if operation in (_START_WRITE, _START_READ):
             self._addressed = device = self._devices.get(data[0])
-            if device is None or self._nacks or not getattr(device, "answers", True):
+            if (
+                device is None
+                or self._nacks
+                or not getattr(device, "answers", True)
+                or any(refuses(data[0]) for refuses in self.refusals)
+            ):
                 self._nacks = max(self._nacks - 1, 0)
                 self._addressed = None
                 return 0

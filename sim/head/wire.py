@@ -11,7 +11,7 @@ from sim.head.board import BYTE_NS, RECEIVER_BYTES, SimHead
 class HeadSerial:
     """Looks like an open `serial.Serial`; who reads waits on the virtual clock.
 
-    ``timeout`` is in seconds; `unplug` pulls its cable out of the computer: the head goes on alone.
+    ``timeout`` is in seconds. It fails once the head is unplugged; one that is plugged in again is another port.
 
     Raises
     ------
@@ -25,7 +25,7 @@ class HeadSerial:
         self.timeout = timeout
         self.is_open = True
         self._head = head
-        self._unplugged = False
+        self._plugged_out = False
         self._received = bytearray()
         head.catch_up()
         head.take(head.clock.now_ns())  # what came while nobody had the port open
@@ -34,7 +34,8 @@ class HeadSerial:
         self.is_open = False
 
     def unplug(self) -> None:
-        self._unplugged = True
+        """Pull the head's cable out of the computer."""
+        self._head.unplugged = True
 
     @property
     def in_waiting(self) -> int:
@@ -73,7 +74,8 @@ class HeadSerial:
             self._received += arrived[: RECEIVER_BYTES - len(self._received)]
 
     def _require_open(self) -> None:
-        if self._unplugged:
+        self._plugged_out = self._plugged_out or self._head.unplugged
+        if self._plugged_out:
             raise serial.SerialException(errno.EIO, f"device {self.port} disconnected")
         if not self.is_open:
             raise serial.PortNotOpenError()

@@ -91,7 +91,7 @@ def on_head(
 @contextmanager
 def pseudo_terminal(noise: NoiseModel) -> Iterator[Sensor]:
     with heads.head_on_a_pty(noise) as h:
-        yield Sensor(h.imu, h.world, h.unplug, 0.015, 0.3, LATE_S, delivery_s=0.2, paced=h.clock)
+        yield Sensor(h.imu, h.world, h.unplug, 0.05, 0.3, LATE_S, delivery_s=0.2, paced=h.clock)
 
 
 SENSORS: dict[str, Callable[[NoiseModel], Opened]] = {
