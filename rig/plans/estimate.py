@@ -228,8 +228,10 @@ class TimeLeft:
     def seconds(self) -> float:
         """Time of the bench until the table is back at 0."""
         model, done, angles = self._model, self._done, self._angles_deg
+        if not angles:
+            return 0.0
         if not done:
-            return model.enrollment_s(angles[0] if angles else 0.0, angles)
+            return model.enrollment_s(angles[0], angles)
         left = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[done - 1 :]))
         expected = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[:done]))
         if done > 1 and expected > 0:

@@ -44,7 +44,7 @@ def enrolling(
     name: str = "mug-white", views: int = 8, *, retaken: Sequence[int] = (), shape: tuple[int, int] = (48, 64)
 ) -> Iterator[Event]:
     rng = np.random.default_rng(views)
-    yield Started("enroll", name, views, {})
+    yield Started("enroll", name, views, {}, angles_deg=tuple(360.0 * k / views for k in range(views)))
     for k in range(views):
         yield moved(k, 360.0 * k / views, 360.0 / views if k else 0.0)
         if k in retaken:

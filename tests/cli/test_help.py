@@ -1,0 +1,81 @@
+"""Help: every command has its example, and none of it takes long."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+
+BUDGET_S = 0.35
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+
+
+def commands(group: object, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    inner = getattr(group, "commands", None)
+    if inner is None:
+        yield words
+        return
+    for name, command in inner.items():
+        yield from commands(command, (*words, name))
+
+
+COMMANDS = sorted(commands(typer.main.get_command(app)))
+
+
+def test_there_are_the_commands_of_everybody():
+    assert {words[0] for words in COMMANDS} >= {
+        "enroll", "identify", "replay", "report", "catalog", "import", "export", "log", "eval", "demo", "calibrate",
+        "goto", "home", "status", "stop", "acknowledge", "doctor", "find", "setup", "config", "servo",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_has_an_example_that_begins_with_its_name(words):
+    done = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "100"})
+    assert done.exit_code == 0
+    text = " ".join(done.output.split())
+    assert f"Example: rig {' '.join(words)}" in text
+
+
+def test_help_is_light_and_takes_little_time():
+    """The least of five runs: the others are slower by what the machine did beside."""
+    code = (
+        "import sys; sys.argv = ['rig', '--help']\n"
+        "from rig.cli.main import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print('HEAVY', sorted({'numpy', 'cv2', 'scipy', 'sqlalchemy', 'pydantic', 'jinja2'} & set(sys.modules)))\n"
+    )
+    spent = []
+    for _ in range(5):
+        before = os.times()
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        after = os.times()
+        spent.append(after.children_user + after.children_system - before.children_user - before.children_system)
+        assert "HEAVY []" in done.stdout
+    assert min(spent) < BUDGET_S
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--help", "--no-color"), ("--no-color", "enroll", "--help"), ("fly", "--no-color")]
+)
+def test_no_color_holds_wherever_it_stands(arguments):
+    environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm-256color", "COLUMNS": "90"}
+    environment.pop("NO_COLOR", None)
+    done = subprocess.run([*RIG, *arguments], env=environment, capture_output=True, text=True)
+    text = done.stdout + done.stderr
+    assert "\x1b[3" not in text  # no colour; bold and dim are none
+
+
+def test_a_terminal_that_lacks_signs_gets_question_marks_and_no_traceback(tmp_path):
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = subprocess.run(
+        [*RIG, "goto", "20", "--bench", "sim"], env=environment, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    assert "(asked 20.00?)" in done.stdout
