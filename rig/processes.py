@@ -5,9 +5,12 @@ import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import suppress
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any, Final, TypeVar
+
+from rig.errors import RigError
 
 _Item = TypeVar("_Item")
 _T = TypeVar("_T")
@@ -44,11 +47,30 @@ def over_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: in
         while waiting or futures:
             while waiting and len(futures) < jobs * _AHEAD:
                 item = waiting.popleft()
-                futures[pool.submit(_call, item)] = item  # type: ignore[arg-type]
+                with _deaf_to_interrupts():  # a submission may start a process
+                    futures[pool.submit(_call, item)] = item  # type: ignore[arg-type]
             for future in wait(futures, return_when=FIRST_COMPLETED).done:
                 yield futures.pop(future), future.result()
+    except BrokenProcessPool as error:
+        raise RigError(
+            "a process that worked on the images ended before it was done",
+            next_step="see whether the computer ran out of memory; go on with fewer processes (--jobs 1)",
+        ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Have the processes that are started inherit that they do not hear Ctrl+C, which reaches all of a terminal's.
+
+    The one that the person started hears it when this is over, and stops the others after the item they are at.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker(work: Callable[[Any], object]) -> None:
@@ -57,9 +79,6 @@ def _start_worker(work: Callable[[Any], object]) -> None:
     global _work
     _work = work
     cv2.setNumThreads(1)
-    # Ctrl+C reaches every process of the terminal; the first one stops the others after the object they are at
-    with suppress(ValueError):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _call(item: Any) -> object:

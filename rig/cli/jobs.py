@@ -36,13 +36,18 @@ def run_job(title: str, job: "Generator[Progressed, None, _T]", *, interrupted: 
         job.close()
 
 
+def somebody_there() -> bool:
+    """Tell whether a person can answer."""
+    return sys.stdin.isatty()
+
+
 def confirm(question: str, *, yes: bool, settings: Settings) -> None:
     """Ask before a deletion; without a person at the terminal ``--yes`` is the answer, or nothing is done."""
     from rig.errors import UsageError
 
     if yes:
         return
-    if settings.json or not sys.stdin.isatty():
+    if settings.json or not somebody_there():
         raise UsageError(f"{question} Nobody is there to answer.", next_step="give --yes if you mean it")
     if not typer.confirm(question, err=True):
         print("Nothing was changed.", file=sys.stderr)
