@@ -48,6 +48,7 @@ class HardwareBench:
                 wire=wire,
                 i2c_bus=config.imu.bus,
                 capture=capture,
+                reopen_camera=lambda: open_capture(config.camera.source),
                 state=FileStore(state_path),
                 head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
@@ -73,6 +74,7 @@ def assemble(
     wire: Wire,
     i2c_bus: int | str,
     capture: Capture,
+    reopen_camera: Callable[[], Capture] | None = None,
     state: StateStore,
     head_port: Callable[[], Wire] | None = None,
 ) -> Bench:
@@ -104,6 +106,7 @@ def assemble(
             clock=clock,
             settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
             name=f"camera {config.camera.source}",
+            reopen=reopen_camera,
         )
         findings += tuple(
             f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}"

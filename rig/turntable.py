@@ -215,6 +215,10 @@ class Turntable(AbstractContextManager["Turntable"]):
         self.check_target(target_deg)
         return self._move(target_deg, self._waypoints(target_deg))
 
+    def attend(self) -> None:
+        """Collect what the gyro has measured: its buffer does not last as long as a slow camera may take."""
+        self._heading.update()
+
     def check_still(self, since_ns: int | None = None) -> Stillness:
         """Look again at encoder and gyro, for the evidence of a view taken since the table came to rest.
 

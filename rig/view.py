@@ -139,7 +139,12 @@ class Viewer:
         self._locks = camera.read_locks()
         self._last: NDArray[np.uint8] | None = None
 
-    def attempts(self, settled_ns: int, check_still: Callable[[int], Stillness]) -> Iterator[Attempt]:
+    def attempts(
+        self,
+        settled_ns: int,
+        check_still: Callable[[int], Stillness],
+        meanwhile: Callable[[], object] | None = None,
+    ) -> Iterator[Attempt]:
         """Capture until a frame is accepted or the retakes are used up; the last attempt tells which.
 
         Parameters
@@ -148,10 +153,12 @@ class Viewer:
             When the table came to rest: no older exposure counts.
         check_still
             Looks at encoder and gyro again, after the exposure, from a given time on.
+        meanwhile
+            Called several times a second while a slow camera is waited for.
         """
         after_ns = settled_ns
         for number in range(1, 2 + self._config.retakes):
-            frame = self._camera.capture(after_ns)
+            frame = self._camera.capture(after_ns, meanwhile)
             attempt = self._judge(number, frame, settled_ns, check_still(after_ns))
             self._last = frame.image_bgr
             yield attempt

@@ -168,6 +168,7 @@ def open_sim_bench(
             wire=parts.adapter,
             i2c_bus=parts.i2c.path,
             capture=parts.camera,
+            reopen_camera=parts.reopen_camera,
             state=operator.state,
             head_port=parts.head_port,
         )

@@ -80,6 +80,18 @@ class SimParts(AbstractContextManager["SimParts"]):
             raise DeviceNotFound("There is no rig head at this port.", next_step="Plug its USB cable in.")
         return HeadSerial(self.head)
 
+    def reopen_camera(self) -> SimCapture:
+        """Open the camera's stream anew, as after it was unplugged.
+
+        Raises
+        ------
+        DeviceNotFound
+            It is not plugged in.
+        """
+        if not self.camera.reopen():
+            raise DeviceNotFound("There is no camera.", next_step="Plug the camera in.")
+        return self.camera
+
     def open_wires(self) -> None:
         """Open what a closed bench has let go of: the port, and the camera's stream if the camera is there.
 

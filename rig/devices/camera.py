@@ -1,5 +1,6 @@
 """What the rig asks of a camera."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,6 +27,8 @@ class CameraLocks:
     white_balance_k: float | None
     auto_exposure: bool | None
     auto_white_balance: bool | None
+    focus: float | None = None
+    autofocus: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +45,11 @@ class Camera(Protocol):
     @property
     def identity(self) -> CameraIdentity: ...
 
-    def capture(self, after_ns: int) -> Frame:
-        """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped."""
+    def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
+        """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
+
+        ``meanwhile`` is called several times a second while a slow camera is waited for.
+        """
         ...
 
     def read_locks(self) -> CameraLocks:

@@ -13,8 +13,11 @@ is opened:
 """
 
 import os
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from math import ceil
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,7 +26,7 @@ import numpy as np
 
 from rig.clock import Clock, seconds_between
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
-from rig.errors import DeviceFault, DeviceNotFound, DeviceSilent
+from rig.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 
 V4L2_EXPOSURE_MANUAL = 1
 _V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera chooses the time
@@ -33,6 +36,8 @@ _PROBES = 16  # frames to look at when opened: more than a driver keeps
 _RETRIES = 5  # grabs in a row that may fail
 _FRESH_S = 1.0  # a frame that the camera has just delivered is younger
 _STAMP_ERROR_NS = 2_000_000  # how far a stamp may lie ahead of the clock
+_SLICE_S = 0.2  # how long a frame is waited for without doing what has to be done meanwhile
+_REPLUG_PAUSE_S = 0.25
 
 
 class Capture(Protocol):
@@ -107,6 +112,9 @@ class OpenCvCamera:
         How long `capture` waits for a frame that is new enough.
     latency_s
         For a paced source: the longest time from the start of an exposure until `grab` has it; three frames if None.
+    reopen
+        Opens the source anew (DeviceNotFound while it is not there): a camera that was unplugged and comes back within
+        ``timeout_s`` is set as it was, and goes on.
 
     Raises
     ------
@@ -123,12 +131,16 @@ class OpenCvCamera:
         name: str = "camera",
         timeout_s: float = 3.0,
         latency_s: float | None = None,
+        reopen: Callable[[], Capture] | None = None,
     ) -> None:
         self._capture = capture
+        self._reopen = reopen
+        self._settings = settings or CameraSettings()
+        self.returns = 0
         self._clock = clock
         self._timeout_s = timeout_s
         self._supported: set[int] = set()
-        self.not_taken: tuple[NotTaken, ...] = self._configure(settings or CameraSettings())
+        self.not_taken: tuple[NotTaken, ...] = self._configure(self._settings)
         self._identity = CameraIdentity(
             name,
             round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
@@ -138,6 +150,8 @@ class OpenCvCamera:
         self._period_s = 1 / self._identity.fps if 1 <= self._identity.fps <= 1000 else 1 / 30
         self._latency_ns = round((3 * self._period_s if latency_s is None else latency_s) * 1e9)
         self._last_stamp_ns = -1
+        self._arrived_ns = clock.now_ns()
+        self._waits_s: deque[float] = deque([self._period_s], maxlen=4)
         self.time_base: TimeBase = TimeBase.STAMPED
         self.time_base = self._find_time_base()
 
@@ -145,19 +159,25 @@ class OpenCvCamera:
     def identity(self) -> CameraIdentity:
         return self._identity
 
-    def capture(self, after_ns: int) -> Frame:
+    def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
+
+        ``meanwhile`` is called several times a second while a slow camera is waited for.
 
         Raises
         ------
         DeviceSilent
             No such frame came within the time-out, or the camera has stopped delivering.
+        DeviceMismatch
+            The camera that came back after it was unplugged is another one, or in another mode.
         """
-        deadline_ns = max(self._clock.now_ns(), after_ns) + round(self._timeout_s * 1e9)
+        deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(self._timeout_s, 3 * max(self._waits_s)) * 1e9)
         dropped = 0
         while True:
             if self.time_base is TimeBase.RECORDED:
                 self._clock.sleep(seconds_between(self._clock.now_ns(), after_ns))
+            elif meanwhile is not None:
+                self._await(meanwhile)
             exposed_ns = self._grab()
             if exposed_ns is not None and exposed_ns >= after_ns:
                 return Frame(self._retrieve(), exposed_ns)
@@ -173,12 +193,15 @@ class OpenCvCamera:
         exposure = self._known(cv2.CAP_PROP_EXPOSURE)
         auto_exposure = self._known(cv2.CAP_PROP_AUTO_EXPOSURE)
         auto_white_balance = self._known(cv2.CAP_PROP_AUTO_WB)
+        autofocus = self._known(cv2.CAP_PROP_AUTOFOCUS)
         return CameraLocks(
             exposure_us=None if exposure is None else exposure * _EXPOSURE_UNIT_US,
             gain=self._known(cv2.CAP_PROP_GAIN),
             white_balance_k=self._known(cv2.CAP_PROP_WB_TEMPERATURE),
             auto_exposure=None if auto_exposure is None else auto_exposure in _V4L2_EXPOSURE_AUTO,
             auto_white_balance=None if auto_white_balance is None else auto_white_balance != 0,
+            focus=self._known(cv2.CAP_PROP_FOCUS),
+            autofocus=None if autofocus is None else autofocus != 0,
         )
 
     def close(self) -> None:
@@ -206,9 +229,11 @@ class OpenCvCamera:
         if settings.white_balance_k is not None:
             ask("auto_white_balance", cv2.CAP_PROP_AUTO_WB, 0)
             ask("white_balance_k", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k)
-        if settings.focus is not None:
+        # Focus stays where it is where nobody says where: one that hunts makes another picture of the same thing. A
+        # fixed lens has no autofocus to switch off.
+        if settings.focus is not None or self._capture.get(cv2.CAP_PROP_AUTOFOCUS) > 0:
             ask("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0)
-            ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
+        ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
         read_back = [(name, prop, value, self._capture.get(prop)) for name, prop, value in asked]
         return tuple(
             NotTaken(name, value, reported)
@@ -235,8 +260,56 @@ class OpenCvCamera:
                 return TimeBase.STAMPED
         return TimeBase.PACED
 
+    def _await(self, meanwhile: Callable[[], object]) -> None:
+        """Let the time pass until the next frame is about to come, as far as the last ones tell: `grab` only blocks."""
+        spacing_s, now_ns = max(self._waits_s), self._clock.now_ns()
+        frames = ceil(seconds_between(self._arrived_ns, now_ns) / spacing_s)
+        due_ns = self._arrived_ns + round((frames * spacing_s - _SLICE_S / 2) * 1e9)
+        while (left_s := seconds_between(self._clock.now_ns(), due_ns)) > 0:
+            self._clock.sleep(min(left_s, _SLICE_S))
+            meanwhile()
+
     def _grab(self) -> int | None:
         """Take the next frame; return when its exposure began on the bench's clock, or None if that may be long ago."""
+        try:
+            return self._grab_now()
+        except DeviceSilent:
+            if self._reopen is None or self.time_base is TimeBase.RECORDED or self._capture.isOpened():
+                raise
+            self._return(self._reopen)
+            return self._grab_now()
+
+    def _return(self, reopen: Callable[[], Capture]) -> None:
+        """Wait until the camera is back, and set it as it was; raises what `reopen` does when it stays away."""
+        self._capture.release()
+        give_up_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
+        while True:
+            try:
+                self._capture = reopen()
+                break
+            except DeviceNotFound as missing:
+                if self._clock.now_ns() > give_up_ns:
+                    raise DeviceSilent(
+                        f"{self._identity.name} is gone, and did not come back in {self._timeout_s:g} s",
+                        next_step=missing.next_step,
+                        evidence=missing.evidence,
+                    ) from missing
+                self._clock.sleep(_REPLUG_PAUSE_S)
+        self._last_stamp_ns = -1
+        not_taken, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        got, expected = (
+            tuple(round(self._capture.get(prop)) for prop in mode),
+            (self._identity.width, self._identity.height),
+        )
+        if got != expected or not_taken != self.not_taken:
+            raise DeviceMismatch(
+                f"{self._identity.name} came back as another camera, or with other settings",
+                next_step="Connect the camera that was there, or start again with this one.",
+                evidence={"expected": list(expected), "got": list(got), "not_taken": [n.setting for n in not_taken]},
+            )
+        self.returns += 1
+
+    def _grab_now(self) -> int | None:
         first_ns = self._clock.now_ns()
         attempts, waited_s = 0, 0.0
         while attempts < _RETRIES and waited_s <= self._timeout_s:  # V4L2 itself waits long for a stream that hangs
@@ -244,6 +317,7 @@ class OpenCvCamera:
                 self._clock.sleep(self._period_s)
             asked_ns = self._clock.now_ns()
             if self._capture.grab():
+                self._note_arrival(asked_ns)
                 return self._exposed_ns(asked_ns)
             attempts += 1
             waited_s = seconds_between(first_ns, self._clock.now_ns())
@@ -256,6 +330,16 @@ class OpenCvCamera:
             else "check the camera's cable, and that no other program uses it",
             evidence={"attempts": attempts, "still_open": self._capture.isOpened()},
         )
+
+    def _note_arrival(self, asked_ns: int) -> None:
+        """Learn how long the camera takes: a frame that was waited for has just come."""
+        now_ns = self._clock.now_ns()
+        if seconds_between(asked_ns, now_ns) > self._period_s / 4:
+            self._waits_s.append(seconds_between(asked_ns, now_ns))
+            since_s = seconds_between(self._arrived_ns, now_ns)
+            if since_s < 2 * max(self._waits_s):  # the very next one: the whole of its time, not just the end of it
+                self._waits_s.append(since_s)
+            self._arrived_ns = now_ns
 
     def _exposed_ns(self, asked_ns: int) -> int | None:
         now_ns = self._clock.now_ns()

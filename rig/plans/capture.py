@@ -53,7 +53,7 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
     ViewRejected
         No frame was acceptable; the evidence is that of the last.
     """
-    attempts = viewer.attempts(settled_ns, table.check_still)
+    attempts = viewer.attempts(settled_ns, table.check_still, table.attend)
     for attempt in attempts:
         if attempt.accepted:
             return attempt

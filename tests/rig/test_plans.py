@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import hbr
-import sim.i2c
 from hbr.angles import wrap180
 from rig.catalog import Catalog
 from rig.config import load_config
@@ -164,7 +163,7 @@ def servo_of(s):
 
 
 def i2c_of(s):
-    return next(bus for bus in sim.i2c._open_buses.values() if bus.path == s.bench.imu._bus_name)
+    return s.operator.parts.i2c
 
 
 @pytest.mark.parametrize("moving", [True, False])
