@@ -51,7 +51,7 @@ struct board {
 /* The board that runs: the core knows only one, as on the microcontroller. */
 static struct board *here;
 
-static void emit(struct board *b, uint64_t ns, enum board_event event, int32_t value) {
+static void emit(struct board *b, uint64_t ns, int32_t event, int32_t value) {
     if (b->out_count < QUEUE) {
         struct board_output *slot = &b->out[(b->out_head + b->out_count++) % QUEUE];
         slot->ns = ns;

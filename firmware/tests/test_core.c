@@ -1,0 +1,256 @@
+/* Unit tests of the core on this machine, under sanitizers: `make test`. The deeper ones are in ../tests, in Python. */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "../boards/host/board.h"
+#include "../core/frame.h"
+#include "../hal/hal.h"
+
+static unsigned checks;
+
+#define CHECK(truth)                                                                                                   \
+    do {                                                                                                               \
+        checks++;                                                                                                      \
+        if (!(truth)) {                                                                                                \
+            fprintf(stderr, "%s:%d: %s\n", __FILE__, __LINE__, #truth);                                                \
+            exit(1);                                                                                                   \
+        }                                                                                                              \
+    } while (0)
+
+static uint32_t seed = 1;
+
+static uint8_t random_byte(void) {
+    seed = seed * 1664525U + 1013904223U;
+    return (uint8_t)(seed >> 24);
+}
+
+/* -- frames -------------------------------------------------------------------------------------------------------- */
+
+static void test_crc_is_ccitt_false(void) {
+    CHECK(frame_crc((const uint8_t *)"123456789", 9) == 0x29B1);
+}
+
+static void test_every_frame_comes_back(void) {
+    for (int round = 0; round < 20000; round++) {
+        uint8_t frame[FRAME_MAX], sent[FRAME_MAX], line[FRAME_LINE];
+        uint8_t body = (uint8_t)(random_byte() % (MAX_BODY + 1));
+        for (uint8_t i = 0; i < body + FRAME_HEADER; i++) {
+            frame[i] = sent[i] = random_byte() % 3 ? random_byte() : 0;
+        }
+        uint8_t length = frame_encode(line, frame, body);
+        CHECK(length == body + FRAME_OVERHEAD + 2);
+        CHECK(strlen((const char *)line) == (size_t)length - 1);
+        CHECK(frame_decode(line, (uint8_t)(length - 1)) == body);
+        CHECK(!memcmp(line, sent, body + FRAME_HEADER));
+    }
+}
+
+static void test_garbage_stays_within_its_bytes(void) {
+    for (int round = 0; round < 200000; round++) {
+        uint8_t length = (uint8_t)(random_byte() % (FRAME_LINE + 8));
+        uint8_t *line = malloc(length ? length : 1); /* just so long: the sanitizer sees a byte beyond it */
+        for (uint8_t i = 0; i < length; i++) {
+            line[i] = random_byte() % 4 ? (uint8_t)(random_byte() % 6) : random_byte();
+        }
+        int8_t body = frame_decode(line, length);
+        CHECK(body <= MAX_BODY);
+        free(line);
+    }
+}
+
+/* -- a board without a sensor -------------------------------------------------------------------------------------- */
+
+static int32_t nobody(uint64_t ns, int32_t operation, uint8_t *data, int32_t length) {
+    (void)ns;
+    (void)operation;
+    (void)data;
+    (void)length;
+    return 0;
+}
+
+static uint64_t never(uint64_t ns) {
+    (void)ns;
+    return BOARD_NEVER;
+}
+
+static struct board *board;
+static uint64_t now_ns;
+static uint8_t sequence;
+static int relay, light, trigger;
+static uint64_t relay_ns, light_ns;
+static uint8_t answer[FRAME_LINE], event[FRAME_LINE];
+
+static void run_ms(uint64_t ms) {
+    static uint8_t line[FRAME_LINE];
+    static uint8_t length;
+    struct board_output outputs[64];
+    uint32_t count;
+    board_run(board, now_ns += ms * 1000000);
+    while ((count = board_take(board, outputs, 64))) {
+        for (uint32_t i = 0; i < count; i++) {
+            switch (outputs[i].event) {
+            case BOARD_LIGHT:
+                light = outputs[i].value;
+                light_ns = outputs[i].ns;
+                break;
+            case BOARD_RELAY:
+                relay = outputs[i].value;
+                relay_ns = outputs[i].ns;
+                break;
+            case BOARD_TRIGGER:
+                trigger = outputs[i].value;
+                break;
+            case BOARD_BYTE:
+                if (outputs[i].value) {
+                    line[length++] = (uint8_t)outputs[i].value;
+                    break;
+                }
+                CHECK(frame_decode(line, length) >= 0);
+                memcpy(line[0] >= MESSAGE_SAMPLE ? event : answer, line, sizeof line);
+                length = 0;
+                break;
+            default:
+                break;
+            }
+        }
+    }
+}
+
+static void send(uint8_t id, const void *body, uint8_t length, uint8_t number) {
+    uint8_t frame[FRAME_MAX] = {id, number}, line[FRAME_LINE];
+    memcpy(frame + FRAME_HEADER, body, length);
+    length = frame_encode(line, frame, length);
+    for (uint8_t i = 0; i < length; i++) {
+        board_receive(board, now_ns + (i + 1) * 40000U, line[i]);
+    }
+    run_ms(4);
+}
+
+/* Returns the refusal. */
+static uint8_t ask(uint8_t id, const void *body, uint8_t length) {
+    send(id, body, length, ++sequence);
+    CHECK(answer[1] == sequence);
+    return answer[0] == MESSAGE_DONE ? answer[FRAME_HEADER + 1] : REFUSAL_NONE;
+}
+
+static uint8_t beat(uint16_t deadman_ms) {
+    uint8_t body[SIZE_BEAT] = {(uint8_t)deadman_ms, (uint8_t)(deadman_ms >> 8)};
+    return ask(MESSAGE_BEAT, body, sizeof body);
+}
+
+static uint8_t ask_u8(uint8_t id, uint8_t value) {
+    return ask(id, &value, 1);
+}
+
+static void power_up(void) {
+    now_ns = 0;
+    relay = light = trigger = 0;
+    board = board_open((struct board_outside){nobody, never}, NULL, 0, 7);
+    run_ms(5);
+    CHECK(event[0] == MESSAGE_CHANGED && event[FRAME_HEADER + 9] == RESET_POWER_ON);
+}
+
+static void test_outputs_need_a_heartbeat(void) {
+    power_up();
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NOT_ACTIVE);
+    CHECK(ask_u8(MESSAGE_LIGHT, 9) == REFUSAL_NOT_ACTIVE);
+    CHECK(beat(250) == REFUSAL_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NONE && relay == 1);
+    CHECK(ask_u8(MESSAGE_LIGHT, 9) == REFUSAL_NONE && light == 9);
+    CHECK(ask_u8(MESSAGE_RELAY, 2) == REFUSAL_OUT_OF_RANGE);
+    CHECK(ask(MESSAGE_REST, "", 0) == REFUSAL_NONE);
+    CHECK(relay == 0 && light == 0);
+    board_close(board);
+}
+
+static void test_silence_makes_the_bench_safe(void) {
+    power_up();
+    CHECK(beat(49) == REFUSAL_OUT_OF_RANGE && beat(2001) == REFUSAL_OUT_OF_RANGE);
+    beat(250);
+    uint64_t beaten_ns = now_ns;
+    ask_u8(MESSAGE_RELAY, 1);
+    ask_u8(MESSAGE_LIGHT, 255);
+    run_ms(230);
+    CHECK(relay == 1 && light == 255);
+    run_ms(20);
+    CHECK(relay == 0 && light == 0);
+    CHECK(relay_ns - beaten_ns <= 250000000 + TICK_US * 1000 && relay_ns == light_ns);
+    CHECK(beat(250) == REFUSAL_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_FAULT_LATCHED);
+    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, FAULT_DEADMAN) == REFUSAL_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NOT_ACTIVE); /* not by itself: a beat first */
+    beat(250);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NONE && relay == 1);
+    board_close(board);
+}
+
+static void test_estop_acts_within_a_millisecond(void) {
+    power_up();
+    beat(2000);
+    ask_u8(MESSAGE_RELAY, 1);
+    board_set_estop(board, true);
+    uint64_t opened_ns = now_ns;
+    run_ms(2);
+    CHECK(relay == 0 && relay_ns - opened_ns <= 1000000);
+    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, 0xFF) == REFUSAL_CAUSE_PERSISTS);
+    board_set_estop(board, false);
+    run_ms(2);
+    CHECK(relay == 0);
+    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, 0xFF) == REFUSAL_NONE);
+    for (int i = 0; i < 50; i++) { /* bouncing contacts: never open for a whole millisecond */
+        board_set_estop(board, true);
+        board_run(board, now_ns += 700000);
+        board_set_estop(board, false);
+        board_run(board, now_ns += 300000);
+    }
+    beat(2000);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NONE);
+    board_close(board);
+}
+
+static void test_a_repeated_request_is_answered_but_not_done_twice(void) {
+    power_up();
+    beat(2000);
+    uint8_t width[SIZE_TRIGGER] = {100, 0};
+    send(MESSAGE_TRIGGER, width, sizeof width, 77);
+    CHECK(answer[0] == MESSAGE_TRIGGERED && trigger == 0);
+    uint8_t first[FRAME_LINE];
+    memcpy(first, answer, sizeof first);
+    send(MESSAGE_TRIGGER, width, sizeof width, 77);
+    CHECK(!memcmp(first, answer, FRAME_HEADER + SIZE_TRIGGERED));
+    board_close(board);
+}
+
+static void test_unknown_and_malformed_requests_are_refused(void) {
+    power_up();
+    CHECK(ask(0x00, "", 0) == REFUSAL_UNKNOWN_REQUEST);
+    CHECK(ask(0x7F, "", 0) == REFUSAL_UNKNOWN_REQUEST);
+    CHECK(ask(MESSAGE_LIGHT, "ab", 2) == REFUSAL_MALFORMED);
+    board_close(board);
+}
+
+static void test_a_program_that_hangs_is_restarted(void) {
+    power_up();
+    beat(2000);
+    ask_u8(MESSAGE_RELAY, 1);
+    board_hang(board, true);
+    run_ms(130);
+    CHECK(relay == 0);
+    CHECK(event[0] == MESSAGE_CHANGED && event[FRAME_HEADER + 9] == RESET_WATCHDOG);
+    CHECK(event[FRAME_HEADER + 5] == FAULT_WATCHDOG);
+    board_close(board);
+}
+
+int main(void) {
+    test_crc_is_ccitt_false();
+    test_every_frame_comes_back();
+    test_garbage_stays_within_its_bytes();
+    test_outputs_need_a_heartbeat();
+    test_silence_makes_the_bench_safe();
+    test_estop_acts_within_a_millisecond();
+    test_a_repeated_request_is_answered_but_not_done_twice();
+    test_unknown_and_malformed_requests_are_refused();
+    test_a_program_that_hangs_is_restarted();
+    printf("%u checks, all well\n", checks);
+}
