@@ -46,6 +46,7 @@ class HardwareBench:
                 config,
                 clock,
                 wire=wire,
+                reopen_wire=lambda: open_serial(config.servo.port, config.servo.baud),
                 i2c_bus=config.imu.bus,
                 capture=capture,
                 reopen_camera=lambda: open_capture(config.camera.source),
@@ -72,6 +73,7 @@ def assemble(
     clock: Clock,
     *,
     wire: Wire,
+    reopen_wire: Callable[[], Wire] | None = None,
     i2c_bus: int | str,
     capture: Capture,
     reopen_camera: Callable[[], Capture] | None = None,
@@ -96,7 +98,7 @@ def assemble(
             head = open_head(config, head_port, clock)
             opened.callback(head.close)
             fault = switch_on(head, config.head, clock)  # first: the servo's supply may go through it
-        servo = open_servo(wire, config.servo, clock, config.table.mode)
+        servo = open_servo(wire, config.servo, clock, config.table.mode, reopen_wire)
         findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
         _check_reach(config, servo)
         imu: Imu = head or open_imu(config.imu, i2c_bus, clock)

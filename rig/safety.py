@@ -214,10 +214,14 @@ class Safety:
         if self._store.stop_requested():
             self._store.clear_stop()
             raise _stopped()
+        if self._state in (State.CONNECTED, State.UNREFERENCED, State.READY):
+            try:
+                self._judge()
+            except DeviceSilent:
+                self._go(Happening.LOSE)
         if self._state in (State.DISCONNECTED, State.STOPPED):
             self._servo.verify()
             self._go(Happening.CONNECT if self._state is State.DISCONNECTED else Happening.RECHECK)
-        if self._state is not State.FAULT:
             self._judge()
         self.require_ready()
         self._save(table=self._table(self._servo.read_state().position_deg))

@@ -166,6 +166,7 @@ def open_sim_bench(
             config,
             world.clock,
             wire=parts.adapter,
+            reopen_wire=parts.reopen_adapter,
             i2c_bus=parts.i2c.path,
             capture=parts.camera,
             reopen_camera=parts.reopen_camera,

@@ -92,15 +92,14 @@ class SimParts(AbstractContextManager["SimParts"]):
             raise DeviceNotFound("There is no camera.", next_step="Plug the camera in.")
         return self.camera
 
-    def open_wires(self) -> None:
-        """Open what a closed bench has let go of: the port, and the camera's stream if the camera is there.
+    def reopen_adapter(self) -> SimSerial:
+        """Open the servo's port, also after its adapter was unplugged.
 
         Raises
         ------
         DeviceNotFound
-            The adapter is not plugged in.
+            It is not plugged in.
         """
-        self.camera.reopen()
         if not self.adapter.is_open:
             try:
                 self.adapter.open()
@@ -110,6 +109,18 @@ class SimParts(AbstractContextManager["SimParts"]):
                     next_step="Plug the adapter in.",
                     evidence={"reason": str(error)},
                 ) from error
+        return self.adapter
+
+    def open_wires(self) -> None:
+        """Open what a closed bench has let go of: the port, and the camera's stream if the camera is there.
+
+        Raises
+        ------
+        DeviceNotFound
+            The adapter is not plugged in.
+        """
+        self.camera.reopen()
+        self.reopen_adapter()
 
 
 def _head(config: RigConfig, world: World, servo: SimulatedServo) -> SimHead:

@@ -10,6 +10,7 @@ from rig.bench import Bench
 from rig.errors import (
     DeviceFault,
     DeviceMismatch,
+    DeviceNotFound,
     DeviceSilent,
     FaultLatched,
     RigError,
@@ -324,3 +325,43 @@ def test_a_stop_that_was_asked_for_ends_the_motion_with_torque_off(bench_of, tmp
         assert not FileStore(tmp_path / "state").stop_requested()
         with Turntable(bench) as table:  # stopped, not broken
             assert table.goto(0.0).agrees
+
+
+@pytest.mark.parametrize("when", ["in a motion", "between two"])
+def test_an_adapter_that_is_plugged_in_again_is_opened_anew_and_who_answers_is_looked_at(simulated, when):
+    s = simulated()
+    adapter = s.operator.parts.adapter
+    with pytest.raises(DeviceSilent) as caught, Turntable(s.bench) as table:
+        if when == "in a motion":
+            s.world.clock.call_at(s.world.clock.now_ns() + 1_200_000_000, adapter.unplug)
+            table.goto(300.0)
+        else:
+            table.goto(60.0)
+            adapter.unplug()
+            table.goto(90.0)
+    assert ("did not hear the stop" in "".join(getattr(caught.value, "__notes__", ()))) == (when == "in a motion")
+    s.world.clock.sleep(1.0)
+    stands = s.world.shaft()
+    assert stands[1] == 0
+    with pytest.raises(DeviceNotFound), Turntable(s.bench):
+        pass
+    adapter.replug()
+    s.world.clock.sleep(3.0)
+    assert s.world.shaft() == stands
+    with Turntable(s.bench) as table:
+        assert s.world.shaft() == stands
+        assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+
+
+def test_another_servo_behind_the_adapter_that_came_back_is_refused(simulated):
+    s = simulated()
+    parts = s.operator.parts
+    with pytest.raises(DeviceSilent), Turntable(s.bench) as table:
+        parts.adapter.unplug()
+        table.goto(60.0)
+    parts.servo_bus.detach(parts.servo)
+    parts.servo_bus.attach(XSeriesServo(s.world, "xl330_m288"))
+    parts.adapter.replug()
+    with pytest.raises(DeviceMismatch) as caught, Turntable(s.bench):
+        pass
+    assert caught.value.evidence["got"].startswith("xl330_m288")

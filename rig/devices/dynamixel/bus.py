@@ -181,6 +181,7 @@ class DynamixelBus:
                     self._unanswered = True
                     replies, result = attempt()
                 except (serial.SerialException, OSError) as unplugged:
+                    self.port.lost = True
                     step = "Check the adapter's USB plug, then start again."
                     raise self._silent(what, device_ids, f"the port failed: {unplugged}", step) from unplugged
                 except (LineBabble, IndexError):

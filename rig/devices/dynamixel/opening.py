@@ -1,5 +1,7 @@
 """A servo as the configuration describes it, on an open wire."""
 
+from collections.abc import Callable
+
 from rig.clock import Clock
 from rig.config import ServoConfig
 from rig.devices.dynamixel.ax12 import Ax12Servo
@@ -11,8 +13,16 @@ from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.dynamixel.settings import ServoMode
 
 
-def open_servo(wire: Wire, config: ServoConfig, clock: Clock, mode: str = "turntable") -> RegisterServo:
+def open_servo(
+    wire: Wire,
+    config: ServoConfig,
+    clock: Clock,
+    mode: str = "turntable",
+    reopen: Callable[[], Wire] | None = None,
+) -> RegisterServo:
     """Find the configured servo on ``wire``, to be used as ``mode`` (`table.mode`) says; writes nothing.
+
+    ``reopen`` opens the wire anew after its adapter was unplugged.
 
     Raises
     ------
@@ -24,7 +34,7 @@ def open_servo(wire: Wire, config: ServoConfig, clock: Clock, mode: str = "turnt
     protocol = protocol_of(config.model)
     kind = Ax12Servo if protocol == 1 else DynamixelServo
     return kind(
-        DynamixelBus(ClockedPort(wire, clock, config.port), config.retries, protocol),
+        DynamixelBus(ClockedPort(wire, clock, config.port, reopen), config.retries, protocol),
         bus_id=config.id,
         model=config.model,
         clock=clock,

@@ -2,6 +2,8 @@
 
 import errno
 import termios
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Protocol
 
 import serial
@@ -61,16 +63,35 @@ def open_serial(path: str, baud: int, device: str = "servo") -> Wire:
 class ClockedPort(PortHandler):  # type: ignore[misc]
     """A `PortHandler` for an open wire whose timeouts run on an injected clock.
 
-    Other than the SDK's own it neither spins while it waits nor waits for ever while the line babbles.
+    Other than the SDK's own it neither spins while it waits nor waits for ever while the line babbles. A wire that is
+    ``lost`` (its adapter was unplugged) is opened anew by `reconnect`, where ``reopen`` says how.
     """
 
-    def __init__(self, wire: Wire, clock: Clock, name: str = "") -> None:
+    def __init__(self, wire: Wire, clock: Clock, name: str = "", reopen: Callable[[], Wire] | None = None) -> None:
         super().__init__(name)
         self.ser = wire
         self.baudrate = wire.baudrate
         self.is_open = True
         self.tx_time_per_byte = 10_000.0 / self.baudrate
         self.clock = clock
+        self.lost = False
+        self._reopen = reopen
+
+    def reconnect(self) -> bool:
+        """Open a lost wire anew; return whether there was one to open.
+
+        Raises
+        ------
+        DeviceNotFound
+            The adapter is not back yet.
+        """
+        if not self.lost or self._reopen is None:
+            return False
+        with suppress(serial.SerialException, OSError):
+            self.ser.close()
+        self.ser = self._reopen()
+        self.lost = False
+        return True
 
     def setBaudRate(self, baudrate: int) -> bool:  # noqa: N802 - the SDK's names
         """Change the baud rate to any that the adapter takes: the SDK's own list lacks 250,000 and 4,500,000.

@@ -170,6 +170,7 @@ class RegisterServo(ABC):
         settings.write(self._bus, self._id, self._table, differences)
 
     def verify(self) -> None:
+        self._bus.port.reconnect()
         number, firmware = self._bus.ping(self._id), self._read("Firmware Version")
         if (number, firmware) != (self._identity.model_number, self._identity.firmware):
             raise DeviceMismatch(
