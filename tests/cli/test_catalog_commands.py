@@ -288,20 +288,21 @@ def test_a_busy_catalog_is_told_and_not_waited_for_forever(two: Rig, monkeypatch
 def test_ctrl_c_leaves_nothing_of_an_import(tmp_path: Path) -> None:
     photographs(tmp_path / "in", *(f"obj{n}" for n in range(12)), step_deg=5, side=80)
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
+    incoming = tmp_path / "catalog" / "incoming"
     # like a terminal: the whole group of processes hears it
-    process = subprocess.Popen(
+    with subprocess.Popen(
         [*RIG, "import", "in", "--jobs", "2"],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-    )
-    incoming = tmp_path / "catalog" / "incoming"
-    while process.poll() is None and not any(incoming.rglob("*.png")):
-        pass
-    os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    ) as process:
+        while process.poll() is None and not any(incoming.rglob("*.png")):
+            pass
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert "nothing was imported" in errors
     assert "Traceback" not in errors

@@ -658,7 +658,7 @@ class TestAllOrNothing:
         assert untouched(catalog)
         assert come_in(catalog, package).views == 6
 
-    @pytest.mark.parametrize("step", ["rig.catalog.exchange.intake.sync_folder", "rig.catalog.audit.append"])
+    @pytest.mark.parametrize("step", ["rig.catalog.exchange.admit.sync_folder", "rig.catalog.audit.append"])
     @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
     def test_so_does_one_that_fails_in_its_last_moment(
         self,

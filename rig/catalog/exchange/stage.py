@@ -1,0 +1,105 @@
+"""Images on their way into a catalog: checked, copied aside and described, by several processes."""
+
+import zlib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import BadZipFile, ZipFile
+
+from rig.catalog import images
+from rig.catalog.describing import known_descriptor, within
+from rig.catalog.exchange.package import ImageSource
+from rig.catalog.exchange.plan import Plan
+from rig.catalog.records import Region
+from rig.catalog.schema import DESCRIPTOR
+from rig.errors import UsageError
+
+
+class Item(NamedTuple):
+    """An image to be staged; ``image`` is its name in the package."""
+
+    image: str
+    source: ImageSource
+    sha256: str | None
+    folder: str
+    stem: str
+    describe: bool = False
+    region: Region | None = None
+
+
+class Staged(NamedTuple):
+    """An image that is staged as ``file``, or the reason why not."""
+
+    file: str
+    sha256: str = ""
+    size: int = 0
+    packed: bytes | None = None
+    reason: str = ""
+
+
+def items_of(plan: Plan) -> Iterator[Item]:
+    """Yield every image that a plan takes; those of one enrollment go into one folder."""
+    sources = plan.package.sources
+    for i, item in enumerate(plan.wanted):
+        for j, enrollment in enumerate(item.enrollments):
+            folder = f"{i}-{j}"
+            for view in enrollment.views:
+                yield Item(
+                    view.image,
+                    sources[view.image],
+                    view.image_sha256,
+                    folder,
+                    f"{view.index:03d}",
+                    not view.descriptors,
+                    plan.package.regions.get(view.image),
+                )
+            for k, sitting in enumerate(enrollment.sittings):
+                image, sha256 = sitting.reference_image, sitting.reference_image_sha256
+                if image is not None:
+                    yield Item(image, sources[image], sha256, folder, f"empty-{k:03d}")
+
+
+def stage(root: Path | None, portion: tuple[Item, ...]) -> list[Staged]:
+    """Check images, and copy them into ``root`` and describe them unless it is None; the work of a process."""
+    return [_stage_one(root, item) for item in portion]
+
+
+def _stage_one(root: Path | None, item: Item) -> Staged:
+    try:
+        content = _read(item.source)
+        image = images.decode(content)
+    except images.BadImage as error:
+        return Staged("", reason=str(error))
+    except (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
+        return Staged("", reason=f"cannot be read: {error}")
+    sha256 = images.digest(content)
+    if item.sha256 is not None and sha256 != item.sha256:
+        return Staged("", reason="is not the image that was stored")
+    if root is None:
+        return Staged("", sha256, len(content))
+    packed = None
+    if item.describe:
+        kind = known_descriptor(DESCRIPTOR)
+        try:
+            packed = kind.pack(kind.describe(within(image, item.region)))
+        except UsageError as error:
+            return Staged("", reason=error.what)
+    folder = root / item.folder
+    folder.mkdir(exist_ok=True)
+    file = f"{item.folder}/{item.stem}{images.suffix(content)}"
+    (root / file).write_bytes(content)
+    return Staged(file, sha256, len(content), packed)
+
+
+def _read(source: ImageSource) -> bytes:
+    if source.member is None:
+        with Path(source.file).open("rb") as file:
+            return file.read(images.MAX_FILE_BYTES + 1)
+    with _archive(source.file).open(source.member) as member:
+        return member.read(images.MAX_FILE_BYTES + 1)
+
+
+@cache
+def _archive(file: str) -> ZipFile:
+    return ZipFile(file)
