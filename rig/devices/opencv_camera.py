@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from math import ceil
+from math import floor
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -263,7 +263,7 @@ class OpenCvCamera:
     def _await(self, meanwhile: Callable[[], object]) -> None:
         """Let the time pass until the next frame is about to come, as far as the last ones tell: `grab` only blocks."""
         spacing_s, now_ns = max(self._waits_s), self._clock.now_ns()
-        frames = ceil(seconds_between(self._arrived_ns, now_ns) / spacing_s)
+        frames = 1 + floor(seconds_between(self._arrived_ns, now_ns) / spacing_s)
         due_ns = self._arrived_ns + round((frames * spacing_s - _SLICE_S / 2) * 1e9)
         while (left_s := seconds_between(self._clock.now_ns(), due_ns)) > 0:
             self._clock.sleep(min(left_s, _SLICE_S))

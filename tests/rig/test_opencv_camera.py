@@ -9,9 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from rig.catalog import Catalog
 from rig.clock import SystemClock
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase, open_capture
-from rig.errors import DeviceFault, DeviceNotFound, DeviceSilent
+from rig.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.plans.enroll import enroll
+from rig.plans.events import Rejected
 from sim.camera import FPS, SimCapture
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
@@ -286,3 +289,121 @@ def test_a_network_stream_shows_the_present_after_a_pause(stream: tuple[str, lis
         assert frame.exposed_ns <= clock.now_ns()
     finally:
         camera.close()
+
+
+# -- focus, a pulled cable, and a slow camera --------------------------------------------------------------------------
+
+
+def test_focus_is_held_where_it_is_and_told(world: World) -> None:
+    """Autofocus would make another picture of the same thing at the next sitting; nobody has to ask for its end."""
+    capture = SimCapture(world)
+    capture.drift(autofocus=True)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    locks = camera.read_locks()
+    assert locks.autofocus is False
+    assert locks.focus is not None
+    assert not [n for n in camera.not_taken if "focus" in n.setting]
+    capture.drift(autofocus=True)
+    assert camera.read_locks() != locks
+
+
+def test_a_fixed_lens_has_no_focus_to_complain_about(world: World) -> None:
+    class Fixed(SimCapture):
+        def get(self, prop: int) -> float:
+            return 0.0 if prop in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) else super().get(prop)
+
+        def set(self, prop: int, value: float) -> bool:
+            return prop not in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) and super().set(prop, value)
+
+    camera = OpenCvCamera(Fixed(world), clock=world.clock)
+    assert (camera.read_locks().focus, camera.read_locks().autofocus) == (None, None)
+    assert camera.not_taken == ()
+
+
+def returning(world: World, capture: SimCapture, away_s: float) -> OpenCvCamera:
+    """Return a camera that is unplugged now, and plugged in again ``away_s`` later."""
+
+    def reopen() -> SimCapture:
+        if not capture.reopen():
+            raise DeviceNotFound("there is no camera", next_step="connect the camera")
+        return capture
+
+    camera = OpenCvCamera(capture, clock=world.clock, reopen=reopen)
+    capture.unplug()
+    world.clock.call_at(world.clock.now_ns() + round(away_s * 1e9), capture.replug)
+    return camera
+
+
+@pytest.mark.parametrize("away_s", [0.0, 0.5, 2.0])
+def test_a_camera_that_was_unplugged_goes_on_as_it_was(world: World, away_s: float) -> None:
+    capture = SimCapture(world)
+    camera = returning(world, capture, away_s)
+    locks, after_ns = OpenCvCamera.read_locks(camera), world.clock.now_ns()
+    capture.drift(exposure=33.0)  # as after power-up
+    frame = camera.capture(after_ns)
+    assert frame.exposed_ns >= after_ns + away_s * 1e9
+    assert camera.read_locks() == locks
+    assert camera.returns == 1
+
+
+def test_a_camera_that_stays_away_is_silent_in_bounded_time(world: World) -> None:
+    capture = SimCapture(world)
+    camera = returning(world, capture, 3600.0)
+    begun_ns = world.clock.now_ns()
+    with pytest.raises(DeviceSilent, match="did not come back") as caught:
+        camera.capture(begun_ns)
+    assert caught.value.next_step == "connect the camera"
+    assert world.clock.now_ns() - begun_ns < 4e9
+
+
+def test_another_camera_in_its_place_is_refused(world: World) -> None:
+    capture = SimCapture(world)
+
+    class Small(SimCapture):
+        def set(self, prop: int, value: float) -> bool:
+            return False
+
+        def get(self, prop: int) -> float:
+            return 320.0 if prop == cv2.CAP_PROP_FRAME_WIDTH else super().get(prop)
+
+    camera = OpenCvCamera(capture, clock=world.clock, reopen=lambda: Small(world))
+    capture.unplug()
+    with pytest.raises(DeviceMismatch, match="another camera") as caught:
+        camera.capture(world.clock.now_ns())
+    assert caught.value.evidence["got"][0] == 320
+
+
+@pytest.mark.parametrize("seconds_a_frame", [1.0, 1.5, 2.5])
+def test_while_a_slow_camera_is_waited_for_other_things_get_done(world: World, seconds_a_frame: float) -> None:
+    capture = SimCapture(world)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    capture.every = round(FPS * seconds_a_frame)
+    for _ in range(3):  # how slow it is shows in its first frames
+        camera.capture(world.clock.now_ns())
+    done_ns: list[int] = [world.clock.now_ns()]
+    for _ in range(3):
+        frame = camera.capture(world.clock.now_ns(), lambda: done_ns.append(world.clock.now_ns()))
+        assert frame.exposed_ns > done_ns[0]
+    gaps_s = np.diff([*done_ns, world.clock.now_ns()]) * 1e-9
+    assert gaps_s.max() < 0.8  # the gyro's FIFO lasts for 0.85 s
+
+
+def test_a_fast_camera_is_not_slowed_down_by_other_things(world: World) -> None:
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock)
+    calls: list[int] = []
+    begun_ns = world.clock.now_ns()
+    for _ in range(10):
+        camera.capture(world.clock.now_ns(), lambda: calls.append(1))
+    assert calls == []
+    assert world.clock.now_ns() - begun_ns < 10 * 2.1 * PERIOD_NS + 1e8
+
+
+def test_an_enrollment_with_a_slow_camera_loses_no_sample_of_the_gyro(simulated, tmp_path: Path) -> None:
+    s = simulated()
+    s.operator.parts.camera.every = round(1.2 * FPS)  # 1.2 s a frame; the FIFO lasts for 0.85 s
+    s.operator.next_object = "lamp"
+    with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
+        events = list(enroll(s.bench, catalog, "lamp", views=6))
+    rejected = [reason for event in events if isinstance(event, Rejected) for reason in event.reasons]
+    assert len(rejected) <= 2, rejected  # until the camera's pace is known
+    assert s.bench.imu.statistics.overflows <= 3
