@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 
 from calibration.backlash import plain_approach
 from rig.bench import Bench
+from rig.devices.servo import MotionProfile
 from rig.errors import LimitExceeded, UsageError
 from rig.facts import Estimate, Fact
 from rig.plans.capture import moved
@@ -31,6 +32,9 @@ VALID_DAYS = 180
 
 DISTANCES_DEG = (2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 180.0)
 MIN_ROUNDS = 2
+TYPICAL_S = 0.04
+"""Scatter of a settle time: the period of the control loop."""
+NOMINAL_TRUST = 0.3
 MAX_RESIDUAL_S = 0.25
 """A move that is off by more was hindered: six periods of the control loop."""
 
@@ -84,7 +88,8 @@ def live(bench: Bench, *, rounds: int = 3) -> Generator[Moved | Fact, None, Fact
         finally:
             if may_return:
                 table.goto(start_deg)
-    fact = from_data(moves, when_utc=when_utc, device=bench.apparatus("servo"))
+    nominal = MotionProfile(bench.config.table.velocity_dps, bench.config.table.acceleration_dps2)
+    fact = from_data(moves, nominal, when_utc=when_utc, device=bench.apparatus("servo"))
     yield fact
     return fact
 
@@ -95,17 +100,24 @@ def predicted_s(fact: Fact, distance_deg: float) -> float:
     return float(_seconds(model, np.array([abs(distance_deg)]))[0])
 
 
-def from_data(moves: Sequence[Timed], *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
-    """Fit the model to ``moves`` robustly and judge it."""
+def from_data(moves: Sequence[Timed], nominal: MotionProfile, *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+    """Fit the model to ``moves`` robustly and judge it.
+
+    Steep ramps are over before they can be timed, and wind-up and delay told apart: the ``nominal`` profile says what
+    the wind-up may be, to 30 %.
+    """
+    wind_up_s = nominal.velocity_dps / nominal.acceleration_dps2
     distance = np.abs([move.distance_deg for move in moves])
     seconds = np.array([move.seconds for move in moves])
     fit = least_squares(
-        lambda p: _seconds(p, distance) - seconds,
-        x0=(0.02, 0.3, 0.5),
+        lambda p: np.append(
+            _seconds(p, distance) - seconds, TYPICAL_S * (p[1] - wind_up_s) / (NOMINAL_TRUST * wind_up_s)
+        ),
+        x0=(1 / nominal.velocity_dps, wind_up_s, 0.5),
         bounds=((1e-3, 1e-3, 0.0), (1.0, 20.0, 10.0)),
         x_scale=(0.01, 0.3, 0.3),
         loss="soft_l1",
-        f_scale=0.04,
+        f_scale=TYPICAL_S,
     )
     residuals = seconds - _seconds(fit.x, distance)
     scatter = sqrt(float((residuals**2).sum()) / (len(moves) - 3))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.motion_model import DISTANCES_DEG, Timed, from_data, live, predicted_s
+from rig.devices.servo import MotionProfile
 from rig.errors import UsageError
 from rig.facts import Fact
 from rig.turntable import Turntable
@@ -23,14 +24,14 @@ def drawn(rng: np.random.Generator, pace: float, wind_up: float, delay: float) -
 
 
 def fit(moves: list[Timed]) -> Fact:
-    return from_data(moves, when_utc=WHEN, device={})
+    return from_data(moves, MotionProfile(70.0, 220.0), when_utc=WHEN, device={})
 
 
 def test_the_truth_lies_within_the_stated_uncertainty():
     rng = np.random.default_rng(1)
     z = {"pace": [], "wind_up": [], "delay": []}
     for _ in range(60):
-        truth = {"pace": rng.uniform(0.008, 0.025), "wind_up": rng.uniform(0.15, 0.5), "delay": rng.uniform(0.3, 0.6)}
+        truth = {"pace": rng.uniform(0.008, 0.025), "wind_up": rng.uniform(0.25, 0.4), "delay": rng.uniform(0.3, 0.6)}
         for name, estimate in fit(drawn(rng, **truth)).estimates.items():
             z[name].append((estimate.value - truth[name]) / estimate.uncertainty)
     for name, values in z.items():

@@ -1,0 +1,143 @@
+"""Whether calibrations keep what they state: true values are drawn, and the estimates compared with them.
+
+`python -m benchmarks.calibration_truth [--seeds 20] [--only servo.backlash]` prints a table in Markdown: for each
+quantity the median error and uncertainty, the spread of error over uncertainty (1 is honest), and the share of 95 %
+intervals that hold the truth.
+"""
+
+import argparse
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from math import degrees, sqrt
+from typing import Any
+
+import numpy as np
+
+from calibration import backlash, encoder, gyro_noise, gyro_scale, imu_mounting, motion_model
+from rig.config import load_config
+from rig.facts import Fact
+from rig.turntable import Turntable
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
+from sim.world import World
+
+Truth = Mapping[str, tuple[float, str]]
+"""The true value of each quantity of a fact, and the unit it is printed in."""
+
+
+@contextmanager
+def opened(seed: int, noise: NoiseModel | None = None, *settings: str) -> Iterator[tuple[Any, Any]]:
+    operator = ShelfOperator(World(noise=noise, seed=seed), shelf())
+    with open_sim_bench(load_config(None, settings), operator) as bench:
+        yield bench, operator.parts
+
+
+def last(events: Iterator[Any]) -> Fact:
+    *_, fact = events
+    assert isinstance(fact, Fact)
+    return fact
+
+
+def imu_scale(seed: int) -> tuple[Fact, Truth]:
+    with opened(seed) as (bench, parts):
+        part = parts.imu.inertial
+        return last(gyro_scale.live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
+
+
+def imu_noise(seed: int) -> tuple[Fact, Truth]:
+    rng = np.random.default_rng(seed)
+    noise = NoiseModel(
+        gyro_noise_dps_rthz=float(rng.uniform(0.003, 0.015)), gyro_bias_walk_dps_rts=float(rng.uniform(1e-4, 1e-3))
+    )
+    with opened(seed, noise) as (bench, parts):
+        slope = float(parts.imu.inertial.gyro_slope_dps_c[2])
+        truth = {
+            "angle_random_walk": (noise.gyro_noise_dps_rthz / sqrt(2), "°/√s"),
+            "rate_random_walk": (noise.gyro_bias_walk_dps_rts, "°/s/√s"),
+            "bias_slope": (slope, "°/s/°C"),
+        }
+        return last(gyro_noise.live(bench)), truth
+
+
+def mounting(seed: int) -> tuple[Fact, Truth]:
+    with opened(seed) as (bench, parts):
+        part = parts.imu.inertial
+        truth = {f"tilt_{name}": (degrees(float(part.up[i])), "°") for i, name in enumerate("xy")}
+        truth |= {f"accel_zero_{name}": (float(part.accel_bias_g[i]), "g") for i, name in enumerate("xyz")}
+        truth |= {"axis_x": (0.0, "°"), "axis_y": (0.0, "°")}
+        return last(imu_mounting.live(bench)), truth
+
+
+def play(seed: int) -> tuple[Fact, Truth]:
+    play_deg = float(np.random.default_rng(seed).uniform(0.05, 1.0))
+    with opened(seed, NoiseModel(backlash_deg=play_deg)) as (bench, _):
+        return last(backlash.live(bench)), {"backlash": (play_deg, "°")}
+
+
+def over_the_turn(seed: int) -> tuple[Fact, Truth]:
+    with opened(seed, NoiseModel(encoder_harmonic_deg=0.2)) as (bench, parts):
+        fact = last(encoder.live(bench))
+        (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
+        # The servo's own angle 0 is half a turn from the shaft's: odd harmonics change their sign.
+        return fact, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
+
+
+def motion(seed: int) -> tuple[Fact, Truth]:
+    rng = np.random.default_rng(seed)
+    speed, ramp = rng.uniform(40, 120), rng.uniform(100, 500)
+    with opened(seed, None, f"table.velocity_dps={speed}", f"table.acceleration_dps2={ramp}") as (bench, _):
+        fact = last(motion_model.live(bench))
+        with Turntable(bench) as table:
+            profile = table._profile
+        assert profile is not None
+        return fact, {
+            "pace": (1 / profile.velocity_dps, "s/°"),
+            "wind_up": (profile.velocity_dps / profile.acceleration_dps2, "s"),
+        }
+
+
+PROCEDURES: dict[str, Callable[[int], tuple[Fact, Truth]]] = {
+    "servo.backlash": play,
+    "servo.encoder": over_the_turn,
+    "servo.motion": motion,
+    "imu.scale": imu_scale,
+    "imu.mounting": mounting,
+    "imu.noise": imu_noise,
+}
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--seeds", type=int, default=20)
+    arguments.add_argument("--only", choices=sorted(PROCEDURES))
+    given = arguments.parse_args()
+    print("| calibration | quantity | median error | median uncertainty | error / uncertainty, RMS | 95 % intervals |")
+    print("|---|---|---|---|---|---|")
+    for name, procedure in PROCEDURES.items():
+        if given.only not in (None, name):
+            continue
+        errors: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        units, refused = {}, 0
+        for seed in range(given.seeds):
+            fact, truth = procedure(seed)
+            refused += not fact.passed
+            for key, (true, unit) in truth.items():
+                estimate = fact.estimates[key]
+                errors[key].append((estimate.value - true, estimate.uncertainty))
+                units[key] = unit
+        for key, pairs in errors.items():
+            error, sigma = np.array(pairs).T
+            z = error / sigma
+            print(
+                f"| {name} | {key} | {np.median(np.abs(error)):.2g} {units[key]} | {np.median(sigma):.2g} {units[key]} "
+                f"| {np.sqrt((z**2).mean()):.2f} | {(np.abs(z) < 1.96).sum()}/{z.size} |",
+                flush=True,
+            )
+        if refused:
+            print(f"| {name} | refused | {refused}/{given.seeds} | | | |")
+
+
+if __name__ == "__main__":
+    main()
