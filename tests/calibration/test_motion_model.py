@@ -31,7 +31,11 @@ def test_the_truth_lies_within_the_stated_uncertainty():
     rng = np.random.default_rng(1)
     z = {"pace": [], "wind_up": [], "delay": []}
     for _ in range(60):
-        truth = {"pace": rng.uniform(0.008, 0.025), "wind_up": rng.uniform(0.25, 0.4), "delay": rng.uniform(0.3, 0.6)}
+        truth = {
+            "pace": rng.uniform(0.008, 0.025),
+            "wind_up": max(rng.normal(0.318, 0.095), 0.1),
+            "delay": rng.uniform(0.3, 0.6),
+        }
         for name, estimate in fit(drawn(rng, **truth)).estimates.items():
             z[name].append((estimate.value - truth[name]) / estimate.uncertainty)
     for name, values in z.items():
