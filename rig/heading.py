@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rig.clock import Clock
 from rig.devices.imu import Imu
-from rig.errors import ConfigError, DeviceSilent, NotReady, UsageError
+from rig.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
 
 Axis = Literal["x", "y", "z"]
 
@@ -24,6 +24,10 @@ MEMORY_S = 2.0
 """Rests longer than this teach the bias nothing more: it wanders meanwhile."""
 DRAIN_S, DRAIN_SAMPLES = 0.2, 60
 """How long, and how many, samples may wait in the sensor's FIFO (the MPU-6050 holds 170): a drain costs bus time."""
+HUNG_S, HUNG_SAMPLES = 0.15, 20
+"""How long, and how many, equal samples are no coincidence any more."""
+FINE_DPS = 550.0
+"""Up to this range a sensor's steps are small enough that its noise shows in them."""
 REST_PEAK_DPS = 0.5
 """A table at rest stays within this of its mean rate: eight sigma of the sensor's noise, a ringing of 0.01°."""
 MAX_BIAS_DPS = 25.0
@@ -151,6 +155,7 @@ class GyroHeading:
         self._drained_ns = clock.now_ns()
         self._resting_ns = clock.now_ns()
         self._moving = False
+        self._newest_dps, self._repeated = np.zeros(3), 0
         self._restart()
         self.bias: Bias | None = None
 
@@ -270,6 +275,7 @@ class GyroHeading:
     def _drain(self) -> None:
         new = self._imu.read_samples()
         self._drained_ns = self._clock.now_ns()
+        self._refuse_repetition(new.gyro_dps)
         rate = new.gyro_dps[:, self._column]
         if new.lost:
             self._time_ns, self._rate_dps = self._time_ns[:0], self._rate_dps[:0]
@@ -285,6 +291,27 @@ class GyroHeading:
         self._count += rate.size
         if rate.size and np.abs(rate).max() >= self._saturated_dps:
             self._trouble = f"the rate went beyond the gyro's range of {self._saturated_dps:g} °/s"
+
+    def _refuse_repetition(self, gyro_dps: NDArray[np.float64]) -> None:
+        """Raise `DeviceFault` where the sensor repeats one sample: noise alone would change it (exact zeros aside)."""
+        if not len(gyro_dps) or self._saturated_dps > FINE_DPS:
+            return
+        newest = gyro_dps[-1]
+        others = np.flatnonzero((gyro_dps != newest).any(axis=1))
+        went_on = not others.size and np.array_equal(newest, self._newest_dps)
+        self._repeated = (
+            len(gyro_dps) - (int(others[-1]) + 1 if others.size else 0) + (self._repeated if went_on else 0)
+        )
+        self._newest_dps = newest
+        if newest.all() and self._repeated >= max(HUNG_S * self._imu.rate_hz, HUNG_SAMPLES):
+            ends = float(np.abs(newest).max()) >= self._saturated_dps
+            raise DeviceFault(
+                f"the gyro stands at the end of its range of {self._saturated_dps:.0f} °/s"
+                if ends
+                else f"the gyro hangs: its last {self._repeated} samples are one and the same",
+                next_step="Take its supply away for a moment, then open the bench again.",
+                evidence={"samples": self._repeated, "gyro_dps": [round(float(rate), 3) for rate in newest]},
+            )
 
     def _restart(self) -> None:
         self._sum_dps, self._count, self._trouble = 0.0, 0, ""

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rig.devices.imu import ImuSamples
 from rig.devices.mpu6050 import Mpu6050
-from rig.errors import ConfigError, DeviceSilent, NotReady, UsageError
+from rig.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
 from rig.heading import GyroHeading, Rotation, compare
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
@@ -342,3 +342,33 @@ def test_agreement_is_symmetric_and_bounded(encoder: float, gyro: float, sigma: 
     assert forth.agrees == (abs(encoder - gyro) <= forth.bound_deg)
     assert forth.bound_deg >= 4 * sigma + backlash
     assert agreement(encoder, encoder).agrees
+
+
+@pytest.mark.parametrize(
+    ("hung", "words"),
+    [
+        pytest.param(
+            lambda words: np.broadcast_to(np.array([0, 0, 0, 0, 40, -17, 90]), words.shape), "hangs", id="stuck"
+        ),
+        pytest.param(lambda words: np.full_like(words, 32767), "end of its range", id="saturated"),
+    ],
+)
+@pytest.mark.parametrize("moving", [True, False])
+def test_a_gyro_that_repeats_one_sample_is_refused_within_a_drain(
+    bench: Bench, hung: Any, words: str, moving: bool
+) -> None:
+    bench.heading.rest()
+    bench.sensor.distortions.append(lambda w: hung(w).astype(">i2"))
+    broken_ns = bench.clock.now_ns()
+    with pytest.raises(DeviceFault, match=words):
+        if moving:
+            bench.move(90.0)
+        else:
+            bench.heading.rest(1.0)
+    assert bench.clock.now_ns() - broken_ns < 0.5e9
+
+
+def test_a_perfect_gyro_that_stands_still_does_not_hang() -> None:
+    with Bench(noise=NoiseModel.none()) as bench:
+        bench.heading.rest(1.0)
+        assert bench.move(30.0).angle_deg == pytest.approx(30.0, abs=0.1)
