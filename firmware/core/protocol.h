@@ -4,7 +4,9 @@
 
 #include <stdint.h>
 
+#ifndef PROTOCOL_VERSION /* tests build other ones */
 #define PROTOCOL_VERSION 1
+#endif
 #define FIRMWARE_MAJOR 1
 #define FIRMWARE_MINOR 0
 #define FIRMWARE_PATCH 0

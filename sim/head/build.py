@@ -24,7 +24,7 @@ def missing(kind: str) -> str:
     """Return what this machine lacks for a ``memory`` or ``avr`` head, and how to get it; empty where it has all."""
     if not (FIRMWARE / "Makefile").is_file():
         return "the firmware's sources are not installed: use a clone of the repository"
-    if not (shutil.which("make") and _compiler()):
+    if not (shutil.which("make") and compiler()):
         return "a C compiler and make are not installed: apt-get install gcc make"
     if kind == "avr":
         if not shutil.which("avr-gcc"):
@@ -60,7 +60,7 @@ def avr_library() -> Path:
         out = folder / "libavrhead.so"
         warnings = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-O2", "-fPIC", "-shared"]
         places = ["-isystem", str(headers), "-I", str(FIRMWARE / "boards" / "host"), "-I", str(FIRMWARE / "core")]
-        return [_compiler(), *warnings, *places, "-o", str(out), str(source), "-lsimavr"]
+        return [compiler(), *warnings, *places, "-o", str(out), str(source), "-lsimavr"]
 
     return _cached(key, "libavrhead.so", compile_to)
 
@@ -80,16 +80,17 @@ def _require(kind: str) -> None:
         raise ConfigError(
             f"The simulated rig head cannot be built: {lacking.partition(':')[0]}.",
             next_step=f"{lacking.partition(': ')[2][:1].upper()}{lacking.partition(': ')[2][1:]}; or leave the head "
-            "out: --set imu.driver=mpu6050.",
+            "out: --set imu.connection=i2c.",
         )
 
 
-def _compiler() -> str:
+def compiler() -> str:
+    """Return the C compiler of this machine; empty where it has none."""
     return os.environ.get("CC") or next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), "")
 
 
 def _key(sources: list[Path], how: str) -> str:
-    digest = sha256(f"{_compiler()} {how}".encode())
+    digest = sha256(f"{compiler()} {how}".encode())
     for source in sources:
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
     return digest.hexdigest()[:16]

@@ -1,9 +1,9 @@
 """The head's clock on the bench's clock: offset and drift from round trips, with an honest uncertainty.
 
 A beat leaves the host at t0, is received by the head at u1, its answer leaves the head at u2 and is here at t3. Both
-frames are equally long, so that on an even line the head's u = (u1 + u2)/2 is the bench's t = (t0 + t3)/2, off by
-at most half of what the round trip took beyond the head's own time, d = (t3 − t0) − (u2 − u1). Beats that were held up
-count less. The drift of a ceramic resonator is up to 0.5 %.
+frames are equally long, so that on an even line the head's u = (u1 + u2)/2 is the bench's t = (t0 + t3)/2, off by at
+most half of what the round trip d = (t3 − t0) − (u2 − u1) took beyond the time of the bytes on the line. Beats that
+were held up count less. The drift of a ceramic resonator is up to 0.5 %.
 """
 
 from collections import deque
@@ -88,15 +88,17 @@ class HeadClock:
         x = np.array([b.head_us - self._origin_us for b in beats]) * 1e3
         y = np.array([b.host_ns - self._origin_ns for b in beats]) - x
         delays = np.array([b.delay_ns for b in beats])
+        # A line that is faster than its baud rate says is none that bytes pass one by one (a pseudo-terminal): then
+        # nothing is known of how much of the shortest round trip was the line itself.
         shortest = float(delays.min())
-        weight = 1 / (STEP_SIGMA_NS**2 + ((delays - shortest) / 2) ** 2)
+        line_ns = self._line_ns if shortest >= LINE_TOLERANCE * self._line_ns else 0.0
+        held_up = np.maximum(delays - line_ns, 0.0)
+        # What a frame was held up may have been all on one way: an error spread evenly over ± half of it.
+        weight = 1 / (STEP_SIGMA_NS**2 + held_up**2 / 12)
         information = np.array([[weight.sum(), weight @ x], [weight @ x, weight @ x**2 + DRIFT_SIGMA**-2]])
         self._covariance = np.linalg.inv(information)
         self._fit = self._covariance @ np.array([weight @ y, weight @ (x * y)])
-        # What the shortest round trip took beyond the line itself may have been all on one way. A line that is faster
-        # than its baud rate says is none that bytes pass one by one (a pseudo-terminal): then nothing is known.
-        by_bytes = shortest >= LINE_TOLERANCE * self._line_ns
-        self._asymmetry_ns = (max(shortest - self._line_ns, 0.0) if by_bytes else shortest) / 2
+        self._asymmetry_ns = float(held_up.min()) / 2  # and that of the best one may be the same in all of them
 
     def to_host(self, head_us: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
         """Return the bench's times (ns) of unwrapped times of the head, and their largest standard uncertainty (ns)."""

@@ -1,0 +1,94 @@
+"""The decoder in C and the one in Python: what one takes for a frame, the other does, and they read the same.
+
+In the nightly profile a million lines, in CI some thousands; the C side runs under UBSan, and under ASan where a
+compiler has it (its runtime must be in a process from the start, so that the lines are fed in one of its own).
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+from sim.head import build
+
+NIGHTLY_LINES, LINES = 1_000_000, 20_000
+
+PROGRAM = """
+import ctypes, random, sys
+from rig.devices.head.framing import CrcError, Frame, FrameError, LONGEST, decode, encode
+
+library, count, seed = ctypes.CDLL(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+library.frame_decode.restype = ctypes.c_int8
+library.frame_encode.restype = ctypes.c_uint8
+draw = random.Random(seed)
+frames = errors = 0
+for number in range(count):
+    body = draw.randbytes(draw.randrange(MAX_BODY + 1))
+    if draw.random() < 0.5:
+        body = body.translate(bytes(b if b % 3 else 0 for b in range(256)))
+    frame = Frame(draw.randrange(256), draw.randrange(256), body)
+    line = encode(frame)
+    room = ctypes.create_string_buffer(bytes([frame.id, frame.sequence]) + body, len(body) + 4)
+    out = ctypes.create_string_buffer(LONGEST)
+    length = library.frame_encode(out, room, len(body))
+    assert out.raw[:length] == line, frame
+    wire = bytearray(line[:-1])
+    kind = number % 4
+    if kind == 1:  # bits that flip
+        for _ in range(draw.randrange(1, 4)):
+            wire[draw.randrange(len(wire))] ^= 1 << draw.randrange(8)
+    elif kind == 2:  # bytes that are lost, doubled or inserted
+        at = draw.randrange(len(wire))
+        wire[at : at + draw.randrange(3)] = draw.randbytes(draw.randrange(3))
+    elif kind == 3:
+        wire = bytearray(draw.randbytes(draw.randrange(LONGEST + 8)))
+    raw = ctypes.create_string_buffer(bytes(wire), len(wire)) if wire else ctypes.create_string_buffer(1)
+    length = library.frame_decode(raw, len(wire))
+    try:
+        expected = decode(bytes(wire))
+    except CrcError:
+        assert length == -2, (wire, length)
+    except FrameError:
+        assert length == -1, (wire, length)
+    else:
+        assert length == len(expected.body), (wire, length)
+        assert raw.raw[: length + 2] == bytes([expected.id, expected.sequence]) + expected.body
+        frames += 1
+        continue
+    errors += 1
+assert frames > count // 5 and errors > count // 3, (frames, errors)
+print(frames, errors)
+""".replace("MAX_BODY", "(LONGEST - 6)")
+
+
+@pytest.fixture
+def compiler():
+    if lacking := build.missing("memory"):
+        pytest.skip(lacking)
+
+
+def runtime(name: str) -> str:
+    """Return the path of a sanitizer's runtime, empty where the compiler has none."""
+    told = subprocess.run([build.compiler(), f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+    path = Path(told.stdout.strip())
+    return str(path) if path.is_absolute() else ""
+
+
+def test_both_sides_take_the_same_lines_for_frames(compiler):
+    nightly = settings.get_current_profile_name() == "nightly"
+    asan = runtime("libasan.so")
+    flags = "-g -fsanitize=address,undefined -fno-sanitize-recover" if asan else "-g"
+    library = build.host_library(flags)
+    environment = {**os.environ, "LD_PRELOAD": asan, "ASAN_OPTIONS": "detect_leaks=0"}  # Python's own are not ours
+    count, seed = (NIGHTLY_LINES, os.getpid()) if nightly else (LINES, 1)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(library), str(count), str(seed)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, f"seed {seed}: {done.stderr[-3000:]}"

@@ -1,0 +1,92 @@
+"""Frames of the rig head's line: whole ones come through however the stream is cut, garbage never does."""
+
+import binascii
+
+import pytest
+from cobs import cobs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.devices.head import protocol
+from rig.devices.head.framing import LONGEST, CrcError, Deframer, Frame, FrameError, decode, encode
+from tests.fuzzing import fuzz_settings
+
+BYTE = st.integers(0, 255)
+FRAMES = st.builds(Frame, BYTE, BYTE, st.binary(max_size=protocol.MAX_BODY))
+
+
+def test_the_checksum_is_crc_16_ccitt_false():
+    line = encode(Frame(0x31, 0x32, b"3456789"))
+    assert cobs.decode(line[:-1]) == b"123456789" + (0x29B1).to_bytes(2, "big")
+
+
+@given(FRAMES)
+def test_every_frame_comes_back(frame):
+    line = encode(frame)
+    assert line.endswith(b"\0")
+    assert line.count(b"\0") == 1
+    assert len(line) <= LONGEST
+    assert decode(line[:-1]) == frame
+
+
+@given(FRAMES, st.data())
+def test_a_flipped_bit_is_never_taken_for_good(frame, data):
+    line = bytearray(encode(frame)[:-1])
+    bit = data.draw(st.integers(0, 8 * len(line) - 1))
+    line[bit // 8] ^= 1 << bit % 8
+    deframer = Deframer()
+    assert list(deframer.feed(bytes(line) + b"\0")) == []
+    assert deframer.crc_errors + deframer.malformed >= 1
+
+
+@fuzz_settings()
+@given(st.binary(max_size=3 * LONGEST))
+def test_garbage_raises_nothing_but_frame_errors(line):
+    try:
+        frame = decode(line)
+    except FrameError:
+        return
+    assert encode(frame) == line + b"\0"
+
+
+@fuzz_settings()
+@given(st.lists(FRAMES | st.binary(min_size=1, max_size=60), max_size=12), st.data())
+def test_frames_come_out_of_a_stream_however_it_is_cut(parts, data):
+    stream, expected = b"\0", []
+    for part in parts:
+        if isinstance(part, Frame):
+            stream += encode(part)
+            expected.append(part)
+        else:
+            stream += part.replace(b"\0", b"\1") + b"\0"  # noise that ends before the next frame
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
+    deframer = Deframer()
+    got = [f for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True) for f in deframer.feed(stream[a:b])]
+    assert [f for f in got if f in expected] == expected
+    for frame in got:  # noise that is a frame by chance is one: its checksum holds
+        content = bytes([frame.id, frame.sequence]) + frame.body
+        assert encode(frame) == cobs.encode(content + binascii.crc_hqx(content, 0xFFFF).to_bytes(2, "big")) + b"\0"
+
+
+def test_an_endless_line_takes_no_memory():
+    deframer = Deframer()
+    for _ in range(1000):
+        assert list(deframer.feed(b"\xff" * 4096)) == []
+    assert len(deframer._line) <= LONGEST
+    assert list(deframer.feed(b"\0" + encode(Frame(1, 2, b"3")))) == [Frame(1, 2, b"3")]
+
+
+def test_a_wrong_checksum_is_told_from_garbage():
+    line = bytearray(encode(Frame(1, 2, b"abc"))[:-1])
+    line[3] ^= 0x10
+    with pytest.raises(CrcError):
+        decode(bytes(line))
+    with pytest.raises(FrameError):
+        decode(b"\x09abc")
+
+
+def test_every_message_fits_its_frame_and_is_known_by_its_id():
+    for number, kind in protocol.MESSAGES.items():
+        assert number == kind.ID
+        assert kind.LAYOUT.size <= protocol.MAX_BODY
+    assert protocol.Beat.LAYOUT.size == protocol.Pulse.LAYOUT.size  # the same time on the line, both ways
