@@ -235,7 +235,9 @@ class EnrollView(LiveView):
         left = f"{duration_words(self._left.seconds)} left" if self._left and self._of else ""
         bar.add_row(
             Text(self._title, style="bold"),
-            ProgressBar(total=max(1, self._of), completed=self._taken, width=max(8, min(40, width - 60))),
+            ProgressBar(
+                total=max(1, self._of), completed=self._taken, width=max(8, min(40, width - 60)), complete_style="cyan"
+            ),
             f"{self._taken}/{self._of}",
             left,
             Text(self._hint, style="dim") if width >= WIDE else "",
@@ -296,7 +298,7 @@ class IdentifyView(LiveView):
     def _leading(self) -> str:
         if self._ranked is None:
             return ""
-        return f"{self._ranked.candidates[0].name} in the lead ({signed(self._ranked.margin, 3)})"
+        return f"{self._ranked.candidates[0].name} {signed(self._ranked.margin, 3)}"
 
     def render(self) -> RenderableType:
         table = Table(box=None, pad_edge=False, expand=False)
@@ -318,7 +320,9 @@ class IdentifyView(LiveView):
                 f"{azimuth_words(one.pose_deg)}°",
             ]
             if wide:
-                cells.append(ProgressBar(total=1.0, completed=max(0.0, min(1.0, one.score)), width=24))
+                cells.append(
+                    ProgressBar(total=1.0, completed=max(0.0, min(1.0, one.score)), width=24, complete_style="cyan")
+                )
             table.add_row(*cells)
         if self._ended:
             return table if candidates else Group()

@@ -25,15 +25,19 @@ def moved(index: int, move: Move) -> Moved:
     )
 
 
-def announced(index: int, table: Turntable, target_deg: float) -> Generator[Event, None, Move]:
+def announced(
+    index: int, table: Turntable, target_deg: float, *, asked_deg: float | None = None
+) -> Generator[Event, None, Move]:
     """Turn the table to ``target_deg``; that it goes the long way round, unwinding its cable, is said before.
+
+    Where ``asked_deg`` is the same angle, the long way is what was asked for.
 
     Raises
     ------
     LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `Turntable.goto`.
     """
-    if turns := table.turns_back(target_deg):
+    if target_deg != asked_deg and (turns := table.turns_back(target_deg)):
         yield Unwinding(index, table.rest_deg, target_deg, turns, table.limits_deg)
     return table.goto(target_deg)
 

@@ -85,7 +85,8 @@ def identify(
                 break
             decided = _decided(number, step, table, top)
             yield decided
-            move = yield from announced(number, table, decided.target_deg)
+            asked_deg = table.rest_deg - step.rotation_deg
+            move = yield from announced(number, table, decided.target_deg, asked_deg=asked_deg)
             travelled_deg += abs(move.rotation_deg)
             orientation_deg -= move.rotation_deg  # as the table turns, the camera goes around the object backwards
             number += 1

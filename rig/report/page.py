@@ -23,6 +23,7 @@ from rig.report.score_chart import score_chart
 from rig.report.summary import Fact, enrollment_facts, totals
 
 JPEG_QUALITY: Final = 84
+COLUMNS: Final = 12
 _STAMP: Final = (56, 56)
 _FEW: Final = 3
 """So many retrievals or objects are all unfolded at once; of more, the first and those that went wrong."""
@@ -236,7 +237,11 @@ def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> _Object:
     ring = Markup()
     if views:
         pictures = [view.picture_bgr for view in views]
-        sheet = _data_uri(contact_sheet(pictures, [view.azimuth_deg for view in views], tile=TILE))
+        sheet = _data_uri(
+            contact_sheet(
+                pictures, [view.azimuth_deg for view in views], columns=min(COLUMNS, len(pictures)), tile=TILE
+            )
+        )
         stamp = _data_uri(thumbnail(pictures[0], _STAMP))
         ring = Markup(azimuth_ring([RingView(v.azimuth_deg, v.evidence.sharpness, len(v.refused)) for v in views]))
     retakes = record.retakes
