@@ -236,6 +236,13 @@ class SimHead:
         self._line_free_ns = at_ns
         return at_ns
 
+    def babble(self, data: bytes) -> None:
+        """Let the host hear ``data``, as if the head had sent it now."""
+        self.catch_up()
+        now_ns = self.clock.now_ns()
+        heard = [(now_ns + (i + 1) * BYTE_NS, byte) for i, byte in enumerate(data)]
+        self._coming = deque(sorted([*self._coming, *heard], key=lambda arriving: arriving[0]))
+
     def take(self, until_ns: int) -> bytes:
         """Return the bytes that have arrived at the host by ``until_ns``."""
         arrived = bytearray()
