@@ -104,6 +104,11 @@ class Host(Protocol):
         ...
 
     def serial_ports(self) -> list[SerialPort]: ...
+
+    def serial_port(self, path: str) -> SerialPort | None:
+        """Return the port of that name, whatever is behind it (a pseudo-terminal, too); None where there is none."""
+        ...
+
     def i2c_buses(self) -> list[Node]: ...
     def cameras(self) -> list[Node]: ...
 
@@ -176,6 +181,13 @@ class LinuxHost:
                 )
             )
         return sorted(ports, key=lambda port: (not port.usb, _natural(port.path)))
+
+    def serial_port(self, path: str) -> SerialPort | None:
+        known = next((port for port in self.serial_ports() if self.same_file(port.path, path)), None)
+        if known is not None or not self._at(path).exists():
+            return known
+        node = self._node(path, "no adapter of this computer's", "")
+        return SerialPort(**node, latency_ms=None, latency_file="", usb={})
 
     def i2c_buses(self) -> list[Node]:
         return self._nodes("sys/class/i2c-dev", "")

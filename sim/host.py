@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,8 +12,9 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, Wire
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.devices.opencv_camera import Capture
-from rig.errors import DeviceNotFound
+from rig.errors import DeviceNotFound, RigError
 from rig.host import SERIAL_NAMES, LinuxHost, User
+from sim.i2c import SimI2cBus
 from sim.parts import SimParts
 
 
@@ -97,22 +98,24 @@ class SimHost(LinuxHost):
         super().__init__(root, parts.world.clock, user or User.current())
         self.parts = parts
         self._port = config.servo.port
+        self._head_port = config.head.port
         self._bus = self.i2c_name(config.imu.bus)
 
     def open_wire(self, path: str, baud: int) -> Wire:
-        if self._at(path).resolve() != self._at(self._port).resolve():
+        if self.parts.head is not None and self.same_file(path, self._head_port):
+            return self.parts.head_port()
+        if not self.same_file(path, self._port):
             raise DeviceNotFound(f"There is no port {path}.", next_step="Plug the adapter in.", evidence={"port": path})
-        self.parts.open_wires()
-        self.parts.adapter.baudrate = baud
-        return self.parts.adapter
+        adapter = self.parts.reopen_adapter()
+        adapter.baudrate = baud
+        return adapter
 
     def i2c_path(self, bus: int | str) -> str:
-        return self.parts.i2c.path if self.i2c_name(bus) == self._bus else self.i2c_name(bus)
+        wired = isinstance(self.parts.i2c, SimI2cBus) and self.i2c_name(bus) == self._bus
+        return self.parts.i2c.path if wired else self.i2c_name(bus)
 
-    def open_capture(self, source: int | str) -> Capture:
-        if not self.parts.camera.reopen():
-            raise DeviceNotFound(f"There is no camera {source}.", next_step="Plug the camera in.")
-        return self.parts.camera
+    def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one
+        return self.parts.reopen_camera()
 
 
 @contextmanager
@@ -128,12 +131,18 @@ def simulated_host(config: RigConfig, parts: SimParts) -> Iterator[SimHost]:
             computer.serial_port(by_id=config.servo.port if stable else None)
             if not stable:
                 computer.link(config.servo.port, Path(folder, "dev/ttyUSB0"))
-        number = re.search(r"(\d+)$", str(config.imu.bus))
-        computer.i2c_bus(int(number[1]) if number else 1)
+        if parts.head is None:
+            number = re.search(r"(\d+)$", str(config.imu.bus))
+            computer.i2c_bus(int(number[1]) if number else 1)
+        elif SERIAL_NAMES.fullmatch(Path(config.head.port).name):
+            computer.serial_port(Path(config.head.port).name, serial="SIM00002")
+        else:
+            computer.write(config.head.port)
         number = re.search(r"(\d+)$", str(config.camera.source))
         computer.camera(int(number[1]) if number else 0)
         computer.keeps_time()
-        _set_up(parts, config.servo.id, config.servo.model)
+        with suppress(RigError):  # no supply, a fault: the doctor tells
+            _set_up(parts, config.servo.id, config.servo.model)
         yield SimHost(Path(folder), parts, config)
 
 

@@ -57,12 +57,14 @@ def find(
 
 def proposal(survey: "Survey") -> "dict[Key, Any]":
     """Return the settings that leave no choice: of devices of which there is one."""
-    from rig.doctor.survey import camera_settings, imu_settings, servo_settings
+    from rig.doctor.survey import camera_settings, head_settings, imu_settings, servo_settings
 
     wanted: dict[Key, Any] = {}
     if len(survey.servos) == 1 and not survey.doubtful:
         wanted |= servo_settings(*survey.servos[0])
-    if len(survey.imus) == 1:
+    if len(survey.heads) == 1 and not survey.imus:
+        wanted |= head_settings(survey.heads[0])
+    if len(survey.imus) == 1 and not survey.heads:
         wanted |= imu_settings(survey.imus[0])
     if len(survey.cameras) == 1:
         wanted |= camera_settings(survey.cameras[0])

@@ -85,7 +85,7 @@ class Dialogue:
 
     def run(self) -> "dict[Key, Any]":
         """Return the keys of the configuration that were found out."""
-        from rig.doctor.survey import Survey, camera_settings, imu_settings, servo_settings
+        from rig.doctor.survey import Survey, camera_settings, head_settings, imu_settings, servo_settings
 
         survey = Survey()
         self._survey(survey)
@@ -101,9 +101,13 @@ class Dialogue:
             self._permanent_settings()
         elif not survey.servos:
             self._which_port()
-        imu = self._pick("IMU", survey.imus, list(map(str, survey.imus)))
+        imus = [(str(found), imu_settings(found)) for found in survey.imus]
+        imus += [(f"on the rig head at {port.path}", head_settings(port)) for port in survey.heads]
+        imu = self._pick("IMU", imus, [shown for shown, _ in imus])
         if imu is not None:
-            self.wanted |= imu_settings(imu)
+            self.wanted |= imu[1]
+            if self.case.config.imu.connection == "head" and ("imu", "connection") not in imu[1]:
+                self.wanted[("imu", "connection")] = "i2c"
         shown = [f"{c.node.path}: {c.node.name}, {c.width}x{c.height}" for c in survey.cameras]
         camera = self._pick("camera", survey.cameras, shown, lambda found: found.node)
         if camera is not None:

@@ -49,15 +49,21 @@ def bench_state(case: Case) -> Iterator[Finding]:
 
 def ports(case: Case) -> Iterator[Finding]:
     """The servo's serial port, the IMU's bus and the camera's device file: there, permitted, free, fast."""
-    wanted = case.config.servo.port
-    found = case.host.serial_ports()
-    port = next((p for p in found if case.host.same_file(p.path, wanted)), None)
-    if port is None:
-        yield _missing(case, wanted, found)
-    else:
+    head = case.config.imu.connection == "head"
+    for key, wanted in (("servo.port", case.config.servo.port), ("head.port", case.config.head.port))[: 1 + head]:
+        port = case.host.serial_port(wanted)
+        if port is None:
+            yield _missing(case, key, wanted, case.host.serial_ports())
+            continue
         yield from access(case, "port", port, "dialout")
         if port.latency_ms is not None:
             yield _latency(case, port)
+    if not head:
+        yield from _i2c(case)
+    yield from _video(case)
+
+
+def _i2c(case: Case) -> Iterator[Finding]:
     bus = case.host.i2c_name(case.config.imu.bus)
     buses = case.host.i2c_buses()
     node = next((n for n in buses if case.host.same_file(n.path, bus)), None)
@@ -68,6 +74,9 @@ def ports(case: Case) -> Iterator[Finding]:
         yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", mend)
     else:
         yield bad("port", f"there is no I2C bus {bus}, nor any other", i2c_command(case))
+
+
+def _video(case: Case) -> Iterator[Finding]:
     source = case.config.camera.source
     if isinstance(source, str) and not source.isdigit() and not source.startswith("/dev/"):
         return  # a file or a stream
@@ -172,12 +181,12 @@ def i2c_command(case: Case) -> str:
     return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in case.host.model else "sudo modprobe i2c-dev"
 
 
-def _missing(case: Case, wanted: str, found: list[SerialPort]) -> Finding:
+def _missing(case: Case, key: str, wanted: str, found: list[SerialPort]) -> Finding:
     usb = [port for port in found if port.usb]
     if not usb:
-        mend = "Plug the U2D2 in, then: " + case.rig("find")
+        mend = "Plug the adapter in, then: " + case.rig("find")
         return bad("port", f"there is no serial port {wanted}, nor any other on USB", mend)
-    mend = case.set("servo.port", usb[0].stable or usb[0].path) if len(usb) == 1 else case.rig("setup")
+    mend = case.set(key, usb[0].stable or usb[0].path) if len(usb) == 1 else case.rig("setup")
     return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", mend)
 
 

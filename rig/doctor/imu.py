@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from rig.config import ImuConfig
+from rig.devices.head.opening import open_head
+from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, ImuSamples
 from rig.devices.open_imu import open_imu
 from rig.doctor.case import Case
-from rig.doctor.finding import Finding, bad, fine, warning
+from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.doctor.scan import FoundImu, scan_imus
 
 SECONDS, DRAIN_S = 1.5, 0.25
@@ -28,26 +30,38 @@ def imu(case: Case) -> Iterator[Finding]:
     if case.holder is not None:
         yield warning("imu", "not asked: opening it would spoil the measurement that is running", case.rig("stop"))
         return
-    config = case.config.imu
+    config, clock = case.config, case.host.clock
+    if config.imu.connection == "head":
+        head = open_head(config, lambda: case.host.open_wire(config.head.port, BAUD), clock)
+        with closing(head):
+            who = head.identity
+            text = f"{who.model} on a rig head ({who.board}, firmware {who.firmware}) at {config.head.port}"
+            yield fine("imu", text, serial=who.serial)
+            if (fault := head.fault) is not None:
+                yield of_error("imu", fault, case.rig("acknowledge"))
+            yield from _at_rest(case, head)
+        return
     try:
-        there = scan_imus(case.host, config.bus)
+        there = scan_imus(case.host, config.imu.bus)
     except OSError as error:
         yield _bus_failed(case, error)
         return
-    here = next((found for found in there if found.address == config.address), None)
+    here = next((found for found in there if found.address == config.imu.address), None)
     if here is None or here.driver is None:
-        yield _wrong(case, config, here, there)
+        yield _wrong(case, config.imu, here, there)
         return
-    with closing(open_imu(config, case.host.i2c_path(config.bus), case.host.clock)) as sensor:
-        identity = sensor.identity
-        case.identities["imu"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
-        bus = case.host.i2c_name(config.bus)
-        yield fine(
-            "imu", f"{identity.model} at {identity.bus_address:#04x} of {bus} (identity {identity.who_am_i:#04x})"
-        )
-        samples = _samples(case, sensor)
-        yield from _rest(case, sensor, samples)
-        yield from _gravity(case, sensor)
+    with closing(open_imu(config.imu, case.host.i2c_path(config.imu.bus), clock)) as sensor:
+        bus, identity = case.host.i2c_name(config.imu.bus), sensor.identity
+        text = f"{identity.model} at {identity.bus_address:#04x} of {bus} (identity {identity.who_am_i:#04x})"
+        yield fine("imu", text)
+        yield from _at_rest(case, sensor)
+
+
+def _at_rest(case: Case, sensor: Imu) -> Iterator[Finding]:
+    identity = sensor.identity
+    case.identities["imu"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+    yield from _rest(case, sensor, _samples(case, sensor))
+    yield from _gravity(case, sensor)
 
 
 def _samples(case: Case, sensor: Imu) -> ImuSamples:

@@ -11,7 +11,7 @@ from rig.devices.dynamixel.port import ClockedPort, Wire
 from rig.devices.dynamixel.registers import ControlTable, control_table
 from rig.doctor.case import Case
 from rig.doctor.register_words import baud_codes
-from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, scan_servos
+from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos, without_echoes
 from rig.errors import DeviceMismatch, DeviceNotFound, DeviceRefused, DeviceSilent, SeveralServos, UsageError
 
 MAX_ID = 252
@@ -150,16 +150,18 @@ def _the_only_one(case: Case, wire: Wire, say: Callable[[str], None]) -> FoundSe
     for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
         if protocol == 1 and found:
             break
+        there: list[Heard] = []
         for rate in rates:
             say(f"{case.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
             for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
-                found += heard.servos
+                there.append(heard)
                 if heard.doubtful:
                     raise SeveralServos(
                         f"Two servos answer at once to id {', '.join(map(str, heard.doubtful))} at {rate} baud.",
                         next_step="Unplug all servos but the one that is meant, then try again.",
                         evidence={"ids": list(heard.doubtful), "baud": rate},
                     )
+        found = [servo for heard in without_echoes(there, case.config.servo.baud) for servo in heard.servos]
     if not found:
         raise DeviceNotFound(
             f"No servo answers on {case.config.servo.port} at any baud rate.",

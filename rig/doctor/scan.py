@@ -89,6 +89,17 @@ def scan_servos(wire: Wire, clock: Clock, bauds: Sequence[int] = BAUD_RATES, *, 
             wire.baudrate = before
 
 
+def without_echoes(heard: Sequence[Heard], preferred: int) -> list[Heard]:
+    """Return what was heard at several rates; of a port that has no baud rate, what was heard at one, ``preferred``.
+
+    On a pseudo-terminal, a port in the network or a board that relays bytes the same servos answer whatever the rate.
+    """
+    said = {frozenset((servo.bus_id, servo.model_number, servo.firmware) for servo in each.servos) for each in heard}
+    if len(heard) < 3 or len(said) > 1 or not heard[0].servos:
+        return list(heard)
+    return [next((each for each in heard if each.baud == preferred), heard[0])]
+
+
 def spoiled_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) -> int:
     """Return how many of some reads of a servo's status came back spoiled; the bus must not retry by itself."""
     spoiled = 0

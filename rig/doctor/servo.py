@@ -11,7 +11,7 @@ from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos
+from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos, without_echoes
 from rig.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 
 READS = 100
@@ -29,6 +29,10 @@ def servo(case: Case) -> Iterator[Finding | str]:
         yield warning("servo", "not asked: the bench is in use", case.rig("stop"))
         return
     config = case.config.servo
+    if case.config.imu.connection == "head" and case.config.head.power:
+        text = "not asked: its supply goes through the rig head's relay, which is closed only while a program works"
+        yield warning("servo", text, case.rig("status"))
+        return
     with ExitStack() as opened:
         try:
             wire = case.host.open_wire(config.port, config.baud)
@@ -67,14 +71,15 @@ def _elsewhere(case: Case, wire: Wire) -> Iterator[Finding | str]:
     config = case.config.servo
     protocol = protocol_of(config.model)
     rates = BAUD_RATES if protocol == 2 else BAUD_RATES_1
-    there: list[FoundServo] = []
+    answered: list[Heard] = []
     for rate in [config.baud, *(rate for rate in rates if rate != config.baud)]:
         yield f"{config.port}: nobody at id {config.id}; asking at {rate} baud ..."
         for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
             if heard.doubtful:
                 yield _duplicate(case, heard)
                 return
-            there += heard.servos
+            answered.append(heard)
+    there = [found for heard in without_echoes(answered, config.baud) for found in heard.servos]
     wanted = f"no servo answers at id {config.id}, {config.baud} baud, {config.port}"
     if not there:
         yield bad("servo", f"{wanted}, nor any other at any baud rate", POWER + case.rig("doctor"))

@@ -11,12 +11,23 @@ import cv2
 import serial
 
 from rig.config_file import Key
+from rig.devices.head.opening import open_head
+from rig.devices.head.protocol import BAUD
 from rig.doctor.case import Case
 from rig.doctor.computer import access, i2c_command
 from rig.doctor.examination import Check
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundImu, FoundServo, Heard, scan_imus, scan_servos
-from rig.errors import DeviceNotFound
+from rig.doctor.scan import (
+    BAUD_RATES,
+    BAUD_RATES_1,
+    FoundImu,
+    FoundServo,
+    Heard,
+    scan_imus,
+    scan_servos,
+    without_echoes,
+)
+from rig.errors import DeviceNotFound, RigError
 from rig.host import Node, SerialPort
 
 _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
@@ -49,6 +60,7 @@ class Survey:
     servos: list[tuple[SerialPort, FoundServo]] = field(default_factory=list)
     imus: list[FoundImu] = field(default_factory=list)
     cameras: list[FoundCamera] = field(default_factory=list)
+    heads: list[SerialPort] = field(default_factory=list)
     doubtful: bool = False
     """Two servos with one id were heard."""
 
@@ -62,6 +74,9 @@ class Survey:
 
     def look_for_servos(self, case: Case) -> Iterator[Finding | str]:
         known = case.host.serial_ports()
+        configured = case.host.serial_port(case.config.servo.port)
+        if configured is not None and not any(case.host.same_file(port.path, configured.path) for port in known):
+            known.append(configured)
         if self.ports is not None:
             known = [port for port in known if port.path in self.ports]
         asked = [p for p in known if p.usb or case.host.same_file(p.path, case.config.servo.port)]
@@ -82,19 +97,33 @@ class Survey:
                 for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
                     if protocol == 1 and len(self.servos) > before and not self.both_protocols:
                         break
+                    answered: list[Heard] = []
                     for rate in rates:
-                        yield (f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ...")
-                        for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
-                            yield from self._heard(case, port, heard)
+                        yield f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ..."
+                        answered += scan_servos(wire, case.host.clock, [rate], protocol=protocol)
+                    for heard in without_echoes(answered, case.config.servo.baud):
+                        yield from self._heard(case, port, heard)
         except DeviceNotFound as error:
             yield of_error("servo", error)
             return
         except (serial.SerialException, OSError) as error:
             yield bad("servo", f"{port.path} failed: {error}", "Plug the adapter in again, then: " + case.rig("find"))
             return
-        if len(self.servos) == before and not self.doubtful:
-            text = f"{port.path} ({port.name}): no servo answers at any baud rate, in either protocol"
+        if len(self.servos) > before or self.doubtful:
+            return
+        yield f"{port.path}: asking for a rig head ..."
+        config = case.config.model_copy(update={"head": case.config.head.model_copy(update={"port": port.path})})
+        try:
+            with closing(open_head(config, lambda: case.host.open_wire(port.path, BAUD), case.host.clock)) as head:
+                who = head.identity
+                self.heads.append(port)
+                text = f"{port.path}: a rig head ({who.board}, firmware {who.firmware}) with {who.model}"
+                yield fine("imu", text, port=port.path)
+        except DeviceNotFound:
+            text = f"{port.path} ({port.name}): no servo answers at any baud rate, in either protocol, nor a rig head"
             yield warning("servo", text, "Check the servo's cable and switch on its supply, then: " + case.rig("find"))
+        except RigError as error:  # a head, but not as it should be
+            yield of_error("imu", error)
 
     def _heard(self, case: Case, port: SerialPort, heard: Heard) -> Iterator[Finding]:
         for found in heard.servos:
@@ -121,7 +150,7 @@ class Survey:
             if troubles:
                 yield from troubles
                 continue
-            yield (f"{node.path}: asking for IMUs ...")
+            yield f"{node.path}: asking for IMUs ..."
             try:
                 there = scan_imus(case.host, node.path)
             except OSError as error:
@@ -134,9 +163,9 @@ class Survey:
                     yield fine("imu", str(found), bus=found.bus, address=found.address)
                 else:
                     yield warning("imu", f"{found}: the rig has no driver for it", "Use an MPU-6050 or a BNO055")
-        if not asked:
+        if not asked and not self.heads:
             yield bad("imu", "no I2C bus", i2c_command(case))
-        elif len(self.imus) == before:
+        elif len(self.imus) == before and not self.heads:
             mend = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + case.rig("find")
             yield warning("imu", "no IMU answers on any I2C bus", mend)
 
@@ -149,7 +178,7 @@ class Survey:
             if troubles:
                 yield from troubles
                 continue
-            yield (f"{node.path}: opening ...")
+            yield f"{node.path}: opening ..."
             try:
                 capture = case.host.open_capture(node.path)
             except DeviceNotFound as error:
@@ -176,7 +205,13 @@ def imu_settings(found: FoundImu) -> dict[Key, Any]:
     """Return the keys of the configuration that mean this IMU."""
     number = found.bus.removeprefix("/dev/i2c-")
     bus = int(number) if number.isdigit() else found.bus
-    return {("imu", "model"): found.driver, ("imu", "bus"): bus, ("imu", "address"): found.address}
+    where: dict[Key, Any] = {("imu", "model"): found.driver, ("imu", "bus"): bus, ("imu", "address"): found.address}
+    return where
+
+
+def head_settings(port: SerialPort) -> dict[Key, Any]:
+    """Return the keys of the configuration that mean the IMU on a rig head."""
+    return {("imu", "connection"): "head", ("head", "port"): port.stable or port.path}
 
 
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:

@@ -245,6 +245,16 @@ def test_find_says_what_to_write_and_it_is_right(parts, home):
     assert told["settings"]["camera.source"] == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
 
 
+def test_a_rig_head_is_found_on_its_port(home):
+    done = rig("find", "--bench", "sim", "--set", "imu.connection=head")
+    assert done.exit_code == 0
+    assert "a rig head" in done.stdout
+    (home / "rig.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
+    config = load_config(home / "rig.toml")
+    assert config.imu.connection == "head"
+    assert config.head.port.endswith("SIM00002-if00-port0")
+
+
 def test_find_on_an_empty_computer(parts, home):
     for folder in ("sys/class", "dev"):
         shutil.rmtree(parts.computer.root / folder)

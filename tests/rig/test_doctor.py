@@ -383,6 +383,22 @@ def test_a_clone_is_named():
         assert "MPU-6500" in text
 
 
+def test_an_imu_on_a_rig_head_is_looked_at_there():
+    with unopened("imu.connection=head", "head.port=/dev/ttyUSB1") as bench:
+        set_up(bench)
+        bench.computer.serial_port("ttyUSB1", serial="HEAD")
+        assert not bench.troubles("port", "servo", "imu")
+        assert any("rig head" in f.text for f in bench.findings("imu"))
+        bench.parts.head.unplugged = True
+        assert "no rig head" in one(bench.troubles("imu"))[0]
+
+
+def test_a_servo_fed_by_the_heads_relay_is_not_called_dead():
+    with unopened("imu.connection=head", "head.port=/dev/ttyUSB1", "head.power=true") as bench:
+        text, _ = one(bench.troubles("servo"))
+        assert "relay" in text
+
+
 # -- what is kept -----------------------------------------------------------------------------------------------------
 
 

@@ -47,6 +47,16 @@ def test_terminals_and_ports_with_nothing_behind_them_are_no_ports(computer):
     assert ports[0].usb == {}
 
 
+def test_a_port_that_no_adapter_makes_can_be_named(computer):
+    computer.write("dev/pts/3")
+    named = host(computer, uid=0).serial_port("/dev/pts/3")
+    assert (named.path, named.usb, named.usable) == ("/dev/pts/3", {}, True)
+    assert host(computer).serial_port("/dev/pts/4") is None
+    computer.serial_port()
+    stable = "/dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_SIM00001-if00-port0"
+    assert host(computer).serial_port(stable).path == "/dev/ttyUSB0"
+
+
 def test_ports_on_usb_come_first(computer):
     soldered = computer.root / "sys/devices/soc/uart0"
     soldered.mkdir(parents=True)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.devices.dynamixel.registers import model_numbers
-from rig.doctor.scan import BAUD_RATES, CHIPS, Heard, scan_imus, scan_servos
+from rig.doctor.scan import BAUD_RATES, CHIPS, Heard, scan_imus, scan_servos, without_echoes
 from sim.faults import Faults
 from sim.faults.schedule import read_faults
 from tests.fuzzing import fuzz_settings
@@ -94,6 +94,26 @@ def test_an_adapter_that_hears_itself_changes_nothing():
         faults.clear()
         assert [servo.bus_id for servo in said.servos] == [1]
         assert not said.doubtful
+
+
+def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
+    class Relay:
+        """A pseudo-terminal: whatever rate it is told, the bytes arrive."""
+
+        def __init__(self, wire):
+            self.wire, self.baudrate = wire, wire.baudrate
+
+        def __getattr__(self, name):
+            return getattr(self.wire, name)
+
+    with unopened() as bench:
+        said = list(scan_servos(Relay(bench.parts.adapter), bench.case.host.clock))
+        assert [len(each.servos) for each in said] == [1] * 8
+        (once,) = without_echoes(said, 115_200)
+        assert once.baud == 115_200
+        bench.add_servo(1, 1_000_000)
+        real = heard(bench)
+        assert without_echoes(real, 57_600) == real  # two servos of one kind, at two rates
 
 
 def test_rates_that_the_adapter_lacks_are_left_out():
