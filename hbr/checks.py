@@ -1,6 +1,11 @@
 """What an image must be."""
 
+from typing import Final
+
 import numpy as np
+
+#: Sides of a frame in which an object can be looked for.
+LEAST_PX: Final = 16
 
 
 def check_image(image: object) -> None:
@@ -25,3 +30,19 @@ def check_image(image: object) -> None:
         raise ValueError(f"the image has shape {image.shape}; one BGR image of shape (H, W, 3) is needed")
     if image.size == 0:
         raise ValueError(f"the image is empty, shape {image.shape}; check the capture or the crop")
+
+
+def check_frame(image: object) -> None:
+    """Refuse what `check_image` refuses, and what is too small to look for an object in.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `check_image`, or a side is shorter than 16 pixels.
+    """
+    check_image(image)
+    assert isinstance(image, np.ndarray)
+    if min(image.shape[:2]) < LEAST_PX:
+        raise ValueError(
+            f"the frame has {image.shape[1]} x {image.shape[0]} pixels; an object is looked for in {LEAST_PX} and more"
+        )

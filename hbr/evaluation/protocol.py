@@ -53,6 +53,8 @@ class Protocol:
     enrolled : int or None
         Of each object so many views stay enrolled, at equal distances, and queries are taken from the others; None for
         all views, queries among them.
+    absent : tuple of str
+        Names of objects that are not enrolled at all: what comes of looking for strangers. By the dense filter alone.
     """
 
     trials: int = 10
@@ -63,6 +65,7 @@ class Protocol:
     drift_deg: float = 0.0
     seed: int = 0
     enrolled: int | None = None
+    absent: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.trials < 1 or self.max_views < 1:
@@ -93,7 +96,7 @@ class Runs:
     alike_error_deg : float64
         The same to the nearest orientation from which the object looks as it does from the true one.
     lead : float64
-        `hbr.lead` of the best object, a view; nan of the dense filter.
+        `hbr.lead` of the best object, a view; by the dense filter, its score above the second's.
     score : float64
         Score of the best object, a view.
     posterior : float64
@@ -193,6 +196,9 @@ class _Trials:
         self._azimuth_deg = views.azimuth_deg[self._rows]
         name = views.object_names[object_index]
         self._enrolled = _enrolled(views, protocol.enrolled)
+        absent = np.array([other in protocol.absent for other in views.object_names])
+        self._enrolled &= ~absent[views.object_index]
+        self._is_stranger = bool(absent[object_index])
         self._free = np.flatnonzero(~self._enrolled[self._rows]) if protocol.enrolled else np.arange(len(self._rows))
         self._index: DenseIndex | None = None
         if len(queries) != len(self._rows):
@@ -207,7 +213,6 @@ class _Trials:
         self._alike = _looks_alike(compared.similarity(own, own), self._ring)
         similar = compared.similarity(queries, views.descriptors)
         similar[:, ~self._enrolled] = -np.inf
-        self._similar = similar
         self._own_similar = similar[:, self._rows]
         objects = range(len(views.object_names))
         self._reach = np.stack([similar[:, views.of(j)].max(axis=1, initial=-np.inf) for j in objects])
@@ -228,6 +233,8 @@ class _Trials:
         if method.dense:
             self._run_dense(method, draws, runs, at)
             return
+        if self._protocol.absent:
+            raise ValueError(f"{method.label} cannot look for strangers here; use methods of the dense filter")
         seen = [int(draws.order[0])]
         travelled_deg = 0.0
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
@@ -264,7 +271,8 @@ class _Trials:
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
         for n in range(last):
             keep = self._keep(np.array(seen))
-            index = self._index if self._protocol.enrolled else self._index.without(self._rows[~keep])
+            gone = self._rows[~keep & self._enrolled[self._rows]]
+            index = self._index.without(np.cumsum(self._enrolled)[gone] - 1) if len(gone) else self._index
             measured_deg = (self._azimuth_deg[seen] + draws.error_deg[: n + 1]).tolist()
             # the views near to the newest query left the model for the queries before, too
             belief: Belief | None = None
@@ -277,6 +285,7 @@ class _Trials:
             ranking = belief.ranking()
             self._judge(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
             runs.score[*at, n] = ranking.scores[0]
+            runs.lead[*at, n] = ranking.scores[0] - ranking.scores[1] if len(ranking.scores) > 1 else ranking.scores[0]
             runs.posterior[*at, n] = belief.posterior(BETA).sum(axis=1).max()
             runs.travelled_deg[*at, n] = travelled_deg
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
@@ -321,7 +330,7 @@ class _Trials:
                 keep[self._ring[(place[seen] + 1) % len(self._ring)]] = False
             case "queries":
                 pass
-        if not keep.any():
+        if not keep.any() and not self._is_stranger:
             name = self._views.object_names[self._object]
             raise ValueError(
                 f"after {len(seen)} queries no view of {name} is left; use fewer views or removal 'queries'"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.arrays import FloatArray, ImageArray
-from hbr.checks import check_image
+from hbr.checks import check_frame
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -113,7 +113,7 @@ class Background:
     """
 
     def __init__(self, reference_bgr: ImageArray) -> None:
-        check_image(reference_bgr)
+        check_frame(reference_bgr)
         self.shape = reference_bgr.shape[:2]
         self._grey_levels = shrunk(reference_bgr)
         self._log = _logarithm(self._grey_levels)

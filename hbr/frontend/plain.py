@@ -36,16 +36,17 @@ def plain_difference(small: ImageArray) -> Mask | None:
     if not (_even(left, right) or _quiet(away[:, edge + 2 : -edge - 2])):
         return None
     # the object's own contrast: what a twentieth of the frame exceeds, of every third pixel each way
-    contrast = np.sort(away[1::3, 1::3], axis=None)[-(away[1::3, 1::3].size // 20 + 1)]
-    differs: Mask = away > max(threshold, _SHARE * float(contrast))
+    sample = np.sort(away[::3, ::3], axis=None)
+    contrast = float(sample[-(len(sample) // 20 + 1)])
+    differs: Mask = away > max(threshold, _SHARE * contrast)
     return differs
 
 
 def _even(left: cv2.typing.MatLike, right: cv2.typing.MatLike) -> bool:
-    """Whether the frame's two sides are of one colour, from top to bottom."""
+    """Whether the frame's two sides are of one colour, as far as no object reaches there."""
     sides = np.concatenate([left, right]).reshape(-1, 3)
     off = np.abs(sides - np.median(sides, axis=0)).max(axis=1)
-    return bool((off > _ROUGH_LEVELS).mean() < _ROUGH)
+    return bool((off > 1.5 * _ROUGH_LEVELS).mean() < 1.5 * _ROUGH)
 
 
 def _quiet(away: cv2.typing.MatLike) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.arrays import ImageArray
-from hbr.checks import check_image
+from hbr.checks import check_frame
 from hbr.frontend.background import Background, Light, shrunk
 from hbr.frontend.guess import guessed
 from hbr.frontend.plain import plain_difference
@@ -112,7 +112,7 @@ def sight(
     TypeError, ValueError
         The frame is no such image, the reference has another size, or a box lies outside.
     """
-    check_image(image_bgr)
+    check_frame(image_bgr)
     background = Background(reference) if isinstance(reference, np.ndarray) else reference
     height, width = image_bgr.shape[:2]
     if background is not None and background.shape != (height, width):
