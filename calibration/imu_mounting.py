@@ -28,6 +28,8 @@ VALID_DAYS = 180
 
 STEPS = 8
 READINGS = 60
+SPACING_S = 0.025
+"""Between readings of the accelerometer: what its low-pass of some 40 Hz remembers of the last is gone."""
 MAX_TILT_DEG = 10.0
 """The cosine of more costs 1.5 % of the rate: more than the gyro's own scale error."""
 MAX_LEVEL_DEG = 5.0
@@ -105,7 +107,7 @@ def live(bench: Bench) -> Generator[Moved | Fact, None, Fact]:
                         turns.append(turn)
                     yield moved(index, move)
                 if index < STEPS:
-                    readings = np.array([bench.imu.read_gravity_g() for _ in _paced(bench, READINGS)])
+                    readings = np.array([bench.imu.read_gravity_g() for _ in _paced(bench, table)])
                     sigma = float(readings.std(axis=0, ddof=1).max()) / sqrt(READINGS)
                     levels.append(Level(table.rest_deg, readings.mean(axis=0), sigma))
         finally:
@@ -247,10 +249,13 @@ def _listen(bench: Bench, table: Turntable) -> None:
         table.check_still()
 
 
-def _paced(bench: Bench, count: int) -> Generator[int, None, None]:
-    for index in range(count):
-        yield index
-        bench.clock.sleep(1.0 / bench.imu.rate_hz)
+def _paced(bench: Bench, table: Turntable) -> Generator[None, None, None]:
+    """Pace readings of the accelerometer; meanwhile the gyro's samples must not overflow."""
+    for index in range(READINGS):
+        yield
+        bench.clock.sleep(SPACING_S)
+        if index % 10 == 9:
+            table.check_still()
 
 
 def _turn(kept: Recording, before_ns: int, column: int, sign: int, direction: int) -> Turn | None:
