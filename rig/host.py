@@ -187,6 +187,7 @@ class LinuxHost:
         if known is not None or not self._at(path).exists():
             return known
         node = self._node(path, "no adapter of this computer's", "")
+        node["holders"] = ()  # a pseudo-terminal is always held, by the program that is its other end
         return SerialPort(**node, latency_ms=None, latency_file="", usb={})
 
     def i2c_buses(self) -> list[Node]:
