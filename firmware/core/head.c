@@ -346,7 +346,9 @@ void head_init(struct head *head) {
     } else if (head->reset_cause == RESET_BROWN_OUT) {
         latch(head, FAULT_BROWN_OUT);
     }
-    head->changed = true; /* the first word after a start */
+    uint8_t end = 0;
+    hal_uart_write(&end, 1); /* of a frame that was broken off by the reset */
+    head->changed = true;    /* the first word after a start */
 }
 
 void head_step(struct head *head) {

@@ -37,9 +37,10 @@ struct arriving {
 struct board {
     avr_t *avr;
     struct board_outside outside;
-    uint64_t base;  /* cycles before the last reset: a reset begins the emulator's count anew */
-    uint64_t count; /* the emulator's, when we last looked */
-    uint8_t *flash;
+    uint64_t base; /* cycles before the last reset, where that begins the emulator's count anew (simavr 1.7) */
+    uint64_t last; /* the emulator's count when we last looked */
+    bool was_reset;
+    void (*reset)(avr_t *avr); /* the core's own */
     uint32_t flash_size;
 
     struct arriving arriving[QUEUE];
@@ -211,6 +212,12 @@ static void no_log(avr_t *avr, const int level, const char *format, va_list ap) 
     (void)ap;
 }
 
+static void on_reset(avr_t *avr) {
+    struct board *b = avr->custom.data;
+    b->was_reset = true;
+    b->reset(avr);
+}
+
 /* After a reset, whatever its cause, what is wired from outside is still there. */
 static void wire_up(struct board *b) {
     /* At reset these pins are level-triggered, and low ones would be polled in every cycle, for ever after. */
@@ -247,8 +254,10 @@ struct board *board_open(struct board_outside outside, const uint8_t *image, uin
     avr->log = LOG_NONE;
     memcpy(avr->flash, image, image_size);
     avr->codeend = avr->flashend;
-    b->flash = avr->flash;
     b->flash_size = image_size;
+    b->reset = avr->reset;
+    avr->custom.data = b;
+    avr->reset = on_reset;
 
     avr_eeprom_desc_t eeprom = {.ee = (uint8_t *)&serial, .offset = 0, .size = sizeof serial};
     avr_ioctl(avr, AVR_IOCTL_EEPROM_SET, &eeprom);
@@ -288,18 +297,20 @@ void board_close(struct board *b) {
     free(b);
 }
 
-/* The emulator has begun its count anew. */
-static void take_reset(struct board *b, uint64_t before, uint8_t cause) {
-    b->base += before;
-    b->count = b->avr->cycle;
+static void take_reset(struct board *b, uint8_t cause) {
+    if (b->avr->cycle < b->last) {
+        b->base += b->last;
+    }
+    b->last = b->avr->cycle;
+    b->was_reset = false;
     emit(b, cycle_now(b), BOARD_RESET, cause);
     wire_up(b);
 }
 
 void board_reset(struct board *b, uint8_t cause) {
-    uint64_t before = b->avr->cycle;
+    b->last = b->avr->cycle;
     avr_reset(b->avr);
-    take_reset(b, before, cause);
+    take_reset(b, cause);
     b->avr->data[MCUSR] = cause == RESET_POWER_ON    ? PORF
                           : cause == RESET_BROWN_OUT ? BORF
                           : cause == RESET_EXTERNAL  ? EXTRF
@@ -325,7 +336,7 @@ void board_hang(struct board *b, bool hangs) {
         return;
     }
     for (uint32_t at = 0; at + 1 < b->flash_size; at += 2) {
-        if ((b->flash[at] | b->flash[at + 1] << 8) == OP_RJMP_SELF) {
+        if ((b->avr->flash[at] | b->avr->flash[at + 1] << 8) == OP_RJMP_SELF) {
             while (!(b->avr->sreg[S_I] && b->avr->state == cpu_Sleeping)) { /* in the main loop, for sure */
                 avr_run(b->avr);
             }
@@ -375,14 +386,13 @@ static void run_to(struct board *b, uint64_t cycle) {
         /* Neither a sleep nor a burst of instructions passes a timer. */
         avr_cycle_timer_register(avr, cycle - cycle_now(b), nothing, b);
     }
-    b->count = avr->cycle;
     while (cycle_now(b) < cycle) {
+        b->last = avr->cycle;
         avr_run(avr);
-        if (avr->cycle < b->count) { /* the watchdog bit */
-            take_reset(b, b->count, RESET_WATCHDOG);
+        if (b->was_reset) { /* the watchdog bit */
+            take_reset(b, RESET_WATCHDOG);
             return;
         }
-        b->count = avr->cycle;
     }
 }
 

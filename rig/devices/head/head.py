@@ -470,6 +470,8 @@ class RigHead:
         try:
             self._link.poll()
             if self._restarted is not None and not self._set_up:
+                self._who = self._link.request(Hello(PROTOCOL_VERSION), Identity)
+                self._restarted = Reset(self._who.reset_cause)
                 self._begin()
             if seconds_between(self._beaten_ns, self._clock.now_ns()) * BEATS_A_DEADMAN * 1000 >= self._deadman_ms:
                 self._beat()
