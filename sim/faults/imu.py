@@ -63,7 +63,8 @@ def _delayed(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
 
     def delay(words: Words) -> Words:
         if not waiting:
-            waiting.append(np.repeat(words[:1], round(values["seconds"] * parts.imu.rate_hz), axis=0))
+            held = round(values["seconds"] * parts.imu.rate_hz)
+            waiting.append(np.resize(words, (held, words.shape[1])))  # what was before, again
         line = np.concatenate([waiting[0], words])
         waiting[0] = line[len(words) :]
         return line[: len(words)]
