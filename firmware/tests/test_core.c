@@ -106,6 +106,9 @@ static void run_ms(uint64_t ms) {
                     line[length++] = (uint8_t)outputs[i].value;
                     break;
                 }
+                if (!length) {
+                    break; /* the zero that ends what a reset broke off */
+                }
                 CHECK(frame_decode(line, length) >= 0);
                 memcpy(line[0] >= MESSAGE_SAMPLE ? event : answer, line, sizeof line);
                 length = 0;
