@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from sim.faults.kind import Delay, End, Parameter, kind, repeatedly, share
-from sim.parts import SimParts, SimulatedServo
+from sim.parts import SimParts
 from sim.servo import Ax12Servo, Frame, XSeriesServo
+from sim.servo.configured import SimulatedServo
 from sim.servo.control_table import Memory
 from sim.servo.device import OVERLOAD_ERROR
 from sim.world import World

@@ -125,7 +125,14 @@ SCENARIOS: dict[str, Scenario] = {
             "restart the sensor",
             step=ACK,
         ),
-        stopped("imu.delayed@move20", 502, "encoder and gyro disagree", "restart the sensor", step=ACK),
+        stopped(
+            "imu.delayed@move20",
+            404,
+            "the gyro tells of a turn while the encoder stands",
+            "restart the sensor",
+            answer=502,
+            step=ACK,
+        ),
         stopped(
             "imu.intermittent@move20", 404, "the sensor fell asleep and lost its settings", "mend its supply", step=ACK
         ),
