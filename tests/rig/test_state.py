@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from fuzzing import fuzz_settings
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -61,6 +62,7 @@ def test_what_was_written_is_read(tmp_path_factory, table, what):
     assert not list(folder.glob("*.part"))
 
 
+@fuzz_settings(0.1)
 @given(st.binary(max_size=300))
 def test_what_is_damaged_is_told_and_never_believed(tmp_path_factory, damage):
     folder = tmp_path_factory.getbasetemp() / "damaged"

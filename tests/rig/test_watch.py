@@ -144,7 +144,7 @@ def test_a_calibration_of_the_gyro_does_not_trust_it():
     assert "imu.sign" in caught.value.next_step
 
 
-@pytest.mark.parametrize("velocity", [2.0, 90.0, 180.0])
+@pytest.mark.parametrize("velocity", [5.0, 90.0, 180.0])
 @pytest.mark.parametrize("target", [0.5, 40.0])
 def test_no_honest_motion_is_broken_off(velocity, target):
     fast = (f"table.velocity_dps={velocity}", "table.acceleration_dps2=900")
