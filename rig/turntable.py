@@ -3,7 +3,7 @@
 from collections import deque
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from math import ceil, copysign, floor, isfinite, sqrt
+from math import ceil, copysign, floor, isfinite, remainder, sqrt
 from types import TracebackType
 from typing import Self
 
@@ -170,12 +170,15 @@ class Turntable(AbstractContextManager["Turntable"]):
     def within_reach(self, target_deg: float) -> float:
         """Return the angle equivalent to ``target_deg`` (whole turns away) within the limits, nearest to where we are.
 
-        ``target_deg`` itself where it is within the limits: the cable is unwound only when it must be.
+        ``target_deg`` itself where it is within the limits: the cable is unwound only when it must be. Of a servo that
+        pans over less than a turn, the limit that comes nearest to an angle which it does not reach.
         """
         low, high = self._config.limits_deg
         if low <= target_deg <= high:
             return target_deg
         turns = range(ceil((low - target_deg) / 360), floor((high - target_deg) / 360) + 1)
+        if not turns:
+            return min((low, high), key=lambda limit: abs(remainder(limit - target_deg, 360.0)))
         return min((target_deg + 360 * k for k in turns), key=lambda angle: abs(angle - self._rest_deg))
 
     def turns_back(self, target_deg: float) -> int:
@@ -339,9 +342,8 @@ class Turntable(AbstractContextManager["Turntable"]):
             if watch:
                 lag_deg = None if state.trajectory_deg is None else state.trajectory_deg - state.position_deg
                 watch.look(state, angle_deg, lag_deg)
-            elif cause := unfit(state, self._limits, self._servo.limits):
-                self._safety.latch(cause)
-                raise cause
+            else:
+                self._safety.refuse_unfit(state)
             if slip:
                 self._look_for_slip(slip, state.time_ns, angle_deg)
             arrived = state.in_position and not state.moving and abs(angle_deg - goal_deg) <= config.tolerance_deg

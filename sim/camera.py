@@ -78,6 +78,8 @@ class SimCapture:
         Asked at each `grab` whether it fails.
     hangs
         Whether no frame arrives although the camera is there: `grab` gives up after `SELECT_S`.
+    orbits
+        Whether the table takes the camera around the object, instead of turning the object.
     blur_px
         Width of the blur of a lens that was knocked; the camera does not know.
     tampers
@@ -89,6 +91,7 @@ class SimCapture:
         self.latency_ns = 0
         self.falters: list[Callable[[], bool]] = []
         self.hangs = False
+        self.orbits = False
         self.blur_px = 0.0
         self.tampers: list[Callable[[Image, int], Image]] = []
         self._world = world
@@ -291,6 +294,7 @@ class SimCapture:
 
     def _picture(self, scene: Scene, table_deg: float) -> Image:
         """Return what the lens sees of a scene under nominal light."""
+        table_deg = -table_deg if self.orbits else table_deg
         image = self._backdrop.copy()
         if scene.thing is None:
             return image

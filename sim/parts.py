@@ -66,7 +66,9 @@ class SimParts(AbstractContextManager["SimParts"]):
         i2c = head or SimI2cBus(world.clock)
         i2c.attach(config.imu.address, imu)
         adapter = SimSerial(servo_bus, config.servo.baud, READ_SLICE_S)
-        return cls(world, servo_bus, servo, adapter, i2c, imu, SimCapture(world), head)
+        camera = SimCapture(world)
+        camera.orbits = config.table.carries == "camera"
+        return cls(world, servo_bus, servo, adapter, i2c, imu, camera, head)
 
     def head_port(self) -> HeadSerial:
         """Open the head's line, as often as it is plugged in.

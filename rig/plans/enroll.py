@@ -33,9 +33,10 @@ def enroll(
 ) -> Generator[Event, None, Enrolled]:
     """Enroll the object ``name`` with views at even steps; yields events and returns the last of them.
 
-    The table turns upwards from 0, so that its play is taken up; view k has the azimuth −k·360/views. Where the cable
-    does not reach for that, it begins further back. An interrupted enrollment keeps its views: ``resume`` takes the
-    missing ones, of an object that nobody has moved since. Closing the generator takes the torque off.
+    The table turns upwards from 0, so that its play is taken up; view k has the azimuth −k·360/views (+ where the servo
+    takes the camera around the object). Where the cable does not reach for that, it begins further back; a servo that
+    pans over less than a turn takes the views that it reaches. An interrupted enrollment keeps its views: ``resume``
+    takes the missing ones, of an object that nobody has moved since. Closing the generator takes the torque off.
 
     Raises
     ------
@@ -49,7 +50,7 @@ def enroll(
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.view` and `rig.turntable`; views stored so far stay.
     """
-    views = views or bench.config.enroll.views
+    limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     provenance = Provenance(
         bench=bench.name,
         devices=bench.devices(),
@@ -61,17 +62,17 @@ def enroll(
     )
     if resume:
         enrollment = catalog.resume(name, provenance=provenance)
-        views = len(enrollment.planned_azimuth_deg)
     else:
         enrollment = catalog.begin(
             name,
-            planned_azimuth_deg=even_azimuths(views, bench.config.table.limits_deg),
+            planned_azimuth_deg=even_azimuths(views or bench.config.enroll.views, limits_deg, sign),
             provenance=provenance,
             label=label,
             note=note,
             replace=replace,
         )
-    angles_deg = table_angles(enrollment.planned_azimuth_deg, bench.config.table.limits_deg)
+    views = len(enrollment.planned_azimuth_deg)
+    angles_deg = table_angles(enrollment.planned_azimuth_deg, limits_deg, sign)
     missing = enrollment.missing()
     to_go = {index: angles_deg[index] for index in missing}
     yield Started(
@@ -96,6 +97,7 @@ def enroll(
 def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float]) -> Generator[Event, None, int]:
     """Take and store the views at these table angles, turn back to 0, and return how many frames were taken again."""
     viewer = Viewer(bench.camera, bench.config.view)
+    sign = bench.config.table.orientation_sign
     retakes = 0
     imu = _ImuAngle()
     first: tuple[int, float, NDArray[np.uint8]] | None = None
@@ -115,7 +117,7 @@ def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, f
                 index=index,
                 commanded_deg=move.commanded_deg,
                 encoder_deg=move.encoder_deg,
-                azimuth_deg=float(wrap360(-(imu.angle_deg if move.by_gyro else move.encoder_deg))),
+                azimuth_deg=float(wrap360(sign * (imu.angle_deg if move.by_gyro else move.encoder_deg))),
                 descriptor=viewer.describe(shot.image_bgr),
                 captured_ns=shot.evidence.exposed_ns,
                 imu_deg=imu.angle_deg,

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from math import ceil, floor
 from typing import Final
 
 from hbr.angles import wrap360
@@ -21,23 +22,38 @@ FRAMES: Final = 1.5
 _FLOAT_DEG: Final = 1e-6
 
 
-def even_azimuths(views: int, limits_deg: tuple[float, float]) -> list[float]:
+def even_azimuths(views: int, limits_deg: tuple[float, float], sign: int = -1) -> list[float]:
     """Return the azimuths of ``views`` even steps of one turn, in the order in which the table takes them.
 
-    They begin at azimuth 0, where the cable's limits let the table turn up from 0; else further back.
+    They begin at azimuth 0, where the cable's limits let the table turn up from 0; else further back. Of a servo that
+    pans over less than a turn they are those within its limits: the object is seen from some of its sides.
+
+    Parameters
+    ----------
+    views
+        How many there would be in a whole turn.
+    limits_deg
+        Lowest and highest table angle.
+    sign
+        Sense of the orientation: -1 where the table turns the object, +1 where it takes the camera around it
+        (`TableConfig.orientation_sign`).
     """
     step_deg = 360.0 / views
+    low, high = limits_deg
     start_deg = 0.0
-    if 360.0 - step_deg > limits_deg[1]:
-        reach_deg = limits_deg[1] - (360.0 - step_deg)
-        start_deg = max(reach_deg // step_deg * step_deg, limits_deg[0])
-    return [float(wrap360(-(start_deg + k * step_deg))) for k in range(views)]
+    if 360.0 - step_deg > high - low:
+        start_deg = ceil(low / step_deg - _FLOAT_DEG) * step_deg
+        views = floor((high - start_deg) / step_deg + _FLOAT_DEG) + 1
+    elif 360.0 - step_deg > high:
+        start_deg = max((high - (360.0 - step_deg)) // step_deg * step_deg, low)
+    return [float(wrap360(sign * (start_deg + k * step_deg))) for k in range(views)]
 
 
-def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float]) -> tuple[float, ...]:
+def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], sign: int = -1) -> tuple[float, ...]:
     """Return the table's angle, unwrapped, for each planned azimuth: upwards all the way, within the limits.
 
-    The table turns backwards under a camera that goes around, and upwards so that its play stays taken up.
+    The table turns backwards under a camera that goes around (``sign`` -1), and upwards so that its play stays taken
+    up.
 
     Raises
     ------
@@ -46,9 +62,9 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float]) 
     """
     if not azimuth_deg:
         return ()
-    angles = [-float(wrap360(azimuth_deg[0]))]
+    angles = [sign * float(wrap360(azimuth_deg[0]))]
     for before, after in pairwise(azimuth_deg):
-        angles.append(angles[-1] + float(wrap360(before - after)))
+        angles.append(angles[-1] + float(wrap360(sign * (after - before))))
     low, high = limits_deg
     turns = [
         whole
@@ -151,17 +167,17 @@ def rehearse(
     """
     known = {} if catalog is None else {summary.name: summary for summary in catalog.objects()}
     table_deg = Turntable(bench).angle_deg()
-    limits_deg = bench.config.table.limits_deg
+    limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     model = MotionModel(bench.config)
     found = []
     for name in map(clean_name, names):
         action, why = _action(known.get(name), resume=resume, replace=replace, tray=len(names) > 1)
         azimuths: Sequence[float] = ()
         if action in ("enroll", "replace"):
-            azimuths = even_azimuths(views or bench.config.enroll.views, limits_deg)
-            angles = table_angles(azimuths, limits_deg)
+            azimuths = even_azimuths(views or bench.config.enroll.views, limits_deg, sign)
+            angles = table_angles(azimuths, limits_deg, sign)
         elif action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
-            every = table_angles(kept.planned_azimuth_deg, limits_deg)
+            every = table_angles(kept.planned_azimuth_deg, limits_deg, sign)
             azimuths = [kept.planned_azimuth_deg[index] for index in kept.missing]
             angles = tuple(every[index] for index in kept.missing)
         else:

@@ -64,11 +64,12 @@ def identify(
     bench.operator.place(None)
     started_ns = bench.clock.now_ns()
     travelled_deg = 0.0
+    sign = bench.config.table.orientation_sign  # as the table turns, the camera goes around the object backwards
     number = 0
     trouble: RigError | None = None
     with Turntable(bench) as table:
         move = table.hold()
-        orientation_deg = -move.encoder_deg
+        orientation_deg = sign * move.encoder_deg
         while True:
             yield moved(number, move)
             shot = yield from capture(number, viewer, table, move.settled_ns)
@@ -83,12 +84,12 @@ def identify(
             yield ranked
             if isinstance(step, Stop):
                 break
-            decided = _decided(number, step, table, top)
+            asked_deg = table.rest_deg + sign * step.rotation_deg
+            decided = _decided(number, step, table.within_reach(asked_deg), top)
             yield decided
-            asked_deg = table.rest_deg - step.rotation_deg
             move = yield from announced(number, table, decided.target_deg, asked_deg=asked_deg)
             travelled_deg += abs(move.rotation_deg)
-            orientation_deg -= move.rotation_deg  # as the table turns, the camera goes around the object backwards
+            orientation_deg += sign * move.rotation_deg
             number += 1
         seconds = seconds_between(started_ns, bench.clock.now_ns())
         try:
@@ -115,12 +116,12 @@ def identify(
     return answer
 
 
-def _decided(number: int, turn: Turn, table: Turntable, top: int) -> Decided:
+def _decided(number: int, turn: Turn, target_deg: float, top: int) -> Decided:
     return Decided(
         index=number,
         side="left" if turn.rotation_deg >= 0 else "right",
         rotation_deg=turn.rotation_deg,
-        target_deg=table.within_reach(table.rest_deg - turn.rotation_deg),
+        target_deg=target_deg,
         s_left=turn.s_left,
         s_right=turn.s_right,
         rivals=turn.rivals[:top],
