@@ -14,7 +14,8 @@ from typing import Any, Protocol, Self, runtime_checkable
 from pydantic import BaseModel
 
 from rig.clock import Clock
-from rig.config import RigConfig, Values, mistaken, validate
+from rig.config import RigConfig
+from rig.config_values import Values, mistaken, validate
 from rig.devices.camera import Camera
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from rig.config import RigConfig, Values
+    from rig.config import RigConfig
+    from rig.config_values import Values
     from rig.config_words import KeyFacts
 
 app = typer.Typer(help="Look at the configuration, judge it, and change it.", no_args_is_help=True)
@@ -94,7 +95,7 @@ def path(settings: Settings) -> None:
 
     Example: rig config path
     """
-    from rig.config import default_path, search_paths
+    from rig.config_values import default_path, search_paths
 
     found = settings.config or default_path()
     if settings.json:
@@ -112,8 +113,9 @@ def init(settings: Settings) -> None:
 
     Example: rig config init --config rig.toml
     """
-    from rig.config import FILE_NAME, RigConfig
+    from rig.config import RigConfig
     from rig.config_file import save
+    from rig.config_values import FILE_NAME
     from rig.config_words import blank_file
 
     target = settings.config or Path(FILE_NAME)
@@ -140,8 +142,9 @@ def set_(
 
     Example: rig config set servo.port /dev/ttyUSB1
     """
-    from rig.config import FILE_NAME, default_path, load_config, parsed
+    from rig.config import load_config
     from rig.config_file import changed_lines, read_text, save, with_values
+    from rig.config_values import FILE_NAME, default_path, parsed
 
     target = settings.config or default_path() or Path(FILE_NAME)
     old = read_text(target) if target.exists() else ""
@@ -159,7 +162,7 @@ def set_(
 
 def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseModel]]":
     from rig.bench import check_config
-    from rig.config import read_values
+    from rig.config_values import read_values
 
     values = read_values(settings.config, settings.overrides)
     return values, *check_config(values)

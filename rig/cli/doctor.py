@@ -132,7 +132,7 @@ def print_finding(screen: "Console", finding: "Finding") -> None:
 
 
 def _config_words(settings: Settings) -> str:
-    from rig.config import default_path
+    from rig.config_values import default_path
 
     path = settings.config or default_path()
     return f"{path}: no mistakes" if path else "no rig.toml: the defaults are in force (rig setup writes one)"

@@ -155,8 +155,8 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
 
 def _follow(settings: Settings, case: "Case", what: str, old: int, new: int) -> str:
     """Let the configuration file say what the servo says now, where it said what the servo said before."""
-    from rig.config import default_path
     from rig.config_file import read_text, save, with_values
+    from rig.config_values import default_path
 
     path = settings.config or default_path()
     configured = getattr(case.config.servo, what)

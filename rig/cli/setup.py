@@ -37,8 +37,9 @@ def setup(
     Example: rig setup --bench sim --yes
     """
     from rig.cli.doctor import case_of, examination
-    from rig.config import FILE_NAME, RigConfig, default_path
+    from rig.config import RigConfig
     from rig.config_file import read_text, save, stated, with_values
+    from rig.config_values import FILE_NAME, default_path
     from rig.config_words import blank_file
 
     path = settings.config or default_path() or Path(FILE_NAME)

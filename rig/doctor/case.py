@@ -8,7 +8,8 @@ from shlex import quote
 from typing import Any
 
 from rig.bench import bench_kind
-from rig.config import RigConfig, validate
+from rig.config import RigConfig
+from rig.config_values import validate
 from rig.errors import BenchBusy
 from rig.host import Host, Hosted, LinuxHost
 from rig.state import Holder, holder

@@ -5,7 +5,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from rig.config import RigConfig, validate
+from rig.config import RigConfig
+from rig.config_values import validate
 from rig.facts.fact import Fact
 
 

@@ -21,7 +21,8 @@ import hbr
 from hbr.descriptors import descriptor
 from rig.bench import Bench
 from rig.catalog import images
-from rig.config import RigConfig, validate
+from rig.config import RigConfig
+from rig.config_values import validate
 from rig.errors import RigError, UsageError
 from rig.files import write
 from rig.plans.events import Accepted, Event, Started, event_dict

@@ -21,7 +21,7 @@ from rig.catalog import Catalog
 from rig.cli.command import Settings
 from rig.cli.present import Progress, line
 from rig.clock import SystemClock, seconds_between
-from rig.config import validate
+from rig.config_values import validate
 from rig.errors import UsageError
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted

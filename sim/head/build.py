@@ -10,7 +10,7 @@ from pathlib import Path
 
 import platformdirs
 
-from rig.config import APP
+from rig.config_values import APP
 from rig.errors import ConfigError
 
 HERE = Path(__file__).resolve().parent

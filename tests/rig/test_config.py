@@ -1,5 +1,7 @@
 """The configuration: every mistake at once, each with its key."""
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -69,8 +71,11 @@ def test_a_setting_without_key_or_value_is_a_configuration_error(text):
 
 def test_a_catalog_path_is_relative_to_its_file_and_benches_do_not_share_by_default(tmp_path):
     file = tmp_path / "rig.toml"
-    file.write_text('[catalog]\npath = "data/objects"\n', encoding="utf-8")
+    text = 'state_dir = "kept"\ncalibration_dir = "/facts"\n[catalog]\npath = "data/objects"\n'
+    file.write_text(text, encoding="utf-8")
     assert load_config(file).catalog_path("hardware") == tmp_path / "data" / "objects"
+    assert load_config(file).state_path("hardware") == tmp_path / "kept" / "hardware"
+    assert load_config(file).calibration_path("hardware") == Path("/facts/hardware")
     assert RigConfig().catalog_path("sim") != RigConfig().catalog_path("hardware")
 
 
