@@ -28,6 +28,8 @@ TOLERANCE_DEG = 0.5
 UPDATE = "docs/faults.md is not what is: look at the difference, then python tests/faults/document.py"
 VIEWS_AGAIN = 12
 """Of an object that is enrolled anew."""
+SHORT = 8
+"""Views where the rest of the turn would prove nothing more."""
 
 
 def test_there_is_a_scenario_and_a_row_of_the_page_for_every_fault() -> None:
@@ -106,3 +108,28 @@ def test_an_identification_names_the_object_or_is_stopped(tmp_path: Path, name: 
             assert identified.name == (NAME if scenario.answer == FOUND else None)
         assert rig.torque == (scenario.torque and outcome.error is not None)
         check_stands(rig)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "camera.off@view3+1s",
+        "camera.stuck@view3+0.1s",
+        "black_frame@view3+0.7s",
+        "exposure_jump@view3+0.05s",
+        "babble:period=0.001@move3+2s",
+        "crc_flip:rate=0.3@move3+0.5s",
+        "i2c_nack:rate=0.3@move3+0.1s",
+        "overheat:celsius=60@move3+1s",
+        "light_flicker:depth=0.5@move3+5s",
+        "slip:angle=0.2@move3",
+    ],
+)
+def test_what_passes_in_time_ends_nothing(tmp_path: Path, fault: str) -> None:
+    """Waited for, taken again, or repeated: the enrollment is complete, at the right angles."""
+    with new_rig(tmp_path) as rig:
+        outcome = enrollment(rig, fault, views=SHORT)
+        assert outcome.error is None
+        assert rig.faults.history, "the fault did not happen"
+        check_stored(rig, set(range(SHORT)), tolerance_deg=TOLERANCE_DEG, planned=SHORT)
+        assert not rig.torque
