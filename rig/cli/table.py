@@ -95,7 +95,7 @@ def status(settings: Settings) -> None:
             "doubt": safety.doubt or None,
             "table_deg": None if safety.doubt else safety.reference.to_table(state.position_deg),
             "limits_deg": list(config.limits_deg),
-            "servo": {**plain(bench.servo.identity), **plain(state)},
+            "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.line)},
             "imu": {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()},
             "camera": {**plain(bench.camera.identity), "locks": plain(bench.camera.read_locks())},
             "findings": list(bench.findings),
