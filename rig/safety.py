@@ -20,7 +20,7 @@ from types import MappingProxyType
 
 from rig.clock import Clock
 from rig.config import RigConfig
-from rig.devices.servo import Servo
+from rig.devices.servo import Servo, ServoState
 from rig.errors import (
     DeviceFault,
     DeviceSilent,
@@ -206,6 +206,8 @@ class Safety:
             A fault waits to be acknowledged.
         Unreferenced
             How far the cable is wound up is in doubt.
+        DeviceFault, Overheated, SupplyOutOfRange
+            The servo must not work as it is; latched.
         MotionStopped
             Somebody has asked for a stop.
         DeviceMismatch, DeviceSilent
@@ -224,12 +226,24 @@ class Safety:
             self._go(Happening.CONNECT if self._state is State.DISCONNECTED else Happening.RECHECK)
             self._judge()
         self.require_ready()
-        self._save(table=self._table(self._servo.read_state().position_deg))
+        state = self._servo.read_state()
+        self.refuse_unfit(state)
+        self._save(table=self._table(state.position_deg))
+
+    def refuse_unfit(self, state: ServoState) -> None:
+        """Latch, and raise, what a reading at rest shows: a hardware error, heat, a supply out of range."""
+        if cause := unfit(state, self._config.safety, self._servo.limits):
+            self.latch(cause)
+            raise cause
 
     def require_ready(self) -> None:
-        """Raise `FaultLatched`, `Unreferenced` or another `NotReady` unless the table may move."""
+        """Raise `FaultLatched`, `Unreferenced` or another `NotReady` unless the table may move.
+
+        Also what a device that guards the bench has stopped it for meanwhile; that is latched.
+        """
         if self._state is not State.READY:
             raise self._refusal()
+        self._look_around()
 
     @contextmanager
     def motion(self, ends_deg: tuple[float, ...], stop: Callable[[], bool]) -> Iterator[Motion]:
@@ -281,13 +295,7 @@ class Safety:
         """
         if self._store.stop_requested():
             raise _stopped()
-        for watch in self.watches:
-            try:
-                watch()
-            except LATCHING as fault:
-                if self._state is not State.MOVING:  # a motion latches what breaks it off
-                    self.latch(fault)
-                raise
+        self._look_around()
 
     def released(self) -> None:
         """Take note that the torque is off: where the table rests is kept, and a stop that was asked for is done."""
@@ -379,6 +387,16 @@ class Safety:
         self.declare(self.reference.with_turns(self._servo.read_state().position_deg, turns))
 
     # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _look_around(self) -> None:
+        """Ask the devices that guard the bench; what they have stopped it for is latched."""
+        for watch in self.watches:
+            try:
+                watch()
+            except LATCHING as fault:
+                if self._state is not State.MOVING:  # a motion latches what breaks it off
+                    self.latch(fault)
+                raise
 
     def _guarded_cause(self, symptom: BaseException) -> BaseException:
         """Return why a device that guards the bench has stopped it, if it has: the servo then merely falls silent."""

@@ -228,7 +228,10 @@ class Turntable(AbstractContextManager["Turntable"]):
         The rate is looked at from ``since_ns`` on, but never for less than ``table.quiet_s``; the angles of shaft and
         platter are compared with those of the rest, however long ago.
         """
-        change = abs(self.angle_deg() - self._rest_deg)
+        self._safety.heed_stop()
+        state = self._servo.read_state()
+        self._safety.refuse_unfit(state)
+        change = abs(self._safety.reference.to_table(state.position_deg) - self._rest_deg)
         now_ns = self._clock.now_ns()
         window_s = max(self._config.quiet_s, seconds_between(now_ns if since_ns is None else since_ns, now_ns))
         peak = self._heading.peak_dps(window_s)

@@ -10,6 +10,7 @@ from rig.devices.servo import ServoLimits, ServoState
 from rig.errors import (
     DeviceFault,
     FollowingError,
+    MotionStopped,
     NoProgress,
     Overheated,
     Overloaded,
@@ -97,8 +98,11 @@ def test_a_servo_whose_torque_is_gone_makes_no_progress():
 def test_heat_at_rest_is_found_before_anything_moves_and_is_forgiven_when_it_has_cooled_down():
     with motion_bench() as (bench, wires):
         wires.device.set_temperature(70.0)
+        driven = []
+        wires.bus.taps.append(lambda _: driven.append(wires.device.memory["Torque Enable"]))
         with pytest.raises(Overheated) as caught, Turntable(bench):
             pytest.fail("it moves")
+        assert not any(driven)
         assert "below 62 °C" in caught.value.next_step
         assert bench.safety.state is State.FAULT
         wires.device.set_temperature(65.0)  # not too hot any more, but not cool either
@@ -106,6 +110,21 @@ def test_heat_at_rest_is_found_before_anything_moves_and_is_forgiven_when_it_has
             bench.safety.acknowledge()
         wires.device.set_temperature(50.0)
         assert bench.safety.acknowledge() is State.READY
+
+
+def test_heat_and_a_request_to_stop_are_heeded_between_two_motions_too():
+    with motion_bench() as (bench, wires):
+        with pytest.raises(MotionStopped), Turntable(bench) as table:
+            table.goto(20.0)
+            bench.state.stop = True
+            table.check_still()
+        assert wires.device.memory["Torque Enable"] == 0
+        with pytest.raises(Overheated), Turntable(bench) as table:
+            table.goto(40.0)
+            wires.device.set_temperature(70.0)
+            table.check_still()
+        assert bench.safety.state is State.FAULT
+        assert wires.device.memory["Torque Enable"] == 0
 
 
 @pytest.mark.parametrize("volts", [6.1, 13.95])
