@@ -1,0 +1,128 @@
+"""Stated error rates, kept; and nothing promised of too little data."""
+
+from math import inf
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hbr import DenseIndex, Views, believe
+from hbr.deciding import Rules, certainty_for, conformal_threshold, judge, rehearse, rules
+
+BETA = 60.0
+
+
+def catalog(objects: int = 8, noise: float = 0.15, seed: int = 0) -> Views:
+    rng = np.random.default_rng(seed)
+    azimuth = np.arange(0, 360, 20, dtype=float)
+    parts = []
+    for j in range(objects):
+        used = rng.random(144) < 0.2
+        swing = rng.uniform(0, 2, 144)
+        turn = np.radians(azimuth)[:, None] + rng.uniform(0, 7, 144)
+        levels = (rng.uniform(1, 6, 144) + swing * np.sin(turn)) * used
+        levels = levels + (rng.random(levels.shape) < noise) * rng.integers(-1, 2, levels.shape)
+        parts.append(Views.of_object(f"object {j}", np.rint(np.clip(levels, 0, 7)).astype(np.uint8), azimuth))
+    return Views.concatenate(parts)
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.sampled_from([0.01, 0.02, 0.05, 0.2]), st.integers(120, 400))
+def test_a_conformal_threshold_rejects_the_stated_share_on_average(seed: int, share: float, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    rejected = []
+    for _ in range(300):
+        scores = rng.beta(9, 2, count + 1) ** 2
+        rejected.append(scores[0] < conformal_threshold(scores[1:], share))
+    assert np.mean(rejected) <= share + 4 * np.sqrt(share * (1 - share) / 300)
+    exact = np.floor(share * (count + 1) + 1e-9) / (count + 1)
+    assert abs(np.mean(rejected) - exact) <= 4 * np.sqrt(share * (1 - share) / 300) + 1 / count
+
+
+def test_too_few_scores_reject_nothing() -> None:
+    assert conformal_threshold(np.linspace(0, 1, 48), 0.02) == -inf
+    assert conformal_threshold(np.linspace(0, 1, 49), 0.02) == 0.0
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        conformal_threshold([1.0], 0.0)
+    with pytest.raises(ValueError, match="not finite"):
+        conformal_threshold([np.nan], 0.1)
+
+
+def test_certainty_is_the_least_that_keeps_the_error_rate() -> None:
+    rng = np.random.default_rng(0)
+    posterior = rng.uniform(0.3, 1, (2000, 1))
+    correct = rng.random((2000, 1)) < posterior  # as probable as it says
+    certainty = certainty_for(posterior, correct, 0.05)
+    stops = posterior >= certainty
+    assert (~correct[stops]).mean() <= 0.05
+    assert 0.85 < certainty < 0.95  # the mean above it is 0.95
+    assert certainty_for(posterior[:15], np.ones((15, 1), bool), 0.05) == inf
+    assert certainty_for(posterior[:40], np.ones((40, 1), bool), 0.05) < 1
+
+
+def test_a_rehearsal_looks_for_each_object_without_the_views_it_is_looked_for_by() -> None:
+    views = catalog()
+    rehearsal = rehearse(DenseIndex(views), beta=BETA, views=3, searches=2)
+    assert rehearsal.known.shape == rehearsal.stranger.shape == (16, 3)
+    assert (rehearsal.known < 1).all()
+    assert (rehearsal.stranger <= rehearsal.known).all()
+    assert rehearsal.correct.mean() == 1
+    # the first search once more
+    rows = views.of(0)
+    belief = believe(views.descriptors[rows[0]], 0.0, DenseIndex(views).without(rows[[0, 4, 9]]))
+    assert belief.scores().max() == pytest.approx(rehearsal.known[0, 0], abs=0.01)
+
+
+def test_rules_of_a_catalog_find_its_objects_and_not_others() -> None:
+    everything = catalog(40, seed=3)
+    enrolled = everything.object_index < 30
+    index = DenseIndex(everything.select(enrolled))
+    made = rules(rehearse(index, beta=BETA), error_rate=0.05, false_reject=0.05)
+    assert made.promises == ()
+    assert made.false_accept < 0.1
+    kinds = []
+    for j in range(40):
+        rows = everything.of(j)
+        belief = None
+        for i in rows[[2, 7, 11, 16]]:
+            belief = believe(everything.descriptors[i], float(everything.azimuth_deg[i]), index, before=belief)
+            verdict = judge(belief, made, max_views=4)
+            if verdict.kind != "look":
+                break
+        kinds.append((verdict.kind, verdict.object_index == j))
+        assert verdict.words.startswith(f"object {verdict.object_index} with a probability of")
+    assert [kind for kind, _ in kinds[:30]].count("found") >= 28
+    assert all(right for kind, right in kinds[:30] if kind == "found")
+    assert [kind for kind, _ in kinds[30:]].count("unknown") >= 9
+
+
+def test_a_small_catalog_promises_nothing_and_says_how_much_it_takes() -> None:
+    made = rules(rehearse(DenseIndex(catalog(2)), beta=BETA), error_rate=0.01, false_reject=0.02)
+    assert made.familiar == (-inf,) * 4
+    assert made.certainty == inf
+    assert "49 are needed" in made.promises[0]
+    assert "no search ends early" in made.promises[1]
+    belief = believe(catalog(2).descriptors[0], 0.0, DenseIndex(catalog(2)))
+    assert judge(belief, made, max_views=4).kind == "look"
+    assert judge(belief, made, max_views=1).kind == "found"
+
+
+def test_a_score_that_no_enrolled_object_has_ends_as_unknown_and_never_early() -> None:
+    by = Rules(BETA, 0.9, (0.99, 0.99), 0.01, 0.02, 0.0, 100)
+    index = DenseIndex(catalog(4))
+    stranger = catalog(1, seed=99).descriptors[0]
+    belief = believe(stranger, 0.0, index)
+    assert judge(belief, by, max_views=2).kind == "look"
+    verdict = judge(believe(stranger, 90.0, index, before=belief), by, max_views=2)
+    assert verdict.kind == "unknown"
+    assert "none of those enrolled" in verdict.words
+
+
+def test_what_cannot_be_rehearsed_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least two"):
+        rehearse(DenseIndex(catalog(1)), beta=BETA)
+    with pytest.raises(ValueError, match="more than 18 views"):
+        rehearse(DenseIndex(catalog(2)), beta=BETA, views=18)
+    with pytest.raises(ValueError, match="seen has shape"):
+        rehearse(DenseIndex(catalog(2)), beta=BETA, seen=np.zeros((3, 144), np.uint8))
