@@ -1,56 +1,131 @@
-"""What 100 objects of 72 views take on disk: their descriptors and angles alone, and in a catalog's database."""
+"""Catalogs: what they take on disk, how long a large one takes to answer, how fast photographs come in."""
 
+import argparse
+import json
+import os
+import shlex
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
-from hbr import Views, pack
-from rig.catalog import Catalog, Provenance, ViewRecord
-from rig.clock import SystemClock
+from benchmarks.large_catalog import build
+from hbr import describe, pack
+from rig.catalog import Catalog
+from rig.catalog.exchange import bring_in, plan_import, read_folder
+from rig.clock import SystemClock, seconds_between
 
-#: Objects that are really stored, each image synced to the disk; the database grows in proportion.
-STORED_OBJECTS = 3
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+COIL = Path(os.environ.get("RIG_TEST_DATA", "../shared/data")) / "coil-100"
+_CLOCK = SystemClock()
 
 
 def main() -> None:
-    views = model(100)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--objects", type=int, default=1_000, help="of the large catalog")
+    parser.add_argument("--photographs", type=Path, default=COIL, help="folder in COIL's layout to import")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "models.npz"
-        np.savez(
-            path,
-            packed=np.frombuffer(b"".join(map(pack, views.descriptors)), np.uint8).reshape(-1, 54),
-            azimuth_deg=views.azimuth_deg.astype(np.float32),
-            object_index=views.object_index.astype(np.uint16),
-        )
-        print(f"{'100 x 72 views on disk':<60} {'MB':>6} {'bytes a view':>13}")
-        row("packed descriptors, angles and objects (the paper: 1.5)", path.stat().st_size / len(views))
-        before, after = (
-            database_bytes(Path(folder) / f"catalog-{count}", views, count) for count in (0, STORED_OBJECTS)
-        )
-        row("catalog.sqlite with all records, by proportion", (after - before) / (STORED_OBJECTS * VIEWS_OF_AN_OBJECT))
+        sizes(Path(folder))
+        answers(Path(folder), options.objects)
+        if options.photographs.is_dir():
+            imports(Path(folder), options.photographs)
+        else:
+            print(f"no photographs at {options.photographs}: import not measured")
 
 
-def row(name: str, bytes_a_view: float) -> None:
-    print(f"{name:<60} {bytes_a_view * 100 * VIEWS_OF_AN_OBJECT / 1e6:6.2f} {bytes_a_view:13.1f}")
+def sizes(folder: Path) -> None:
+    """What the paper's 100 objects take without the records."""
+    views = model(100)
+    path = folder / "models.npz"
+    np.savez(
+        path,
+        packed=np.frombuffer(b"".join(map(pack, views.descriptors)), np.uint8).reshape(-1, 54),
+        azimuth_deg=views.azimuth_deg.astype(np.float32),
+        object_index=views.object_index.astype(np.uint16),
+    )
+    print(f"{'on disk':<64} {'MB':>7} {'bytes a view':>13}")
+    size_row("100 objects: packed descriptors and angles (the paper: 1.5 MB)", path.stat().st_size, len(views))
 
 
-def database_bytes(folder: Path, views: Views, objects: int) -> int:
-    """Size of the database of a catalog with the first objects, closed."""
-    with Catalog.open(folder, clock=SystemClock()) as catalog:
-        for j in range(objects):
-            planned = views.azimuth_deg[views.of(j)].tolist()
-            enrollment = catalog.begin(
-                views.object_names[j], planned_azimuth_deg=planned, provenance=Provenance("bench", {}, {})
-            )
-            for i, azimuth_deg in enumerate(planned):
-                descriptor = views.descriptors[views.of(j)[i]]
-                enrollment.add(
-                    ViewRecord(i, -azimuth_deg, -azimuth_deg, azimuth_deg, descriptor, 0), np.zeros((8, 8, 3), np.uint8)
-                )
-            enrollment.finish()
-    return sum(path.stat().st_size for path in folder.glob("catalog.sqlite*"))
+def answers(folder: Path, objects: int) -> None:
+    """The real commands on a large catalog, each in a process of its own."""
+    home = folder / "large"
+    home.mkdir()
+    views = build(home / "catalog", objects)
+    (home / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
+    database = sum(path.stat().st_size for path in (home / "catalog").glob("catalog.sqlite*"))
+    size_row(f"{objects} objects: catalog.sqlite with all records", database, len(views))
+    print(f"\n{f'{objects} objects of {VIEWS_OF_AN_OBJECT} views, from the command to':<64} {'wall s':>7} {'CPU s':>6}")
+    name = views.object_names[objects // 2]
+    for words, until in (
+        ("catalog list", "the end"),
+        (f"catalog show {shlex.quote(name)}", "the end"),
+        ("catalog stats", "the end"),
+        ("identify --json --max-views 2", "the first ranking"),
+    ):
+        runs = sorted(run(home, shlex.split(words), first_ranking="first" in until) for _ in range(3))
+        wall, cpu = runs[1]
+        print(f"rig {words}, {until}".ljust(64) + f" {wall:7.2f} {cpu:6.2f}")
+
+
+def run(home: Path, words: list[str], *, first_ranking: bool) -> tuple[float, float]:
+    """Wall and CPU seconds of a command; the wall's clock stops at the first ranking where that is wanted."""
+    before_s = cpu_s()
+    begin_ns = _CLOCK.now_ns()
+    with subprocess.Popen([*RIG, *words], cwd=home, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        stop_ns = None
+        for line in process.stdout:
+            if first_ranking and stop_ns is None and json.loads(line).get("event") == "ranked":
+                stop_ns = _CLOCK.now_ns()
+    return seconds_between(begin_ns, stop_ns or _CLOCK.now_ns()), cpu_s() - before_s
+
+
+def cpu_s() -> float:
+    """CPU seconds of this process and of those that it has seen end."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
+
+
+def imports(folder: Path, photographs: Path) -> None:
+    """Import everything, between two halves of the bare loop: whatever else the computer does falls on both."""
+    files = sorted(photographs.glob("*.png"))
+    half = len(files) // 2
+    bare_s, bare_cpu_s = bare_loop(files[:half])
+    begin_ns, before_s = _CLOCK.now_ns(), cpu_s()
+    with Catalog.open(folder / "coil", clock=_CLOCK) as catalog:
+        package = read_folder(photographs, now=_CLOCK.utc())
+        for _ in bring_in(catalog, plan_import(catalog, package)):
+            pass
+    import_s, import_cpu_s = seconds_between(begin_ns, _CLOCK.now_ns()), cpu_s() - before_s
+    rest_s, rest_cpu_s = bare_loop(files[half:])
+    bare_s, bare_cpu_s = bare_s + rest_s, bare_cpu_s + rest_cpu_s
+    bare, whole = len(files) / bare_s, package.views / import_s
+    print(f"\n{'photographs into a catalog':<64} {'wall s':>7} {'CPU s':>6} {'images/s':>9} {'ratio':>6}")
+    print(f"{'decode and CEDD alone, one process':<64} {bare_s:7.1f} {bare_cpu_s:6.1f} {bare:9.0f} {1:6.2f}")
+    label = f"import of {package.views}, {len(package.gaps)} gaps, durable, {os.cpu_count()} processes"
+    print(f"{label:<64} {import_s:7.1f} {import_cpu_s:6.1f} {whole:9.0f} {whole / bare:6.2f}")
+
+
+def bare_loop(files: list[Path]) -> tuple[float, float]:
+    """Wall and CPU seconds to decode and describe the files, one after the other."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    begin_ns, before_s = _CLOCK.now_ns(), cpu_s()
+    for file in files:
+        describe(np.asarray(cv2.imread(str(file)), np.uint8))
+    took = seconds_between(begin_ns, _CLOCK.now_ns()), cpu_s() - before_s
+    cv2.setNumThreads(threads)
+    return took
+
+
+def size_row(name: str, size: float, views: int) -> None:
+    print(f"{name:<64} {size / 1e6:7.2f} {size / views:13.1f}")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,116 @@
+"""A catalog of 1,000 objects of 72 views, as large as a bench would make it but for its images, which are tiny.
+
+python -m benchmarks.large_catalog FOLDER [OBJECTS]
+"""
+
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
+from hbr import Views, pack
+from rig.catalog import Catalog, EnrollmentStatus, images
+from rig.catalog.exchange import Package, bring_in, plan_import
+from rig.catalog.exchange.package import Enrollment, ImageSource, Levels, Object, Sitting, View
+from rig.clock import SystemClock
+
+OBJECTS = 1_000
+_NOW = datetime(2026, 1, 1, tzinfo=UTC)
+#: What a bench keeps with a view, in the same keys.
+_EVIDENCE: dict[str, Any] = {
+    "settled_ns": 5916728816,
+    "exposed_ns": 5933333000,
+    "sharpness": 33.943415745695134,
+    "mean_level": 44.277743055555554,
+    "dark_share": 0.0012,
+    "saturated_share": 0.0,
+    "repeated": False,
+    "locks": {
+        "exposure_us": 8000.0,
+        "gain": None,
+        "white_balance_k": 5000.0,
+        "auto_exposure": False,
+        "auto_white_balance": False,
+    },
+    "locks_hold": True,
+    "stillness": {
+        "peak_rate_dps": 0.2092875318066163,
+        "encoder_change_deg": 0.0,
+        "platter_change_deg": -0.00048664122137406784,
+        "still": True,
+    },
+}
+_SITTING = Sitting(
+    started_utc=_NOW,
+    bench="bench-1",
+    software="hbr-rig",
+    devices={"servo": {"model": "xl430_w250", "firmware": 46}, "camera": {"name": "camera 0", "width": 640}},
+    conditions={"view": {"roi": [80, 0, 480, 480]}},
+)
+
+
+def build(folder: Path, objects: int = OBJECTS) -> Views:
+    """Make the catalog in a new folder, and return the views in it."""
+    views = model(objects)
+    with TemporaryDirectory() as aside, Catalog.open(folder, clock=SystemClock()) as catalog:
+        tiny = Path(aside, "tiny.png")
+        tiny.write_bytes(images.encode(np.zeros((8, 8, 3), np.uint8)))
+        made = tuple(_objects(views))
+        sources = {
+            view.image: ImageSource(str(tiny)) for item in made for one in item.enrollments for view in one.views
+        }
+        for _ in bring_in(catalog, plan_import(catalog, Package("benchmark", made, sources)), jobs=1):
+            pass
+    return views
+
+
+def _objects(views: Views) -> Iterator[Object]:
+    settings = {"region": [80, 0, 480, 480]}
+    for j, name in enumerate(views.object_names):
+        rows = views.of(j)
+        azimuths_deg = views.azimuth_deg[rows].tolist()
+        yield Object(
+            name=name,
+            label=f"shelf {j % 20}",
+            created_utc=_NOW,
+            enrollments=(
+                Enrollment(
+                    status=EnrollmentStatus.COMPLETE,
+                    started_utc=_NOW,
+                    finished_utc=_NOW,
+                    planned_azimuth_deg=tuple(azimuths_deg),
+                    sittings=(_SITTING,),
+                    views=tuple(
+                        View(
+                            index=i,
+                            sitting=0,
+                            azimuth_deg=azimuths_deg[i],
+                            commanded_deg=-5.0 * i,
+                            encoder_deg=-5.0 * i + 0.03,
+                            imu_deg=-5.0 * i + 0.1,
+                            imu_sigma_deg=0.5,
+                            captured_utc=_NOW,
+                            captured_ns=i,
+                            image=f"{j}/{i}",
+                            evidence=_EVIDENCE,
+                            descriptors=(
+                                Levels(
+                                    name="cedd", version=1, settings=settings, packed=pack(views.descriptors[row]).hex()
+                                ),
+                            ),
+                        )
+                        for i, row in enumerate(rows.tolist())
+                    ),
+                ),
+            ),
+        )
+
+
+if __name__ == "__main__":
+    build(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else OBJECTS)
+    print(f"{sys.argv[1]}: {VIEWS_OF_AN_OBJECT} views an object")
