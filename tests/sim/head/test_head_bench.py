@@ -1,0 +1,158 @@
+"""A whole bench on a rig head: its gyro measures, its light lights, its relay feeds the servo, its e-stop stops."""
+
+import pytest
+
+from hbr import ViewIndex
+from hbr.angles import wrap180
+from rig.catalog import Catalog
+from rig.config import load_config
+from rig.errors import DeviceSilent, EmergencyStop, FaultLatched, ViewRejected
+from rig.plans.enroll import enroll
+from rig.plans.events import Accepted
+from rig.plans.identify import identify
+from rig.safety import State
+from rig.turntable import Turntable
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.objects.shelf import shelf
+from sim.world import World
+from tests.contract.heads import needs
+
+WIRED = ("imu.connection=head", "head.power=true", "head.light=0.8", "table.orientation=imu")
+
+
+@pytest.fixture
+def on_head(simulated):
+    """Return a function that opens a simulated bench on a head of a kind."""
+
+    def open_one(kind: str = "memory", *settings: str):
+        needs(kind)
+        return simulated(*WIRED, f"bench.sim.head={kind}", *settings, seed=4)
+
+    return open_one
+
+
+def test_enrolled_and_found_with_the_binarys_gyro_as_the_only_source_of_orientation(on_head, tmp_path):
+    s = on_head("avr")
+    truth_deg = []
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        for name in ("lamp", "mug-dots"):
+            taken = (event for event in enroll(s.bench, catalog, name, views=8) if isinstance(event, Accepted))
+            truth_deg += [(event.azimuth_deg, -s.world.table_deg()) for event in taken]
+        for azimuth_deg, true_deg in truth_deg:
+            assert abs(wrap180(azimuth_deg - true_deg)) < 4.0  # an uncalibrated gyro: 1 % of a turn
+        assert any(abs(wrap180(a + round(-a / 45) * 45)) > 0.01 for a, _ in truth_deg)  # and not the encoder's stops
+        s.operator.next_object, s.operator.yaw_deg = "mug-dots", 45.0
+        *_, answer = identify(s.bench, ViewIndex(catalog.views().views))
+    assert answer.name == "mug-dots"
+    health = s.bench.head.health()
+    assert (health["lost"], health["crc_errors"], health["missed"]) == (0, 0, 0)
+
+
+def test_the_bench_is_dark_and_unpowered_before_and_after(on_head):
+    needs("memory")
+    s = on_head()
+    assert s.operator.parts.head.relay_closed
+    assert s.world.scene.light == pytest.approx((1.0,) * 3, abs=0.01)
+    s.bench.close()
+    assert not s.operator.parts.head.relay_closed
+    assert s.world.scene.light == (0.0,) * 3
+    assert not s.operator.parts.servo.powered
+
+
+def test_an_estop_in_mid_motion_stops_the_table_and_latches(on_head):
+    s = on_head()
+    head = s.operator.parts.head
+    with pytest.raises(EmergencyStop), Turntable(s.bench) as table:
+        s.world.clock.call_at(s.world.clock.now_ns() + 1_500_000_000, lambda: setattr(head, "estop_open", True))
+        table.goto(300.0)
+    assert s.bench.safety.state is State.FAULT
+    assert "e-stop" in s.bench.safety.fault.what
+    stopped_deg = s.world.table_deg()
+    assert 1.0 < stopped_deg < 299.0
+    assert not head.relay_closed
+    with pytest.raises(FaultLatched), Turntable(s.bench):
+        pass
+    with pytest.raises(EmergencyStop):
+        s.bench.safety.acknowledge()  # still pressed
+    head.estop_open = False
+    s.world.clock.sleep(0.1)
+    assert not head.relay_closed  # released alone switches nothing on
+    s.bench.safety.acknowledge()
+    assert head.relay_closed
+    assert s.world.table_deg() == pytest.approx(stopped_deg, abs=2.0)  # nothing moved by itself
+    assert s.bench.safety.state in (State.READY, State.UNREFERENCED)
+
+
+def test_an_estop_while_the_table_rests_is_found_before_the_next_motion(on_head):
+    s = on_head()
+    with pytest.raises(EmergencyStop), Turntable(s.bench) as table:
+        table.goto(20.0)
+        s.operator.parts.head.estop_open = True
+        s.world.clock.sleep(0.2)
+        table.goto(40.0)
+    assert s.bench.safety.state is State.FAULT
+    assert s.world.table_deg() == pytest.approx(20.0, abs=1.0)
+
+
+def test_a_light_that_goes_out_spoils_no_view(on_head, tmp_path):
+    s = on_head("memory", "view.retakes=1")
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        events = enroll(s.bench, catalog, "lamp", views=8)
+        with pytest.raises(ViewRejected, match="dark"):
+            for event in events:
+                if isinstance(event, Accepted) and event.index == 2:
+                    s.bench.head.set_light(0.0)
+        assert len(catalog.views().views.azimuth_deg) in (0, 3)
+
+
+def test_a_pulled_cable_of_the_head_ends_the_plan_and_the_head_cuts_the_power(on_head, tmp_path):
+    s = on_head()
+    head = s.operator.parts.head
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        events = enroll(s.bench, catalog, "lamp", views=8)
+        with pytest.raises(DeviceSilent):
+            for event in events:
+                if isinstance(event, Accepted) and event.index == 2:
+                    head.unplugged = True
+    pulled_ns = s.world.clock.now_ns()
+    s.world.clock.sleep(0.5)
+    assert not head.relay_closed
+    assert head.pulses("relay")[-1][0] - pulled_ns < 260_000_000
+    with pytest.raises(DeviceSilent):
+        s.bench.close()
+
+
+def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
+    needs("memory")
+    world = World(seed=4)
+    operator = ShelfOperator(world, shelf())
+    config = load_config(None, WIRED)
+    first = open_sim_bench(config, operator)
+    parts, wires = operator.parts, first.wires.pop_all()
+    first.head._cancel()  # kill -9
+    world.clock.sleep(1.0)
+    assert not parts.head.relay_closed
+    with open_sim_bench(config, operator, parts=parts) as second:
+        assert second.safety.state is State.FAULT
+        with pytest.raises(FaultLatched, match="heard nothing"), Turntable(second):
+            pass
+        assert parts.head.relay_closed  # the servo can be asked how it is; it has no torque
+        second.safety.acknowledge()
+        assert second.safety.fault is None
+        assert second.head.fault is None
+    wires.close()
+
+
+def test_a_bench_whose_estop_is_pressed_says_what_to_do():
+    needs("memory")
+    world = World(seed=4)
+    operator = ShelfOperator(world, shelf())
+    config = load_config(None, WIRED)
+    with open_sim_bench(config, operator) as bench:
+        parts, wires = operator.parts, bench.wires.pop_all()
+    parts.head.estop_open = True
+    world.clock.sleep(0.1)
+    with pytest.raises(EmergencyStop) as caught:
+        open_sim_bench(config, operator, parts=parts)
+    assert "release" in caught.value.next_step
+    wires.close()
