@@ -1,22 +1,12 @@
-"""The one state machine that says whether the table may move, and what must happen before it may move again.
+"""Whether the table may move, and what must happen before it may move again.
 
-    DISCONNECTED ──connect──▶ CONNECTED ──refer──▶ READY ◀──arrive── MOVING
-         ▲                        │  ▲               │                 │
-         │ lose                 doubt│ recheck       └──────start──────▶
-     (any state)                  ▼  │                                 │ stop
-                         UNREFERENCED│                    STOPPED ◀────┘
-                                     └────────────────────────┘
-    (any state) ──latch──▶ FAULT ──acknowledge──▶ CONNECTED
-
-There is no way to set a state: each is reached by what happened, through the table of transitions alone, and a motion
-is a `with` block, which cannot be left without arriving, a stop or a latched fault. A fault outlives the process, and a
-pulled cable; it ends when a person acknowledges it and its cause is gone.
+The states and their transitions are those of `rig.machine`. A motion is a `with` block, which cannot be left without
+arriving, a stop or a latched fault. A fault outlives the process, and a pulled cable; it ends when its cause is gone
+and a person acknowledges it.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from enum import Enum, StrEnum, auto
-from types import MappingProxyType
 
 from rig.clock import Clock
 from rig.config import RigConfig
@@ -42,6 +32,8 @@ from rig.errors import (
     SupplyOutOfRange,
     Unreferenced,
 )
+from rig.machine import Happening, Machine
+from rig.machine import State as State
 from rig.reference import Reference, judge
 from rig.state import BenchState, Fault, MemoryStore, SavedTable, StateStore
 from rig.watch import unfit
@@ -61,50 +53,6 @@ LATCHING = (
     HeadRestarted,
 )
 """Errors that, when they end a motion, leave a fault: something is wrong with the bench and a person must look."""
-
-
-class State(StrEnum):
-    """Of a bench's table."""
-
-    DISCONNECTED = "disconnected"
-    CONNECTED = "connected"
-    UNREFERENCED = "unreferenced"
-    READY = "ready"
-    MOVING = "moving"
-    STOPPED = "stopped"
-    FAULT = "fault"
-
-
-class Happening(Enum):
-    """What takes the machine from one state to another."""
-
-    CONNECT = auto()
-    REFER = auto()
-    DOUBT = auto()
-    START = auto()
-    ARRIVE = auto()
-    STOP = auto()
-    RECHECK = auto()
-    LATCH = auto()
-    ACKNOWLEDGE = auto()
-    LOSE = auto()
-
-
-_S, _H = State, Happening
-_ALWAYS = {_H.LATCH: _S.FAULT, _H.LOSE: _S.DISCONNECTED}
-_JUDGED = {_H.REFER: _S.READY, _H.DOUBT: _S.UNREFERENCED}
-TRANSITIONS: Mapping[State, Mapping[Happening, State]] = MappingProxyType(
-    {
-        _S.DISCONNECTED: {**_ALWAYS, _H.CONNECT: _S.CONNECTED},
-        _S.CONNECTED: {**_ALWAYS, **_JUDGED},
-        _S.UNREFERENCED: {**_ALWAYS, **_JUDGED},
-        _S.READY: {**_ALWAYS, **_JUDGED, _H.START: _S.MOVING},
-        _S.MOVING: {**_ALWAYS, _H.ARRIVE: _S.READY, _H.STOP: _S.STOPPED},
-        _S.STOPPED: {**_ALWAYS, _H.RECHECK: _S.CONNECTED},
-        # A fault stays while the cable is pulled and put in again.
-        _S.FAULT: {_H.LATCH: _S.FAULT, _H.LOSE: _S.FAULT, _H.CONNECT: _S.FAULT, _H.ACKNOWLEDGE: _S.CONNECTED},
-    }
-)
 
 
 class Motion:
@@ -139,7 +87,7 @@ class Safety:
         self._clock = clock
         self._store: StateStore = store or MemoryStore()
         self._kept = self._store.load()
-        self._state = State.FAULT if self._kept.fault else State.DISCONNECTED
+        self._machine = Machine(faulty=self._kept.fault is not None)
         self._doubt = ""
         self._findings: list[str] = []
         self.reference = Reference(
@@ -156,7 +104,7 @@ class Safety:
 
     @property
     def state(self) -> State:
-        return self._state
+        return self._machine.state
 
     @property
     def fault(self) -> Fault | None:
@@ -195,7 +143,7 @@ class Safety:
             self._findings.append(f"the servo reports: {', '.join(condition.hardware_errors)}")
         self._go(Happening.CONNECT)
         self._judge()
-        return self._state
+        return self.state
 
     def prepare(self) -> None:
         """Make sure that the table may move now; before torque comes on.
@@ -216,14 +164,14 @@ class Safety:
         if self._store.stop_requested():
             self._store.clear_stop()
             raise _stopped()
-        if self._state in (State.CONNECTED, State.UNREFERENCED, State.READY):
+        if self.state in (State.CONNECTED, State.UNREFERENCED, State.READY):
             try:
                 self._judge()
             except DeviceSilent:
                 self._go(Happening.LOSE)
-        if self._state in (State.DISCONNECTED, State.STOPPED):
+        if self.state in (State.DISCONNECTED, State.STOPPED):
             self._servo.verify()
-            self._go(Happening.CONNECT if self._state is State.DISCONNECTED else Happening.RECHECK)
+            self._go(Happening.CONNECT if self.state is State.DISCONNECTED else Happening.RECHECK)
             self._judge()
         self.require_ready()
         state = self._servo.read_state()
@@ -241,7 +189,7 @@ class Safety:
 
         Also what a device that guards the bench has stopped it for meanwhile; that is latched.
         """
-        if self._state is not State.READY:
+        if self.state is not State.READY:
             raise self._refusal()
         self._look_around()
 
@@ -263,11 +211,12 @@ class Safety:
         motion = Motion()
         path = [self.reference.to_servo(angle) for angle in ends_deg]
         self._save(table=self._table(self._servo.read_state().position_deg, (min(path), max(path))))
-        self._go(Happening.START)
         try:
+            self._go(Happening.START)
             yield motion
             if motion.position_deg is None:
                 raise MotionStopped("The motion was broken off.", next_step="Start it anew.")
+            self._go(Happening.ARRIVE)
         except BaseException as symptom:
             error = self._guarded_cause(symptom)
             heard = False
@@ -280,12 +229,11 @@ class Safety:
             finally:
                 if isinstance(error, LATCHING):
                     self.latch(error)
-                else:
+                elif self.state is State.MOVING:
                     self._go(Happening.STOP if heard else Happening.LOSE)
             if error is not symptom:
                 raise error from symptom
             raise
-        self._go(Happening.ARRIVE)
         self._save(table=self._table(motion.position_deg))
 
     def heed_stop(self) -> None:
@@ -337,7 +285,7 @@ class Safety:
         """
         for restore in self.restores:
             restore()
-        if self._state in (State.DISCONNECTED, State.STOPPED):
+        if self.state in (State.DISCONNECTED, State.STOPPED):
             self.prepare()
         if reboot:
             if self._judged():
@@ -349,11 +297,11 @@ class Safety:
             raise cause
         for check in self.checks:
             check()
-        if self._state is State.FAULT:
+        if self.state is State.FAULT:
             self._save(fault=None)
             self._go(Happening.ACKNOWLEDGE)
         self._judge()
-        return self._state
+        return self.state
 
     def declare(self, table_deg: float) -> None:
         """Take it from a person who has looked at the cable that the table now stands at ``table_deg``.
@@ -363,7 +311,7 @@ class Safety:
         NotReady
             The servo is not connected, or a fault is latched.
         """
-        if Happening.REFER not in TRANSITIONS[self._state]:
+        if not self._machine.takes(Happening.REFER):
             raise self._refusal()
         position_deg = self._servo.read_state().position_deg
         self.reference.declare(position_deg, table_deg)
@@ -394,7 +342,7 @@ class Safety:
             try:
                 watch()
             except LATCHING as fault:
-                if self._state is not State.MOVING:  # a motion latches what breaks it off
+                if self.state is not State.MOVING:  # a motion latches what breaks it off
                     self.latch(fault)
                 raise
 
@@ -411,10 +359,9 @@ class Safety:
         return symptom
 
     def _go(self, happening: Happening) -> None:
-        following = TRANSITIONS[self._state].get(happening)
-        if following is None:
+        if not self._machine.takes(happening):
             raise self._refusal()
-        self._state = following
+        self._machine.go(happening)
 
     def _judged(self) -> bool:
         """Compare what the servo says with what was written down; return whether the turns are beyond doubt."""
@@ -428,7 +375,7 @@ class Safety:
     def _judge(self) -> None:
         """Go where the comparison leads; a fault stays."""
         certain = self._judged()
-        if self._state is not State.FAULT:
+        if self.state is not State.FAULT:
             self._go(Happening.REFER if certain else Happening.DOUBT)
 
     def _refusal(self) -> NotReady:
@@ -440,7 +387,7 @@ class Safety:
                 next_step=f"{fault.next_step} Then `rig acknowledge`.",
                 evidence={"code": fault.code, **fault.evidence},
             )
-        match self._state:
+        match self.state:
             case State.UNREFERENCED:
                 return Unreferenced(
                     f"How far the table's cable is wound up is in doubt: {self._doubt}.",
@@ -454,7 +401,7 @@ class Safety:
                 )
             case _:
                 return NotReady(
-                    f"The table is {self._state}.", next_step="Open the bench, and move it in `with Turntable(bench):`."
+                    f"The table is {self.state}.", next_step="Open the bench, and move it in `with Turntable(bench):`."
                 )
 
     def _table(self, position_deg: float, path_deg: tuple[float, float] | None = None) -> SavedTable:

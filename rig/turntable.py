@@ -9,9 +9,9 @@ from typing import Self
 
 from rig.bench import Bench
 from rig.clock import seconds_between
-from rig.devices.servo import MotionProfile, ServoState
+from rig.devices.servo import MotionProfile
+from rig.diagnosis import cause_of, unsettled
 from rig.errors import (
-    DeviceFault,
     DeviceRefused,
     DeviceSilent,
     FollowingError,
@@ -21,11 +21,9 @@ from rig.errors import (
     NotReady,
     RigError,
     RotationDisagreement,
-    SupplyLost,
-    WatchdogTripped,
 )
-from rig.heading import Agreement, GyroHeading, Rotation, Stillness, compare, finite
-from rig.watch import SlipWatch, Watch, incredible, unfit
+from rig.heading import Agreement, GyroHeading, Rotation, Stillness, compare
+from rig.watch import SlipWatch, Watch, incredible
 
 QUIET_COUNTS = 3
 """Encoder counts that readings at rest may differ by: one of quantisation, the rest of its noise."""
@@ -319,7 +317,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._servo.move_to(self._safety.reference.to_servo(goal_deg))
             self._wait_for_rest(goal_deg, quiet_s, allowed_s, watch, slip)
         except (DeviceRefused, FollowingError, MotionTimeout, NoProgress) as symptom:
-            raise self._cause(symptom) from None
+            raise cause_of(symptom, self._servo, self._limits) from None
 
     def _wait_for_rest(
         self,
@@ -358,46 +356,8 @@ class Turntable(AbstractContextManager["Turntable"]):
                 return
             elapsed_s = seconds_between(start_ns, self._clock.now_ns())
             if elapsed_s > allowed_s:
-                raise self._unsettled(goal_deg, allowed_s, state, arrived=arrived)
-
-    def _unsettled(self, goal_deg: float, allowed_s: float, state: ServoState, *, arrived: bool) -> RigError:
-        """Return why the table does not come to rest: it has not arrived, it shakes, or the gyro does not tell."""
-        peak_dps = self._heading.peak_dps(self._config.quiet_s)
-        evidence = {
-            "goal_deg": round(goal_deg, 2),
-            "encoder_deg": round(self._safety.reference.to_table(state.position_deg), 2),
-            "in_position": state.in_position,
-            "moving": state.moving,
-            "peak_rate_dps": finite(peak_dps),
-            "load_percent": round(state.load_percent, 1),
-            "voltage_v": round(state.voltage_v, 1),
-        }
-        if arrived and not isfinite(peak_dps):
-            return DeviceFault(
-                f"The table has arrived at {goal_deg:.1f}°, but samples of the gyro are missing: is it at rest?",
-                next_step="Check the IMU's cable and supply.",
-                evidence=evidence,
-            )
-        if arrived and peak_dps > self._profile_dps():
-            return DeviceFault(
-                f"The table has arrived at {goal_deg:.1f}°, but the gyro tells of {peak_dps:.0f} °/s.",
-                next_step="Check the IMU: no table that stands turns like that.",
-                evidence=evidence,
-            )
-        if arrived:
-            return MotionTimeout(
-                f"The table has arrived at {goal_deg:.1f}° but does not come to rest within {allowed_s:.1f} s.",
-                next_step="Look for what shakes the bench; table.quiet_dps says how much is too much.",
-                evidence=evidence,
-            )
-        return MotionTimeout(
-            f"The table did not arrive at {goal_deg:.1f}° within {allowed_s:.1f} s.",
-            next_step="Look for what slows the table down, and for a cable at its end.",
-            evidence=evidence,
-        )
-
-    def _profile_dps(self) -> float:
-        return self._profile.velocity_dps if self._profile else self._config.velocity_dps
+                peak_dps = self._heading.peak_dps(config.quiet_s)
+                raise unsettled(goal_deg, angle_deg, allowed_s, state, arrived, peak_dps, config.velocity_dps)
 
     def _look_for_slip(self, slip: SlipWatch, time_ns: int, angle_deg: float) -> None:
         slip.note(time_ns, angle_deg)
@@ -417,28 +377,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         if quiet_s == 0 or self._heading.bias is None:
             return True
         return self._heading.peak_dps(quiet_s) <= self._config.quiet_dps
-
-    def _cause(self, symptom: RigError) -> RigError:
-        """Return why the servo does not do what it was told, where it knows; else ``symptom`` itself."""
-        try:
-            condition = self._servo.read_condition()
-        except RigError:
-            return symptom
-        if condition.watchdog_tripped:
-            return WatchdogTripped(
-                "The servo heard nothing from the computer for too long, and stopped the table by itself.",
-                next_step="Was the computer asleep, or too busy? Start again; an enrollment goes on with --resume.",
-                evidence={"watchdog_s": self._config.watchdog_s, **symptom.evidence},
-            )
-        if condition.power_lost:
-            return SupplyLost(
-                "The servo was without supply for a moment: its torque is off, and it forgot its turns.",
-                next_step="Check the supply, its plug and its cable.",
-                evidence=symptom.evidence,
-            )
-        if condition.hardware_errors:
-            return unfit(self._servo.read_state(), self._limits, self._servo.limits) or symptom
-        return symptom
 
     def _stop(self) -> bool:
         """Bring the table to a stop along its ramp; return False where the servo hears nothing: its watchdog stops it.

@@ -14,8 +14,7 @@ from rig.cli.main import app
 from rig.clock import SystemClock
 from rig.config import load_config
 from rig.errors import Stalled
-from rig.safety import Fault
-from rig.state import FileStore, holder
+from rig.state import Fault, FileStore, holder
 from rig.stop import stop
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]

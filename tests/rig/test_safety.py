@@ -24,7 +24,8 @@ from rig.errors import (
     Unreferenced,
     UsageError,
 )
-from rig.safety import LATCHING, TRANSITIONS, Happening, Safety, State
+from rig.machine import TRANSITIONS, Happening
+from rig.safety import LATCHING, Safety, State
 from rig.state import BenchState, MemoryStore
 from sim.clock import VirtualClock
 
