@@ -111,7 +111,7 @@ def rehearsal_lines(found: Sequence[Rehearsal]) -> list[str]:
         first, last = one.angles_deg[0], one.angles_deg[-1]
         lines += [
             f"  The table stands at {one.table_deg:.1f}° and "
-            + ("begins there" if abs(one.table_deg - first) < 1 else f"first turns to {first:.1f}°")
+            + _beginning(one.table_deg, first)
             + f", goes up to {last:.1f}° and back to 0°: {one.travel_deg:.0f}° of travel.",
             f"  Its cable reaches from {one.limits_deg[0]:g}° to {one.limits_deg[1]:g}°.",
             "  Table angles: " + ", ".join(f"{angle:.1f}" for angle in one.angles_deg),
@@ -121,6 +121,12 @@ def rehearsal_lines(found: Sequence[Rehearsal]) -> list[str]:
         views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
         lines.append(f"{counted(len(found), 'object')}, {counted(views, 'view')}, about {duration_words(seconds)}")
     return [*lines, "Nothing was moved or stored."]
+
+
+def _beginning(table_deg: float, first_deg: float) -> str:
+    if abs(table_deg - first_deg) < 1:
+        return "begins there"
+    return f"first {'unwinds' if abs(table_deg) - abs(first_deg) > 180 else 'turns'} to {first_deg:.1f}°"
 
 
 class Progress:

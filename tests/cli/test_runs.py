@@ -10,8 +10,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from rig.bench import ObjectStandsThere
+from rig.catalog import Catalog
+from rig.cli.identify import _Model
 from rig.cli.main import app
+from rig.clock import SystemClock
 from rig.plans.events import Insight
+from rig.presence import TableWatcher
+from sim.bench import SimBenchKind
+from sim.objects.shelf import shelf
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 SMALL = (
@@ -212,3 +219,70 @@ def test_the_shell_completes_objects_benches_and_strategies(enrolled):
     assert complete("identify", "--strategy", "s") == {"sweep"}
     assert complete("ide") == {"identify"}
     assert complete("enroll", "--config", "nonsense.toml", "l") == set()
+
+
+@pytest.fixture
+def without_hands(monkeypatch):
+    """Have the simulated bench opened as a real one is: nobody puts objects on the table; return its world."""
+    opened = []
+    really = SimBenchKind.open
+
+    def open_without(self, config, options, seed):
+        bench = really(self, config, options, seed)
+        opened.append(bench.operator.world)
+        bench.operator = ObjectStandsThere()
+        return bench
+
+    monkeypatch.setattr(SimBenchKind, "open", open_without)
+    return opened
+
+
+def test_on_a_bench_without_hands_a_person_is_asked_for_each_object(rig, without_hands, tmp_path):
+    Path("tray.csv").write_text("name,label\nlamp,\nradio,desk\nclock,\nbook-atlas,\n", encoding="utf-8")
+    done = CliRunner().invoke(
+        app, ["enroll", "--list", "tray.csv", "--views", "4", "--set", "view.min_sharpness=0"], input="\ns\nq\n"
+    )
+    assert done.exit_code == 0, done.output
+    assert "1 of 4  lamp: left out, it is enrolled already" in done.stdout
+    assert "2 of 4: put radio (desk) on the table" in done.stderr
+    assert "3 of 4: put clock on the table" in done.stderr
+    assert "3 of 4  clock: left out, as asked" in done.stdout
+    assert "4 of 4: put book-atlas on the table" in done.stderr
+    assert "1 enrolled now; 4 in the list." in done.stderr
+    names = {o["name"] for o in json.loads(rig("catalog", "list", "--json").stdout)["objects"]}
+    assert "radio" in names
+    assert not {"clock", "book-atlas"} & names
+
+
+def test_on_a_bench_without_hands_watching_goes_by_the_camera(rig, without_hands, monkeypatch):
+    class Comes(TableWatcher):
+        """The world that changes while it is waited."""
+
+        def place(self, name):
+            (world,) = without_hands
+            if self._empty is not None:
+                raise KeyboardInterrupt
+            world.clock.call_at(world.clock.now_ns() + 3 * 10**9, lambda: world.put(shelf()["lamp"], 33.0))
+            super().place(name)
+
+    monkeypatch.setattr("rig.presence.TableWatcher", Comes)
+    done = rig("identify", "--watch", "--json")
+    assert done.exit_code == 130
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [e["name"] for e in events if e["event"] == "identified"] == ["lamp"]
+    assert [e["why"] for e in events if e["event"] == "waiting"] == [
+        "the first object, on the empty table",
+        "the next object",
+    ]
+
+
+def test_what_is_enrolled_while_a_desk_watches_is_found_at_once(rig, enrolled):
+    """No retraining: the model is loaded anew when the catalog has changed, and only then."""
+    folder, _ = enrolled
+    with Catalog.open(folder / "catalog", clock=SystemClock(), read_only=True) as catalog:
+        model = _Model(catalog)
+        before = model()
+        assert model() is before
+        assert rig("enroll", "amphora", "--views", "4").exit_code == 0
+        assert "amphora" not in before.views.object_names
+        assert "amphora" in model().views.object_names

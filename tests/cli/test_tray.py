@@ -13,6 +13,8 @@ import pytest
 
 from rig.catalog import Catalog
 from rig.clock import SystemClock
+from rig.plans.replay import check
+from rig.plans.saved_run import load_run
 from sim.objects.shelf import CONFUSABLE, shelf
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
@@ -120,7 +122,8 @@ def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identifi
             for view in details.views:
                 catalog.read_image(view)  # whole, and the one that was stored
 
-    process = Process(folder, "identify", "--watch", "--seed", "3", "--set", f"bench.sim.object={json.dumps(NAMES)}")
+    things = f"bench.sim.object={json.dumps(NAMES)}"
+    process = Process(folder, "identify", "--watch", "--save-run", "runs", "--seed", "3", "--set", things)
     answers = []
     for event in process.events():
         if event["event"] == "identified":
@@ -130,3 +133,10 @@ def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identifi
     code, _ = process.end(signal.SIGINT)
     assert code == 130
     assert answers == NAMES
+
+    runs = sorted((folder / "runs").iterdir())
+    assert [path.name for path in runs[: len(NAMES)]] == [f"{number:04d}" for number in range(1, len(NAMES) + 1)]
+    for path in runs[: len(NAMES) : 12]:
+        found = check(load_run(path))
+        assert found.differences == []
+        assert found.views >= 2

@@ -397,3 +397,22 @@ def test_an_enrollment_killed_between_its_last_view_and_its_end_is_finished_by_r
     events = list(enroll(s.bench, catalog, "dice", resume=True))
     assert [type(event) for event in events] == [Started, Enrolled]
     assert catalog.object("dice").summary.views == 4
+
+
+def test_the_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, catalog):
+    s = simulated()
+    list(enroll(s.bench, catalog, "dice", views=4))
+    old_ids = set(catalog.views().view_ids.tolist())
+    assert len(old_ids) == 4
+    again = enroll(s.bench, catalog, "dice", views=5, replace=True)
+    for event in again:
+        if isinstance(event, Enrolled):
+            break
+        assert set(catalog.views().view_ids.tolist()) == old_ids
+        if isinstance(event, Accepted) and event.index == 3:
+            again.close()  # a pulled plug changes nothing about that
+    assert set(catalog.views().view_ids.tolist()) == old_ids
+    list(enroll(s.bench, catalog, "dice", resume=True))
+    new_ids = set(catalog.views().view_ids.tolist())
+    assert len(new_ids) == 5
+    assert not new_ids & old_ids
