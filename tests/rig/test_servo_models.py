@@ -93,7 +93,7 @@ AX = (
 def test_an_ax12_is_no_turntable_and_says_why() -> None:
     with pytest.raises(ConfigError, match="300°") as caught:
         servo_of(parts_of(*AX[:2]), *AX[:2])
-    assert 'mode = "pan"' in caught.value.next_step
+    assert 'In [table] set mode = "pan"' in caught.value.next_step
 
 
 @settings(max_examples=20)

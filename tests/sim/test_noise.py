@@ -32,7 +32,7 @@ def test_no_noise_is_none_at_all() -> None:
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("servo.model=ax_12a", "xl430_w250"),
+        ("servo.model=mx_106", "xl430_w250"),
         ("servo.baud=12345", "57600"),
         ("bench.sim.noise.structure_damping=1.5", "below 1"),
     ],

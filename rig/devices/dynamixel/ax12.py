@@ -29,7 +29,7 @@ class Ax12Servo(RegisterServo):
         if options.get("mode", ServoMode.TURNTABLE) is not ServoMode.PAN:
             raise ConfigError(
                 "An AX-12A cannot be a turntable: it measures its angle over 300° only, and counts no turns.",
-                next_step='Set servo.mode = "pan" and limits within 300° (zero_deg = 150, limits_deg = [-150, 150]), '
+                next_step='In [table] set mode = "pan", zero_deg = 150 and limits_deg = [-150, 150] (its 300°), '
                 "or take a servo of the X series.",
             )
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
