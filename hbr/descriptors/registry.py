@@ -19,9 +19,13 @@ _KNOWN: Final[dict[str, Descriptor]] = {
         _COLOURS,
         _EDGES,
         Joined("cedd+colours", 1, (_CEDD, _COLOURS), (0.5, 0.5)),
-        Joined("edges+colours", 1, (_EDGES, _COLOURS), (0.7, 0.3)),
+        Joined("edges+colours", 1, (_EDGES, _COLOURS), (0.6, 0.4)),
     )
 }
+
+
+#: Those that the paper's voting compares: CEDD's levels.
+PAPERS: Final = tuple(known.name for known in _KNOWN.values() if isinstance(known, Cedd))
 
 
 def descriptor(name: str) -> Descriptor:

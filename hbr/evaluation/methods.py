@@ -79,7 +79,7 @@ _LIST_SWEEP: Final = tuple(Method(f"list-{n}", f"HBR lists of {n}", list_length=
 METHODS: Final = {method.name: method for method in (*_LISTED, *_DENSE, *_OMEGA_SWEEP, *_LIST_SWEEP)}
 GROUPS: Final[dict[str, tuple[Method, ...]]] = {
     "all": _LISTED,
-    "beyond": _DENSE,
+    "beyond": _DENSE[:-1],  # the oracle tries every view, which takes its time
     "omega-sweep": _OMEGA_SWEEP,
     "list-sweep": _LIST_SWEEP,
 }

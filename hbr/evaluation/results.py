@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hbr.arrays import FloatArray
 from hbr.evaluation.methods import Method
-from hbr.evaluation.protocol import Runs
+from hbr.evaluation.protocol import CERTAINTY, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
 _BEST: int = 10
@@ -40,7 +40,10 @@ class Point:
 
 @dataclass(frozen=True)
 class Stopping:
-    """The search that ends as soon as the lead a view reaches the margin, or when all views are taken."""
+    """The search that ends as soon as the lead a view reaches the margin, or when all views are taken.
+
+    By the dense filter it ends as soon as the best object has the probability `CERTAINTY`.
+    """
 
     margin: float
     views_mean: float
@@ -100,6 +103,9 @@ QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
     ("ahbr", 4, "sweep-45", 4),
     ("ahbr-90", 4, "sweep-90", 4),
     ("ahbr-90", 4, "sweep-45", 4),
+    *(("dense", n, other, n) for n in (2, 3) for other in ("dense-90", "dense-45", "dense-coin", "dense-random")),
+    ("dense", 2, "dense-mutual", 2),
+    ("dense", 2, "dense-oracle", 2),
 )
 
 
@@ -204,10 +210,12 @@ def _point(runs: Runs, method: int, n: int) -> Point:
 
 def _stopping(runs: Runs, method: int, margin: float, min_views: int) -> Stopping:
     looked = _looked(runs, method)
-    lead, rank, travelled_deg = (
-        part[method][..., looked].reshape(-1, len(looked)) for part in (runs.lead, runs.rank, runs.travelled_deg)
+    lead, posterior, rank, travelled_deg = (
+        part[method][..., looked].reshape(-1, len(looked))
+        for part in (runs.lead, runs.posterior, runs.rank, runs.travelled_deg)
     )
-    leads = (lead >= margin) & (looked + 1 >= min_views)
+    by_filter = not np.isnan(posterior).any()
+    leads = posterior >= CERTAINTY if by_filter else (lead >= margin) & (looked + 1 >= min_views)
     stops = np.where(leads.any(axis=1), leads.argmax(axis=1), len(looked) - 1)
     trial = np.arange(len(stops))
     hits = int((rank[trial, stops] == 1).sum())

@@ -25,13 +25,34 @@ def evaluate(
         str, typer.Option(help="Noise of the queries: none, gn, gn:VARIANCE, mb, mb:PIXELS:DEGREES, gn+mb.")
     ] = "none",
     methods: Annotated[
-        str, typer.Option(help="Methods or groups (all, omega-sweep, list-sweep), separated by commas.")
-    ] = "all",
+        str | None,
+        typer.Option(
+            help="Methods or groups, separated by commas: all (the paper), beyond (the dense filter "
+            "and its baselines), omega-sweep, list-sweep. all for CEDD, beyond for other descriptors."
+        ),
+    ] = None,
+    descriptor: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="What views are described by: cedd, edges+colours, ...; see hbr.descriptors."
+        ),
+    ] = "cedd",
+    perturb: Annotated[
+        str,
+        typer.Option(help="What else differs for queries, as KIND:STRENGTH joined by +: shift:2+gain:1, all:3."),
+    ] = "none",
+    enrolled: Annotated[
+        int | None, typer.Option(min=1, metavar="VIEWS", help="Enroll so many views of each object, query the others.")
+    ] = None,
     trials: Annotated[int, typer.Option(min=1, help="Trials of each object.")] = 10,
     views: Annotated[int, typer.Option(min=1, help="Queries of a trial.")] = 8,
     removal: Annotated[
-        str, typer.Option(help="Views taken out of the model: near (closer than 10° to a query), paper79, queries.")
-    ] = "near",
+        str | None,
+        typer.Option(
+            help="Views taken out of the model: near (closer than 10° to a query), paper79, queries. near; queries "
+            "with --enrolled."
+        ),
+    ] = None,
     size: Annotated[int | None, typer.Option(min=2, metavar="PIXELS", help="Longer side of all images.")] = None,
     orientation_noise: Annotated[
         float, typer.Option(min=0, metavar="DEGREES", help="Standard deviation of each measured orientation.")
@@ -42,7 +63,9 @@ def evaluate(
     rotate: Annotated[
         float, typer.Option(min=0, max=180, metavar="DEGREES", help="Turn queries in their plane, by up to so much.")
     ] = 0.0,
-    background: Annotated[str, typer.Option(help="Behind a query's object: same, uniform, textured.")] = "same",
+    background: Annotated[
+        str, typer.Option(help="Behind a query's object: same, uniform, textured; bench, other-bench (drawn benches).")
+    ] = "same",
     prefilter: Annotated[
         float, typer.Option(min=0, metavar="PIXELS", help="Blur all images by a Gaussian of this standard deviation.")
     ] = 0.0,
@@ -60,9 +83,11 @@ def evaluate(
 
     Example: rig eval coil-100 --noise mb --methods all --trials 10
     """
+    from hbr.descriptors import PAPERS
     from hbr.evaluation.condition import Condition
     from hbr.evaluation.methods import choose_methods
     from hbr.evaluation.noise import Noise
+    from hbr.evaluation.perturb import Perturbations
     from hbr.evaluation.protocol import Protocol
     from rig.cli.present import Progress
     from rig.errors import UsageError
@@ -76,9 +101,26 @@ def evaluate(
     try:
         plan = Plan.of(
             _dataset(settings, folder, objects),
-            Condition(size, Noise.parse(noise), rotate, background, prefilter),  # type: ignore[arg-type]
-            choose_methods(methods.split(",")),
-            Protocol(trials, views, removal, 10.0, orientation_noise, drift, settings.seed or 0),  # type: ignore[arg-type]
+            Condition(
+                size,
+                Noise.parse(noise),
+                rotate,
+                background,  # type: ignore[arg-type]
+                prefilter,
+                Perturbations.parse(perturb),
+                descriptor,
+            ),
+            choose_methods((methods or ("all" if descriptor in PAPERS else "beyond")).split(",")),
+            Protocol(
+                trials,
+                views,
+                removal or ("queries" if enrolled else "near"),  # type: ignore[arg-type]
+                10.0,
+                orientation_noise,
+                drift,
+                settings.seed or 0,
+                enrolled,
+            ),
         )
         dataset = plan.dataset
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"

@@ -28,11 +28,18 @@ _LOOKS: Final = {
     "coin": ("#cc79a7", False),
     "sweep-45": ("#1d2126", False),
     "sweep-90": ("#1d2126", True),
+    "dense": ("#6a3d9a", False),
+    "dense-coin": ("#cc79a7", False),
+    "dense-random": ("#0072b2", False),
+    "dense-45": ("#1d2126", False),
+    "dense-90": ("#1d2126", True),
+    "dense-mutual": ("#009e73", False),
+    "dense-oracle": ("#b08900", True),
 }
 _OTHERS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#1d2126", "#8a8f96", "#b08900")
 _BEST_10: Final = ("#b08900", False)
 #: More bands than these hide each other; the tables have all intervals.
-_BANDS: Final = ("hbr", "ahbr")
+_BANDS: Final = ("hbr", "ahbr", "dense")
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ class _Series:
 def figures(results: dict[str, Any]) -> dict[str, Figure]:
     """Return the figures that the results allow, by the name of their file."""
     drawn = {"hit-rate": hit_rate_figure(results), "travel": travel_figure(results)}
-    methods = [m for m in results["methods"] if m["name"] in ("hbr", "ahbr")] or results["methods"][:2]
+    methods = [m for m in results["methods"] if m["name"] in ("hbr", "ahbr", "dense")] or results["methods"][:2]
     drawn["pose"] = pose_figure(results, methods)
     for prefix, title, words in (
         ("omega-", "weight of the orientation, ω", "ω-sweep"),
@@ -151,6 +158,12 @@ def _title(results: dict[str, Any]) -> str:
         words.append(f"{condition['background']} background")
     if condition["rotation_deg"]:
         words.append(f"turned by up to {condition['rotation_deg']:g}°")
+    if condition["perturbations"] != "none":
+        words.append(condition["perturbations"])
+    if protocol["enrolled"]:
+        words.append(f"{protocol['enrolled']} views enrolled")
+    if condition["descriptor"] != "cedd":
+        words.append(condition["descriptor"])
     if condition["prefilter_px"]:
         words.append(f"prefilter {condition['prefilter_px']:g} px")
     return "; ".join(words)

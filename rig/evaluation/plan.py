@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any, Final
 
+from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, Photograph, PhotographedObject, read_photograph
 from hbr.evaluation.methods import Method
@@ -11,7 +12,7 @@ from hbr.evaluation.protocol import Protocol
 from rig.catalog import Catalog
 
 #: Changes when the same settings would give other numbers.
-FORMAT: Final = 1
+FORMAT: Final = 2
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,9 @@ class Plan:
                 "rotation_deg": condition.rotation_deg,
                 "background": condition.background,
                 "prefilter_px": condition.prefilter_px,
+                "perturbations": str(condition.perturbations),
+                "descriptor": condition.descriptor,
+                "descriptor_version": descriptor(condition.descriptor).version,
             },
             "protocol": asdict(self.protocol),
             "methods": [asdict(method) for method in self.methods],

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
+from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Runs
 from hbr.evaluation.results import Contest, contests, method_results, pose_rmse_by_object, step_median_ms
-from hbr.packing import PACKED_BYTES
 from rig.evaluation.plan import Plan
 
 
@@ -31,7 +31,7 @@ def evaluate(plan: Plan, runs: Runs, margin: float, min_views: int) -> dict[str,
     rng = generator(plan.protocol.seed, plan.dataset.name, "bootstrap", 0)
     return {
         "settings": plan.settings(),
-        "bytes_per_view": PACKED_BYTES,
+        "bytes_per_view": descriptor(plan.condition.descriptor).size_bytes,
         "methods": [
             {
                 "name": result.method.name,

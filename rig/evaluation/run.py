@@ -27,7 +27,10 @@ def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Vie
         levels[j] = found
         advance(objects[j].name)
     return Views.concatenate(
-        [Views.of_object(item.name, levels[j], item.azimuth_deg) for j, item in enumerate(objects)]
+        [
+            Views.of_object(item.name, levels[j], item.azimuth_deg, plan.condition.descriptor)
+            for j, item in enumerate(objects)
+        ]
     )
 
 

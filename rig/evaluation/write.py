@@ -8,7 +8,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from hbr.evaluation.protocol import Runs
+from hbr.evaluation.protocol import CERTAINTY, Runs
 from rig.errors import UsageError
 from rig.evaluation.drawing import Figure
 from rig.evaluation.figures import figures
@@ -85,7 +85,8 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Figure]) -> str:
             ("Hit-rates", "Percent, with Wilson's 95 % interval; best 10 after all views.", *curves),
             (
                 "Decisions and poses",
-                f"A search ends when the best object leads by {stopping['margin']:g} a view, or after all views: views "
+                f"A search ends when the best object leads by {stopping['margin']:g} a view (by the dense "
+                f"filter: has a probability of {CERTAINTY:g}), or after all views: views "
                 "taken (mean, 95th percentile), hit-rate then, mean of the degrees turned. Pose error after all views, "
                 "of the trials that found the object: median and RMSE, plain, then symmetry-aware. Median time of the "
                 "last step.",

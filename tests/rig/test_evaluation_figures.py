@@ -45,8 +45,10 @@ def results(*methods: dict) -> dict:
                 "background": "uniform",
                 "rotation_deg": 20.0,
                 "prefilter_px": 1.5,
+                "perturbations": "none",
+                "descriptor": "cedd",
             },
-            "protocol": {"trials": 10},
+            "protocol": {"trials": 10, "enrolled": None},
         },
         "methods": list(methods),
     }
