@@ -276,7 +276,7 @@ static void look(struct imu *imu, struct counters *counters) {
         empty_fifo(imu);
         return;
     }
-    if (edges != imu->edges && passed(edge_us, imu->began_us)) {
+    if (edges != imu->edges && passed(edge_us, imu->began_us + 1)) {
         return; /* an edge came while we asked: whether the count knows of it cannot be told. Ask again */
     }
     if (!frames) {

@@ -250,9 +250,9 @@ class SimHead:
             arrived.append(self._coming.popleft()[1])
         return bytes(arrived)
 
-    def next_arrival_ns(self) -> int | None:
-        """Return when the next byte known of arrives; a byte is known of when its first bit leaves."""
-        return self._coming[0][0] if self._coming else None
+    def arrival_ns(self, count: int) -> int | None:
+        """Return when the ``count``-th byte, or the last, of those on the line arrives; a byte is when it has begun."""
+        return self._coming[min(count, len(self._coming)) - 1][0] if self._coming else None
 
     # -- time -------------------------------------------------------------------------------------------------------
 

@@ -49,7 +49,7 @@ class HeadSerial:
         self._collect()
         while len(self._received) < size and clock.now_ns() < deadline_ns:
             # A byte is known of when it begins to arrive: steps of a byte's length miss none.
-            arrival_ns = self._head.next_arrival_ns() or clock.now_ns() + BYTE_NS
+            arrival_ns = self._head.arrival_ns(size - len(self._received)) or clock.now_ns() + BYTE_NS
             clock.advance_to(min(arrival_ns, deadline_ns))
             self._collect()
         data = bytes(self._received[:size])

@@ -87,6 +87,10 @@ class Deframer:
                 self.frames += 1
                 yield frame
 
+    def missing(self, length: int) -> int:
+        """Return how many bytes complete the present line, at least 1, if it is ``length`` bytes long with its zero."""
+        return max(length - len(self._line), 1)
+
     def reset(self) -> None:
         """Forget a frame that has begun."""
         self._line.clear()

@@ -113,6 +113,7 @@ class HeadLink:
         self._sequence = (self._sequence + 1) % 256
         body = message.LAYOUT.pack(*astuple(message))
         line = encode(Frame(message.ID, self._sequence, body))
+        reply_bytes = protocol.REPLIES.get(type(message), Done).LAYOUT.size + HEADER + CRC + 2
         for attempt in range(attempts):
             self.statistics.retries += bool(attempt)
             self._reply = None
@@ -120,7 +121,7 @@ class HeadLink:
             self._guarded(lambda: self._wire.write(line))
             deadline_ns = self.sent_ns + round(REPLY_S * 1e9)
             while self._clock.now_ns() < deadline_ns:
-                self._take(self._guarded(lambda: self._wire.read(max(self._wire.in_waiting, 1))))
+                self._take(self._guarded(lambda: self._wire.read(self._deframer.missing(reply_bytes))))
                 answer = self._answer(message)
                 if isinstance(answer, expected):
                     return answer
