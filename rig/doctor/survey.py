@@ -1,7 +1,7 @@
 """What is connected to the computer, and how it would be written into the configuration."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -87,43 +87,54 @@ class Survey:
             yield from self._on_port(case, port)
 
     def _on_port(self, case: Case, port: SerialPort) -> Iterator[Finding | str]:
+        """Ask who is at a port, the quick questions first: AX-12A can only be asked one by one."""
         troubles = [finding for finding in access(case, "servo", port, "dialout") if finding.mend]
         if troubles:
             yield from troubles
             return
-        before = len(self.servos)
+        known_head = case.config.imu.connection == "head" and case.host.same_file(port.path, case.config.head.port)
         try:
-            with closing(case.host.open_wire(port.path, BAUD_RATES[0])) as wire:
-                for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
-                    if protocol == 1 and len(self.servos) > before and not self.both_protocols:
-                        break
-                    answered: list[Heard] = []
-                    for rate in rates:
-                        yield f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ..."
-                        answered += scan_servos(wire, case.host.clock, [rate], protocol=protocol)
-                    for heard in without_echoes(answered, case.config.servo.baud):
-                        yield from self._heard(case, port, heard)
+            servos = False if known_head else (yield from self._servos(case, port, 2, BAUD_RATES))
+            head = False if servos else (yield from self._head(case, port))
+            if not (head or known_head) and (self.both_protocols or not servos):
+                servos = (yield from self._servos(case, port, 1, BAUD_RATES_1)) or servos
         except DeviceNotFound as error:
             yield of_error("servo", error)
-            return
         except (serial.SerialException, OSError) as error:
             yield bad("servo", f"{port.path} failed: {error}", "Plug the adapter in again, then: " + case.rig("find"))
-            return
-        if len(self.servos) > before or self.doubtful:
-            return
+        else:
+            if not (servos or head or self.doubtful):
+                text = f"{port.path} ({port.name}): no servo answers at any baud rate, nor a rig head"
+                mend = "Check the servo's cable and switch on its supply, then: " + case.rig("find")
+                yield warning("servo", text, mend)
+
+    def _servos(
+        self, case: Case, port: SerialPort, protocol: int, rates: Sequence[int]
+    ) -> Generator[Finding | str, None, bool]:
+        answered: list[Heard] = []
+        with closing(case.host.open_wire(port.path, rates[0])) as wire:
+            for rate in rates:
+                yield f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ..."
+                answered += scan_servos(wire, case.host.clock, [rate], protocol=protocol)
+        for heard in without_echoes(answered, case.config.servo.baud):
+            yield from self._heard(case, port, heard)
+        return any(heard.anything for heard in answered)
+
+    def _head(self, case: Case, port: SerialPort) -> Generator[Finding | str, None, bool]:
         yield f"{port.path}: asking for a rig head ..."
         config = case.config.model_copy(update={"head": case.config.head.model_copy(update={"port": port.path})})
         try:
             with closing(open_head(config, lambda: case.host.open_wire(port.path, BAUD), case.host.clock)) as head:
                 who = head.identity
-                self.heads.append(port)
-                text = f"{port.path}: a rig head ({who.board}, firmware {who.firmware}) with {who.model}"
-                yield fine("imu", text, port=port.path)
         except DeviceNotFound:
-            text = f"{port.path} ({port.name}): no servo answers at any baud rate, in either protocol, nor a rig head"
-            yield warning("servo", text, "Check the servo's cable and switch on its supply, then: " + case.rig("find"))
+            return False
         except RigError as error:  # a head, but not as it should be
             yield of_error("imu", error)
+            return True
+        self.heads.append(port)
+        text = f"{port.path}: a rig head ({who.board}, firmware {who.firmware}) with {who.model}"
+        yield fine("imu", text, port=port.path)
+        return True
 
     def _heard(self, case: Case, port: SerialPort, heard: Heard) -> Iterator[Finding]:
         for found in heard.servos:

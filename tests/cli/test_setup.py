@@ -152,6 +152,7 @@ class Hands(io.StringIO):
 
 
 def test_an_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
+    monkeypatch.setattr("rig.doctor.survey.BAUD_RATES_1", (1_000_000,))
     parts.parts.servo_bus.detach(parts.parts.servo)  # nothing answers: the ports cannot be told apart
     parts.computer.serial_port("ttyUSB5", serial="OTHER")
     class_file = parts.computer.root / "sys/class/tty/ttyUSB5"

@@ -48,7 +48,8 @@ def test_a_second_servo_at_any_rate_forbids_it_and_nothing_is_written(place):
         assert WRITE not in bench.instructions
 
 
-def test_no_servo_an_unknown_one_and_a_bench_in_use():
+def test_no_servo_an_unknown_one_and_a_bench_in_use(monkeypatch):
+    monkeypatch.setattr("rig.doctor.lone_servo.BAUD_RATES_1", (1_000_000,))
     with unopened() as bench:
         bench.parts.servo.memory["Model Number"] = 4711
         with pytest.raises(DeviceMismatch, match="4711"), lone_servo(bench.case):
@@ -96,7 +97,8 @@ def test_a_servo_that_answers_reads_alone_can_be_renamed():
         assert bench.parts.servo.memory["ID"] == 5
 
 
-def test_an_ax_12a_is_renamed_by_its_own_protocol():
+def test_an_ax_12a_is_renamed_by_its_own_protocol(monkeypatch):
+    monkeypatch.setattr("rig.doctor.lone_servo.BAUD_RATES_1", (1_000_000, 115_200))  # each asks 253 ids
     with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(1, 1_000_000)) as bench:
         with lone_servo(bench.case) as servo:
             assert servo.found.model == "ax_12a"
