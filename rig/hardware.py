@@ -1,7 +1,7 @@
 """The bench of real devices: servo on a serial port, IMU on I2C, camera through OpenCV."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from pydantic import BaseModel
@@ -19,7 +19,7 @@ from rig.devices.imu import Imu
 from rig.devices.open_imu import open_imu
 from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
 from rig.devices.servo import Servo
-from rig.errors import ConfigError, RigError
+from rig.errors import ConfigError, RigError, StateNotKept
 from rig.state import BenchLock, FileStore, StateStore
 
 
@@ -58,10 +58,11 @@ class HardwareBench:
 
     @contextmanager
     def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:  # noqa: ARG002
-        """Open the servo alone."""
+        """Open the servo alone; to stop it, it must be reached although nothing can be written to the disk."""
         clock = SystemClock()
         with ExitStack() as wires:
-            wires.callback(BenchLock(config.state_path("hardware"), clock).close)
+            with suppress(StateNotKept):
+                wires.callback(BenchLock(config.state_path("hardware"), clock).close)
             wire = open_serial(config.servo.port, config.servo.baud)
             wires.callback(wire.close)
             yield open_servo(wire, config.servo, clock, config.table.mode)

@@ -188,7 +188,7 @@ class BenchLock:
                 break
             if attempt + 1 == LOCK_ATTEMPTS:
                 self._file.close()
-                raise _busy(path, holder(path))
+                raise busy(path, holder(path))
             clock.sleep(0.02)  # somebody may only be looking who holds it
         FileStore(path).clear_stop()  # meant for whoever held the bench before
         mine = Holder(
@@ -219,7 +219,7 @@ def holder(path: Path) -> Holder | None:
             if _try_lock(file):
                 return None
             text = file.read()
-    except FileNotFoundError:
+    except OSError:  # nobody ever held it; or who did, is not for this user to know
         return None
     try:
         return Holder.model_validate_json(text)
@@ -237,11 +237,13 @@ def _try_lock(file: TextIO) -> bool:
     return True
 
 
-def _busy(path: Path, who: Holder | None) -> BenchBusy:
+def busy(path: Path, who: Holder | None) -> BenchBusy:
+    """Return the error that the bench with the state folder ``path`` is held by ``who``."""
     name = f"process {who.pid} (`{who.command}`, since {who.since_utc})" if who and who.pid else "another process"
     return BenchBusy(
         f"The bench is in use by {name}.",
-        next_step="Wait until it is done, or end it with `rig stop` (table stopped, torque off).",
+        next_step="Wait until it is done, or end it with `rig stop` (table stopped, torque off). "
+        "Another bench on this computer needs a state_dir of its own.",
         evidence={"state": str(path)},
     )
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rig.bench import open_servo
 from rig.clock import Clock, seconds_between
 from rig.config import RigConfig
-from rig.errors import BenchBusy
+from rig.errors import BenchBusy, StateNotKept
 from rig.state import FileStore, Holder, holder
 
 HEED_S = 2.0
@@ -48,11 +48,14 @@ def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None)
     who, signalled = holder(path), False
     if who is not None:
         store = FileStore(path)
-        store.request_stop()
-        if not _wait(clock, HEED_S, lambda: not store.stop_requested() or holder(path) is None):
+        with suppress(StateNotKept):  # a full disk: the signal is left
+            store.request_stop()
+        if not store.stop_requested() or not _wait(
+            clock, HEED_S, lambda: not store.stop_requested() or holder(path) is None
+        ):
             # It is not in its control loop: asking for its next object, computing, or hanging.
             signalled = who.pid > 0 and _signal(who)
-        if not _wait(clock, END_S, lambda: holder(path) is None) and store.stop_requested():
+        if not _wait(clock, END_S, lambda: holder(path) is None) and (store.stop_requested() or signalled):
             raise _deaf(who, config)
         if holder(path) is not None:
             return Stop(who, signalled, ended=False, torque_was_on=None)

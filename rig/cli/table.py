@@ -88,12 +88,13 @@ def status(settings: Settings) -> None:
     with settings.open_bench() as bench:
         state, safety = bench.servo.read_state(), bench.safety
         config = bench.config.table
+        table_deg = None if safety.doubt else safety.reference.to_table(state.position_deg)
         report = {
             "bench": bench.name,
             "state": str(safety.state),
             "fault": safety.fault.model_dump() if safety.fault else None,
             "doubt": safety.doubt or None,
-            "table_deg": None if safety.doubt else safety.reference.to_table(state.position_deg),
+            "table_deg": table_deg,
             "limits_deg": list(config.limits_deg),
             "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.line)},
             "imu": {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()},
@@ -105,13 +106,19 @@ def status(settings: Settings) -> None:
         return
     print(f"bench    {report['bench']}")
     print(f"state    {_state_words(safety)}")
-    print(f"table    {_short(report['table_deg'])}° (limits {config.limits_deg[0]:g}°..{config.limits_deg[1]:g}°)")
+    print(f"table    {_table_words(table_deg, config.limits_deg)}")
     for device in ("servo", "imu", "camera"):
         facts = report[device]
         assert isinstance(facts, dict)
         print(f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in facts.items() if key != "time_ns"))
     for finding in bench.findings:
         print(f"note     {finding}")
+
+
+def _table_words(angle_deg: float | None, limits_deg: tuple[float, float]) -> str:
+    low, high = limits_deg
+    reach = f"the cable reaches from {low:g}° to {high:g}°, {low / 360:+.2f} to {high / 360:+.2f} turns"
+    return f"in doubt; {reach}" if angle_deg is None else f"{angle_deg:.2f}° ({angle_deg / 360:+.2f} turns); {reach}"
 
 
 def _state_words(safety: "Safety") -> str:
