@@ -10,9 +10,8 @@ from typing import Any
 from rig.bench import bench_kind
 from rig.config import RigConfig
 from rig.config_values import validate
-from rig.errors import BenchBusy
 from rig.host import Host, Hosted, LinuxHost
-from rig.state import Holder, holder
+from rig.state import Holder, busy, holder
 
 
 @dataclass
@@ -54,11 +53,7 @@ class Case:
     def require_free(self) -> None:
         """Raise `BenchBusy` while another program works with the bench."""
         if self.holder is not None:
-            raise BenchBusy(
-                f"The bench is in use by process {self.holder.pid} (`{self.holder.command}`).",
-                next_step=f"Wait until it is done, or end it with `{self.rig('stop')}`.",
-                evidence={"pid": self.holder.pid},
-            )
+            raise busy(self.config.state_path(self.bench), self.holder)
 
 
 @contextmanager
