@@ -32,7 +32,8 @@ def setup(
 ) -> None:
     """Find servo, IMU and camera, ask what cannot be found out, and write a commented rig.toml; then see a doctor.
 
-    An existing file keeps its comments and everything that was not asked about. Nothing moves; Ctrl+C leaves the file untouched.
+    An existing file keeps its comments and everything that was not asked about. Nothing moves; Ctrl+C leaves the file
+    untouched.
 
     Example: rig setup --bench sim --yes
     """
