@@ -19,7 +19,7 @@ demo: $(READY)
 	@$(BIN)/rig demo
 
 test: $(READY)
-	@$(BIN)/python -m pytest -n auto
+	@$(BIN)/python -m pytest -n auto -rs
 
 lint: $(READY)
 	@$(BIN)/ruff format --check .
