@@ -72,10 +72,11 @@ def opened_head(
     *,
     sensor: Callable[[], HeadSensor] = mpu6050,
     reopen: Callable[[SimHead], Wire] | None = None,
+    clock_error: float = CLOCK_ERROR,
     **options: float,
 ) -> Iterator[Head]:
     """Yield a driver on a simulated head with its sensor."""
-    with simulated_head(kind, noise) as (head, world):
+    with simulated_head(kind, noise, clock_error=clock_error) as (head, world):
         settings = sensor()
         device = SimMpu6050(head.world_then) if settings.name == "MPU-6050" else SimBno055(head.world_then)
         head.attach(device.address, device)
