@@ -123,11 +123,21 @@ def _judged(rig: Rig) -> Iterator[Outcome]:
         outcome.found_s = seconds_between(began_ns, rig.world.clock.now_ns())
 
 
-def enrollment(rig: Rig, *faults: str, resume: bool = False, replace: bool = False, views: int = VIEWS) -> Outcome:
+def enrollment(
+    rig: Rig,
+    *faults: str,
+    resume: bool = False,
+    replace: bool = False,
+    views: int = VIEWS,
+    at_most: int | None = None,
+) -> Outcome:
+    """Enroll; leave the plan after ``at_most`` views where that is given."""
     with _judged(rig) as outcome, rig.opened(*faults) as (bench, catalog):
-        outcome.events.extend(
-            enroll(bench, catalog, NAME, views=None if resume else views, resume=resume, replace=replace)
-        )
+        plan = enroll(bench, catalog, NAME, views=None if resume else views, resume=resume, replace=replace)
+        for event in plan:
+            outcome.events.append(event)
+            if len(outcome.stored) == at_most:
+                plan.close()
     return outcome
 
 
