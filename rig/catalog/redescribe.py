@@ -168,6 +168,6 @@ def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[tuple[b
             found.append((kind.pack(kind.describe(within(image, item.region))), ""))
         except (CatalogError, UsageError) as error:
             found.append((None, error.what))
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: the descriptor cannot describe such an image
             found.append((None, str(error)))
     return found

@@ -265,7 +265,7 @@ def _look_at(path: Path, item: _Item, quick: bool) -> _Looked:
         kind = descriptor(name)
         try:
             right = kind.pack(kind.describe(within(image, region_of(json.loads(settings)))))
-        except RigError:
+        except (RigError, ValueError):
             right = None
         if right != packed:
             different.append((name, version, right))

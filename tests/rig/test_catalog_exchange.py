@@ -78,7 +78,7 @@ def full(open_catalog: Callable[[str], Catalog]) -> Catalog:
     catalog.delete("gone")
     tin = catalog.begin("tin", planned_azimuth_deg=plan(3), provenance=PROVENANCE)
     tin.set_reference_image(image(99))
-    edges = {"edges+colours": descriptor("edges+colours").describe(image(30))}
+    edges = {"cedd-blurred": descriptor("cedd-blurred").describe(image(30))}
     tin.add(
         described(0, 30, imu_deg=0.1, imu_sigma_deg=0.5, front_end={"refused": "no object"}, further=edges), image(30)
     )

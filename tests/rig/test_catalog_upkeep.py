@@ -129,16 +129,16 @@ class TestOneByOne:
     def test_a_view_keeps_its_front_end_and_an_enrollment_the_empty_table(self, catalog: Catalog) -> None:
         enrollment = catalog.begin("mug", planned_azimuth_deg=plan(1), provenance=PROVENANCE)
         enrollment.set_reference_image(image(99))
-        edges = descriptor("edges+colours").describe(image(0))
+        edges = descriptor("cedd-blurred").describe(image(0))
         box = {"box": [1, 2, 3, 4], "gains": [1.0, 1.1, 0.9]}
-        enrollment.add(described(0, 0, (0, 0, 12, 12), front_end=box, further={"edges+colours": edges}), image(0))
+        enrollment.add(described(0, 0, (0, 0, 12, 12), front_end=box, further={"cedd-blurred": edges}), image(0))
         enrollment.finish()
         (view,) = catalog.object("mug").views
         assert (view.record.front_end, view.record.region) == (box, (0, 0, 12, 12))
         assert view.sitting.reference_image is not None
         assert (catalog.path / view.sitting.reference_image).is_file()
         assert np.array_equal(catalog.views().views.descriptors[0], hbr.describe(image(0)[:, :12]))
-        assert [kind.name for kind in statistics(catalog).descriptors] == ["cedd", "edges+colours"]
+        assert [kind.name for kind in statistics(catalog).descriptors] == ["cedd", "cedd-blurred"]
 
 
 class TestLog:

@@ -63,6 +63,7 @@ def read_folder(folder: Path, *, pattern: str = DEFAULT_PATTERN, table_angles: b
     if not folder.is_dir():
         raise ImportRefused(f"there is no folder {folder}", next_step="check the path")
     real = folder.resolve()
+    inside: dict[Path, bool] = {}
     names = _names(folder / NAMES)
     photographs: list[tuple[str, Photograph]] = []
     refused = []
@@ -72,7 +73,7 @@ def read_folder(folder: Path, *, pattern: str = DEFAULT_PATTERN, table_angles: b
         shown = path.relative_to(folder)
         if not path.is_file():
             refused.append(Refused(str(shown), "is no file"))
-        elif not path.resolve().is_relative_to(real):
+        elif not _stays(path, real, inside):
             refused.append(Refused(str(shown), "is a link that leaves the folder"))
         elif (found := named.fullmatch(shown.with_suffix("").as_posix())) is None:
             refused.append(Refused(str(shown), f"is not named like {pattern}"))
@@ -121,6 +122,15 @@ def write_folder(folder: Path, objects: Iterable[tuple[Object, dict[str, Path]]]
                     )
                 target.write_bytes(checked(files[view.image], view.image_sha256))
     return count
+
+
+def _stays(path: Path, real: Path, inside: dict[Path, bool]) -> bool:
+    """Tell whether a file is really within a folder; what is known of folders is kept, there may be many files."""
+    if path.is_symlink():
+        return path.resolve().is_relative_to(real)
+    if path.parent not in inside:
+        inside[path.parent] = path.parent.resolve().is_relative_to(real)
+    return inside[path.parent]
 
 
 def _regex(pattern: str) -> re.Pattern[str]:

@@ -1,5 +1,6 @@
 """Images on their way into a catalog: checked, copied aside and described, by several processes."""
 
+import os
 import zlib
 from collections.abc import Iterator
 from functools import cache
@@ -85,17 +86,20 @@ def _stage_one(root: Path | None, item: Item) -> Staged:
             packed = kind.pack(kind.describe(within(image, item.region)))
         except UsageError as error:
             return Staged("", reason=error.what)
-    folder = root / item.folder
-    folder.mkdir(exist_ok=True)
     file = f"{item.folder}/{item.stem}{images.suffix(content)}"
-    (root / file).write_bytes(content)
+    try:
+        (root / file).write_bytes(content)
+    except FileNotFoundError:
+        (root / item.folder).mkdir(exist_ok=True)
+        (root / file).write_bytes(content)
     return Staged(file, sha256, len(content), packed)
 
 
 def _read(source: ImageSource) -> bytes:
     if source.member is None:
         with Path(source.file).open("rb") as file:
-            return file.read(images.MAX_FILE_BYTES + 1)
+            # a limit far above the size would have as much memory set aside
+            return file.read(min(os.fstat(file.fileno()).st_size, images.MAX_FILE_BYTES) + 1)
     with _archive(source.file).open(source.member) as member:
         return member.read(images.MAX_FILE_BYTES + 1)
 
