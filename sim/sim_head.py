@@ -1,0 +1,69 @@
+"""`rig sim-head`: a rig head for programs that want to open a serial port."""
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from rig.cli.command import Settings, command
+
+
+@command
+def sim_head(
+    settings: Settings,
+    kind: Annotated[
+        Literal["memory", "avr"],
+        typer.Option(help="The firmware built for this computer, or the AVR binary in an emulated ATmega328P."),
+    ] = "memory",
+    spin: Annotated[float, typer.Option(metavar="DPS", help="Let the platter turn, in degrees a second.")] = 0.0,
+    link: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Also reach the port under this name, while it is there.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="End by itself; else Ctrl+C does.")] = None,
+) -> None:
+    """Simulate a rig head with its IMU on a pseudo-terminal in real time, and print the port to connect to.
+
+    What its outputs do is told as it happens. Model and address of the IMU come from the section [imu].
+
+    Example: rig sim-head --spin 30
+    """
+    from rig.errors import UsageError
+    from sim.head.realtime import HeadPty, PacedClock
+    from sim.motion import to_velocity
+    from sim.parts import SimParts
+    from sim.world import World
+
+    config = settings.load()
+    imu = config.imu.model_copy(update={"connection": "head"})
+    config = config.model_copy(update={"imu": imu, "bench": {**config.bench, "sim": {"head": kind}}})
+    world = World(seed=settings.seed or 0)
+    with ExitStack() as ends:
+        parts = ends.enter_context(SimParts.connected(config, world))
+        head = parts.head
+        assert head is not None
+        head.listeners.append(
+            lambda change: print(f"{change.time_ns * 1e-9:.4f} s: {change.pin} {change.value:g}", file=sys.stderr)
+        )
+        if spin:
+            world.drive(to_velocity(0.0, 0.0, spin, abs(spin), 100.0))
+        terminal = HeadPty(head)
+        ends.callback(terminal.close)
+        if link is not None:
+            try:
+                link.symlink_to(terminal.port)
+            except OSError as error:
+                raise UsageError(
+                    f"{link} cannot be made: {error.strerror}.", next_step="Give a name that is not in use."
+                ) from error
+            ends.callback(link.unlink, missing_ok=True)
+        if settings.json:
+            settings.print_json({"port": terminal.port, "kind": kind, "imu": config.imu.model})
+        else:
+            print(terminal.port, flush=True)
+            where = f"--set imu.connection=head --set head.port={terminal.port}"
+            print(f"{config.imu.model} on a head; for a rig: {where}. Ctrl+C ends it.", file=sys.stderr)
+        clock = PacedClock(world.clock)
+        while seconds is None or world.clock.now_ns() < seconds * 1e9:
+            clock.sleep(0.01)

@@ -1,0 +1,40 @@
+"""`rig sim-head` as another program sees it: a real process, a real (pseudo) terminal, real time."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from rig.clock import SystemClock
+from rig.devices.dynamixel.port import open_serial
+from rig.devices.head.head import RigHead
+from rig.devices.head.protocol import BAUD
+from tests.contract.heads import mpu6050, needs
+
+
+@pytest.mark.parametrize("kind", ["memory", "avr"])
+def test_a_program_with_pyserial_finds_a_head(kind, tmp_path):
+    needs(kind)
+    arguments = ["sim-head", "--json", "--kind", kind, "--spin", "30", "--seconds", "30", "--link", "head"]
+    command = [sys.executable, "-c", "from rig.cli.main import main; main()", *arguments]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=tmp_path)
+    try:
+        told = json.loads(program.stdout.readline())
+        assert told["kind"] == kind
+        assert (tmp_path / "head").resolve() == (tmp_path / told["port"]).resolve()
+        clock = SystemClock()
+        wire = open_serial(str(tmp_path / "head"), BAUD, "head")
+        head = RigHead(wire, clock, mpu6050(), deadman_s=2.0)
+        clock.sleep(0.3)
+        head.read_samples()
+        clock.sleep(0.5)
+        samples = head.read_samples()
+        assert samples.lost == 0
+        assert len(samples.time_ns) > 20
+        assert samples.gyro_dps[:, 2] - samples.gyro_dps[:, 2].mean() == pytest.approx(0.0, abs=0.5)
+        assert 20 < samples.gyro_dps[:, 2].mean() < 40  # 30, and the zero of an uncalibrated gyro
+        head.close()
+    finally:
+        program.kill()
+        program.communicate()
