@@ -29,8 +29,8 @@ _BIN_DEG: Final = 360 / BINS
 KEPT: Final = 500
 #: How fast a bin's weight in the mean azimuth falls with its support.
 _POSE_SHARPNESS: Final = 60.0
-#: Objects that are scored at a time: what a core's own cache holds.
-_CHUNK: Final = 64
+#: Degrees between the keys of two objects.
+_APART: Final = 4000.0
 
 Floats = NDArray[np.float32]
 
@@ -58,7 +58,8 @@ class DenseIndex:
         rows, begin = views.of_each(self.object_index)
         count = np.diff(begin, append=len(rows))
         inside = np.arange(count.max()) < count[:, None]
-        #: Rows of each object's views, padded by the first of them.
+        rows = rows[np.lexsort((views.azimuth_deg[rows], np.repeat(np.arange(len(count)), count)))]
+        #: Rows of each object's views by rising azimuth, padded by the first of them.
         self.rows = np.repeat(rows[begin][:, None], count.max(), axis=1)
         self.rows[inside] = rows
         #: Where `rows` is padding, or a view that was left out.
@@ -68,6 +69,14 @@ class DenseIndex:
         self.dead_deg: FloatArray = np.array(
             [_spacing(own[ok]) / 2 for own, ok in zip(self.azimuth_deg, inside, strict=True)]
         )
+        # three turns of every object's views, each object far from the others: one sorted row of keys for all
+        turns_deg = np.where(inside, self.azimuth_deg, np.inf)
+        unrolled_deg = np.concatenate([turns_deg - 360, turns_deg, turns_deg + 360], axis=1)
+        self._copies = np.argsort(unrolled_deg, axis=1, kind="stable")
+        unrolled_deg = np.take_along_axis(unrolled_deg, self._copies, axis=1)
+        self._copies %= count.max()
+        self._ring_deg = np.where(np.isinf(unrolled_deg), 1000.0, unrolled_deg)
+        self._keys = (self._ring_deg + _APART * np.arange(len(count))[:, None]).ravel()
 
     def __len__(self) -> int:
         return len(self.object_index)
@@ -97,24 +106,29 @@ class DenseIndex:
         float32 array (k, 72)
             For azimuths 0, 5, 10, ... at the first query.
         """
-        own = similar.astype(np.float32)[self.rows[places]]
+        slope = self.omega / 360
+        own = similar[self.rows[places]]
         own[self.left_out[places]] = -np.inf
-        out = np.empty((len(places), BINS), np.float32)
-        seen_deg = (np.arange(BINS) * _BIN_DEG + turned_deg)[None, :, None]
-        slope = np.float32(self.omega / 360)
-        for start in range(0, len(places), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            chunk = places[part]
-            away = (seen_deg - self.azimuth_deg[chunk][:, None]).astype(np.float32)
-            # degrees to the nearest whole turn, in place: this is the filter's whole time
-            away -= np.float32(360) * np.rint(away * np.float32(1 / 360))
-            np.abs(away, out=away)
-            away -= self.dead_deg[chunk].astype(np.float32)[:, None, None]
-            np.maximum(away, 0, out=away)
-            away *= -slope
-            away += own[part][:, None]
-            away.max(axis=2, out=out[part])
-        return out
+        own = np.take_along_axis(own, self._copies[places], axis=1)
+        ring_deg, width = self._ring_deg[places], own.shape[1]
+        seen_deg = np.mod(np.arange(BINS) * _BIN_DEG + turned_deg, 360.0)
+        dead_deg = self.dead_deg[places][:, None]
+        at = seen_deg + _APART * places[:, None]
+        # views [first, last) see the azimuth within their dead zone
+        first = np.searchsorted(self._keys, at - dead_deg, side="left") - width * places[:, None]
+        last = np.searchsorted(self._keys, at + dead_deg, side="right") - width * places[:, None]
+        # of those before and behind a running maximum knows the best: the penalty is a straight line
+        before = np.maximum.accumulate(own + slope * ring_deg, axis=1)
+        behind = np.maximum.accumulate((own - slope * ring_deg)[:, ::-1], axis=1)[:, ::-1]
+        risen = np.where(first > 0, np.take_along_axis(before, np.maximum(first - 1, 0), axis=1), -np.inf)
+        fallen = np.where(last < width, np.take_along_axis(behind, np.minimum(last, width - 1), axis=1), -np.inf)
+        best = np.maximum(risen - slope * seen_deg, fallen + slope * seen_deg) + slope * dead_deg
+        for step in range(int((last - first).max(initial=0))):
+            place = np.minimum(first + step, width - 1)
+            within = np.where(first + step < last, np.take_along_axis(own, place, axis=1), -np.inf)
+            np.maximum(best, within, out=best)
+        support: Floats = best.astype(np.float32)
+        return support
 
 
 @dataclass(frozen=True, eq=False)

@@ -271,15 +271,15 @@ class _Trials:
         seen = [int(draws.order[0])]
         travelled_deg = 0.0
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
+        belief: Belief | None = None
         for n in range(last):
-            keep = self._keep(np.array(seen))
-            gone = self._rows[~keep & self._enrolled[self._rows]]
-            index = self._index.without(np.cumsum(self._enrolled)[gone] - 1) if len(gone) else self._index
+            gone = self._rows[~self._keep(np.array(seen)) & self._enrolled[self._rows]]
+            index = self._index
             measured_deg = (self._azimuth_deg[seen] + draws.error_deg[: n + 1]).tolist()
-            # the views near to the newest query left the model for the queries before, too
-            belief: Belief | None = None
-            for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
-                belief = believe(self._queries[i], angle_deg, index, before=belief)
+            if len(gone):  # the views near to the newest query left the model for the queries before, too
+                index, belief = index.without(np.cumsum(self._enrolled)[gone] - 1), None
+                for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
+                    belief = believe(self._queries[i], angle_deg, index, before=belief)
             start_ns = self._now_ns()
             belief = believe(self._queries[seen[-1]], measured_deg[-1], index, before=belief)
             following = self._next_dense(method, draws, seen, belief) if n + 1 < last else seen[-1]
