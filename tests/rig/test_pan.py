@@ -37,29 +37,20 @@ def test_orientations_mean_the_same_whether_object_or_camera_turns(simulated, tm
     views = []
     for overrides in ((), ARM):
         with Catalog.open(tmp_path / str(len(views)), clock=simulated().bench.clock, create=True) as catalog:
-            views.append(enrolled(simulated, catalog, "mug-star", *overrides, views=8))
-    sides = {round(view.azimuth_deg) % 360: view.image_bgr.astype(float) for view in views[0]}
-    assert sorted(sides) == list(range(0, 360, 45))
-    for view in views[1]:
-        azimuth = round(view.azimuth_deg) % 360
-        unlike = {side: np.abs(sides[side] - view.image_bgr).mean() for side in (azimuth, -azimuth % 360)}
-        assert min(unlike, key=lambda side: unlike[side]) == azimuth
-
-
-def test_an_arm_takes_the_views_in_the_other_sense(simulated, tmp_path: Path) -> None:
-    with Catalog.open(tmp_path, clock=simulated().bench.clock, create=True) as catalog:
-        turned, around = (
-            enrolled(simulated, catalog, "lamp", views=4),
-            enrolled(simulated, catalog, "teapot", *ARM, views=4),
-        )
+            views.append(enrolled(simulated, catalog, "mug-star", *overrides, views=4))
+    turned, around = views
     assert [view.azimuth_deg for view in turned[1:]] == pytest.approx([270, 180, 90], abs=0.5)
     assert [view.azimuth_deg for view in around[1:]] == pytest.approx([90, 180, 270], abs=0.5)
+    sides = {round(view.azimuth_deg) % 360: view.image_bgr.astype(float) for view in turned}
+    for view in around:
+        azimuth = round(view.azimuth_deg) % 360
+        unlike = {side: np.abs(image - view.image_bgr).mean() for side, image in sides.items()}
+        assert min(unlike, key=lambda side: unlike[side]) == azimuth
 
 
 def test_an_ax12_enrolls_the_sides_that_it_reaches_and_finds_by_them(simulated, tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=simulated().bench.clock, create=True) as catalog:
-        for name in ("toy-car", "teapot"):
-            assert len(enrolled(simulated, catalog, name, *AX, views=12)) == 11  # the 300° that it reaches
+        assert len(enrolled(simulated, catalog, "toy-car", *AX, views=12)) == 11  # the 300° that it reaches
         s = simulated(*AX)
         s.operator.next_object, s.operator.yaw_deg = "toy-car", 30.0
         *_, found = identify(s.bench, ViewIndex(catalog.views().views))
