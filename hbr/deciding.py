@@ -137,9 +137,9 @@ def rehearse(
         for start in np.unique(np.arange(searches) * len(rows) // searches).tolist():
             queries = _spread(azimuth_deg, start, views)
             without = index.without(rows[queries])
-            belief: Belief | None = None
+            so_far: DenseIndex | Belief = without
             for i in queries:
-                belief = believe(levels[rows[i]], float(azimuth_deg[i]), without, before=belief, kept=len(index))
+                so_far = belief = believe(levels[rows[i]], float(azimuth_deg[i]), so_far, kept=len(index))
                 scores, odds = belief.scores(), belief.posterior(beta).sum(axis=1)
                 known.append(scores.max())
                 stranger.append(np.delete(scores, place).max())
@@ -224,7 +224,7 @@ def judge(belief: Belief, by: Rules, *, max_views: int = 8) -> Verdict:
     odds = belief.posterior(by.beta).sum(axis=1)
     best = int(odds.argmax())
     probability, score = float(odds[best]), float(belief.scores()[best])
-    object_index = int(belief.index.object_index[belief.places[best]])
+    object_index = int(belief.index.object_index[best])
     name = belief.index.views.object_names[object_index]
     least = by.familiar[min(belief.queries, len(by.familiar)) - 1]
     familiar = score >= least

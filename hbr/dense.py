@@ -89,15 +89,26 @@ class DenseIndex:
             raise ValueError("an object would be left without any view; leave out fewer")
         return fewer
 
-    def support(self, similar: FloatArray, places: IndexArray, turned_deg: float) -> Floats:
-        """Return what one query adds to every hypothesis of some objects.
+    def only(self, places: IndexArray) -> "DenseIndex":
+        """Return an index of some objects alone, whose later steps do not look at the others."""
+        fewer = copy(self)
+        rows = np.unique(self.rows[places])
+        fewer.views = self.views.select(rows)
+        fewer.compared = self.compared.only(rows)
+        fewer.object_index = self.object_index[places]
+        fewer.rows = np.searchsorted(rows, self.rows[places])
+        for name in ("left_out", "azimuth_deg", "dead_deg", "_copies", "_ring_deg"):
+            setattr(fewer, name, getattr(self, name)[places])
+        fewer._keys = (fewer._ring_deg + _APART * np.arange(len(places))[:, None]).ravel()
+        return fewer
+
+    def support(self, similar: FloatArray, turned_deg: float) -> Floats:
+        """Return what one query adds to every hypothesis.
 
         Parameters
         ----------
         similar : float array (n,)
             Similarity of the query to every view.
-        places : integer array (k,)
-            Positions of the objects in `object_index`.
         turned_deg : float
             Orientation since the first query, counter-clockwise.
 
@@ -107,16 +118,16 @@ class DenseIndex:
             For azimuths 0, 5, 10, ... at the first query.
         """
         slope = self.omega / 360
-        own = similar[self.rows[places]]
-        own[self.left_out[places]] = -np.inf
-        own = np.take_along_axis(own, self._copies[places], axis=1)
-        ring_deg, width = self._ring_deg[places], own.shape[1]
+        own = similar[self.rows]
+        own[self.left_out] = -np.inf
+        own = np.take_along_axis(own, self._copies, axis=1)
+        ring_deg, width = self._ring_deg, own.shape[1]
         seen_deg = np.mod(np.arange(BINS) * _BIN_DEG + turned_deg, 360.0)
-        dead_deg = self.dead_deg[places][:, None]
-        at = seen_deg + _APART * places[:, None]
+        dead_deg, place = self.dead_deg[:, None], np.arange(len(self))[:, None]
+        at = seen_deg + _APART * place
         # views [first, last) see the azimuth within their dead zone
-        first = np.searchsorted(self._keys, at - dead_deg, side="left") - width * places[:, None]
-        last = np.searchsorted(self._keys, at + dead_deg, side="right") - width * places[:, None]
+        first = np.searchsorted(self._keys, at - dead_deg, side="left") - width * place
+        last = np.searchsorted(self._keys, at + dead_deg, side="right") - width * place
         # of those before and behind a running maximum knows the best: the penalty is a straight line
         before = np.maximum.accumulate(own + slope * ring_deg, axis=1)
         behind = np.maximum.accumulate((own - slope * ring_deg)[:, ::-1], axis=1)[:, ::-1]
@@ -124,8 +135,8 @@ class DenseIndex:
         fallen = np.where(last < width, np.take_along_axis(behind, np.minimum(last, width - 1), axis=1), -np.inf)
         best = np.maximum(risen - slope * seen_deg, fallen + slope * seen_deg) + slope * dead_deg
         for step in range(int((last - first).max(initial=0))):
-            place = np.minimum(first + step, width - 1)
-            within = np.where(first + step < last, np.take_along_axis(own, place, axis=1), -np.inf)
+            at_step = np.minimum(first + step, width - 1)
+            within = np.where(first + step < last, np.take_along_axis(own, at_step, axis=1), -np.inf)
             np.maximum(best, within, out=best)
         support: Floats = best.astype(np.float32)
         return support
@@ -138,9 +149,7 @@ class Belief:
     Attributes
     ----------
     index : DenseIndex
-        The enrolled views.
-    places : integer array (k,)
-        Positions of the objects that are still considered, in `index.object_index`, ascending.
+        The enrolled views of the objects that are still considered.
     support : float32 array (k, 72)
         A, the sum of what each query adds, at most their number; for azimuths 0, 5, ... at the first query.
     orientation_deg : float64 array (n,)
@@ -148,7 +157,6 @@ class Belief:
     """
 
     index: DenseIndex
-    places: IndexArray
     support: Floats
     orientation_deg: FloatArray
 
@@ -171,7 +179,7 @@ class Belief:
         scores = self.scores()
         order = np.argsort(-scores, kind="stable")
         azimuth_deg = self._azimuth_deg(order) + self.turned_deg
-        return DenseRanking(self.index.object_index[self.places[order]], scores[order], wrap360(azimuth_deg))
+        return DenseRanking(self.index.object_index[order], scores[order], wrap360(azimuth_deg))
 
     def _azimuth_deg(self, which: IndexArray) -> FloatArray:
         """Azimuth at the first query of these objects: the mean around the best bin, weighted by the support.
@@ -180,7 +188,7 @@ class Belief:
         """
         support = self.support[which].astype(np.float64)
         best = support.argmax(axis=1)
-        reach = np.maximum(1, np.rint(2.5 * self.index.dead_deg[self.places[which]] / _BIN_DEG)).astype(int)
+        reach = np.maximum(1, np.rint(2.5 * self.index.dead_deg[which] / _BIN_DEG)).astype(int)
         offset = np.arange(-BINS // 2, BINS // 2)
         near = np.take_along_axis(support, (best[:, None] + offset) % BINS, axis=1)
         weight = np.exp(_POSE_SHARPNESS * (near - near.max(axis=1, keepdims=True)))
@@ -218,14 +226,7 @@ class DenseRanking:
     pose_deg: FloatArray
 
 
-def believe(
-    query: LevelArray,
-    orientation_deg: float,
-    index: DenseIndex,
-    *,
-    before: Belief | None = None,
-    kept: int = KEPT,
-) -> Belief:
+def believe(query: LevelArray, orientation_deg: float, so_far: DenseIndex | Belief, *, kept: int = KEPT) -> Belief:
     """Add a query to what is believed.
 
     Parameters
@@ -234,10 +235,8 @@ def believe(
         The view, described as the enrolled ones are.
     orientation_deg : float
         Orientation of the camera around the object, counter-clockwise, from any zero that all queries share.
-    index : DenseIndex
-        The enrolled views.
-    before : Belief, optional
-        After the queries so far; none for the first.
+    so_far : DenseIndex or Belief
+        The enrolled views for the first query, what was believed before for any other.
     kept : int
         Objects that are considered further after the first query: those with the most similar views.
 
@@ -246,6 +245,7 @@ def believe(
     TypeError, ValueError
         The query is no view of the index's descriptor, the orientation is not finite, or `kept` is below 1.
     """
+    index = so_far.index if isinstance(so_far, Belief) else so_far
     query = np.asarray(query)
     length = index.views.descriptors.shape[1]
     if query.dtype != np.uint8 or query.shape != (length,):
@@ -257,16 +257,15 @@ def believe(
     if kept < 1:
         raise ValueError(f"kept is {kept}; at least 1 object is needed")
     similar = index.compared.similarity(query[None])[0]
-    if before is None:
-        places = np.arange(len(index))
-        if len(places) > kept:
-            best = similar[index.rows].max(axis=1)
-            places = np.sort(np.argsort(-best, kind="stable")[:kept])
-        support = index.support(similar, places, 0.0)
-        return Belief(index, places, support, np.array([orientation_deg], np.float64))
-    turned_deg = float(wrap180(orientation_deg - before.orientation_deg[0]))
-    support = before.support + index.support(similar, before.places, turned_deg)
-    return Belief(index, before.places, support, np.append(before.orientation_deg, orientation_deg))
+    if isinstance(so_far, Belief):
+        turned_deg = float(wrap180(orientation_deg - so_far.orientation_deg[0]))
+        support = so_far.support + index.support(similar, turned_deg)
+        return Belief(index, support, np.append(so_far.orientation_deg, orientation_deg))
+    if len(index) > kept:
+        best = np.where(index.left_out, -np.inf, similar[index.rows]).max(axis=1)
+        index = index.only(np.sort(np.argsort(-best, kind="stable")[:kept]))
+        similar = index.compared.similarity(query[None])[0]
+    return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64))
 
 
 def believe_all(queries: Sequence[LevelArray] | LevelArray, orientation_deg: ArrayLike, index: DenseIndex) -> Belief:
@@ -274,10 +273,9 @@ def believe_all(queries: Sequence[LevelArray] | LevelArray, orientation_deg: Arr
     orientations = np.asarray(orientation_deg, np.float64)
     if len(queries) < 1 or orientations.shape != (len(queries),):
         raise ValueError(f"{len(queries)} queries and orientations of shape {orientations.shape}; one each is needed")
-    belief: Belief | None = None
-    for query, angle_deg in zip(queries, orientations.tolist(), strict=True):
-        belief = believe(query, angle_deg, index, before=belief)
-    assert belief is not None
+    belief = believe(queries[0], float(orientations[0]), index)
+    for query, angle_deg in zip(queries[1:], orientations[1:].tolist(), strict=True):
+        belief = believe(query, angle_deg, belief)
     return belief
 
 

@@ -106,7 +106,7 @@ def next_look(
     if rivals.any():
         gained = rivals - remaining[chosen]
         first, second = np.unravel_index(int(gained.argmax()), gained.shape)
-        objects = belief.index.object_index[belief.places]
+        objects = belief.index.object_index
         ordered = sorted((first, second), key=lambda i: -probability[i])
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
         alike = float(similar[chosen, first, second])
@@ -152,7 +152,7 @@ def _all_turns() -> FloatArray:
 
 
 def _leader(belief: Belief) -> int:
-    return int(belief.index.object_index[belief.places[belief.support.max(axis=1).argmax()]])
+    return int(belief.index.object_index[belief.support.max(axis=1).argmax()])
 
 
 def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
@@ -175,9 +175,8 @@ def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArra
 def _expected(belief: Belief, place: IndexArray, bin_of: IndexArray, turns_deg: FloatArray) -> FloatArray:
     """Similarity of what the hypotheses would show after each turn, (a, m, m)."""
     index = belief.index
-    places = belief.places[place]
     seen_deg = bin_of * (360.0 / BINS) + belief.turned_deg + turns_deg[:, None]
-    own_deg = index.azimuth_deg[places]
+    own_deg = index.azimuth_deg[place]
     away_deg = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None]))
-    nearest = np.where(index.left_out[places], np.inf, away_deg).argmin(axis=2)
-    return index.compared.among(index.rows[places[None], nearest])
+    nearest = np.where(index.left_out[place], np.inf, away_deg).argmin(axis=2)
+    return index.compared.among(index.rows[place[None], nearest])

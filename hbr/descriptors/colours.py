@@ -88,6 +88,9 @@ class _Kernel:
         apart = np.einsum("ij,ij->i", own, own)[:, None] + self._squares - 2 * own @ self._rows.T
         return _fallen(apart)
 
+    def only(self, rows: IndexArray, /) -> "_Kernel":
+        return _Kernel(self._rows[rows])
+
     def among(self, rows: IndexArray, /) -> FloatArray:
         part, squares = self._rows[rows], self._squares[rows]
         return _fallen(squares[:, :, None] + squares[:, None, :] - 2 * part @ part.transpose(0, 2, 1))

@@ -102,6 +102,9 @@ class _Cosine:
         similar: FloatArray = np.minimum(_unit(queries) @ self._unit.T, 1, dtype=np.float64)
         return similar
 
+    def only(self, rows: IndexArray, /) -> "_Cosine":
+        return _Cosine(self._unit[rows])
+
     def among(self, rows: IndexArray, /) -> FloatArray:
         part = self._unit[rows]
         similar: FloatArray = np.minimum(part @ part.transpose(0, 2, 1), 1, dtype=np.float64)

@@ -69,6 +69,9 @@ class _Average:
             [p.similarity(queries[:, own]) for p, own in zip(self._parts, self._columns, strict=True)]
         )
 
+    def only(self, rows: IndexArray, /) -> "_Average":
+        return _Average([part.only(rows) for part in self._parts], self._weights, self._columns)
+
     def among(self, rows: IndexArray, /) -> FloatArray:
         return self._weighted([part.among(rows) for part in self._parts])
 

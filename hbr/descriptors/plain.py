@@ -5,6 +5,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.cedd import BINS, cedd, covered, describe
@@ -45,7 +46,7 @@ class Cedd:
 
     def prepared(self, rows: LevelArray, /) -> "_Tanimoto":
         check_levels(self, rows)
-        return _Tanimoto(rows)
+        return _Tanimoto(rows.astype(np.float32))  # which holds products of levels 0..7 exactly
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return tanimoto(a, b)
@@ -58,14 +59,16 @@ class Cedd:
 
 
 class _Tanimoto:
-    def __init__(self, rows: LevelArray) -> None:
-        # float32 holds products of levels 0..7 exactly
-        self._rows = rows.astype(np.float32)
-        self._squares = squares(self._rows)
+    def __init__(self, rows: NDArray[np.float32]) -> None:
+        self._rows = rows
+        self._squares = squares(rows)
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
         own = queries.astype(np.float32)
         return tanimoto_of_dots((own @ self._rows.T).astype(np.float64), squares(own)[:, None], self._squares)
+
+    def only(self, rows: IndexArray, /) -> "_Tanimoto":
+        return _Tanimoto(self._rows[rows])
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         part, lengths = self._rows[rows], self._squares[rows]

@@ -13,6 +13,10 @@ class Comparison(Protocol):
         """Similarity of every query, uint8 (n, length), to every row, float64 (n, m)."""
         ...
 
+    def only(self, rows: IndexArray, /) -> "Comparison":
+        """Some of the rows, in this order, as rows of their own."""
+        ...
+
     def among(self, rows: IndexArray, /) -> FloatArray:
         """Similarity of rows to each other within groups: indices (g, k) in, float64 (g, k, k) out."""
         ...

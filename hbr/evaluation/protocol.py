@@ -271,17 +271,16 @@ class _Trials:
         seen = [int(draws.order[0])]
         travelled_deg = 0.0
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
-        belief: Belief | None = None
+        so_far: DenseIndex | Belief = self._index
         for n in range(last):
             gone = self._rows[~self._keep(np.array(seen)) & self._enrolled[self._rows]]
-            index = self._index
             measured_deg = (self._azimuth_deg[seen] + draws.error_deg[: n + 1]).tolist()
             if len(gone):  # the views near to the newest query left the model for the queries before, too
-                index, belief = index.without(np.cumsum(self._enrolled)[gone] - 1), None
+                so_far = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
-                    belief = believe(self._queries[i], angle_deg, index, before=belief)
+                    so_far = believe(self._queries[i], angle_deg, so_far)
             start_ns = self._now_ns()
-            belief = believe(self._queries[seen[-1]], measured_deg[-1], index, before=belief)
+            so_far = belief = believe(self._queries[seen[-1]], measured_deg[-1], so_far)
             following = self._next_dense(method, draws, seen, belief) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = belief.ranking()
@@ -314,8 +313,8 @@ class _Trials:
         left = np.setdiff1d(self._free, seen)[::3]
         leads = []
         for i in left.tolist():
-            scores = believe(self._queries[i], float(self._azimuth_deg[i]), belief.index, before=belief).scores()
-            own = belief.index.object_index[belief.places] == self._object
+            scores = believe(self._queries[i], float(self._azimuth_deg[i]), belief).scores()
+            own = belief.index.object_index == self._object
             leads.append(scores[own].max(initial=-np.inf) - scores[~own].max(initial=-np.inf))
         return int(left[int(np.argmax(leads))])
 

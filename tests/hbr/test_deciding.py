@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hbr import DenseIndex, Views, believe
+from hbr import Belief, DenseIndex, Views, believe
 from hbr.deciding import Rules, certainty_for, conformal_threshold, judge, rehearse, rules
 
 BETA = 60.0
@@ -84,9 +84,9 @@ def test_rules_of_a_catalog_find_its_objects_and_not_others() -> None:
     kinds = []
     for j in range(40):
         rows = everything.of(j)
-        belief = None
+        so_far: DenseIndex | Belief = index
         for i in rows[[2, 7, 11, 16]]:
-            belief = believe(everything.descriptors[i], float(everything.azimuth_deg[i]), index, before=belief)
+            so_far = belief = believe(everything.descriptors[i], float(everything.azimuth_deg[i]), so_far)
             verdict = judge(belief, made, max_views=4)
             if verdict.kind != "look":
                 break
@@ -114,7 +114,7 @@ def test_a_score_that_no_enrolled_object_has_ends_as_unknown_and_never_early() -
     stranger = catalog(1, seed=99).descriptors[0]
     belief = believe(stranger, 0.0, index)
     assert judge(belief, by, max_views=2).kind == "look"
-    verdict = judge(believe(stranger, 90.0, index, before=belief), by, max_views=2)
+    verdict = judge(believe(stranger, 90.0, belief), by, max_views=2)
     assert verdict.kind == "unknown"
     assert "none of those enrolled" in verdict.words
 

@@ -67,7 +67,7 @@ def test_time_that_a_turn_takes_is_weighed_against_what_it_tells() -> None:
 
 def test_where_one_was_already_nothing_new_is_expected() -> None:
     first = believe(looked(30.0), 0.0, INDEX)
-    second = believe(looked(180.0), 150.0, INDEX, before=first)
+    second = believe(looked(180.0), 150.0, first)
     look = next_look(second, beta=60.0, seconds=np.zeros(BINS - 1))
     landing = (150 + look.rotations_deg) % 360
     visited = np.isin(landing, [0.0, 150.0])
