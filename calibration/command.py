@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -9,12 +10,17 @@ import typer
 from rig.cli.command import Settings, command
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rig.bench import Bench
     from rig.facts import Fact
 
 EXIT_QUALITY = 6
+
+MARKER_SHARE = 11 / 15
+"""Side of a marker over that of its square, on every board that is printed."""
+
+BoardColumns = Annotated[int, typer.Option(min=3, max=20, help="Squares across the board.")]
+BoardRows = Annotated[int, typer.Option(min=3, max=20, help="Squares down the board.")]
+SquareMm = Annotated[float, typer.Option(min=2, max=100, help="Side of a square, as measured on the print, in mm.")]
 
 app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 
@@ -72,6 +78,55 @@ def imu(
         imu_mounting.live,
         lambda bench: gyro_noise.live(bench, minutes=minutes),
     )
+
+
+@app.command("camera")
+@command
+def camera(
+    settings: Settings,
+    columns: BoardColumns = 8,
+    rows: BoardRows = 6,
+    square_mm: SquareMm = 15.0,
+) -> None:
+    """Calibrate focal length, principal point and distortion with the board on the turning table.
+
+    Example: rig calibrate camera --bench sim
+    """
+    from calibration import camera_model
+    from rig.markers import Board
+
+    board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
+    run(settings, lambda bench: camera_model.live(bench, board))
+
+
+@app.command("table")
+@command
+def table(
+    settings: Settings,
+    columns: BoardColumns = 8,
+    rows: BoardRows = 6,
+    square_mm: SquareMm = 15.0,
+    print_board: Annotated[
+        Path | None,
+        typer.Option(
+            "--print-board", metavar="FILE", help="Only write the board to print, .pdf or .png, true to scale."
+        ),
+    ] = None,
+) -> None:
+    """Calibrate where the table's axis is in the camera's frame, and how truly it turns; the camera comes first.
+
+    Example: rig calibrate table --print-board board.pdf
+    """
+    from calibration import table_axis
+    from rig.markers import Board
+
+    board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
+    if print_board is not None:
+        from calibration.print_board import write_board
+
+        print(write_board(board, print_board))
+        return
+    run(settings, lambda bench: table_axis.live(bench, _in_force(bench, "camera.intrinsics"), board))
 
 
 @app.command("noise")
@@ -182,6 +237,26 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
             calibrate(bench, store)
 
 
+def _in_force(bench: "Bench", name: str) -> "Fact":
+    """Return the calibration of that name in force on the bench, which another one needs.
+
+    Raises
+    ------
+    UsageError
+        There is none.
+    """
+    from rig.errors import UsageError
+    from rig.facts import FactStore, State
+
+    store = FactStore(bench.config.calibration_path(bench.name))
+    for standing in store.standings(bench.apparatus(), bench.clock.utc()):
+        if standing.fact.name == name and standing.state is State.IN_FORCE:
+            return standing.fact
+    raise UsageError(
+        f"{name} is not calibrated on this bench.", next_step=f"Run `rig calibrate {name.partition('.')[0]}` first."
+    )
+
+
 def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Fact":
     """Tell the events of a procedure as they come, and return its fact."""
     from calibration.events import Ask, Progress
@@ -195,7 +270,7 @@ def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Fact":
             if isinstance(event, Fact):
                 fact = event
             elif isinstance(event, Ask):
-                typer.prompt(f"{event.words}\nThen press Enter", default="", show_default=False, err=settings.json)
+                _ask(event.words)
             elif settings.json:
                 settings.print_json(event_dict(event))
             else:
@@ -204,6 +279,13 @@ def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Fact":
         events.close()
     assert fact is not None, "a procedure ends with its fact"
     return fact
+
+
+def _ask(words: str) -> None:
+    """Say what a person is to do, and wait until it is done; where nobody sits before it, go on."""
+    print(words, file=sys.stderr)
+    if sys.stdin.isatty():
+        typer.prompt("Then press Enter", default="", show_default=False, err=True)
 
 
 def _print_json(settings: Settings, fact: "Fact", path: "Path") -> None:

@@ -22,8 +22,10 @@ from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.host import simulated_host
 from sim.noise import NoiseModel
+from sim.objects.board import boards
 from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
+from sim.optics import Optics
 from sim.parts import SimParts
 from sim.world import Thing, World
 
@@ -75,7 +77,8 @@ class ShelfOperator:
     Every placement misses the table's axis by a little, as hands do. Once a bench is open, ``parts`` is what it is made
     of, and ``faults`` what goes wrong with that. ``state`` is what benches in this world remember of the table; whoever
     sets a new one up looks at its cable, and says that it hangs free. The things in ``queue`` are put up to be
-    identified one after the other, and round again.
+    identified one after the other, and round again. Calibration boards are at hand, too; they are seen through the
+    ``optics`` of a camera that the world's seed draws.
     """
 
     def __init__(
@@ -89,6 +92,7 @@ class ShelfOperator:
         self.parts: SimParts | None = None
         self.faults: Faults | None = None
         self.state: StateStore = MemoryStore()
+        self.optics = Optics.drawn(world.rng("optics"))
         self._rng = world.rng("operator")
 
     def place(self, name: str | None) -> None:
@@ -108,6 +112,9 @@ class ShelfOperator:
                 self.queue.rotate(-1)
             name = self.next_object or drawn
             yaw_deg = drawn_deg if self.yaw_deg is None else self.yaw_deg
+        if name in (stands := boards(self.optics)):
+            self.world.put(stands[name])
+            return
         if name not in self.things:
             raise ObjectNotFound(
                 f"There is no {name!r} on the simulated shelf.",

@@ -1,0 +1,331 @@
+"""Where the table's axis is in the camera's frame, and how truly it turns, from a board that rides on the table.
+
+The board's poses lie on circles about the axis: the axes of the rotations between them give its direction, a linear
+fit to their centres a point on it. From there one fit of all corners, with the encoder's angles θ taken as they are:
+
+    x = project(a + L(θ)·R(u, θ)·(X₀ − a)),    X₀ the board's points at θ = 0
+
+by `least_squares(loss="soft_l1")`, with L the lean of a bearing out of true, to a side that goes round twice a turn.
+"""
+
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from math import degrees, hypot, radians, sqrt
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from calibration.board_views import BoardView, as_json, look, points, turned_otherwise
+from calibration.camera_model import PARAMETERS, matrix_of
+from calibration.events import Ask, Progress
+from rig.bench import Bench
+from rig.facts import Estimate, Fact
+from rig.markers import Board
+from rig.plans.events import Event
+
+NAME = "table.axis"
+VALID_DAYS = 365
+
+STANDS = ("calibration-board upright", "calibration-board back")
+ANGLES_DEG = tuple(float(angle) for angle in range(-60, 61, 10))
+MIN_VIEWS = 8
+MIN_SPAN_DEG = 60.0
+MAX_RMS_PX = 0.4
+MAX_WOBBLE_DEG = 0.5
+MAX_UNCERTAINTY_PX = 0.3
+ROBUST_PX = 0.3
+CORNER_PX = 0.1
+"""How well a corner is found: what is known of the camera weighs against the corners by it."""
+PIVOT_MM = 80.0
+"""The bearing is about as far as this below the board's middle."""
+BIAS_PX = 0.02
+"""What OpenCV's corners are off by together, whatever their number."""
+FIRST_POSE = 15
+"""Parameters before the poses of the board: direction, point and lean (two each), the pivot, and the camera."""
+
+Floats = NDArray[np.float64]
+
+
+def live(
+    bench: Bench, intrinsics: Fact, board: Board | None = None
+) -> Generator[Event | Ask | Progress | Fact, None, Fact]:
+    """Have the board put on two stands, look at it from thirteen sides each, and find the axis.
+
+    Parameters
+    ----------
+    bench
+        An open one.
+    intrinsics
+        The camera's calibration.
+    board
+        Its layout, as printed.
+
+    Raises
+    ------
+    ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
+        See `rig.view` and `rig.turntable`.
+    """
+    board = board or Board()
+    when_utc = bench.clock.utc()
+    views, troubles = yield from look(bench, board, STANDS, ANGLES_DEG)
+    fact = from_data(
+        views, board, intrinsics, troubles=troubles, when_utc=when_utc, device=bench.apparatus("camera", "servo")
+    )
+    yield fact
+    return fact
+
+
+def from_data(
+    views: Sequence[BoardView],
+    board: Board,
+    intrinsics: Fact,
+    *,
+    troubles: Sequence[str] = (),
+    when_utc: datetime,
+    device: Mapping[str, Any],
+) -> Fact:
+    """Fit the axis to ``views`` of the board and judge it; see `calibration.camera_model.from_data`."""
+    refusals = list(troubles)
+    estimates: dict[str, Estimate] = {}
+    rms = None
+    evidence: dict[str, Any] = {"intrinsics": intrinsics.id, "views": as_json(views)}
+    span = max((v.table_deg for v in views), default=0.0) - min((v.table_deg for v in views), default=0.0)
+    if len(views) < MIN_VIEWS or span < MIN_SPAN_DEG:
+        refusals.append(
+            f"The board was found in {len(views)} views over {span:.0f}°, {MIN_VIEWS} over {MIN_SPAN_DEG:g}° are "
+            "needed: is it lit, sharp and in the frame, and the one that --print-board printed?"
+        )
+    else:
+        matrix, distortion = matrix_of(intrinsics)
+        poses = [_pose(board, view, matrix, distortion) for view in views]
+        _, loose = turned_otherwise(views, poses)
+        refusals += [loose] if loose else []
+        axis = _Axis(views, board, intrinsics, poses)
+        estimates, rms = axis.fit()
+        evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
+        refusals += _judge(estimates, rms)
+    return Fact(
+        name=NAME,
+        estimates=estimates,
+        residual=rms,
+        limit=MAX_RMS_PX,
+        residual_unit="px",
+        refusals=tuple(refusals),
+        valid_days=VALID_DAYS,
+        when_utc=when_utc,
+        device=device,
+        evidence=evidence,
+    )
+
+
+def region_of_interest(
+    axis: Fact, intrinsics: Fact, *, radius_mm: float, height_mm: float, below_mm: float, size: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Return x, y, width, height of the part of the frame in which an object on the table stays while it turns.
+
+    Parameters
+    ----------
+    axis, intrinsics
+        What was calibrated.
+    radius_mm, height_mm
+        Of a cylinder about the axis that holds the object.
+    below_mm
+        How far the platter's top is below the calibrated point on the axis, which is at the height of the board's
+        middle.
+    size
+        Width and height of the frame.
+    """
+    value = {name: estimate.value for name, estimate in axis.estimates.items()}
+    up = np.array([value["ux"], value["uy"], value["uz"]])
+    foot = np.array([value["x"], value["y"], value["z"]]) - up * below_mm
+    side = np.cross(up, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    depth = np.cross(side, up)
+    around = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    ring = radius_mm * (np.cos(around)[:, None] * side + np.sin(around)[:, None] * depth)
+    cylinder = np.concatenate([foot + ring, foot + ring + up * height_mm])
+    matrix, distortion = matrix_of(intrinsics)
+    seen = cv2.projectPoints(cylinder, np.zeros(3), np.zeros(3), matrix, np.array(distortion))[0].reshape(-1, 2)
+    low = np.clip(np.floor(seen.min(axis=0)), 0, np.array(size) - 1).astype(int)
+    high = np.clip(np.ceil(seen.max(axis=0)), low + 1, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+
+class _Axis:
+    """The fit: two angles of the axis, two offsets of a point on it, its lean, the camera, and a pose for each stand.
+
+    The camera and the height about which the axis leans are not free: what is known of them pulls, by its uncertainty.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[BoardView],
+        board: Board,
+        intrinsics: Fact,
+        poses: Sequence[tuple[Floats, Floats]],
+    ) -> None:
+        self._views = views
+        camera = [intrinsics.estimates[name] for name, _ in PARAMETERS]
+        self._known = np.array([-PIVOT_MM, *(estimate.value for estimate in camera)])
+        self._known_sigma = np.array([PIVOT_MM / 2, *(estimate.uncertainty for estimate in camera)])
+        self._known_sigma[1:3] *= sqrt(2)  # both focal lengths err together: two of them know no more than one
+        self._points = [points(board, view) for view in views]
+        self._middle = board.points_mm().mean(axis=0)
+        self._stands = sorted({view.stand for view in views})
+        self._up, self._origin = _first_axis(views, poses, self._middle)
+        # Two directions across the axis, in which the point on it may move and the axis lean.
+        first = np.cross(self._up, [0.0, 0.0, 1.0])
+        first /= np.linalg.norm(first)
+        self._across = np.stack([first, np.cross(self._up, first)])
+        self._start = np.zeros(FIRST_POSE + 6 * len(self._stands))
+        self._start[6:FIRST_POSE] = self._known
+        for number, stand in enumerate(self._stands):
+            index = min((i for i, v in enumerate(views) if v.stand == stand), key=lambda i: abs(views[i].table_deg))
+            back = cv2.Rodrigues(self._up * -radians(views[index].table_deg))[0]
+            rotation, translation = poses[index]
+            at_zero = back @ cv2.Rodrigues(rotation)[0]
+            place = self._origin + back @ (translation.ravel() - self._origin)
+            begin = FIRST_POSE + 6 * number
+            self._start[begin : begin + 3] = cv2.Rodrigues(at_zero)[0].ravel()
+            self._start[begin + 3 : begin + 6] = place
+        self.centres_mm = np.array([cv2.Rodrigues(r)[0] @ self._middle + t.ravel() for r, t in poses])
+        offset = self.centres_mm - self._origin
+        radial = np.linalg.norm(offset - np.outer(offset @ self._up, self._up), axis=1)
+        self.radii_mm = [
+            float(np.mean([r for r, v in zip(radial, views, strict=True) if v.stand == stand]))
+            for stand in self._stands
+        ]
+
+    def fit(self) -> tuple[dict[str, Estimate], float]:
+        """Return the estimates, and the root mean square of the corners' residuals in pixels."""
+        # From no lean at all the fit may walk to a lean about the wrong side: it begins at three, and the best counts.
+        starts = [self._start.copy() for _ in range(3)]
+        for start, turn in zip(starts, np.radians([0.0, 120.0, 240.0]), strict=True):
+            start[4:6] = radians(0.05) * np.array([np.cos(turn), np.sin(turn)])
+        tried = [self._solved(start, evaluations=15) for start in starts]
+        solved = self._solved(min(tried, key=lambda found: float(found.cost)).x, evaluations=60)
+        residuals = self._residuals(solved.x)[: -self._known.size]
+        freedom = max(residuals.size - solved.x.size, 1)
+        rms = float(np.sqrt((residuals.reshape(-1, 2) ** 2).sum(axis=1).mean()))
+        covariance = np.linalg.inv(solved.jac.T @ solved.jac) * float((residuals**2).sum()) / freedom
+        # How everything told depends on the parameters, by differences.
+        told = self._told(solved.x)
+        steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-12
+        jacobian = np.column_stack(
+            [
+                (self._told(solved.x + step * unit) - told) / step
+                for step, unit in zip(steps, np.eye(steps.size), strict=True)
+            ]
+        )
+        sigma = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+        names = ("x", "y", "z", "ux", "uy", "uz", "px", "py", "wobble")
+        units = ("mm", "mm", "mm", "", "", "", "px", "px", "°")
+        estimates = {
+            name: Estimate(float(value), float(s), unit)
+            for name, unit, value, s in zip(names, units, told, sigma, strict=True)
+        }
+        for name in ("px", "py"):
+            estimates[name] = replace(estimates[name], uncertainty=hypot(estimates[name].uncertainty, BIAS_PX))
+        estimates["eccentricity"] = Estimate(self.radii_mm[0], float(np.linalg.norm(sigma[:3])), "mm of the board")
+        return estimates, rms
+
+    def _solved(self, start: Floats, evaluations: int) -> Any:
+        return least_squares(
+            self._residuals, start, loss="soft_l1", f_scale=ROBUST_PX, x_scale="jac", max_nfev=evaluations
+        )
+
+    def _geometry(self, p: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the axis' direction, the point on it about which it leans, and the lean."""
+        up = self._up + p[0:2] @ self._across
+        up = up / np.linalg.norm(up)
+        return up, self._origin + p[2:4] @ self._across + p[6] * up, p[4:6]
+
+    def _seen(self, points_mm: Floats, p: Floats) -> Floats:
+        fx, fy, cx, cy, *distortion = p[7:FIRST_POSE]
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        seen = cv2.projectPoints(points_mm, np.zeros(3), np.zeros(3), matrix, np.array(distortion))[0]
+        return np.asarray(seen, dtype=np.float64).reshape(-1, 2)
+
+    def _told(self, p: Floats) -> Floats:
+        """Return what is told: the point on the axis beside the first board's middle, the direction, and the rest."""
+        up, point, lean = self._geometry(p)
+        pose = p[FIRST_POSE : FIRST_POSE + 6]
+        middle = cv2.Rodrigues(pose[:3])[0] @ self._middle + pose[3:]
+        beside = point + up * float((middle - point) @ up)
+        return np.concatenate([beside, up, self._seen(beside[None], p)[0], [degrees(hypot(*lean))]])
+
+    def _residuals(self, p: Floats) -> Floats:
+        up, point, lean = self._geometry(p)
+        parts = []
+        for view, board_points in zip(self._views, self._points, strict=True):
+            begin = FIRST_POSE + 6 * self._stands.index(view.stand)
+            at_zero = board_points @ cv2.Rodrigues(p[begin : begin + 3])[0].T + p[begin + 3 : begin + 6]
+            turn = radians(view.table_deg)
+            c, s = np.cos(2 * turn), np.sin(2 * turn)
+            leaning = (c * lean[0] - s * lean[1]) * self._across[0] + (s * lean[0] + c * lean[1]) * self._across[1]
+            rotation = cv2.Rodrigues(leaning)[0] @ cv2.Rodrigues(up * turn)[0]
+            now = point + (at_zero - point) @ rotation.T
+            parts.append((self._seen(now, p) - view.corners_px).ravel())
+        parts.append(CORNER_PX * (p[6:FIRST_POSE] - self._known) / self._known_sigma)
+        return np.concatenate(parts)
+
+
+def _pose(board: Board, view: BoardView, matrix: Floats, distortion: Sequence[float]) -> tuple[Floats, Floats]:
+    """Return rotation vector and translation (mm) of the board in the camera's frame."""
+    _, rotation, translation = cv2.solvePnP(points(board, view), view.corners_px, matrix, np.array(distortion))
+    return np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+
+
+def _first_axis(
+    views: Sequence[BoardView], poses: Sequence[tuple[Floats, Floats]], middle: Floats
+) -> tuple[Floats, Floats]:
+    """Return direction and a point of the axis: from the rotations between poses, and the circles of the middles."""
+    direction = np.zeros(3)
+    equations, values = [], []
+    for (a, (rotation_a, shift_a)), (b, (rotation_b, shift_b)) in (
+        (first, second)
+        for i, first in enumerate(zip(views, poses, strict=True))
+        for second in list(zip(views, poses, strict=True))[i + 1 :]
+        if first[0].stand == second[0].stand and abs(second[0].table_deg - first[0].table_deg) > 15.0
+    ):
+        before, after = cv2.Rodrigues(rotation_a)[0], cv2.Rodrigues(rotation_b)[0]
+        between = after @ before.T
+        turned = cv2.Rodrigues(between)[0].ravel()
+        direction += turned * np.sign(b.table_deg - a.table_deg)
+        centre_a, centre_b = before @ middle + shift_a.ravel(), after @ middle + shift_b.ravel()
+        equations.append(np.eye(3) - between)
+        values.append(centre_b - between @ centre_a)
+    direction /= np.linalg.norm(direction)
+    # Along the axis nothing is determined: the point nearest to the boards is taken.
+    centres = np.array([cv2.Rodrigues(r)[0] @ middle + t.ravel() for r, t in poses])
+    equations.append(direction[None])
+    values.append(np.array([float(centres.mean(axis=0) @ direction)]))
+    point = np.linalg.lstsq(np.concatenate(equations), np.concatenate(values), rcond=None)[0]
+    return direction, np.asarray(point, dtype=np.float64)
+
+
+def _judge(estimates: Mapping[str, Estimate], rms: float) -> list[str]:
+    refusals = []
+    if rms > MAX_RMS_PX:
+        refusals.append(
+            f"The corners are off the circles by {rms:.2f} px (RMS), above {MAX_RMS_PX:g}: the board is loose, the "
+            "table moved while it was looked at, or the camera was touched since its calibration. Fix them, run `rig "
+            "calibrate camera` where the lens was touched, and calibrate again."
+        )
+    uncertainty = max(estimates["px"].uncertainty, estimates["py"].uncertainty)
+    if uncertainty > MAX_UNCERTAINTY_PX:
+        refusals.append(
+            f"The axis is uncertain by {uncertainty:.2f} px in the image, more than {MAX_UNCERTAINTY_PX:g}: bring "
+            "the board nearer, or light it better."
+        )
+    wobble = estimates["wobble"]
+    if wobble.value - 2 * wobble.uncertainty > MAX_WOBBLE_DEG:
+        refusals.append(
+            f"The axis wobbles by {wobble.value:.2f}°, more than {MAX_WOBBLE_DEG:g}°: the bearing is out of true, or "
+            "the horn loose."
+        )
+    return refusals

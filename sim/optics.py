@@ -1,0 +1,106 @@
+"""A true camera: pinhole with distortion, before a table whose axis stands anywhere in its frame."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import cos, radians, sin
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.objects.projection import CENTRE_PX, COS, HEIGHT, SIN, WIDTH, Floats
+
+FOCAL_PX = 1000.0
+DISTANCE_MM = 500.0
+"""From the lens to the centre of the platter's top: together 2 px a mm, as `sim.objects.projection` has it."""
+SUPERSAMPLING = 2
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What calibrations of the camera and of the table's axis should find.
+
+    Attributes
+    ----------
+    focal_px, centre_px : tuple of 2
+        Focal lengths and principal point.
+    distortion : tuple of 5
+        k1, k2, p1, p2, k3 of OpenCV's model.
+    rotation : tuple of 9
+        Rows of the rotation from the room's frame (x right, y away, z up along the table's axis) into the camera's.
+    translation_mm : tuple of 3
+        Where the camera's frame has the centre of the platter's top.
+    wobble_deg
+        By how much the axis leans, to a side that goes round twice as fast as the table: a bearing out of true. (What
+        goes round with the table cannot be told from how the board stands.)
+    """
+
+    focal_px: tuple[float, float] = (FOCAL_PX, FOCAL_PX)
+    centre_px: tuple[float, float] = (WIDTH / 2, HEIGHT / 2)
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    rotation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, -SIN, -COS, 0.0, COS, -SIN)
+    translation_mm: tuple[float, float, float] = (
+        (CENTRE_PX[0] - WIDTH / 2) * DISTANCE_MM / FOCAL_PX,
+        (CENTRE_PX[1] - HEIGHT / 2) * DISTANCE_MM / FOCAL_PX,
+        DISTANCE_MM,
+    )
+    wobble_deg: float = 0.0
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, *, wobble_deg: float = 0.0) -> Self:
+        """Return a camera as they are: focal length ±5 %, principal point ±10 px, mounted askew by some degrees."""
+        plain = cls()
+        fx = FOCAL_PX * (1 + 0.05 * float(rng.standard_normal()))
+        fy = fx * (1 + 0.002 * float(rng.standard_normal()))
+        cx, cy = plain.centre_px[0] + 10 * rng.standard_normal(), plain.centre_px[1] + 10 * rng.standard_normal()
+        k1, k2 = 0.08 * rng.standard_normal(), 0.1 * rng.standard_normal()
+        p1, p2 = 0.0005 * rng.standard_normal(2)
+        askew = cv2.Rodrigues(np.radians([3.0, 1.0, 1.5]) * rng.standard_normal(3))[0]
+        rotation = askew @ np.array(plain.rotation).reshape(3, 3)
+        shift = np.array([6.0, 6.0, 20.0]) * rng.standard_normal(3)
+        translation = askew @ np.array(plain.translation_mm) + shift
+        # The platter stays in view however the camera looks.
+        translation[:2] = np.array(plain.translation_mm[:2]) + shift[:2]
+        return cls(
+            (fx, fy),
+            (float(cx), float(cy)),
+            (float(k1), float(k2), float(p1), float(p2), 0.0),
+            tuple(rotation.ravel().tolist()),
+            (float(translation[0]), float(translation[1]), float(translation[2])),
+            wobble_deg,
+        )
+
+    @property
+    def matrix(self) -> Floats:
+        """The camera matrix (3, 3)."""
+        return np.array(
+            [[self.focal_px[0], 0.0, self.centre_px[0]], [0.0, self.focal_px[1], self.centre_px[1]], [0.0, 0.0, 1.0]]
+        )
+
+    def to_camera(self, table_deg: float) -> tuple[Floats, Floats]:
+        """Return rotation (3, 3) and translation (3,) from the platter's frame into the camera's."""
+        rotation = np.array(self.rotation).reshape(3, 3)
+        if self.wobble_deg:
+            lean = radians(self.wobble_deg)
+            around = 2 * radians(table_deg)
+            rotation = rotation @ cv2.Rodrigues(np.array([lean * cos(around), lean * sin(around), 0.0]))[0]
+        return rotation @ _about_vertical(table_deg), np.array(self.translation_mm)
+
+    def rays(self, factor: int = SUPERSAMPLING) -> NDArray[np.float32]:
+        """Return where the ray of each sub-pixel passes the plane one unit before the lens, float32 (n, 2)."""
+        return _rays(self, factor)
+
+
+def _about_vertical(angle_deg: float) -> Floats:
+    c, s = cos(radians(angle_deg)), sin(radians(angle_deg))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@lru_cache(maxsize=2)
+def _rays(optics: Optics, factor: int) -> NDArray[np.float32]:
+    x = (np.arange(WIDTH * factor) + 0.5) / factor - 0.5
+    y = (np.arange(HEIGHT * factor) + 0.5) / factor - 0.5
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
+    rays = cv2.undistortPoints(grid, optics.matrix, np.array(optics.distortion))
+    return np.asarray(rays.reshape(-1, 2), dtype=np.float32)

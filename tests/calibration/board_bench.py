@@ -1,0 +1,50 @@
+"""Views of a simulated board, without a bench around it."""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import cv2
+import numpy as np
+
+from calibration.board_views import MIN_CORNERS, BoardView
+from rig.markers import Board, sight
+from sim.objects.board import BoardOnPlatter, boards
+from sim.objects.solid import empty_platter
+from sim.optics import Optics
+
+Picture = np.ndarray
+
+
+def seen(
+    optics: Optics,
+    stands: Sequence[str],
+    angles_deg: Sequence[float],
+    *,
+    board: Board | None = None,
+    change: Callable[[BoardOnPlatter], BoardOnPlatter] = lambda board: board,
+    spoil: Callable[[Picture], Picture] = lambda picture: picture,
+    ratio: float = 1.0,
+) -> list[BoardView]:
+    """Return what the camera sees of the board; the encoder says ``ratio`` times the table's angle."""
+    rng = np.random.default_rng(0)
+    views = []
+    for number, stand in enumerate(stands):
+        thing = change(boards(optics)[stand])
+        for angle_deg in angles_deg:
+            picture = empty_platter()
+            thing.draw(picture, angle_deg)
+            noisy = np.clip(spoil(picture) + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+            found = sight(board or thing.board, noisy)
+            if found.ids.size >= MIN_CORNERS:
+                encoder_deg = ratio * angle_deg + float(rng.normal(0, 0.03))
+                views.append(BoardView(number, encoder_deg, found.ids, found.corners_px))
+    return views
+
+
+@cache
+def optics(seed: int, wobble_deg: float = 0.0) -> Optics:
+    return Optics.drawn(np.random.default_rng(seed), wobble_deg=wobble_deg)
+
+
+def blurred(picture: Picture) -> Picture:
+    return cv2.GaussianBlur(picture, (0, 0), 6.0)

@@ -1,0 +1,65 @@
+"""The printed board: found by the camera, and true to scale."""
+
+import re
+import shutil
+import subprocess
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.print_board import write_board
+from rig.errors import UsageError
+from rig.markers import Board, sight
+
+
+def px_per_mm(board: Board, picture) -> float:
+    found = sight(board, picture)
+    assert found.ids.size == board.corners
+    flat = np.column_stack([board.points_mm()[found.ids][:, :2], np.ones(found.ids.size)])
+    map_, residual, *_ = np.linalg.lstsq(flat, found.corners_px, rcond=None)
+    assert np.sqrt(residual.sum() / found.ids.size) < 0.5
+    return float(np.linalg.norm(map_[0]))
+
+
+def test_the_png_says_how_large_it_is(tmp_path):
+    words = write_board(Board(), tmp_path / "board.png")
+    assert "8 squares must be 120 mm" in words
+    data = (tmp_path / "board.png").read_bytes()
+    at = data.index(b"pHYs") + 4
+    assert int.from_bytes(data[at : at + 4], "big") == 12_000
+    assert px_per_mm(Board(), cv2.imread(str(tmp_path / "board.png"))) == pytest.approx(12.0, rel=1e-3)
+
+
+def test_the_pdf_is_drawn_true_to_scale(tmp_path):
+    """Painted from the page's own operators: PDF readers need not be installed."""
+    board = Board(columns=6, rows=5, square_mm=20.0, marker_mm=20.0 * 11 / 15)
+    write_board(board, tmp_path / "board.pdf")
+    data = (tmp_path / "board.pdf").read_bytes()
+    stream = zlib.decompress(data[data.index(b"stream\n") + 7 : data.index(b"\nendstream")]).decode("ascii")
+    scale = 8.0 / (72 / 25.4)  # 8 pixels a millimetre
+    page = np.full((210 * 8, 297 * 8, 3), 255, np.uint8)
+    for x, y, w, h in re.findall(r"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re", stream):
+        left, low, right, high = (float(v) * scale for v in (x, y, float(x) + float(w), float(y) + float(h)))
+        page[round(210 * 8 - high) : round(210 * 8 - low), round(left) : round(right)] = 0
+    assert px_per_mm(board, page) == pytest.approx(8.0, rel=1e-3)
+    x0, x1 = (float(v) for v in re.search(r"([\d.]+) [\d.]+ m ([\d.]+) [\d.]+ l S", stream).groups())
+    assert (x1 - x0) / (72 / 25.4) == pytest.approx(100.0, abs=0.01)
+
+
+@pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="pdftoppm (Debian: poppler-utils) is not installed")
+def test_a_pdf_reader_draws_it_too(tmp_path):
+    write_board(Board(), tmp_path / "board.pdf")
+    subprocess.run(["pdftoppm", "-r", "150", "-png", tmp_path / "board.pdf", tmp_path / "page"], check=True)
+    (page,) = tmp_path.glob("page*.png")
+    assert px_per_mm(Board(), cv2.imread(str(page))) == pytest.approx(150 / 25.4, rel=1e-3)
+
+
+def test_what_cannot_be_printed_is_refused(tmp_path):
+    with pytest.raises(UsageError, match=r"neither .pdf nor .png"):
+        write_board(Board(), tmp_path / "board.jpg")
+    with pytest.raises(UsageError, match="does not fit"):
+        write_board(Board(square_mm=40.0, marker_mm=29.0), tmp_path / "board.pdf")
+    with pytest.raises(UsageError, match="Cannot write"):
+        write_board(Board(), tmp_path / "nowhere" / "board.pdf")
