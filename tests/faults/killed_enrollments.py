@@ -30,12 +30,17 @@ def main() -> None:
     moments = random.Random(seed)
     clock = SystemClock()
     with new_rig(folder / "bench") as rig:
+        whole_s = float("inf")
         for name in ("cold", "warm"):
             begun_ns = clock.now_ns()
             _child(rig, folder / name, None)
-            whole_s = seconds_between(begun_ns, clock.now_ns())
+            whole_s = min(whole_s, seconds_between(begun_ns, clock.now_ns()))
         for number in range(kills):
-            killed, reported = _child(rig, folder / str(number), moments.uniform(0.0, whole_s))
+            begun_ns = clock.now_ns()
+            moment_s = moments.uniform(0.0, whole_s)
+            killed, reported = _child(rig, folder / str(number), moment_s)
+            if not killed:  # the computer has less to do than before: it was done already
+                whole_s = min(whole_s, seconds_between(begun_ns, clock.now_ns()))
             print(json.dumps({"number": number, "killed": killed, "reported": reported}), flush=True)
 
 
