@@ -98,6 +98,7 @@ def status(settings: Settings) -> None:
             "limits_deg": list(config.limits_deg),
             "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.line)},
             "imu": {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()},
+            **({"head": bench.head.report()} if bench.head else {}),
             "camera": {**plain(bench.camera.identity), "locks": plain(bench.camera.read_locks())},
             "findings": list(bench.findings),
         }
@@ -107,7 +108,9 @@ def status(settings: Settings) -> None:
     print(f"bench    {report['bench']}")
     print(f"state    {_state_words(safety)}")
     print(f"table    {_table_words(table_deg, config.limits_deg)}")
-    for device in ("servo", "imu", "camera"):
+    for device in ("servo", "imu", "head", "camera"):
+        if device not in report:
+            continue
         facts = report[device]
         assert isinstance(facts, dict)
         print(f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in facts.items() if key != "time_ns"))

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import hypot, sqrt
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,9 +111,13 @@ class HeadStatus:
 
 @dataclass(slots=True)
 class HeadStatistics:
-    """Counts since the head was opened; ``lost`` are samples that never reached a reader."""
+    """Counts since the head was opened.
+
+    ``lost`` are samples that never reached a reader; ``dropped`` those among them that the head had no room to send.
+    """
 
     lost: int = 0
+    dropped: int = 0
     reconnects: int = 0
     restarts: int = 0
 
@@ -339,6 +344,18 @@ class RigHead:
         """Return the head's own counts since it started."""
         with self._alone():
             return self._link.request(Count(), Counters)
+
+    def report(self) -> dict[str, Any]:
+        """Return in words how the head does, for people and records."""
+        status = self._status
+        return {
+            "state": status.state.name.lower(),
+            "faults": [str(fault.name).lower() for fault in status.faults],
+            "estop_open": status.estop_open,
+            "relay_closed": status.relay_closed,
+            "sensor": status.imu_status.name.lower(),
+            "line": self.health(),
+        }
 
     def health(self) -> dict[str, float]:
         """Return statistics of line, clock and samples, units in the names."""
@@ -573,10 +590,12 @@ class RigHead:
         elif self._newest is not None:  # the first one after a restart of the head, or of the connection
             gap_s = seconds_between(self._newest_ns, self._clock.now_ns())
             self._miss(max(round(gap_s * self.rate_hz) - 1, 1))
-        self._next_index = (sample.index + 1) % (1 << 16)
         if len(self._samples) == self._samples.maxlen:
             self._miss(1)
         self._samples.append((time_us, sample))
+        if self._newest is not None and self._next_index is not None:
+            self.statistics.dropped += (sample.dropped - self._newest.dropped) % 256
+        self._next_index = (sample.index + 1) % (1 << 16)
         self._newest, self._newest_ns = sample, self._clock.now_ns()
 
     def _miss(self, count: int) -> None:

@@ -1,0 +1,182 @@
+"""Whatever a host, an operator and a bad supply do in whatever order: light and power are on only while all is well."""
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rig.devices.head.link import HeadLink
+from rig.devices.head.protocol import (
+    DEADMAN_MAX_MS,
+    DEADMAN_MIN_MS,
+    Acknowledge,
+    Beat,
+    Done,
+    Fault,
+    Light,
+    Pulse,
+    Relay,
+    Reset,
+    Rest,
+    State,
+    Trigger,
+    Triggered,
+)
+from rig.errors import DeviceRefused
+from sim.head.board import SimHead
+from sim.head.build import missing
+from sim.head.wire import HeadSerial
+from sim.world import World
+
+MS = 1_000_000
+SLACK_NS = 3 * MS
+"""A request and its answer are on the line for up to 2 ms."""
+
+
+class Head(RuleBasedStateMachine):
+    """The firmware's core against a model of what may be on."""
+
+    @initialize()
+    def power_up(self):
+        self.world = World()
+        self.head = SimHead(self.world)
+        self.link = HeadLink(HeadSerial(self.head), self.world.clock, lambda _event: None, "head")
+        self.link.start()
+        self.told: Pulse | None = None
+        self.deadman_ns = 0
+        self.beaten_ns: int | None = None
+        self.acknowledged_ns = 0
+        self.opened_ns: int | None = None
+        self.latched = Fault(0)
+
+    def teardown(self):
+        if hasattr(self, "head"):
+            self.head.close()
+
+    def now_ns(self) -> int:
+        return self.world.clock.now_ns()
+
+    def ask(self, message, expected) -> bool:
+        try:
+            self.link.request(message, expected)
+        except DeviceRefused:
+            return False
+        return True
+
+    # -- what may happen ------------------------------------------------------------------------------------------
+
+    @rule(deadman_ms=st.sampled_from([DEADMAN_MIN_MS, 100, 250, DEADMAN_MAX_MS]))
+    def beat(self, deadman_ms):
+        self.expire()
+        self.told = self.link.request(Beat(deadman_ms), Pulse)
+        self.deadman_ns, self.beaten_ns = deadman_ms * MS, self.link.heard_ns
+
+    @rule(level=st.integers(0, 255))
+    def light(self, level):
+        self.expire()
+        if self.ask(Light(level), Done) and level:
+            assert self.beaten_ns is not None
+            assert not self.latched
+
+    @rule(closed=st.integers(0, 1))
+    def relay(self, closed):
+        self.expire()
+        if self.ask(Relay(closed), Done) and closed:
+            assert self.beaten_ns is not None
+            assert not self.latched
+
+    @rule(width_us=st.integers(10, 3000))
+    def trigger(self, width_us):
+        self.expire()
+        if self.ask(Trigger(width_us), Triggered):
+            assert not self.latched
+
+    @rule(seen=st.sampled_from([0xFF, int(Fault.DEADMAN), int(Fault.ESTOP), 0]))
+    def acknowledge(self, seen):
+        self.expire()
+        if self.ask(Acknowledge(seen), Done):
+            assert not (seen & Fault.ESTOP and self.head.estop_open)
+            if self.latched:
+                self.latched &= ~Fault(seen)
+                if not self.latched:
+                    self.beaten_ns = None
+
+    @rule()
+    def rest(self):
+        self.expire()
+        self.ask(Rest(), Done)
+        self.beaten_ns = None if not self.latched else self.beaten_ns
+
+    @precondition(lambda self: not self.head.estop_open)
+    @rule()
+    def press(self):
+        self.head.estop_open = True
+        self.world.clock.sleep(0.0015)
+        self.latched |= Fault.ESTOP
+        assert not self.head.relay_closed
+        assert self.head.light == 0
+
+    @precondition(lambda self: self.head.estop_open)
+    @rule()
+    def release(self):
+        self.head.estop_open = False
+        self.world.clock.sleep(0.001)
+
+    @rule(seconds=st.sampled_from([0.001, 0.04, 0.12, 0.3, 2.5]))
+    def nothing(self, seconds):
+        self.world.clock.sleep(seconds)
+        self.expire()
+
+    @rule(cause=st.sampled_from([Reset.BROWN_OUT, Reset.EXTERNAL, Reset.WATCHDOG]))
+    def restart(self, cause):
+        self.head.reset(cause)
+        assert not self.head.relay_closed
+        assert self.head.light == 0
+        self.beaten_ns = None
+        self.latched = {Reset.BROWN_OUT: Fault.BROWN_OUT, Reset.WATCHDOG: Fault.WATCHDOG}.get(cause, Fault(0))
+        self.world.clock.sleep(0.01)
+        if self.head.estop_open:
+            self.latched |= Fault.ESTOP
+
+    @rule(noise=st.binary(min_size=1, max_size=40))
+    def babble(self, noise):
+        self.head.send(noise + b"\0")
+        self.world.clock.sleep(0.003)
+
+    # -- what always holds ------------------------------------------------------------------------------------------
+
+    def expire(self):
+        """The deadman, as the model has it: near its end either answer is right, so that nothing is asked then."""
+        if self.beaten_ns is None or self.latched:
+            return
+        self.head.catch_up()
+        silent_ns = self.now_ns() - self.beaten_ns
+        if abs(silent_ns - self.deadman_ns) < SLACK_NS:
+            self.world.clock.sleep(2 * SLACK_NS * 1e-9)
+            silent_ns = self.now_ns() - self.beaten_ns
+        if silent_ns > self.deadman_ns:
+            self.latched |= Fault.DEADMAN
+
+    @invariant()
+    def nothing_is_on_that_must_not_be(self):
+        if not hasattr(self, "head"):
+            return
+        self.head.catch_up()
+        on = self.head.relay_closed or self.head.light > 0
+        if on:
+            assert self.beaten_ns is not None
+            assert not self.latched
+            assert self.now_ns() - self.beaten_ns <= self.deadman_ns + SLACK_NS
+        assert not (on and self.head.estop_open)
+
+    @invariant()
+    def it_tells_what_it_does(self):
+        if getattr(self, "told", None) is not None:
+            told, self.told = self.told, None
+            assert Fault(told.faults) == self.latched
+            assert (told.state == State.FAULT) == bool(self.latched)
+            assert told.state != State.IDLE
+
+
+TestHead = pytest.mark.skipif(bool(missing("memory")), reason=missing("memory"))(Head.TestCase)
+TestHead.settings = settings(max_examples=25, stateful_step_count=30, deadline=None)
