@@ -11,7 +11,7 @@ from hbr.arrays import FloatArray, IndexArray
 from hbr.dense import BINS, Belief
 
 #: Hypotheses that are compared at most, and the share of the belief that need not be compared.
-_STRONGEST: Final = 24
+_STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3
 #: A view this near to one that was had tells little that is new.
 _NEAR_DEG: Final = 25.0

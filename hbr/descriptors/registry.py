@@ -1,9 +1,12 @@
 """The descriptors by name."""
 
+from functools import cache
+from pathlib import Path
 from typing import Final
 
 from hbr.descriptors.colours import Colours
 from hbr.descriptors.edges import Edges
+from hbr.descriptors.embedding import PREFIX, Embedding
 from hbr.descriptors.joined import Joined
 from hbr.descriptors.plain import Cedd
 from hbr.descriptors.protocol import Descriptor
@@ -29,18 +32,25 @@ PAPERS: Final = tuple(known.name for known in _KNOWN.values() if isinstance(know
 
 
 def descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name.
+    """Return the descriptor of this name, or of ``onnx:FILE``, a network's embedding.
 
     Raises
     ------
     ValueError
-        There is none; the message lists those there are.
+        There is none, and the message lists those there are; or the model file cannot be used.
     """
+    if name.startswith(PREFIX):
+        return _embedding(name.removeprefix(PREFIX))
     if name not in _KNOWN:
-        raise ValueError(f"descriptor {name!r} is unknown; use one of {', '.join(names())}")
+        raise ValueError(f"descriptor {name!r} is unknown; use one of {', '.join(names())}, or {PREFIX}FILE")
     return _KNOWN[name]
 
 
+@cache
+def _embedding(path: str) -> Descriptor:
+    return Embedding(Path(path))
+
+
 def names() -> tuple[str, ...]:
-    """Names of all descriptors, the paper's first."""
+    """Names of all descriptors that come with the library, the paper's first."""
     return tuple(_KNOWN)

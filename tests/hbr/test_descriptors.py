@@ -1,6 +1,9 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from hbr import DenseIndex, ViewIndex, Views, believe
 from hbr.descriptors import Descriptor, descriptor, names
 
 
@@ -51,3 +54,89 @@ def test_similarity_is_1_to_itself_symmetric_and_between_0_and_1(one: Descriptor
 def test_an_unknown_name_is_answered_with_those_there_are() -> None:
     with pytest.raises(ValueError, match="'sift' is unknown; use one of cedd"):
         descriptor("sift")
+
+
+def varint(number: int) -> bytes:
+    low, rest = number & 127, number >> 7
+    return bytes([low | 128]) + varint(rest) if rest else bytes([low])
+
+
+def field(number: int, value: int | bytes) -> bytes:
+    """A field of a protocol buffer."""
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    return varint(number << 3 | 2) + varint(len(value)) + value
+
+
+def model() -> bytes:
+    """An ONNX model of two nodes that returns the means of its three channels."""
+
+    def tensor(name: bytes, *sides: int) -> bytes:
+        shape = b"".join(field(1, field(1, side)) for side in sides)
+        return field(1, name) + field(2, field(1, field(1, 1) + field(2, shape)))
+
+    def node(source: bytes, target: bytes, kind: bytes) -> bytes:
+        return field(1, source) + field(2, target) + field(3, target) + field(4, kind)
+
+    graph = field(1, node(b"x", b"p", b"GlobalAveragePool")) + field(1, node(b"p", b"y", b"Flatten")) + field(2, b"g")
+    graph += field(11, tensor(b"x", 1, 3, 224, 224)) + field(12, tensor(b"y", 1, 3))
+    return field(1, 8) + field(7, graph) + field(8, field(1, b"") + field(2, 13))
+
+
+def test_a_network_s_embedding_is_a_descriptor_like_any_other(tmp_path: Path) -> None:
+    file = tmp_path / "means.onnx"
+    file.write_bytes(model())
+    own = descriptor(f"onnx:{file}")
+    assert (own.length, own.size_bytes) == (3, 3)
+    assert own.name == f"onnx:{file}"
+    red, blue = (np.full((60, 60, 3), colour, np.uint8) for colour in ((20, 20, 220), (220, 20, 20)))
+    levels = np.stack([own.describe(image) for image in (red, blue)])
+    assert levels[0].argmax() == 0  # R, G, B
+    assert levels[1].argmax() == 2
+    similar = own.similarity(levels, levels)
+    np.testing.assert_allclose(np.diag(similar), 1, atol=1e-6)
+    assert similar[0, 1] < 0.5
+    np.testing.assert_array_equal(own.unpack(own.pack(levels[0])), levels[0])
+    index = DenseIndex(Views(levels, [0.0, 0.0], np.array([0, 1]), ("red", "blue"), own.name))  # type: ignore[arg-type]
+    assert believe(levels[1], 0.0, index).ranking().object_index[0] == 1
+
+
+def test_a_model_that_cannot_be_used_is_refused_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
+        descriptor(f"onnx:{tmp_path / 'none.onnx'}")
+    (tmp_path / "text.onnx").write_text("no model")
+    with pytest.raises(ValueError, match="no model that OpenCV can run"):
+        descriptor(f"onnx:{tmp_path / 'text.onnx'}")
+
+
+def test_a_blur_of_a_block_makes_cedd_of_noise_like_cedd_without() -> None:
+    """What the prefilter is for."""
+    rng = np.random.default_rng(0)
+    noisy = np.clip(photo() + rng.normal(0, 25, (120, 160, 3)), 0, 255).astype(np.uint8)
+    same = {
+        name: descriptor(name).similarity(*(descriptor(name).describe(i)[None] for i in (photo(), noisy)))[0, 0]
+        for name in ("cedd", "cedd-blurred")
+    }
+    assert same["cedd-blurred"] > 0.8 > 0.5 > same["cedd"]
+
+
+def test_views_of_different_descriptors_are_not_mixed() -> None:
+    views = [Views.of_object("a", descriptor(n).describe(photo())[None], [0.0], n) for n in ("cedd", "edges")]
+    with pytest.raises(ValueError, match="views of cedd and edges cannot be compared"):
+        Views.concatenate(views)
+    with pytest.raises(ValueError, match="edges needs the shape"):
+        Views.of_object("a", views[0].descriptors, [0.0], "edges")
+    with pytest.raises(ValueError, match="compares CEDD alone"):
+        ViewIndex(views[1])
+
+
+@pytest.mark.parametrize("name", [name for name in names() if not name.startswith("cedd")])
+@pytest.mark.parametrize(("gain", "exponent"), [(0.6, 1.0), (1.25, 1.0), (1.0, 1.2)])
+def test_strength_of_the_light_and_gamma_hardly_matter_to_what_sees_the_object_alone(
+    name: str, gain: float, exponent: float
+) -> None:
+    own = descriptor(name)
+    image = np.where(photo(3) > 20, photo(3) * 0.75, photo(3))
+    changed = (255 * (np.clip(image * gain, 0, 255) / 255) ** exponent).astype(np.uint8)
+    same = own.similarity(own.describe(image.astype(np.uint8))[None], own.describe(changed)[None])
+    assert same[0, 0] > 0.9
