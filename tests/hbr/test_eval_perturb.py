@@ -1,0 +1,115 @@
+"""Queries that differ from the enrolled views in place, light, and what is around."""
+
+import numpy as np
+import pytest
+
+from hbr import describe, descriptor
+from hbr.evaluation.condition import Condition, object_mask
+from hbr.evaluation.perturb import STRENGTHS, Perturbations
+from hbr.evaluation.scenes import HEIGHT, WIDTH, other_bench, plain_bench
+
+
+def ball() -> np.ndarray:
+    """A ball of two colours in the dark, 128 x 128."""
+    y, x = np.indices((128, 128))
+    inside = (y - 64) ** 2 + (x - 64) ** 2 < 40**2
+    image = np.full((128, 128, 3), 20, np.uint8)
+    image[inside] = (60, 80, 200)
+    image[inside & (x > 64)] = (200, 180, 60)
+    return image
+
+
+def shot(text: str, seed: int = 0, bench: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    image = ball()
+    return Perturbations.parse(text).photograph(image, object_mask(image), np.random.default_rng(seed), bench)
+
+
+def differs(text: str) -> float:
+    """Mean change of the grey levels over some draws."""
+    return float(np.mean([np.abs(shot(text, seed)[0].astype(int) - ball()).mean() for seed in range(12)]))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in STRENGTHS if kind != "shadow"])
+def test_a_perturbation_changes_the_picture_the_more_the_stronger(kind: str) -> None:
+    changes = [differs(f"{kind}:{strength}") for strength in (1, 2, 3)]
+    assert 0.05 < changes[0] < changes[1] < changes[2]
+
+
+def test_none_leaves_the_photograph_as_it_is_and_seeds_repeat() -> None:
+    np.testing.assert_array_equal(shot("none")[0], ball())
+    np.testing.assert_array_equal(shot("all:2", 5)[0], shot("all:2", 5)[0])
+    assert (shot("all:2", 5)[0] != shot("all:2", 6)[0]).any()
+
+
+def test_shift_and_scale_are_those_that_are_stated() -> None:
+    places, sizes = [], []
+    for seed in range(60):
+        mask = object_mask(shot("shift:2+scale:2", seed)[0])
+        y, x = np.nonzero(mask)
+        places.append([(x.mean() - 63.5) / 128, (y.mean() - 63.5) / 128])
+        sizes.append(np.sqrt(mask.sum() / object_mask(ball()).sum()))
+    assert 0.05 < np.abs(places).max() < 0.066
+    assert 0.88 < min(sizes) < 0.93
+    assert 1.07 < max(sizes) < 1.12
+
+
+def test_on_a_bench_the_empty_bench_comes_with_the_picture_in_the_same_light() -> None:
+    bench = plain_bench(np.random.default_rng(0))
+    picture, empty = shot("gain:3+white-balance:3+gradient:3", 1, bench)
+    assert empty is not None
+    assert picture.shape == empty.shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_array_equal(picture[:40], empty[:40])
+    assert np.abs(empty.astype(int) - bench).mean() > 5
+    assert np.abs(picture.astype(int) - empty)[100:180, 120:200].mean() > 20
+
+
+def test_a_cast_shadow_darkens_the_bench_and_not_the_object() -> None:
+    bench = plain_bench(np.random.default_rng(0))
+    with_shadow, _ = shot("shadow:3", 3, bench)
+    without, _ = shot("none", 3, bench)
+    change = with_shadow.astype(int) - without
+    assert change.min() < -15
+    assert change.max() <= 1
+    assert np.abs(change[110:150, 150:170]).max() <= 2
+
+
+def test_benches_differ_from_each_other() -> None:
+    benches = [other_bench(np.random.default_rng(seed)) for seed in range(3)]
+    assert all(np.abs(a - b).mean() > 15 for a, b in ((benches[0], benches[1]), (benches[1], benches[2])))
+    assert plain_bench(np.random.default_rng(1)).std(axis=(0, 1)).max() < min(b.std(axis=(0, 1)).max() for b in benches)
+
+
+@pytest.mark.parametrize("text", ["fog", "gain:4", "gain:x", "gain+gain", "all:0", "", "shift:2+", "gain:"])
+def test_what_is_no_perturbation_is_refused(text: str) -> None:
+    if text == "gain:":
+        assert str(Perturbations.parse(text)) == "gain:2"
+        return
+    with pytest.raises(ValueError, match=r"unknown|strength|once"):
+        Perturbations.parse(text)
+
+
+def test_words_and_perturbations_are_each_other_s_inverse() -> None:
+    for text in ("none", "gain:1", "shift:2+scale:3", "all:3"):
+        assert Perturbations.parse(str(Perturbations.parse(text))) == Perturbations.parse(text)
+
+
+def test_the_bench_s_own_descriptor_knows_a_thing_on_another_bench_where_cedd_does_not() -> None:
+    """The whole way that `rig eval --background other-bench` goes."""
+    conditions = {
+        name: Condition(background="other-bench", perturbations=Perturbations.parse("shift:1+gain:2"), descriptor=name)
+        for name in ("cedd", "edges+colours")
+    }
+    similar = {}
+    for name, condition in conditions.items():
+        enrolled, query = condition.enrolled(ball()), condition.query(ball(), np.random.default_rng(4))
+        levels = [describe(image, descriptor=name, reference=empty) for image, empty in (enrolled, query)]
+        plain = [describe(image, descriptor=name) for image, _ in (enrolled, query)]
+        similar[name] = [float(descriptor(name).similarity(a[None], b[None])[0, 0]) for a, b in (levels, plain)]
+    assert similar["edges+colours"][0] > 0.85
+    assert similar["cedd"][1] < 0.5
+
+
+@pytest.mark.parametrize("setting", [{"rotation_deg": 10}, {"background": "uniform"}])
+def test_conditions_that_exclude_each_other_are_refused(setting: dict) -> None:
+    with pytest.raises(ValueError, match="leave one of them away"):
+        Condition(perturbations=Perturbations.parse("gain"), **setting)
