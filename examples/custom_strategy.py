@@ -34,7 +34,7 @@ def main() -> None:
         Catalog.open(folder, clock=bench.clock) as catalog,
     ):
         for name in OBJECTS:
-            for _ in enroll(bench, catalog, name, views=18):
+            for _ in enroll(bench, catalog, name, views=12):
                 pass
         index = hbr.ViewIndex(catalog.views().views)
         hands = bench.operator

@@ -43,7 +43,7 @@ def test_every_command_has_an_example_that_begins_with_its_name(words):
 
 
 def test_help_is_light_and_takes_little_time():
-    """The least of five runs: the others are slower by what the machine did beside."""
+    """The least of three runs: the others are slower by what the machine did beside."""
     code = (
         "import sys; sys.argv = ['rig', '--help']\n"
         "from rig.cli.main import main\n"
@@ -52,7 +52,7 @@ def test_help_is_light_and_takes_little_time():
         "print('HEAVY', sorted({'numpy', 'cv2', 'scipy', 'sqlalchemy', 'pydantic', 'jinja2'} & set(sys.modules)))\n"
     )
     spent = []
-    for _ in range(5):
+    for _ in range(3):
         before = os.times()
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         after = os.times()

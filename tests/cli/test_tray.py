@@ -18,7 +18,7 @@ from rig.plans.saved_run import load_run
 from sim.objects.shelf import CONFUSABLE, shelf
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
-VIEWS = 8
+VIEWS = 6
 NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:25]
 SMALL = f"""\
 default_bench = "sim"
@@ -86,6 +86,7 @@ def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
     return [event for event in events if event["event"] == kind]
 
 
+@pytest.mark.timeout(300)  # four processes one after the other, on a machine that may be busy
 def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identified(folder):
     first, code, errors = enroll_until(folder, 7 * VIEWS + 3, signal.SIGINT)
     assert code == 130

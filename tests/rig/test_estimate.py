@@ -14,6 +14,7 @@ from rig.plans.enroll import enroll
 from rig.plans.estimate import MotionModel, TimeLeft, even_azimuths, rehearse, table_angles
 from rig.plans.events import Accepted, Enrolled, Moved, Started
 
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 LIMITS = st.floats(-2000, 0).flatmap(
     lambda low: st.tuples(st.just(low), st.floats(max(0.0, low + 360.0), low + 4000.0))
 )
@@ -45,7 +46,7 @@ def test_a_plan_of_another_bench_is_turned_by_whole_turns_or_refused_before_anyt
 
 
 def test_an_enrollment_on_a_short_cable_stays_within_it_and_sees_all_sides(simulated, tmp_path):
-    s = simulated("table.limits_deg=[-180, 185]")
+    s = simulated(*SMALL, "table.limits_deg=[-180, 185]")
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         moves = [e for e in enroll(s.bench, catalog, "dice", views=6) if isinstance(e, Moved)]
         assert [m.commanded_deg for m in moves] == [-120.0, -60.0, 0.0, 60.0, 120.0, 180.0]
@@ -56,7 +57,7 @@ def test_an_enrollment_on_a_short_cable_stays_within_it_and_sees_all_sides(simul
 
 @pytest.mark.parametrize("views", [8, 36])
 def test_the_motion_model_tells_the_time_within_a_tenth(simulated, tmp_path, views):
-    s = simulated(seed=3)
+    s = simulated(*SMALL, seed=3)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         (before,) = rehearse(s.bench, catalog, ["dice"], views=views)
         left = TimeLeft(MotionModel(s.bench.config), before.angles_deg)
@@ -77,7 +78,7 @@ def test_the_motion_model_tells_the_time_within_a_tenth(simulated, tmp_path, vie
 
 
 def test_a_rehearsal_moves_and_stores_nothing_and_says_what_would_happen(simulated, tmp_path):
-    s = simulated()
+    s = simulated(*SMALL)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         list(enroll(s.bench, catalog, "dice", views=4))
         plan = enroll(s.bench, catalog, "lamp", views=6)

@@ -150,19 +150,18 @@ def folder(tmp_path):
 @pytest.fixture
 def keyboard(folder):
     """Return a terminal in which an enrollment of many views has begun."""
-    keyboard = Keyboard(folder, "enroll", "dice", "--views", "36")
+    keyboard = Keyboard(folder, "enroll", "dice", "--views", "24")
     keyboard.until("p pauses")
     yield keyboard
     keyboard.close()
 
 
-@pytest.mark.parametrize(("pause", "on"), [("p", "p"), (" ", "p")])
-def test_a_key_pauses_and_goes_on_and_the_terminal_is_left_as_it_was(keyboard, pause, on):
-    keyboard.type(pause)
+def test_a_key_pauses_and_goes_on_and_the_terminal_is_left_as_it_was(keyboard):
+    keyboard.type(" ")
     keyboard.until("Paused, the table holds its place")
-    assert "36 views enrolled" not in keyboard.seen
-    keyboard.type("xyz" + on)
-    keyboard.until("36 views enrolled")
+    assert "24 views enrolled" not in keyboard.seen
+    keyboard.type("xyzp")
+    keyboard.until("24 views enrolled")
     assert keyboard.end() == 0
     assert "Going on." in keyboard.seen
     assert termios.tcgetattr(keyboard.slave) == keyboard.before

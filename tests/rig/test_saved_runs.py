@@ -28,7 +28,8 @@ def saved(tmp_path_factory):
     home = tmp_path_factory.mktemp("runs")
     operator = ShelfOperator(World(seed=9), shelf())
     runs = {}
-    settings = ("identify.max_views=4", "identify.margin=0.9")  # every run takes all its views
+    small = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+    settings = (*small, "identify.max_views=4", "identify.margin=0.9")  # every run takes all its views
     with (
         open_sim_bench(load_config(None, settings), operator) as bench,
         Catalog.open(home / "catalog", clock=bench.clock) as catalog,

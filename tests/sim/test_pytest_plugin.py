@@ -19,16 +19,10 @@ def run(folder: Path, *arguments: str, code: str) -> subprocess.CompletedProcess
     )
 
 
-def test_the_documented_tests_pass_elsewhere(tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
-    done = run(tmp_path, code=code)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 passed" in done.stdout
-
-
-def test_the_marker_sets_the_seed_and_the_noise(tmp_path):
+def test_the_documented_tests_pass_elsewhere_and_the_marker_sets_seed_and_noise(tmp_path):
+    (documented,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
     code = (
-        "import pytest\n"
+        f"{documented}\n"
         "from sim.noise import NoiseModel\n"
         "@pytest.mark.sim('identify.max_views=3', seed=5, noise=NoiseModel.none())\n"
         "def test_marked(sim_bench, sim_world):\n"
@@ -40,6 +34,7 @@ def test_the_marker_sets_the_seed_and_the_noise(tmp_path):
     )
     done = run(tmp_path, code=code)
     assert done.returncode == 0, done.stdout + done.stderr
+    assert "4 passed" in done.stdout
 
 
 def test_it_costs_nothing_where_nobody_asks(tmp_path):
