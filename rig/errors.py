@@ -328,7 +328,7 @@ class CatalogDamaged(CatalogError):
 
 
 class CatalogBusy(RigError):
-    """Another process holds the catalog or the bench."""
+    """Another process holds the catalog."""
 
     code = 900
     title = "busy"
