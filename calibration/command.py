@@ -1,7 +1,8 @@
 """`rig calibrate ...`."""
 
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,15 +89,15 @@ def camera(
     rows: BoardRows = 6,
     square_mm: SquareMm = 15.0,
 ) -> None:
-    """Calibrate focal length, principal point and distortion with the board on the turning table.
+    """Calibrate the camera: lens with the board on the turning table, sharpness, noise, flat field and drift.
 
     Example: rig calibrate camera --bench sim
     """
-    from calibration import camera_model
+    from calibration import camera_light, camera_model
     from rig.markers import Board
 
     board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
-    run(settings, lambda bench: camera_model.live(bench, board))
+    run(settings, camera_light.live_scene, camera_light.live_card, lambda bench: camera_model.live(bench, board))
 
 
 @app.command("table")
@@ -223,17 +224,15 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
     with settings.open_bench() as bench:
         store = FactStore(bench.config.calibration_path(bench.name))
         for procedure in procedures:
-            fact = _told(settings, procedure(bench))
-            path = store.keep(fact)
-            if settings.json:
-                _print_json(settings, fact, path)
-            else:
-                print(verdict(fact))
-                print(
-                    f"Kept in {path}" + (", in force from now on." if fact.passed else "; what was in force stays so.")
-                )
-            if not fact.passed:
-                raise typer.Exit(EXIT_QUALITY)
+            for fact in _told(settings, procedure(bench)):
+                path = store.keep(fact)
+                if settings.json:
+                    _print_json(settings, fact, path)
+                else:
+                    then = ", in force from now on." if fact.passed else "; what was in force stays so."
+                    print(f"{verdict(fact)}\nKept in {path}{then}")
+                if not fact.passed:
+                    raise typer.Exit(EXIT_QUALITY)
             calibrate(bench, store)
 
 
@@ -257,28 +256,23 @@ def _in_force(bench: "Bench", name: str) -> "Fact":
     )
 
 
-def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Fact":
-    """Tell the events of a procedure as they come, and return its fact."""
+def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Iterator[Fact]":
+    """Tell the events of a procedure as they come, and yield its facts."""
     from calibration.events import Ask, Progress
     from rig.cli.present import line
     from rig.facts import Fact
     from rig.plans.events import event_dict
 
-    fact: Fact | None = None
-    try:
+    with closing(events):
         for event in events:
             if isinstance(event, Fact):
-                fact = event
+                yield event
             elif isinstance(event, Ask):
                 _ask(event.words)
             elif settings.json:
                 settings.print_json(event_dict(event))
             else:
                 print(event.words if isinstance(event, Progress) else line(event), flush=True)
-    finally:
-        events.close()
-    assert fact is not None, "a procedure ends with its fact"
-    return fact
 
 
 def _ask(words: str) -> None:

@@ -22,7 +22,7 @@ from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.host import simulated_host
 from sim.noise import NoiseModel
-from sim.objects.board import boards
+from sim.objects.board import utensils
 from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
 from sim.optics import Optics
@@ -77,8 +77,8 @@ class ShelfOperator:
     Every placement misses the table's axis by a little, as hands do. Once a bench is open, ``parts`` is what it is made
     of, and ``faults`` what goes wrong with that. ``state`` is what benches in this world remember of the table; whoever
     sets a new one up looks at its cable, and says that it hangs free. The things in ``queue`` are put up to be
-    identified one after the other, and round again. Calibration boards are at hand, too; they are seen through the
-    ``optics`` of a camera that the world's seed draws.
+    identified one after the other, and round again. Calibration boards and a grey card are at hand, too; the boards
+    are seen through the ``optics`` of a camera that the world's seed draws.
     """
 
     def __init__(
@@ -112,8 +112,8 @@ class ShelfOperator:
                 self.queue.rotate(-1)
             name = self.next_object or drawn
             yaw_deg = drawn_deg if self.yaw_deg is None else self.yaw_deg
-        if name in (stands := boards(self.optics)):
-            self.world.put(stands[name])
+        if name in (at_hand := utensils(self.optics)):
+            self.world.put(at_hand[name])
             return
         if name not in self.things:
             raise ObjectNotFound(

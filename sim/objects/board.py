@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rig.markers import Board
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 from sim.optics import SUPERSAMPLING, Optics
+from sim.world import Thing
 
 TEXTURE_PX_MM = 10
 
@@ -100,8 +101,25 @@ def _texture(board: Board) -> NDArray[np.uint8]:
     return np.dstack([paper, np.full_like(paper, 255)])
 
 
+@dataclass(frozen=True)
+class GreyCard:
+    """A plain card that fills the frame."""
+
+    level: int = 170
+    name: str = "grey-card"
+
+    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:  # noqa: ARG002
+        """Fill ``image``."""
+        image[:] = self.level
+
+
+def utensils(optics: Optics, board: Board | None = None) -> dict[str, Thing]:
+    """Return what the calibrations of the camera ask to be put up, by name: the grey card, and the board's stands."""
+    return {GreyCard().name: GreyCard(), **boards(optics, board)}
+
+
 def boards(optics: Optics, board: Board | None = None) -> dict[str, BoardOnPlatter]:
-    """Return the stands that the optical calibrations ask for, by name."""
+    """Return the board as the calibrations ask for it to stand, by name."""
     layout = board or Board()
     return {
         "calibration-board upright": BoardOnPlatter(layout, optics, tilt_deg=4.0),

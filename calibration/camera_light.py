@@ -1,0 +1,313 @@
+"""What the camera makes of light: its noise, its flat field, and whether light and settings stay as they are.
+
+Photon transfer (EMVA 1288): of a scene at rest the variance σ² of a pixel over frames grows with its mean μ,
+
+    σ² = K·μ + σ_d²,    K levels an electron, σ_d the dark noise, quantisation (1/12) included,
+
+so that a saturated pixel holds 255/K electrons. Flat field: a card that fills the frame shows the lens' loss towards
+the corners, beside a gradient that is the lamp's. Drift: the card's brightness over minutes.
+"""
+
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.events import Ask, Progress
+from rig.bench import Bench
+from rig.devices.camera import CameraLocks
+from rig.facts import Estimate, Fact
+from rig.plans.events import plain
+from rig.view import looks
+
+NOISE, FLAT_FIELD, DRIFT, SHARPNESS = "camera.noise", "camera.flat_field", "camera.drift", "camera.sharpness"
+VALID_DAYS = 180
+
+CARD = "grey-card"
+BOARD = "calibration-board upright"
+PAIRS = 24
+"""Frames of the scene at rest."""
+CARD_FRAMES, CARD_SECONDS = 40, 240.0
+BINS = 24
+LEVELS = (8.0, 235.0)
+"""Between them a pixel is neither cut off at black nor saturated."""
+MIN_SPAN = 80.0
+"""Grey levels that the scene must span for noise that grows and noise that does not to be told apart."""
+BLOCK = 16
+MAX_DRIFT_PERCENT = 1.0
+MAX_FLICKER = 0.02
+MAX_CAST = 0.15
+MAX_LOSS = 0.5
+MIN_SHARPNESS = 20.0
+"""Squared levels: a board in focus has hundreds."""
+
+
+@dataclass(frozen=True, slots=True)
+class CardFrames:
+    """A card that fills the frame: brightness of each frame as B, G, R, float64 (n, 3), when it was, and their mean.
+
+    ``seconds`` float64 (n,); ``mean`` float64 (rows, columns), the mean grey level of blocks.
+    """
+
+    levels: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    mean: NDArray[np.float64]
+
+
+def live_scene(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
+    """Look at the board at rest, and find the camera's noise; yields what to do, and the facts of noise and sharpness.
+
+    Raises
+    ------
+    DeviceFault, DeviceSilent
+        The camera fails.
+    """
+    when_utc = bench.clock.utc()
+    yield Ask("Put the calibration board upright in the middle of the platter, lit as usual; take your hands off.")
+    bench.operator.place(BOARD)
+    frames = [bench.camera.capture(bench.clock.now_ns()).image_bgr for _ in range(PAIRS)]
+    yield Progress(1.0, f"{PAIRS} frames of the scene at rest")
+    device = bench.apparatus("camera")
+    view = bench.config.view
+    yield sharpness([looks(frame, view).sharpness for frame in frames], when_utc=when_utc, device=device)
+    fact = photon_transfer(np.stack(frames), when_utc=when_utc, device=device)
+    yield fact
+    return fact
+
+
+def live_card(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
+    """Look at a card for some minutes; yields what to do, then the facts of the flat field and of the drift.
+
+    Raises
+    ------
+    DeviceFault, DeviceSilent
+        The camera fails.
+    """
+    when_utc = bench.clock.utc()
+    yield Ask("Hold or stand a plain grey or white card before the camera, so that it fills the frame, lit as usual.")
+    bench.operator.place(CARD)
+    locks = bench.camera.read_locks()
+    levels, seconds = [], []
+    total: NDArray[np.float64] | None = None
+    start_ns = bench.clock.now_ns()
+    for index in range(CARD_FRAMES):
+        image = bench.camera.capture(bench.clock.now_ns()).image_bgr
+        levels.append(image.reshape(-1, 3).mean(axis=0))
+        seconds.append((bench.clock.now_ns() - start_ns) * 1e-9)
+        blocks = _blocks(image)
+        total = blocks if total is None else total + blocks
+        if index % 10 == 9:
+            yield Progress((index + 1) / CARD_FRAMES, f"{seconds[-1]:.0f} of {CARD_SECONDS:g} s of the card")
+        bench.clock.sleep(CARD_SECONDS / CARD_FRAMES)
+    assert total is not None
+    card = CardFrames(np.array(levels), np.array(seconds), total / CARD_FRAMES)
+    device = bench.apparatus("camera")
+    flat = flat_field(card, when_utc=when_utc, device=device)
+    yield flat
+    fact = drift(card, locks, bench.camera.read_locks(), when_utc=when_utc, device=device)
+    yield fact
+    return fact
+
+
+def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+    """Fit gain and read noise to ``frames`` of a scene at rest, uint8 (n, H, W, 3), and judge them."""
+    green = frames[..., 1].astype(np.float64)
+    # The lamp's flicker moves all pixels together: each frame is brought to the brightness of all.
+    brightness = green.mean(axis=(1, 2))
+    green *= (brightness.mean() / brightness)[:, None, None]
+    mean, variance = green.mean(axis=0).ravel(), green.var(axis=0, ddof=1).ravel()
+    usable = (mean > LEVELS[0]) & (mean < LEVELS[1])
+    mean, variance = mean[usable], variance[usable]
+    refusals = []
+    estimates = {}
+    residual = None
+    curve: list[list[float]] = []
+    low, high = (np.quantile(mean, [0.02, 0.98]).tolist()) if mean.size else (0.0, 0.0)
+    if high - low < MIN_SPAN:
+        refusals.append(
+            f"The scene spans {high - low:.0f} grey levels, {MIN_SPAN:g} are needed: put something black and white "
+            "before the camera, and lock an exposure that neither saturates nor darkens."
+        )
+    else:
+        edges = np.linspace(low, high, BINS + 1)
+        which = np.clip(np.digitize(mean, edges) - 1, 0, BINS - 1)
+        filled = [b for b in range(BINS) if (which == b).sum() >= 50]
+        at = np.array([mean[which == b].mean() for b in filled])
+        noise = np.array([variance[which == b].mean() for b in filled])
+        count = np.array([(which == b).sum() for b in filled])
+        # Scatter of a bin's variance: of n pixels and N frames each, relative √(2 / n(N−1)).
+        sigma = noise * np.sqrt(2 / (count * (len(frames) - 1)))
+        design = np.column_stack([at, np.ones_like(at)]) / sigma[:, None]
+        (gain, floor), *_ = np.linalg.lstsq(design, noise / sigma, rcond=None)
+        scatter = noise / sigma - design @ (gain, floor)
+        birge = max(float((scatter**2).sum()) / max(len(filled) - 2, 1), 1.0)
+        covariance = np.linalg.inv(design.T @ design) * birge
+        dark = max(float(floor) - 1 / 12, 0.0)
+        curve = np.column_stack([at, noise]).round(4).tolist()
+        residual = float(np.max(np.abs(noise - (gain * at + floor)) / noise))
+        if gain <= 0:
+            refusals.append(
+                "The noise does not grow with the light: the frames are processed. Switch noise reduction off."
+            )
+        else:
+            full_well = 255 / float(gain)
+            full_well_sigma = full_well / float(gain) * sqrt(covariance[0, 0])
+            read = sqrt(dark) / float(gain)
+            # σ_r = √floor / K: its derivatives by both.
+            slope = np.array([-read / gain, 1 / (2 * gain * max(sqrt(dark), 0.05))])
+            estimates = {
+                "full_well_e": Estimate(full_well, full_well_sigma, "electrons"),
+                "read_noise_e": Estimate(read, sqrt(float(slope @ covariance @ slope)), "electrons"),
+            }
+    return Fact(
+        name=NOISE,
+        estimates=estimates,
+        residual=residual,
+        limit=None,
+        residual_unit="of the variance",
+        refusals=tuple(refusals),
+        valid_days=VALID_DAYS,
+        when_utc=when_utc,
+        device=device,
+        evidence={"frames": len(frames), "mean_variance": curve},
+    )
+
+
+def sharpness(values: Sequence[float], *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+    """Judge the sharpness of frames of the board: the reference by which a lens that shifted is noticed."""
+    mean = float(np.mean(values))
+    refusals: tuple[str, ...] = ()
+    if mean < MIN_SHARPNESS:
+        refusals = (
+            f"The board's sharpness is {mean:.1f}, below {MIN_SHARPNESS:g}: focus the lens, and calibrate again.",
+        )
+    return Fact(
+        name=SHARPNESS,
+        estimates={"sharpness": Estimate(mean, float(np.std(values, ddof=1)), "squared levels")},
+        residual=None,
+        limit=None,
+        residual_unit="squared levels",
+        refusals=refusals,
+        valid_days=VALID_DAYS,
+        when_utc=when_utc,
+        device=device,
+        evidence={"sharpness": [round(float(value), 2) for value in values]},
+    )
+
+
+def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+    """Fit the loss of light towards the corners to a card that fills the frame, and judge it."""
+    rows, columns = card.mean.shape
+    y, x = np.mgrid[0:rows, 0:columns]
+    x = (x + 0.5) / columns * 2 - 1
+    y = ((y + 0.5) / rows * 2 - 1) * (rows / columns)
+    square = (x**2 + y**2) / (1 + (rows / columns) ** 2)  # 1 in the corners
+    design = np.column_stack([np.ones(square.size), x.ravel(), y.ravel(), -square.ravel()])
+    values = card.mean.ravel()
+    found, *_ = np.linalg.lstsq(design, values, rcond=None)
+    residuals = values - design @ found
+    scatter = float((residuals**2).sum()) / (values.size - 4)
+    covariance = np.linalg.inv(design.T @ design) * scatter
+    level = float(found[0])
+    residual = float(np.abs(residuals).max()) / max(level, 1e-9)
+    loss = float(found[3]) / max(level, 1e-9)
+    refusals = []
+    if not LEVELS[0] < level < LEVELS[1]:
+        refusals.append(
+            f"The card's level is {level:.0f}: it is too dark or saturated. Change camera.exposure_us, and calibrate "
+            "again."
+        )
+    if residual > 0.05:
+        refusals.append(
+            f"Parts of the frame are off the card's smooth shading by {residual:.0%}: it does not fill the frame, is "
+            "not plain, or a shadow lies on it."
+        )
+    if loss > MAX_LOSS:
+        refusals.append(
+            f"The corners lose {loss:.0%} of the light: something covers the lens, or the zoom is at its end."
+        )
+    return Fact(
+        name=FLAT_FIELD,
+        estimates={
+            "vignetting": Estimate(loss, sqrt(covariance[3, 3]) / max(level, 1e-9), "of the light in the corners"),
+            "gradient_x": Estimate(float(found[1]) / max(level, 1e-9), sqrt(covariance[1, 1]) / max(level, 1e-9), ""),
+            "gradient_y": Estimate(float(found[2]) / max(level, 1e-9), sqrt(covariance[2, 2]) / max(level, 1e-9), ""),
+        },
+        residual=residual,
+        limit=0.05,
+        residual_unit="of the level",
+        refusals=tuple(refusals),
+        valid_days=VALID_DAYS,
+        when_utc=when_utc,
+        device=device,
+        evidence={"mean": card.mean.round(2).tolist()},
+    )
+
+
+def drift(
+    card: CardFrames, before: CameraLocks, after: CameraLocks, *, when_utc: datetime, device: Mapping[str, Any]
+) -> Fact:
+    """Judge how steady light and settings are, and the white balance by the card's colour."""
+    grey = card.levels.mean(axis=1)
+    relative = grey / grey.mean()
+    minutes = card.seconds / 60
+    design = np.column_stack([np.ones_like(minutes), minutes - minutes.mean()])
+    (_, slope), *_ = np.linalg.lstsq(design, relative, rcond=None)
+    residuals = relative - design @ (1.0, slope)
+    flicker = float(residuals.std(ddof=2))
+    slope_sigma = flicker / sqrt(float(((minutes - minutes.mean()) ** 2).sum()))
+    blue, green, red = card.levels.mean(axis=0).tolist()
+    n = len(grey)
+    ratios = {"red_green": card.levels[:, 2] / card.levels[:, 1], "blue_green": card.levels[:, 0] / card.levels[:, 1]}
+    estimates = {
+        "drift": Estimate(100 * float(slope), 100 * slope_sigma, "% a minute"),
+        "flicker": Estimate(flicker, flicker / sqrt(2 * (n - 2)), "of the light"),
+        **{name: Estimate(float(r.mean()), float(r.std(ddof=1)) / sqrt(n), "") for name, r in ratios.items()},
+    }
+    refusals = []
+    if before != after:
+        refusals.append(f"The camera's settings changed by themselves: {before} became {after}. Lock them in [camera].")
+    drifted = 100 * abs(float(slope)) * float(minutes[-1] - minutes[0])
+    if drifted - 200 * slope_sigma * float(minutes[-1] - minutes[0]) > MAX_DRIFT_PERCENT:
+        refusals.append(
+            f"The light drifted by {drifted:.1f} % in {minutes[-1]:.0f} minutes, more than {MAX_DRIFT_PERCENT:g} %: "
+            "let the lamps warm up, keep daylight out, and calibrate again."
+        )
+    if flicker > MAX_FLICKER:
+        refusals.append(
+            f"The light flickers by {flicker:.1%}, more than {MAX_FLICKER:.0%}: choose an exposure of whole periods "
+            "of the mains (10 or 8.33 ms), or a lamp that does not."
+        )
+    cast = max(abs(red / green - 1), abs(blue / green - 1)) if green else 1.0
+    if cast > MAX_CAST:
+        refusals.append(
+            f"The card looks coloured: red {red / green:.2f} and blue {blue / green:.2f} of green. Change "
+            "camera.white_balance_k until they are near 1, or use a grey card."
+        )
+    return Fact(
+        name=DRIFT,
+        estimates=estimates,
+        residual=drifted,
+        limit=MAX_DRIFT_PERCENT,
+        residual_unit="% in the time of the test",
+        refusals=tuple(refusals),
+        valid_days=VALID_DAYS,
+        when_utc=when_utc,
+        device=device,
+        evidence={
+            "seconds": card.seconds.round(2).tolist(),
+            "levels_bgr": card.levels.round(3).tolist(),
+            "locks": plain(after),
+        },
+    )
+
+
+def _blocks(image: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return the mean grey level of blocks, float64 (rows, columns); what does not fill a block is left out."""
+    height, width = (side // BLOCK * BLOCK for side in image.shape[:2])
+    grey = image[:height, :width].mean(axis=2)
+    return np.asarray(grey.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3)), dtype=np.float64)
