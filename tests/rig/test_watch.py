@@ -95,6 +95,30 @@ def test_a_servo_whose_torque_is_gone_makes_no_progress():
             assert table.goto(60.0).agrees
 
 
+def test_a_servo_whose_readings_stand_still_is_never_sent_back_to_where_they_stopped():
+    with motion_bench() as (bench, wires):
+        kept, speeds = [], []
+
+        def stick(memory) -> None:
+            kept.append(memory.live())
+            memory.set_live(kept[0])
+
+        def look() -> None:
+            speeds.append(wires.world.shaft()[1])
+            wires.world.clock.call_at(wires.world.clock.now_ns() + 10_000_000, look)
+
+        look()
+        with pytest.raises((NoProgress, FollowingError, RotationDisagreement)), Turntable(bench) as table:
+            wires.world.clock.call_at(
+                wires.world.clock.now_ns() + 1_500_000_000, lambda: wires.device.distortions.append(stick)
+            )
+            table.goto(300.0)
+        wires.world.clock.sleep(1.0)
+        assert max(speeds) > 80
+        assert min(speeds) > -1
+        assert wires.device.memory["Torque Enable"] == 0
+
+
 def test_heat_at_rest_is_found_before_anything_moves_and_is_forgiven_when_it_has_cooled_down():
     with motion_bench() as (bench, wires):
         wires.device.set_temperature(70.0)
