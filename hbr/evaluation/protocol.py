@@ -387,18 +387,22 @@ class _Trials:
         runs.lead[at] = (ranking.scores[0] - reach.max()) / len(seen)
 
 
+def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:
+    """Which views are the nearest to `count` equally spaced azimuths."""
+    mask = np.zeros(len(azimuth_deg), np.bool_)
+    if len(azimuth_deg):
+        away_deg = np.abs(wrap180(azimuth_deg[:, None] - np.arange(count) * 360 / count))
+        mask[away_deg.argmin(axis=0)] = True
+    return mask
+
+
 def _enrolled(views: Views, count: int | None) -> NDArray[np.bool_]:
-    """The views nearest to `count` equally spaced azimuths of every object; all without a count."""
+    """Of every object the views that stay enrolled; all without a count."""
     mask = np.ones(len(views), np.bool_)
-    if count is None:
-        return mask
-    mask[:] = False
-    wanted_deg = np.arange(count) * 360 / count
-    for j in range(len(views.object_names)):
-        rows = views.of(j)
-        away_deg = np.abs(wrap180(views.azimuth_deg[rows][:, None] - wanted_deg))
-        if len(rows):
-            mask[rows[away_deg.argmin(axis=0)]] = True
+    if count is not None:
+        for j in range(len(views.object_names)):
+            rows = views.of(j)
+            mask[rows] = views_enrolled(views.azimuth_deg[rows], count)
     return mask
 
 

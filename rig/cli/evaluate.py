@@ -12,6 +12,7 @@ from rig.cli.command import EXIT_INTERRUPTED, Settings, command
 
 if TYPE_CHECKING:
     from hbr.evaluation.datasets import Dataset
+    from rig.evaluation.plan import Plan
 
 
 @command
@@ -69,6 +70,14 @@ def evaluate(
     prefilter: Annotated[
         float, typer.Option(min=0, metavar="PIXELS", help="Blur all images by a Gaussian of this standard deviation.")
     ] = 0.0,
+    matrix: Annotated[
+        bool,
+        typer.Option(
+            "--matrix",
+            help="One perturbation at a time, each at three strengths, by the dense filter and a sweep of 90°; needs "
+            "--enrolled.",
+        ),
+    ] = False,
     objects: Annotated[
         str | None, typer.Option(metavar="FIRST-LAST", help="These objects alone, counted from 1; e.g. 51-100.")
     ] = None,
@@ -125,6 +134,9 @@ def evaluate(
         dataset = plan.dataset
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
+        if matrix:
+            _matrix(settings, plan, jobs, out)
+            return
         store = Store(out / "runs", plan.settings(), resume=resume)
 
         def tell(progress: Progress, event: str) -> Callable[[str], None]:
@@ -166,6 +178,29 @@ def evaluate(
     for sentence in contest_sentences(results):
         console.print(sentence, markup=False, highlight=False, soft_wrap=True)
     print(f"Written: {out / 'report.html'}, results.json, results.csv and the figures beside it.", file=sys.stderr)
+
+
+def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
+    from rich.console import Console
+
+    from rig.cli.present import Progress
+    from rig.evaluation.matrix import matrix_rows, run_matrix, write_matrix
+
+    if plan.protocol.enrolled is None:
+        raise ValueError("--matrix takes its queries from the views that are not enrolled; give --enrolled 18 or fewer")
+    with Progress("enrolling, searching") as progress:
+        progress.start(2 * len(plan.dataset.objects))
+
+        def advance(_name: str) -> None:
+            progress.advance()
+
+        results = run_matrix(plan, jobs, advance)
+    write_matrix(results, out)
+    if settings.json:
+        settings.print_json({"event": "finished", **results})
+        return
+    Console().print(matrix_rows(results).terminal())
+    print(f"Written: {out / 'matrix.json'}, with Wilson's intervals.", file=sys.stderr)
 
 
 def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "Dataset":

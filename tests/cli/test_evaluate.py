@@ -182,3 +182,52 @@ def test_the_catalog_is_evaluated_where_no_folder_is_named(tmp_path: Path, monke
     assert done.exit_code == 0, done.output
     assert results(Path("out"))["settings"]["dataset"]["objects"] == ["mug", "tea box"]
     assert results(Path("out"))["methods"][0]["curve"][0]["hit_rate"] > 0.5
+
+
+def test_the_matrix_has_every_perturbation_at_three_strengths(photographs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    few = ("--enrolled", "6", "--trials", "1", "--views", "2", "--jobs", "1", "--objects", "1-2")
+    done = run(photographs, "--matrix", "--descriptor", "edges+colours", *few, "--out", out)
+    assert done.exit_code == 0, done.output
+    found = json.loads((out / "matrix.json").read_text())
+    kinds = {row["kind"] for row in found["matrix"]}
+    assert {"none", "gn", "mb", "defocus", "gain", "white-balance", "shift", "scale", "elevation"} <= kinds
+    assert {"occlusion", "background"} <= kinds
+    assert all(
+        {row["strength"] for row in found["matrix"] if row["kind"] == kind} == {1, 2, 3} for kind in kinds - {"none"}
+    )
+    assert all(len(row["hit_rate"]) == 2 and row["trials"] == 2 for row in found["matrix"])
+    assert found["matrix"][0]["hit_rate"][-1] == 1
+    assert "white-balance" in done.output
+    assert run(photographs, "--matrix", "--descriptor", "edges", "--out", out).exit_code == 2
+
+
+def test_other_descriptors_are_judged_by_the_dense_filter(photographs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ("--descriptor", "edges+colours", "--perturb", "shift:1+gain:1", "--enrolled", "6", *QUICK[2:])
+    done = run(photographs, "--methods", "dense,dense-90", *options, "--out", out)
+    assert done.exit_code == 0, done.output
+    found = results(out)
+    assert found["bytes_per_view"] == 160
+    assert found["settings"]["condition"]["perturbations"] == "shift:1+gain:1"
+    assert found["settings"]["protocol"]["enrolled"] == 6
+    assert [method["name"] for method in found["methods"]] == ["dense", "dense-90"]
+    assert "probability of" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--descriptor", "sift"), "'sift' is unknown"),
+        (("--perturb", "fog"), "'fog' is unknown"),
+        (("--descriptor", "edges", "--methods", "hbr"), "compares CEDD alone"),
+        (("--background", "bench", "--rotate", "10"), "leave one of them"),
+        (("--enrolled", "12", "--methods", "dense"), "queries it needs more"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_in_words(
+    photographs: Path, tmp_path: Path, options: tuple[str, ...], words: str
+) -> None:
+    done = run(photographs, *options, *QUICK[2:], "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert words in " ".join(done.output.split())

@@ -1,0 +1,112 @@
+"""The matrix of perturbations: run over processes, and written for people and programs."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.dense import DenseIndex
+from hbr.evaluation.matrix import Cell, cells, enrolled_few, hits
+from hbr.evaluation.statistics import wilson
+from hbr.views import Views
+from rig.errors import UsageError
+from rig.evaluation.plan import Plan
+from rig.evaluation.report import Rows
+from rig.processes import over_processes
+
+_Enrolled = dict[bool, Views]
+
+
+def run_matrix(plan: Plan, jobs: int, advance: Callable[[str], None]) -> dict[str, Any]:
+    """Return the hit-rate of every cell after each number of views, as JSON values; equal plans give equal values.
+
+    `advance` is called with the name of each object, once when it is enrolled and once when it was searched for.
+
+    Raises
+    ------
+    DatasetError, ValueError
+        A photograph cannot be used, or there are too few.
+    """
+    matrix = cells(plan.condition)
+    names = [item.name for item in plan.dataset.objects]
+    enrolled: dict[int, _Enrolled] = {}
+    for j, own in over_processes(partial(_enroll, plan, matrix), range(len(names)), jobs):
+        enrolled[j] = own
+        advance(names[j])
+    models = {
+        on_bench: Views.concatenate([enrolled[j][on_bench] for j in range(len(names))]) for on_bench in enrolled[0]
+    }
+    found: dict[int, NDArray[np.bool_]] = {}
+    for j, own_hits in over_processes(partial(_search, plan, matrix, models), range(len(names)), jobs):
+        found[j] = own_hits
+        advance(names[j])
+    together = np.stack([found[j] for j in range(len(names))])  # objects, cells, trials, views
+    rows = []
+    for c, cell in enumerate(matrix):
+        trials = together[:, c].reshape(-1, together.shape[-1])
+        counts = trials.sum(axis=0).tolist()
+        low, high = zip(*(wilson(count, len(trials)) for count in counts), strict=True)
+        rows.append(
+            {
+                "kind": cell.kind,
+                "strength": cell.strength,
+                "trials": len(trials),
+                "hit_rate": [count / len(trials) for count in counts],
+                "hit_rate_low": list(low),
+                "hit_rate_high": list(high),
+            }
+        )
+    return {"settings": plan.settings(), "matrix": rows}
+
+
+def matrix_rows(results: dict[str, Any]) -> Rows:
+    """Return the table: a row a perturbation, a column a strength, hit-rates in percent with one view and with all."""
+    by_kind: dict[str, dict[int, str]] = {}
+    for row in results["matrix"]:
+        one, last = (f"{100 * row['hit_rate'][n]:.1f}" for n in (0, -1))
+        by_kind.setdefault(row["kind"], {})[row["strength"]] = f"{one} / {last}"
+    views = len(results["matrix"][0]["hit_rate"])
+    heads = [f"hit-rate, %, N = 1 / {views}", "strength 1", "2", "3"]
+    return Rows(heads, [[kind, *(own.get(s, own.get(0, "")) for s in (1, 2, 3))] for kind, own in by_kind.items()])
+
+
+def write_matrix(results: dict[str, Any], folder: Path) -> None:
+    """Write matrix.json.
+
+    Raises
+    ------
+    UsageError
+        The folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1)
+        (folder / "matrix.json").write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(
+            f"The results cannot be written to {folder}.",
+            next_step="Name another folder with --out.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+
+
+def _enroll(plan: Plan, matrix: Sequence[Cell], j: int) -> _Enrolled:
+    count = plan.protocol.enrolled or len(plan.dataset.objects[j].photographs)
+    kinds = {cell.condition.on_bench for cell in matrix}
+    conditions = {on: replace(plan.condition, background="bench" if on else "same") for on in kinds}
+    return {on: enrolled_few(plan.dataset, j, conditions[on], plan.size, count) for on in sorted(kinds)}
+
+
+def _search(plan: Plan, matrix: Sequence[Cell], models: _Enrolled, j: int) -> NDArray[np.bool_]:
+    indices = {on_bench: DenseIndex(views) for on_bench, views in models.items()}
+    return np.stack(
+        [
+            hits(plan.dataset, j, indices[cell.condition.on_bench], cell.condition, plan.size, plan.protocol)
+            for cell in matrix
+        ]
+    )
