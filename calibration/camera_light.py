@@ -118,7 +118,7 @@ def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Ma
     green = frames[..., 1].astype(np.float64)
     # The lamp's flicker moves all pixels together: each frame is brought to the brightness of all.
     brightness = green.mean(axis=(1, 2))
-    green *= (brightness.mean() / brightness)[:, None, None]
+    green *= (brightness.mean() / np.maximum(brightness, 1e-9))[:, None, None]
     mean, variance = green.mean(axis=0).ravel(), green.var(axis=0, ddof=1).ravel()
     usable = (mean > LEVELS[0]) & (mean < LEVELS[1])
     mean, variance = mean[usable], variance[usable]
@@ -252,7 +252,27 @@ def drift(
     card: CardFrames, before: CameraLocks, after: CameraLocks, *, when_utc: datetime, device: Mapping[str, Any]
 ) -> Fact:
     """Judge how steady light and settings are, and the white balance by the card's colour."""
+    kept: dict[str, Any] = {"when_utc": when_utc, "device": device, "valid_days": VALID_DAYS}
+    evidence = {
+        "seconds": card.seconds.round(2).tolist(),
+        "levels_bgr": card.levels.round(3).tolist(),
+        "locks": plain(after),
+    }
     grey = card.levels.mean(axis=1)
+    if card.levels.min() < 1.0:
+        return Fact(
+            name=DRIFT,
+            estimates={},
+            residual=None,
+            limit=None,
+            residual_unit="",
+            refusals=(
+                "The card is black, or one of its colours: take the cap off the lens, light the card, or raise "
+                "camera.exposure_us.",
+            ),
+            evidence=evidence,
+            **kept,
+        )
     relative = grey / grey.mean()
     minutes = card.seconds / 60
     design = np.column_stack([np.ones_like(minutes), minutes - minutes.mean()])
@@ -282,7 +302,7 @@ def drift(
             f"The light flickers by {flicker:.1%}, more than {MAX_FLICKER:.0%}: choose an exposure of whole periods "
             "of the mains (10 or 8.33 ms), or a lamp that does not."
         )
-    cast = max(abs(red / green - 1), abs(blue / green - 1)) if green else 1.0
+    cast = max(abs(red / green - 1), abs(blue / green - 1))
     if cast > MAX_CAST:
         refusals.append(
             f"The card looks coloured: red {red / green:.2f} and blue {blue / green:.2f} of green. Change "
@@ -295,14 +315,8 @@ def drift(
         limit=MAX_DRIFT_PERCENT,
         residual_unit="% in the time of the test",
         refusals=tuple(refusals),
-        valid_days=VALID_DAYS,
-        when_utc=when_utc,
-        device=device,
-        evidence={
-            "seconds": card.seconds.round(2).tolist(),
-            "levels_bgr": card.levels.round(3).tolist(),
-            "locks": plain(after),
-        },
+        evidence=evidence,
+        **kept,
     )
 
 
