@@ -1,5 +1,6 @@
 """`rig enroll`."""
 
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -63,6 +64,8 @@ def enroll(
 
     views = _views(views, step)
     _check(name, tray, label=label, note=note, resume=resume, replace=replace)
+    if report is not None:
+        _check_folder(report)
     items = read_tray(tray) if tray else ()
     labels = ", ".join(label) if label else None
     if dry_run:
@@ -219,6 +222,25 @@ def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, 
             f"{', '.join(given)} cannot be used with a list.",
             next_step="Labels and notes are columns of the list, and it resumes by itself; "
             "enroll single objects anew with rig enroll NAME --replace.",
+        )
+
+
+def _check_folder(report: Path) -> None:
+    """Refuse a page that could not be written, before the hours that it is to tell of."""
+    from rig.errors import UsageError
+
+    reason = "it is a folder" if report.is_dir() else ""
+    try:
+        report.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+    if not reason and not os.access(report.parent, os.W_OK):
+        reason = "its folder may not be written to"
+    if reason:
+        raise UsageError(
+            f"The report cannot be written to {report}.",
+            next_step="Name another file with --report.",
+            evidence={"reason": reason},
         )
 
 

@@ -167,6 +167,8 @@ def test_a_dry_run_says_all_and_does_nothing(rig):
         (("enroll", "clock", "--step", "50"), "--views 7"),
         (("enroll", "--list", "x.csv", "--replace", "--label", "a"), "--label, --replace"),
         (("enroll", "--list", "x.csv"), "cannot be read"),
+        (("enroll", "clock", "--report", "/proc/nowhere/clock.html"), "The report cannot be written"),
+        (("enroll", "clock", "--report", "catalog"), "The report cannot be written"),
     ],
 )
 def test_what_cannot_be_enrolled_is_said(rig, arguments, words):
