@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from hbr.arrays import FloatArray, LevelArray
 from hbr.dense import Belief, DenseIndex, believe
 
+#: What the lead over the second object counts beside the score.
+LEAD: Final = 0.5
 #: The views of a rehearsed search are this far apart.
 _STEP_DEG: Final = 90.0
 
@@ -25,9 +27,9 @@ class Rehearsal:
     Attributes
     ----------
     known : float64 array
-        Score of the best object, its own among them.
+        Familiarity (`familiarity`), its own object among the enrolled ones.
     stranger : float64 array
-        Score of the best object, had its own not been enrolled.
+        Familiarity, had its own object not been enrolled.
     posterior : float64 array
         Probability of the best object.
     correct : bool array
@@ -54,8 +56,8 @@ class Rules:
     certainty : float
         Probability of the best object that ends a search; above 1 where no search may end early.
     familiar : tuple of float
-        Score after 1, 2, ... views below which the object is unknown; the last holds for all further views. -inf where
-        nothing may be called unknown.
+        Familiarity after 1, 2, ... views below which the object is unknown; the last holds for all further views. -inf
+        where nothing may be called unknown.
     error_rate, false_reject : float
         What was asked for: wrong objects among those named, and enrolled objects called unknown.
     false_accept : float
@@ -86,8 +88,8 @@ class Verdict:
         Look on, or end.
     object_index : int
         The best object, whatever the kind.
-    probability, score : float
-        Its probability among the enrolled objects, and its score a view.
+    probability, familiarity : float
+        Its probability among the enrolled objects, and how much it looks like one of them.
     words : str
         The reason, for people.
     """
@@ -95,7 +97,7 @@ class Verdict:
     kind: Literal["look", "found", "unknown"]
     object_index: int
     probability: float
-    score: float
+    familiarity: float
     words: str
 
 
@@ -141,8 +143,8 @@ def rehearse(
             for i in queries:
                 so_far = belief = believe(levels[rows[i]], float(azimuth_deg[i]), so_far, kept=len(index))
                 scores, odds = belief.scores(), belief.posterior(beta).sum(axis=1)
-                known.append(scores.max())
-                stranger.append(np.delete(scores, place).max())
+                known.append(familiarity(scores))
+                stranger.append(familiarity(np.delete(scores, place)))
                 posterior.append(odds.max())
                 correct.append(odds.argmax() == place)
     if not known:
@@ -155,6 +157,16 @@ def rehearse(
         np.reshape(correct, shape),
         beta,
     )
+
+
+def familiarity(scores: FloatArray) -> float:
+    """Return how much a search looks like one for an enrolled object, of the scores of all objects that are considered.
+
+    The best score, and half of its lead over the second: a stranger is a little like several objects, a known object
+    much like one.
+    """
+    best = float(scores.max())
+    return best + LEAD * (best - float(np.partition(scores, -2)[-2])) if len(scores) > 1 else best
 
 
 def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
@@ -218,25 +230,24 @@ def rules(rehearsal: Rehearsal, *, error_rate: float = 0.01, false_reject: float
 def judge(belief: Belief, by: Rules, *, max_views: int = 8) -> Verdict:
     """Say whether the search may end, and with what.
 
-    An object is found when its probability reaches the rules' certainty while its score is familiar; after the last
-    view the best object is found if its score is familiar, and otherwise unknown.
+    An object is found when its probability reaches the rules' certainty and it is familiar; after the last view the
+    best object is found if it is familiar, and otherwise unknown.
     """
     odds = belief.posterior(by.beta).sum(axis=1)
     best = int(odds.argmax())
-    probability, score = float(odds[best]), float(belief.scores()[best])
+    probability, known = float(odds[best]), familiarity(belief.scores())
     object_index = int(belief.index.object_index[best])
     name = belief.index.views.object_names[object_index]
     least = by.familiar[min(belief.queries, len(by.familiar)) - 1]
-    familiar = score >= least
-    says = f"{name} with a probability of {probability:.3f} and a score of {score:.3f} a view"
-    if familiar and probability >= by.certainty:
-        return Verdict("found", object_index, probability, score, f"{says}: sure enough")
+    says = f"{name} with a probability of {probability:.3f} and a familiarity of {known:.3f}"
+    if known >= least and probability >= by.certainty:
+        return Verdict("found", object_index, probability, known, f"{says}: sure enough")
     if belief.queries < max_views:
-        reason = "not sure yet" if familiar else f"below {least:.3f}, which enrolled objects reach"
-        return Verdict("look", object_index, probability, score, f"{says}: {reason}")
-    if familiar:
-        return Verdict("found", object_index, probability, score, f"{says}: the best after {max_views} views")
-    return Verdict("unknown", object_index, probability, score, f"{says}: below {least:.3f}, so none of those enrolled")
+        reason = "not sure yet" if known >= least else f"below {least:.3f}, which enrolled objects reach"
+        return Verdict("look", object_index, probability, known, f"{says}: {reason}")
+    if known >= least:
+        return Verdict("found", object_index, probability, known, f"{says}: the best after {max_views} views")
+    return Verdict("unknown", object_index, probability, known, f"{says}: below {least:.3f}, so none of those enrolled")
 
 
 def _spread(azimuth_deg: FloatArray, start: int, count: int) -> list[int]:

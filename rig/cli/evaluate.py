@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from hbr.evaluation.datasets import Dataset
     from rig.evaluation.plan import Plan
 
+#: How often other objects are left out.
+_DRAWS = 5
+
 
 @command
 def evaluate(
@@ -78,6 +81,14 @@ def evaluate(
             "--enrolled.",
         ),
     ] = False,
+    leave_out: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="OBJECTS",
+            help="Leave so many objects out, five times, and look for them, too: false accepts and false rejects.",
+        ),
+    ] = None,
     objects: Annotated[
         str | None, typer.Option(metavar="FIRST-LAST", help="These objects alone, counted from 1; e.g. 51-100.")
     ] = None,
@@ -134,6 +145,9 @@ def evaluate(
         dataset = plan.dataset
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
+        if leave_out is not None:
+            _strangers(settings, plan, leave_out, jobs, out)
+            return
         if matrix:
             _matrix(settings, plan, jobs, out)
             return
@@ -184,7 +198,8 @@ def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
     from rich.console import Console
 
     from rig.cli.present import Progress
-    from rig.evaluation.matrix import matrix_rows, run_matrix, write_matrix
+    from rig.evaluation.matrix import matrix_rows, run_matrix
+    from rig.evaluation.write import write_json
 
     if plan.protocol.enrolled is None:
         raise ValueError("--matrix takes its queries from the views that are not enrolled; give --enrolled 18 or fewer")
@@ -195,12 +210,35 @@ def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
             progress.advance()
 
         results = run_matrix(plan, jobs, advance)
-    write_matrix(results, out)
+    write_json(results, out / "matrix.json")
     if settings.json:
         settings.print_json({"event": "finished", **results})
         return
     Console().print(matrix_rows(results).terminal())
     print(f"Written: {out / 'matrix.json'}, with Wilson's intervals.", file=sys.stderr)
+
+
+def _strangers(settings: Settings, plan: "Plan", count: int, jobs: int, out: Path) -> None:
+    from rich.console import Console
+
+    from rig.cli.present import Progress
+    from rig.evaluation.run import enrolled_views
+    from rig.evaluation.strangers import run_strangers, stranger_rows
+    from rig.evaluation.write import write_json
+
+    with Progress("enrolling, searching") as progress:
+        progress.start(2 * len(plan.dataset.objects))
+
+        def advance(_name: str) -> None:
+            progress.advance()
+
+        results = run_strangers(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
+    write_json(results, out / "strangers.json")
+    if settings.json:
+        settings.print_json({"event": "finished", **results})
+        return
+    Console().print(stranger_rows(results).terminal())
+    print(f"Written: {out / 'strangers.json'}, with Wilson's intervals.", file=sys.stderr)
 
 
 def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "Dataset":

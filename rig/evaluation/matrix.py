@@ -1,10 +1,8 @@
 """The matrix of perturbations: run over processes, and written for people and programs."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,6 @@ from hbr.dense import DenseIndex
 from hbr.evaluation.matrix import Cell, cells, enrolled_few, hits
 from hbr.evaluation.statistics import wilson
 from hbr.views import Views
-from rig.errors import UsageError
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import Rows
 from rig.processes import over_processes
@@ -73,26 +70,6 @@ def matrix_rows(results: dict[str, Any]) -> Rows:
     views = len(results["matrix"][0]["hit_rate"])
     heads = [f"hit-rate, %, N = 1 / {views}", "strength 1", "2", "3"]
     return Rows(heads, [[kind, *(own.get(s, own.get(0, "")) for s in (1, 2, 3))] for kind, own in by_kind.items()])
-
-
-def write_matrix(results: dict[str, Any], folder: Path) -> None:
-    """Write matrix.json.
-
-    Raises
-    ------
-    UsageError
-        The folder cannot be written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1)
-        (folder / "matrix.json").write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(
-            f"The results cannot be written to {folder}.",
-            next_step="Name another folder with --out.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
 
 
 def _enroll(plan: Plan, matrix: Sequence[Cell], j: int) -> _Enrolled:

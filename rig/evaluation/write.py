@@ -31,6 +31,26 @@ _HEADINGS = {
 }
 
 
+def write_json(results: Mapping[str, Any], path: Path) -> None:
+    """Write results as a JSON file, in a folder that is made where it is missing.
+
+    Raises
+    ------
+    UsageError
+        It cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1)
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(
+            f"The results cannot be written to {path}.",
+            next_step="Name another folder with --out.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+
+
 def write_results(plan: Plan, runs: Runs, margin: float, min_views: int, folder: Path) -> dict[str, Any]:
     """Write results.json, results.csv, the figures as SVG and PNG, and report.html, and return the results.
 
