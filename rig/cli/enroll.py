@@ -131,13 +131,12 @@ class _Job:
                 if isinstance(event, Item):
                     self.quiet()
                     self._heading = f"{event.number} of {event.of} "
+                if isinstance(event, Enrolled):  # it is in the catalog; that stays the last word about it
+                    self._tell(insight(self._catalog.views().views, event.name))
                 self._tell(event)
                 if isinstance(event, Enrolled):
                     self._done += 1
                     self._complete()
-                    found = insight(self._catalog.views().views, event.name)
-                    self._tell(found)
-                    self._records[-1].insight = found
                     self._kept = 0
         except BaseException:
             self.quiet()

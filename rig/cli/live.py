@@ -134,6 +134,7 @@ class EnrollView(LiveView):
         self._rows: list[_Row] = []
         self._move: Moved | None = None
         self._left: TimeLeft | None = None
+        self._findings: list[str] = []
         self._ended = False
 
     def show(self, event: Event) -> bool:
@@ -159,9 +160,10 @@ class EnrollView(LiveView):
                 self._ended = True
                 self._stop()
                 self.note(line(event))
-            case Insight():
-                for words in insight_words(event):
+                for words in self._findings:
                     self.note(f"  {words}")
+            case Insight():
+                self._findings = insight_words(event)
             case _:
                 self.note(line(event))
         return isinstance(event, Accepted)

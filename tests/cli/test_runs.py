@@ -61,7 +61,8 @@ def test_enrollment_ends_with_what_the_object_may_be_taken_for_and_a_report(enro
     folder, outputs = enrolled
     assert "looks like no other enrolled object" in outputs["lamp"].stdout
     told = [json.loads(line) for line in outputs["dice"].stdout.splitlines()]
-    assert told[-1].keys() == {"event", *(Insight.__dataclass_fields__)}
+    assert told[-2].keys() == {"event", *(Insight.__dataclass_fields__)}
+    assert told[-1]["event"] == "enrolled"
     page = (folder / "lamp.html").read_text(encoding="utf-8")
     assert "Contact sheet of lamp: 8 views" in page
     assert "Ring of 8 views by azimuth" in page

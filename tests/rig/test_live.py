@@ -30,6 +30,11 @@ ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 INSIGHT = Insight("mug-white", 180.0, 0.95, 0.96, (Resemblance("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
 
 
+def enrolled_with_insight() -> list[Event]:
+    *before, last = enrolling(views=8, retaken=(3,))
+    return [*before, INSIGHT, last]
+
+
 def screen(width: int, *, terminal: bool = True) -> Console:
     return Console(file=io.StringIO(), width=width, height=30, force_terminal=terminal, legacy_windows=False)
 
@@ -48,7 +53,7 @@ def shown(console: Console, view: LiveView, events: list[Event]) -> str:
 @pytest.mark.parametrize("width", [30, 40, 60, 72, 84, 100, 200])
 def test_the_table_of_an_enrollment_fits_the_terminal(width):
     console = screen(width)
-    text = shown(console, EnrollView(console, load_config(), "3 of 25"), [*enrolling(views=8, retaken=(3,)), INSIGHT])
+    text = shown(console, EnrollView(console, load_config(), "3 of 25"), enrolled_with_insight())
     assert "accepted" in text.replace("\n", "")
     assert ("asked" in text) == (width >= 60)
     assert ("saturated" in text) == (width >= 84)
@@ -58,7 +63,7 @@ def test_the_table_of_an_enrollment_fits_the_terminal(width):
 def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
     console = screen(80, terminal=False)
     view = EnrollView(console, load_config(), "3 of 25")
-    text = shown(console, view, [*enrolling(views=8, retaken=(3,)), INSIGHT])
+    text = shown(console, view, enrolled_with_insight())
     lines = text.splitlines()
     assert lines[0].startswith("3 of 25 mug-white: 8 views, about ")
     views = [line for line in lines if line.startswith("view ")]
