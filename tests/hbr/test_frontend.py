@@ -1,6 +1,8 @@
 """The object in a frame: found, brought to one scale and one light, or refused with the reason."""
 
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -206,3 +208,31 @@ def test_another_light_and_place_hardly_change_the_bench_s_own_descriptor() -> N
     third = hbr.describe(stranger, descriptor=own, reference=empty)
     same, different = own.similarity(first[None], np.stack([second, third]))[0]
     assert same > 0.85 > different + 0.2
+
+
+def test_the_page_on_descriptors_shows_code_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[2] / "docs/descriptors.md").read_text(encoding="utf-8")
+    empty = table(0)
+    monkeypatch.setattr(cv2, "imread", lambda _path: empty)
+    parts = []
+    for j in range(3):
+        levels = [
+            hbr.describe(
+                with_thing(empty, (100 + 4 * j + i, 60, 60 + 10 * j, 110)), descriptor="edges+colours", reference=empty
+            )
+            for i in range(6)
+        ]
+        parts.append(hbr.Views.of_object(f"thing {j}", np.stack(levels), np.arange(6) * 60.0, "edges+colours"))
+    known: dict[str, Any] = {
+        "frame": with_thing(empty),
+        "views": hbr.Views.concatenate(parts),
+        "orientation_deg": 0.0,
+        "turns": [-90.0, 45.0],
+    }
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(code, known)
+    assert known["seen"].box is not None
+    assert known["verdict"].kind == "look"
+    assert known["look"].rotation_deg in known["turns"]
+    named = set(re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE))
+    assert named == {*hbr.descriptors.names(), "onnx:FILE"}
