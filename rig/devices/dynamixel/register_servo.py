@@ -234,8 +234,8 @@ def prepare_servo(servo: RegisterServo, *, write: bool) -> tuple[str, ...]:
     if not write:
         raise DeviceMismatch(
             f"{len(differences)} EEPROM settings of the servo are not as the rig needs them.",
-            next_step="`rig servo settings --write` writes these values, with torque off (so does opening the bench once "
-            "with --set servo.write_settings=true).",
+            next_step="`rig servo settings --write` writes these values, with torque off (so does opening the bench "
+            "once with --set servo.write_settings=true).",
             evidence={d.register: _found_wanted(d) for d in differences},
         )
     servo.write_settings(differences)
