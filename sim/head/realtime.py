@@ -1,7 +1,10 @@
 """A simulated rig head in real time on a pseudo-terminal, for pyserial and any other program."""
 
+import fcntl
 import os
 import pty
+import sys
+import termios
 import tty
 from collections.abc import Callable
 from contextlib import suppress
@@ -67,6 +70,8 @@ class HeadPty:
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.port = os.ttyname(self._slave)
+        self.sent = 0
+        """Bytes that the head has sent so far."""
         self._cancel = head.clock.every(PUMP_S, self.pump)
 
     def pump(self) -> None:
@@ -79,7 +84,12 @@ class HeadPty:
         self._head.catch_up()
         if data := self._head.take(self._head.clock.now_ns()):
             with suppress(BlockingIOError):  # nobody reads: the terminal is full, and what comes is lost
-                os.write(self._master, data)
+                self.sent += os.write(self._master, data)
+
+    def waiting(self) -> int:
+        """Return how many bytes of the host have arrived and were not carried to the head yet."""
+        count = fcntl.ioctl(self._master, termios.FIONREAD, bytes(4))
+        return int.from_bytes(count, sys.byteorder)
 
     def close(self) -> None:
         self._cancel()

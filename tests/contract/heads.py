@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pytest
 import serial
 
-from rig.clock import Clock
+from rig.clock import Clock, SystemClock
 from rig.devices.dynamixel.port import Wire
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
@@ -100,7 +100,8 @@ def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterat
     head.attach(device.address, device)
     terminal = HeadPty(head)
     try:
-        wire = _PacedWire(serial.Serial(terminal.port, BAUD, timeout=0.002 / speed, exclusive=True), clock)
+        port = serial.Serial(terminal.port, BAUD, timeout=0.002 / speed, exclusive=True)
+        wire = _PacedWire(port, clock, terminal)
         imu = RigHead(wire, clock, mpu6050(), deadman_s=2.0)
         try:
             yield Head(imu, clock, head, device, world, terminal.close)
@@ -112,27 +113,49 @@ def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterat
 
 
 class _PacedWire:
-    """pyserial on a simulated line in this very thread: time goes on before each look at the port."""
+    """pyserial on a simulated line in this very thread: time goes on before each look at the port.
 
-    def __init__(self, port: serial.Serial, clock: Clock) -> None:
+    What one end has written is waited for at the other: how long a busy kernel takes to carry it is not under test.
+    """
+
+    def __init__(self, port: serial.Serial, clock: Clock, terminal: HeadPty) -> None:
         self._port = port
         self._clock = clock
+        self._terminal = terminal
+        self._taken = 0
         self.baudrate = port.baudrate
 
     @property
     def in_waiting(self) -> int:
         self._clock.now_ns()
+        self._settle()
         return self._port.in_waiting
 
     def read(self, size: int = 1) -> bytes:
         self._clock.now_ns()
-        return self._port.read(size)
+        self._settle()
+        data = self._port.read(size)
+        self._taken += len(data)
+        return data
 
     def write(self, data: bytes, /) -> int | None:
-        return self._port.write(data)
+        written = self._port.write(data)
+        self._until(lambda: self._terminal.waiting() >= len(data))
+        return written
 
     def reset_input_buffer(self) -> None:
-        self._port.reset_input_buffer()
+        self._taken += len(self._port.read(self.in_waiting))
 
     def close(self) -> None:
         self._port.close()
+
+    def _settle(self) -> None:
+        self._until(lambda: self._taken + self._port.in_waiting >= self._terminal.sent)
+
+    @staticmethod
+    def _until(carried: Callable[[], bool]) -> None:
+        for _ in range(10_000):
+            if carried():
+                return
+            SystemClock().sleep(0.0001)
+        raise AssertionError("the kernel does not carry what was written")

@@ -121,7 +121,7 @@ class HeadLink:
             self._guarded(lambda: self._wire.write(line))
             deadline_ns = self.sent_ns + round(REPLY_S * 1e9)
             while self._clock.now_ns() < deadline_ns:
-                self._take(self._guarded(lambda: self._wire.read(self._deframer.missing(reply_bytes))))
+                self._take(self._guarded(lambda: self._read(reply_bytes)))
                 answer = self._answer(message)
                 if isinstance(answer, expected):
                     return answer
@@ -150,6 +150,10 @@ class HeadLink:
                 raise refusal(self.name, message, answer.refusal)
             return answer if answer.request == message.ID else None
         return answer
+
+    def _read(self, line_bytes: int) -> bytes:
+        """Read what is there, and what a line of so many bytes still lacks: its end is then known when it is there."""
+        return self._wire.read(max(self._wire.in_waiting, self._deframer.missing(line_bytes)))
 
     def _take(self, data: bytes) -> None:
         for frame in self._deframer.feed(data):
