@@ -255,6 +255,8 @@ class Safety:
     def latch(self, error: RigError) -> None:
         """Latch a fault: nothing moves until it is acknowledged. The first one stays until then."""
         self._go(Happening.LATCH)
+        if "rig acknowledge" not in error.next_step:
+            error.next_step += " Then `rig acknowledge`."
         if self._kept.fault is None:
             fault = Fault.of(error, self._clock.utc().isoformat(timespec="seconds"))
             try:
@@ -384,7 +386,7 @@ class Safety:
             fault = self._kept.fault
             return FaultLatched(
                 f"A fault is latched since {fault.utc}: {fault.what}",
-                next_step=f"{fault.next_step} Then `rig acknowledge`.",
+                next_step=fault.next_step,
                 evidence={"code": fault.code, **fault.evidence},
             )
         match self.state:

@@ -175,7 +175,7 @@ class Watch:
         if beyond_deg > config.following_error_deg:
             raise FollowingError(
                 f"The table is at {angle_deg:.1f}°, which is not on its way to {self._goal_deg:.1f}°.",
-                next_step="Look for what turned it; then acknowledge, and look at the angle that `rig status` tells.",
+                next_step="Look for what turned it, and at the angle that `rig status` tells.",
                 evidence=evidence,
             )
         if abs(angle_deg - self._goal_deg) > self._tolerance_deg and self._stands_still(state.time_ns, angle_deg):

@@ -127,7 +127,7 @@ def _table_words(angle_deg: float | None, limits_deg: tuple[float, float]) -> st
 def _state_words(safety: "Safety") -> str:
     if safety.fault is not None:
         fault = safety.fault
-        return f"{safety.state} {fault.code} since {fault.utc}: {fault.what} {fault.next_step} Then `rig acknowledge`."
+        return f"{safety.state} {fault.code} since {fault.utc}: {fault.what} {fault.next_step}"
     return f"{safety.state}: {safety.doubt} (`rig home --help`)" if safety.doubt else str(safety.state)
 
 

@@ -117,7 +117,9 @@ def test_zero_may_be_declared_where_the_table_stands(rig):
 def test_a_fault_is_told_by_every_command_until_it_is_acknowledged(rig):
     rig("goto", "5")
     store = FileStore(Path("state/sim"))
-    stalled = Stalled("The table is blocked at 7.0°.", next_step="Free it.", evidence={"load_percent": 99})
+    stalled = Stalled(
+        "The table is blocked at 7.0°.", next_step="Free it. Then `rig acknowledge`.", evidence={"load_percent": 99}
+    )
     store.save(store.load().model_copy(update={"fault": Fault.of(stalled, "2026-01-02T03:04:05+00:00")}))
     for refused in (
         rig("goto", "0"),
