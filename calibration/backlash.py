@@ -17,9 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from calibration.charts import MODEL, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
 from rig.errors import LimitExceeded, UsageError
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.plans.capture import moved
 from rig.plans.events import Moved, plain
@@ -147,6 +149,27 @@ def plain_approach(bench: Bench) -> Generator[None, None, None]:
         yield
     finally:
         bench.config = before
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return what each reversal lost beyond the fitted ratio: the play, whatever the length of the leg."""
+    if "backlash" not in fact.estimates:
+        return None
+    play, ratio = fact.estimates["backlash"], fact.estimates["ratio"].value
+    legs = [(i + 1, leg) for i, leg in enumerate(fact.evidence["legs"]) if not leg["trouble"]]
+    lost = [(leg["encoder_deg"] - ratio * leg["gyro_deg"]) * np.sign(leg["encoder_deg"]) for _, leg in legs]
+    ends = [legs[0][0], legs[-1][0]]
+    return chart(
+        "Play of the gears",
+        Axis("reversal", whole=True),
+        Axis("encoder beyond gyro, °", span=(0.0,)),
+        [
+            Series(
+                f"play {play}", ends, [play.value] * 2, MODEL, dots=False, curve=True, band=[2 * play.uncertainty] * 2
+            ),
+            Series("measured", [i for i, _ in legs], lost),
+        ],
+    )
 
 
 def _judge(estimates: Mapping[str, Estimate], residual: float, limit: float, worst: int) -> list[str]:

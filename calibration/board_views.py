@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration import pictures
 from calibration.events import Ask, Progress
 from rig.bench import Bench
 from rig.markers import Board, Sighting, sight
@@ -32,6 +33,13 @@ STANDS = {
     "calibration-board right": "leaning back by about 15° at the right edge, turned in its plane the other way",
 }
 """How the board is to stand, by the name under which a simulated bench knows it."""
+
+PICTURES = {
+    "calibration-board upright": pictures.BOARD_UPRIGHT,
+    "calibration-board back": pictures.BOARD_BACK,
+    "calibration-board left": pictures.BOARD_LEFT,
+    "calibration-board right": pictures.BOARD_RIGHT,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +70,7 @@ def look(
     known = set(np.asarray(board.layout().getIds()).ravel().tolist())
     viewer = Viewer(bench.camera, bench.config.view)
     for number, stand in enumerate(stands):
-        yield Ask(f"Put the calibration board {STANDS[stand]}; fix it there, and take your hands off.")
+        yield Ask(f"Put the calibration board {STANDS[stand]}; fix it there, and take your hands off.", PICTURES[stand])
         bench.operator.place(stand)
         with Turntable(bench) as table:
             for angle_deg in angles_deg:

@@ -7,6 +7,7 @@ from collections.abc import Generator, Mapping
 from datetime import datetime
 from typing import Any
 
+from calibration import pictures
 from calibration.events import Ask
 from rig.bench import Bench
 from rig.facts import Estimate, Fact
@@ -32,10 +33,10 @@ def live(bench: Bench) -> Generator[Ask | Fact, None, Fact]:
     when_utc = bench.clock.utc()
     bench.servo.torque_off()
     ends_deg = []
-    for direction in ("counter-clockwise", "clockwise"):
-        yield Ask(f"Turn the table by hand {direction}, seen from above, until its cable is just not taut.")
+    for direction, picture in (("counter-clockwise", pictures.TURN_LEFT), ("clockwise", pictures.TURN_RIGHT)):
+        yield Ask(f"Turn the table by hand {direction}, seen from above, until its cable is just not taut.", picture)
         ends_deg.append(bench.safety.reference.to_table(bench.servo.read_state().position_deg))
-    yield Ask("Turn the table back by hand until its cable hangs free.")
+    yield Ask("Turn the table back by hand until its cable hangs free.", pictures.CABLE_FREE)
     fact = from_data(
         ends_deg[0],
         ends_deg[1],

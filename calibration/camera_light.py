@@ -17,9 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration import pictures
+from calibration.charts import MODEL, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
 from rig.devices.camera import CameraLocks
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.plans.events import plain
 from rig.view import looks
@@ -67,7 +70,10 @@ def live_scene(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
         The camera fails.
     """
     when_utc = bench.clock.utc()
-    yield Ask("Put the calibration board upright in the middle of the platter, lit as usual; take your hands off.")
+    yield Ask(
+        "Put the calibration board upright in the middle of the platter, lit as usual; take your hands off.",
+        pictures.BOARD_UPRIGHT,
+    )
     bench.operator.place(BOARD)
     frames = [bench.camera.capture(bench.clock.now_ns()).image_bgr for _ in range(PAIRS)]
     yield Progress(1.0, f"{PAIRS} frames of the scene at rest")
@@ -88,7 +94,10 @@ def live_card(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
         The camera fails.
     """
     when_utc = bench.clock.utc()
-    yield Ask("Hold or stand a plain grey or white card before the camera, so that it fills the frame, lit as usual.")
+    yield Ask(
+        "Hold or stand a plain grey or white card before the camera, so that it fills the frame, lit as usual.",
+        pictures.CARD,
+    )
     bench.operator.place(CARD)
     locks = bench.camera.read_locks()
     levels, seconds = [], []
@@ -201,11 +210,7 @@ def sharpness(values: Sequence[float], *, when_utc: datetime, device: Mapping[st
 
 def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
     """Fit the loss of light towards the corners to a card that fills the frame, and judge it."""
-    rows, columns = card.mean.shape
-    y, x = np.mgrid[0:rows, 0:columns]
-    x = (x + 0.5) / columns * 2 - 1
-    y = ((y + 0.5) / rows * 2 - 1) * (rows / columns)
-    square = (x**2 + y**2) / (1 + (rows / columns) ** 2)  # 1 in the corners
+    square, x, y = _shading(card.mean.shape)
     design = np.column_stack([np.ones(square.size), x.ravel(), y.ravel(), -square.ravel()])
     values = card.mean.ravel()
     found, *_ = np.linalg.lstsq(design, values, rcond=None)
@@ -318,6 +323,87 @@ def drift(
         evidence=evidence,
         **kept,
     )
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return what the fact of noise, sharpness, flat field or drift was fitted to."""
+    evidence = fact.evidence
+    if not fact.estimates:
+        return None
+    match fact.name:
+        case "camera.noise":
+            mean, variance = np.array(evidence["mean_variance"]).T
+            gain = 255 / fact.estimates["full_well_e"].value
+            floor = (gain * fact.estimates["read_noise_e"].value) ** 2 + 1 / 12
+            ends = np.array([0.0, mean.max()])
+            return chart(
+                "Photon transfer",
+                Axis("mean, grey levels", span=(0.0,)),
+                Axis("variance, squared levels", span=(0.0,)),
+                [
+                    Series("shot and read noise", ends.tolist(), (gain * ends + floor).tolist(), MODEL, False, True),
+                    Series("measured", mean.tolist(), variance.tolist()),
+                ],
+            )
+        case "camera.flat_field":
+            square, _, _ = _shading(np.array(evidence["mean"]).shape)
+            share = np.array(evidence["mean"]) / np.array(evidence["mean"]).max()
+            rings = np.round(square * 20) / 20
+            at = np.unique(rings)
+            means = np.array([share[rings == ring].mean() for ring in at])
+            level = float((means + fact.estimates["vignetting"].value * at * means[0]).mean())
+            return chart(
+                "Light over the frame, by rings about its middle",
+                Axis("squared distance from the middle (corner: 1)"),
+                Axis("share of the light"),
+                [
+                    Series(
+                        f"loses {fact.estimates['vignetting'].value:.0%}",
+                        [0.0, 1.0],
+                        [level, level * (1 - fact.estimates["vignetting"].value)],
+                        MODEL,
+                        dots=False,
+                        curve=True,
+                    ),
+                    Series("mean of a ring", at.tolist(), means.tolist()),
+                ],
+            )
+        case "camera.drift":
+            grey = np.array(evidence["levels_bgr"]).mean(axis=1)
+            minutes = np.array(evidence["seconds"]) / 60
+            slope = fact.estimates["drift"].value
+            return chart(
+                "Brightness of the card",
+                Axis("minutes"),
+                Axis("off the mean, %"),
+                [
+                    Series(
+                        f"{fact.estimates['drift']}",
+                        [minutes[0], minutes[-1]],
+                        [slope * float(m - minutes.mean()) for m in (minutes[0], minutes[-1])],
+                        MODEL,
+                        dots=False,
+                        curve=True,
+                    ),
+                    Series("frames", minutes.tolist(), (100 * (grey / grey.mean() - 1)).tolist()),
+                ],
+            )
+        case _:
+            return chart(
+                "Sharpness of the board",
+                Axis("frame", whole=True),
+                Axis("squared levels", span=(0.0,)),
+                [Series("measured", list(range(1, len(evidence["sharpness"]) + 1)), evidence["sharpness"])],
+            )
+
+
+def _shading(shape: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the squared distance of blocks from the middle, 1 in the corners, and their x and y, −1 to 1 across."""
+    rows, columns = shape
+    y, x = np.mgrid[0:rows, 0:columns]
+    x = (x + 0.5) / columns * 2 - 1
+    y = ((y + 0.5) / rows * 2 - 1) * (rows / columns)
+    return (x**2 + y**2) / (1 + (rows / columns) ** 2), x, y
 
 
 def _blocks(image: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -12,8 +12,10 @@ import cv2
 import numpy as np
 
 from calibration.board_views import STANDS, BoardView, as_json, coverage, look, points, turned_otherwise
+from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.markers import Board
 from rig.plans.events import Event
@@ -139,6 +141,32 @@ def matrix_of(fact: Fact) -> tuple["np.ndarray[tuple[int, int], np.dtype[np.floa
     value = {name: estimate.value for name, estimate in fact.estimates.items()}
     matrix = np.array([[value["fx"], 0.0, value["cx"]], [0.0, value["fy"], value["cy"]], [0.0, 0.0, 1.0]])
     return matrix, [value[name] for name in ("k1", "k2", "p1", "p2")]
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return where in the frame corners were seen; every stand has its colour."""
+    views = fact.evidence["views"]
+    if not views:
+        return None
+    width, height = fact.evidence["size"]
+    frame = Series("frame", [0, width, width, 0, 0], [0, 0, height, height, 0], "#8a8f96", dots=False, curve=True)
+    stands = sorted({view["stand"] for view in views})
+    corners = [np.array([p for view in views if view["stand"] == s for p in view["corners_px"]]) for s in stands]
+    covered = float((np.array(fact.evidence["coverage"]) > 0).mean())
+    rms = "" if fact.residual is None else f", {fact.residual:.2f} px off (RMS)"
+    return chart(
+        f"Corners seen: {covered:.0%} of the frame{rms}",
+        Axis("x, px"),
+        Axis("y, px", falling=True),
+        [
+            frame,
+            *(
+                Series(f"stand {s + 1}", c[:, 0].tolist(), c[:, 1].tolist(), colour)
+                for s, c, colour in zip(stands, corners, (MEASURED, MODEL, OTHER, "#cc79a7"), strict=False)
+            ),
+        ],
+        square=True,
+    )
 
 
 def _judge(estimates: Mapping[str, Estimate], rms_px: float, each: Any, covered: float) -> list[str]:

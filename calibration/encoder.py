@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.charts import MODEL, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
 from rig.errors import LimitExceeded, UsageError
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.plans.capture import moved
 from rig.plans.events import Moved, plain
@@ -184,6 +186,43 @@ def from_data(
         when_utc=when_utc,
         device=device,
         evidence={"steps": plain(list(steps)), "turn_deg": turn_deg},
+    )
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return the encoder's error over its turn, as fitted and as the steps show it."""
+    if not fact.estimates:
+        return None
+    turn_deg = fact.evidence["turn_deg"]
+    steps = [step for step in fact.evidence["steps"] if not step["leg"]["trouble"]]
+    values = np.array([fact.estimates[name].value for name in NAMES])
+    sigma = np.array([fact.estimates[name].uncertainty for name in NAMES])
+    phi = np.linspace(0.0, turn_deg, 121)
+    basis = _basis(phi, turn_deg)
+    encoder = np.array([step["leg"]["encoder_deg"] for step in steps])
+    gyro = np.array([step["leg"]["gyro_deg"] for step in steps])
+    # Whole turns: over them the error is nil, and what is left is the gyro's scale.
+    error = np.cumsum(encoder - gyro * encoder.sum() / gyro.sum())
+    sense = np.sign(steps[0]["to_deg"] - steps[0]["from_deg"]) * np.sign(encoder[0])
+    to = np.array([step["to_deg"] for step in steps])
+    seen = sense * error
+    seen += float(np.mean(_basis(to, turn_deg) @ values - seen))
+    return chart(
+        "Error of the encoder over its turn",
+        Axis("position of the encoder, °", span=(0.0, turn_deg)),
+        Axis("reads too much, °"),
+        [
+            Series(
+                "two harmonics",
+                phi.tolist(),
+                (basis @ values).tolist(),
+                MODEL,
+                dots=False,
+                curve=True,
+                band=(2 * np.sqrt(basis**2 @ sigma**2)).tolist(),
+            ),
+            Series("steps, summed up", np.mod(to, turn_deg).tolist(), seen.tolist()),
+        ],
     )
 
 

@@ -13,6 +13,10 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """Something that a person must do before the procedure goes on; it goes on when the next event is asked for."""
+    """Something that a person must do before the procedure goes on; it goes on when the next event is asked for.
+
+    ``picture`` shows it on a terminal.
+    """
 
     words: str
+    picture: str = ""

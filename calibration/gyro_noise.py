@@ -20,9 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from calibration.charts import MODEL, Axis, Series, chart
 from calibration.events import Progress
 from rig.bench import Bench
 from rig.errors import UsageError
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 
 NAME = "imu.noise"
@@ -205,6 +207,27 @@ def rotation_sigma_deg(fact: Fact, seconds: float) -> float:
     """
     arw, walk = fact.estimates["angle_random_walk"].value, fact.estimates["rate_random_walk"].value
     return sqrt(arw**2 * seconds + walk**2 * seconds**3 / 3)
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return the Allan deviation over the time that is averaged, measured and fitted."""
+    taus = fact.evidence["tau_s"]
+    return chart(
+        "Allan deviation of the gyro at rest",
+        Axis("averaged over, s", log=True),
+        Axis("°/s", log=True),
+        [
+            Series(
+                "angle and rate random walk",
+                taus,
+                fact.evidence["allan_deviation_model_dps"],
+                MODEL,
+                dots=False,
+                curve=True,
+            ),
+            Series("measured", taus, fact.evidence["allan_deviation_dps"]),
+        ],
+    )
 
 
 def _fit(rate: NDArray[np.float64], period_s: float, trend: NDArray[np.float64]) -> tuple[float, float]:

@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg
 from rig.bench import Bench
 from rig.errors import LimitExceeded, UsageError
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.heading import DRAIN_S, MEMORY_S
 from rig.plans.capture import moved
@@ -160,6 +162,44 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
         when_utc=when_utc,
         device=device,
         evidence=evidence,
+    )
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return encoder over gyro for each leg, and the scale."""
+    legs = [(i + 1, leg) for i, leg in enumerate(fact.evidence["legs"]) if not leg["trouble"] and leg["gyro_deg"]]
+    if not legs or not fact.estimates:
+        return None
+    scale = fact.estimates["scale"]
+
+    def percent(ratio: float) -> float:
+        return 100 * (ratio - 1)
+
+    ends = [legs[0][0], legs[-1][0]]
+    return chart(
+        "Scale of the gyro, by whole turns",
+        Axis("leg", whole=True),
+        Axis("encoder beyond gyro, %"),
+        [
+            Series(
+                f"scale {scale.value:.5f}",
+                ends,
+                [percent(scale.value)] * 2,
+                MODEL,
+                dots=False,
+                curve=True,
+                band=[200 * scale.uncertainty] * 2,
+            ),
+            *(
+                Series(
+                    words,
+                    [i for i, leg in legs if sign * leg["encoder_deg"] > 0],
+                    [percent(leg["encoder_deg"] / leg["gyro_deg"]) for _, leg in legs if sign * leg["encoder_deg"] > 0],
+                    colour,
+                )
+                for words, sign, colour in (("upwards", 1, MEASURED), ("downwards", -1, OTHER))
+            ),
+        ],
     )
 
 

@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.recording import Recording, recording
 from rig.bench import Bench
 from rig.errors import LimitExceeded
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.plans.capture import moved
 from rig.plans.events import Moved
@@ -188,6 +190,22 @@ def from_data(
             "encoder_deg": [turn.encoder_deg for turn in turns],
             "levels": [{"table_deg": level.table_deg, "mean_g": level.mean_g.tolist()} for level in levels],
         },
+    )
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return what the accelerometer reads across the axis over the turn: a tilt and an offset make a circle of it."""
+    levels = fact.evidence["levels"]
+    if not levels or not fact.estimates:
+        return None
+    mean_g = np.array([level["mean_g"] for level in levels])
+    angles = [level["table_deg"] for level in levels]
+    across = [(i, colour) for i, colour in enumerate((MEASURED, OTHER, MODEL)) if np.abs(mean_g[:, i]).mean() < 0.5]
+    return chart(
+        "Gravity across the table's axis",
+        Axis("table, °"),
+        Axis("accelerometer, g"),
+        [Series(f"{'xyz'[i]} axis", angles, mean_g[:, i].tolist(), colour, curve=True) for i, colour in across],
     )
 
 

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from calibration.backlash import plain_approach
+from calibration.charts import MODEL, Axis, Series, chart
 from rig.bench import Bench
 from rig.devices.servo import MotionProfile
 from rig.errors import LimitExceeded, UsageError
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.plans.capture import moved
 from rig.plans.events import Moved, plain
@@ -148,6 +150,25 @@ def from_data(moves: Sequence[Timed], nominal: MotionProfile, *, when_utc: datet
         when_utc=when_utc,
         device=device,
         evidence={"moves": plain(list(moves)), "scatter_s": scatter},
+    )
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return the time of each move over its length, and the model."""
+    if not fact.estimates:
+        return None
+    moves = fact.evidence["moves"]
+    model = np.array([fact.estimates[name].value for name in ("pace", "wind_up", "delay")])
+    lengths = [abs(move["distance_deg"]) for move in moves]
+    distance = np.linspace(0.5, max(lengths), 121)
+    return chart(
+        "Time until the table is at rest",
+        Axis("length of the move, °", span=(0.0,)),
+        Axis("seconds", span=(0.0,)),
+        [
+            Series("model", distance.tolist(), _seconds(model, distance).tolist(), MODEL, dots=False, curve=True),
+            Series("measured", lengths, [move["seconds"] for move in moves]),
+        ],
     )
 
 

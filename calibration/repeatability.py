@@ -22,8 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
+from calibration import pictures
+from calibration.charts import LIMIT, OTHER, Axis, Series, chart
+from calibration.events import Ask
 from rig.bench import Bench
 from rig.errors import UsageError
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.plans.capture import capture, moved
 from rig.plans.events import Accepted, Event
@@ -53,7 +57,7 @@ class Sitting:
 
 def live(
     bench: Bench, name: str, *, placements: int = 5, error_rate: float = ERROR_RATE
-) -> Generator[Event | Fact, None, Fact]:
+) -> Generator[Event | Ask | Fact, None, Fact]:
     """Have ``name`` placed several times at its mark, and look at it from all sides; yields events, then the fact.
 
     Raises
@@ -73,7 +77,12 @@ def live(
     viewer = Viewer(bench.camera, bench.config.view)
     sittings: list[Sitting] = []
     index = 0
-    for _ in range(placements):
+    for placing in range(1, placements + 1):
+        again = "again, taken off and put back" if placing > 1 else "as it stands when it is enrolled"
+        yield Ask(
+            f"Put {name} at its mark on the platter, {again} (placing {placing} of {placements}); take your hands off.",
+            pictures.OBJECT_AT_MARK,
+        )
         bench.operator.place(name)
         rounds = []
         with Turntable(bench) as table:
@@ -196,6 +205,30 @@ def from_data(
             "between": between.round(4).tolist(),
             "by_step": _by_step(sittings),
         },
+    )
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return how alike views are that lie some degrees of the table apart."""
+    steps = [step["step_deg"] for step in fact.evidence["by_step"]]
+    threshold = fact.estimates["repeatability"].value
+    return chart(
+        "Similarity of repeated views",
+        Axis("apart, ° of the table"),
+        Axis("Tanimoto similarity", span=(1.0,)),
+        [
+            Series("median", steps, [step["median"] for step in fact.evidence["by_step"]], curve=True),
+            Series("tenth percentile", steps, [step["tenth"] for step in fact.evidence["by_step"]], OTHER, curve=True),
+            Series(
+                f"unknown below {threshold:.3f}",
+                [steps[0], steps[-1]],
+                [threshold] * 2,
+                LIMIT,
+                False,
+                True,
+                dashed=True,
+            ),
+        ],
     )
 
 

@@ -21,8 +21,10 @@ from scipy.optimize import least_squares
 
 from calibration.board_views import BoardView, as_json, look, points, turned_otherwise
 from calibration.camera_model import PARAMETERS, matrix_of
+from calibration.charts import LIMIT, MODEL, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
+from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
 from rig.markers import Board
 from rig.plans.events import Event
@@ -153,6 +155,33 @@ def region_of_interest(
     low = np.clip(np.floor(seen.min(axis=0)), 0, np.array(size) - 1).astype(int)
     high = np.clip(np.ceil(seen.max(axis=0)), low + 1, size).astype(int)
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+
+def plot(fact: Fact) -> Figure | None:
+    """Return the way of the board's middle about the axis, seen along it, and the circles that were fitted."""
+    if not fact.estimates:
+        return None
+    value = {name: estimate.value for name, estimate in fact.estimates.items()}
+    up = np.array([value["ux"], value["uy"], value["uz"]])
+    offset = np.array(fact.evidence["board_centres_mm"]) - np.array([value["x"], value["y"], value["z"]])
+    side = np.cross(up, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    across, along = offset @ side, offset @ np.cross(side, up)
+    around = np.linspace(0.0, 2 * np.pi, 97)
+    return chart(
+        f"The board about the axis, seen from above; wobble {fact.estimates['wobble']}",
+        Axis("mm"),
+        Axis("mm from the axis", falling=True),
+        [
+            *(
+                Series("", (r * np.cos(around)).tolist(), (r * np.sin(around)).tolist(), MODEL, dots=False, curve=True)
+                for r in fact.evidence["radius_mm"]
+            ),
+            Series("middle of the board", across.tolist(), along.tolist()),
+            Series("axis", [0.0], [0.0], LIMIT),
+        ],
+        square=True,
+    )
 
 
 class _Axis:

@@ -141,7 +141,7 @@ def _standing(facts: list[Fact], device: Mapping[str, Any], now_utc: datetime) -
             passed[-1], State.OTHER_DEVICE, f"{passed[-1].name} was calibrated on another device: {changed}"
         )
     fact = here[-1]
-    days = (now_utc - fact.when_utc).total_seconds() / 86400
+    days = max((now_utc - fact.when_utc).total_seconds() / 86400, 0.0)  # a simulated clock runs ahead
     age = f"{fact.name} was calibrated {days:.0f} days ago"
     if fact.expired(now_utc):
         return Standing(fact, State.EXPIRED, f"{age}; it holds for {fact.valid_days:.0f}")
