@@ -193,7 +193,7 @@ def _disagreement(move: Move) -> RotationDisagreement:
         )
     return RotationDisagreement(
         f"The servo turned {move.rotation_encoder_deg:.2f}°, the platter {move.gyro.angle_deg:.2f}°.",
-        next_step="Tighten the platter and enroll the object anew with --replace: "
+        next_step="Tighten the platter, `rig acknowledge`, and enroll the object anew with --replace: "
         "views from before and after a slip do not fit together.",
         evidence={
             "difference_deg": round(move.agreement.difference_deg, 3),
