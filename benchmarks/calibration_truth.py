@@ -12,14 +12,27 @@ from contextlib import contextmanager
 from math import degrees, sqrt
 from typing import Any
 
+import cv2
 import numpy as np
 
-from calibration import backlash, encoder, gyro_noise, gyro_scale, imu_mounting, motion_model
+from calibration import (
+    backlash,
+    camera_light,
+    camera_model,
+    encoder,
+    gyro_noise,
+    gyro_scale,
+    imu_mounting,
+    motion_model,
+    table_axis,
+)
 from rig.config import load_config
 from rig.facts import Fact
+from rig.markers import Board
 from rig.turntable import Turntable
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
+from sim.objects.board import boards
 from sim.objects.shelf import shelf
 from sim.world import World
 
@@ -98,6 +111,64 @@ def motion(seed: int) -> tuple[Fact, Truth]:
         }
 
 
+def light(seed: int) -> NoiseModel:
+    rng = np.random.default_rng(seed)
+    return NoiseModel(
+        full_well_e=float(rng.uniform(4e3, 2e4)),
+        read_noise_e=float(rng.uniform(8, 40)),
+        vignetting=float(rng.uniform(0, 0.3)),
+        light_flicker=float(rng.uniform(0.001, 0.01)),
+    )
+
+
+def photons(seed: int) -> tuple[Fact, Truth]:
+    noise = light(seed)
+    with opened(seed, noise) as (bench, _):
+        fact = last(camera_light.live_scene(bench))
+    return fact, {"full_well_e": (noise.full_well_e, "electrons"), "read_noise_e": (noise.read_noise_e, "electrons")}
+
+
+def card(seed: int, name: str, truth: Truth) -> tuple[Fact, Truth]:
+    with opened(seed, light(seed)) as (bench, _):
+        events = [*camera_light.live_card(bench)]
+    return next(event for event in events if isinstance(event, Fact) and event.name == name), truth
+
+
+def corners(seed: int) -> tuple[Fact, Truth]:
+    return card(seed, camera_light.FLAT_FIELD, {"vignetting": (light(seed).vignetting, "")})
+
+
+def steadiness(seed: int) -> tuple[Fact, Truth]:
+    return card(seed, camera_light.DRIFT, {"flicker": (light(seed).light_flicker, ""), "drift": (0.0, "%/min")})
+
+
+def lens(seed: int) -> tuple[Fact, Truth]:
+    operator = ShelfOperator(World(seed=seed), shelf())
+    with open_sim_bench(load_config(None, ()), operator) as bench:
+        fact = last(camera_model.live(bench))
+    optics = operator.optics
+    values = (*optics.focal_px, *optics.centre_px, *optics.distortion[:4])
+    return fact, {name: (value, unit) for (name, unit), value in zip(camera_model.PARAMETERS, values, strict=True)}
+
+
+def axis(seed: int) -> tuple[Fact, Truth]:
+    operator = ShelfOperator(World(seed=seed), shelf())
+    with open_sim_bench(load_config(None, ()), operator) as bench:
+        fact = last(table_axis.live(bench, last(camera_model.live(bench))))
+    optics = operator.optics
+    up, origin = np.array(optics.rotation).reshape(3, 3)[:, 2], np.array(optics.translation_mm)
+    rotation, translation = boards(optics)[table_axis.STANDS[0]].pose(0.0)
+    middle = rotation @ Board().points_mm().mean(axis=0) + translation
+    beside = origin + up * ((middle - origin) @ up)
+    seen = cv2.projectPoints(beside[None], np.zeros(3), np.zeros(3), optics.matrix, np.array(optics.distortion))[0]
+    names = ("x", "y", "z", "ux", "uy", "uz", "px", "py")
+    units = ("mm", "mm", "mm", "", "", "", "px", "px")
+    return fact, {
+        name: (float(value), unit)
+        for name, value, unit in zip(names, [*beside, *up, *seen.ravel()], units, strict=True)
+    }
+
+
 PROCEDURES: dict[str, Callable[[int], tuple[Fact, Truth]]] = {
     "servo.backlash": play,
     "servo.encoder": over_the_turn,
@@ -105,6 +176,11 @@ PROCEDURES: dict[str, Callable[[int], tuple[Fact, Truth]]] = {
     "imu.scale": imu_scale,
     "imu.mounting": mounting,
     "imu.noise": imu_noise,
+    "camera.noise": photons,
+    "camera.flat_field": corners,
+    "camera.drift": steadiness,
+    "camera.intrinsics": lens,
+    "table.axis": axis,
 }
 
 

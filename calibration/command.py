@@ -222,7 +222,7 @@ def report(
     from calibration.report import write_page
     from rig.facts import FactStore
 
-    with settings.open_bench() as bench:
+    with settings.open_bench(tell=False) as bench:
         store = FactStore(bench.config.calibration_path(bench.name))
         now_utc = bench.clock.utc()
         standings = store.standings(bench.apparatus(), now_utc)
@@ -244,7 +244,7 @@ def show(settings: Settings) -> None:
     from rig.facts import FactStore, State
     from rig.plans.events import plain
 
-    with settings.open_bench() as bench:
+    with settings.open_bench(tell=False) as bench:
         store = FactStore(bench.config.calibration_path(bench.name))
         standings = store.standings(bench.apparatus(), bench.clock.utc())
         if settings.json:

@@ -166,12 +166,12 @@ def plot(fact: Fact) -> Figure | None:
     offset = np.array(fact.evidence["board_centres_mm"]) - np.array([value["x"], value["y"], value["z"]])
     side = np.cross(up, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
-    across, along = offset @ side, offset @ np.cross(side, up)
+    across, along = offset @ -side, offset @ np.cross(side, up)  # the camera is below
     around = np.linspace(0.0, 2 * np.pi, 97)
     return chart(
         f"The board about the axis, seen from above; wobble {fact.estimates['wobble']}",
         Axis("mm"),
-        Axis("mm from the axis", falling=True),
+        Axis("mm from the axis"),
         [
             *(
                 Series("", (r * np.cos(around)).tolist(), (r * np.sin(around)).tolist(), MODEL, dots=False, curve=True)

@@ -49,7 +49,8 @@ class Bench(AbstractContextManager["Bench"]):
     """The open devices of one bench, on one clock.
 
     ``conditions`` says under which noise model or calibration the bench works, ``findings`` what opening it revealed
-    that a person should know; both are kept with every enrollment. ``state`` is where the table's turns and faults
+    that a person should know; both are kept with every enrollment. ``out_of_force`` are the findings about calibrations
+    that do not hold, or not as they were kept. ``state`` is where the table's turns and faults
     outlive the program, ``head`` the rig head that ``imu`` is on, if it is on one, ``wires`` what must be closed after
     the devices.
     """
@@ -63,6 +64,7 @@ class Bench(AbstractContextManager["Bench"]):
     operator: Operator = field(default_factory=ObjectStandsThere)
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
+    out_of_force: tuple[str, ...] = field(default=(), init=False)
     state: StateStore = field(default_factory=MemoryStore, repr=False)
     head: RigHead | None = None
     wires: ExitStack = field(default_factory=ExitStack, repr=False)
@@ -215,8 +217,7 @@ def calibrate(bench: Bench, store: FactStore) -> None:
     bench.config, told = put_in_force(config, facts)
     bench.safety.reference.calibrate(bench.config.table)
     bench.conditions = {**bench.conditions, CALIBRATIONS: [fact.id for fact in facts]}
-    bench.findings = (
-        *findings,
+    bench.out_of_force = (
         *told,
         *(error.what for error in store.unreadable),
         *(
@@ -225,6 +226,7 @@ def calibrate(bench: Bench, store: FactStore) -> None:
             if standing.state is not State.IN_FORCE
         ),
     )
+    bench.findings = (*findings, *bench.out_of_force)
 
 
 def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:

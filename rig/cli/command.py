@@ -91,11 +91,13 @@ class Settings:
     def bench_name(self) -> str:
         return self.bench or self.load().default_bench
 
-    def open_bench(self) -> "Bench":
+    def open_bench(self, *, tell: bool = True) -> "Bench":
+        """Open the bench and say what a person should know of it, unless the command does so itself (``tell``)."""
         from rig.bench import open_bench
 
         bench = open_bench(self.bench_name, self.load(), seed=self.seed)
-        for finding in bench.safety.findings:  # before anything moves
+        # Before anything moves.
+        for finding in (*bench.safety.findings, *(bench.out_of_force if tell else ())):
             print(f"Note: {finding}.", file=sys.stderr)
         return bench
 

@@ -85,7 +85,7 @@ def status(settings: Settings) -> None:
     """
     from rig.plans.events import plain
 
-    with settings.open_bench() as bench:
+    with settings.open_bench(tell=False) as bench:
         state, safety = bench.servo.read_state(), bench.safety
         config = bench.config.table
         table_deg = None if safety.doubt else safety.reference.to_table(state.position_deg)

@@ -1,18 +1,24 @@
-"""`rig calibrate imu` as its users call it."""
+"""`rig calibrate` as its users call it."""
 
 import json
+from datetime import timedelta
 
 import pytest
 from typer.testing import CliRunner
 
+from calibration import camera_model, encoder, table_axis
+from calibration.report import plot
 from rig.cli.main import app
-from rig.facts import Fact
+from rig.clock import SystemClock
+from rig.facts import Estimate, Fact, FactStore
+from rig.markers import Board
 
 
 @pytest.fixture
 def rig(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "rig.toml").write_text('default_bench = "sim"\ncalibration_dir = "facts"\n', encoding="utf-8")
+    config = 'default_bench = "sim"\ncalibration_dir = "facts"\n[catalog]\npath = "catalog"\n'
+    (tmp_path / "rig.toml").write_text(config, encoding="utf-8")
 
     def run(*arguments: str):
         return CliRunner().invoke(app, list(arguments))
@@ -26,11 +32,11 @@ def test_the_help_has_an_example_and_the_group_lists_the_procedure(rig):
 
 
 def test_what_passed_is_kept_and_in_force_from_then_on(rig, tmp_path):
-    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--seed", "6")
+    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4", "--seed", "6")
     assert done.exit_code == 0, done.output
     paths = sorted((tmp_path / "facts" / "sim").iterdir())
     facts = [Fact.from_file(path) for path in paths]
-    assert [fact.name for fact in facts] == ["imu.scale", "imu.mounting", "imu.noise"]
+    assert [fact.name for fact in facts] == ["imu.scale", "imu.mounting", "imu.noise", "imu.rotation"]
     for path, fact in zip(paths, facts, strict=True):
         assert f"PASS {fact.name}" in done.stdout
         assert path.name in "".join(done.stdout.split())
@@ -43,23 +49,23 @@ def test_what_passed_is_kept_and_in_force_from_then_on(rig, tmp_path):
 
 
 def test_json_is_one_object_a_line_and_ends_with_the_fact(rig):
-    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--seed", "6", "--json")
+    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4", "--seed", "6", "--json")
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert {event["event"] for event in events} == {"moved", "progress", "calibrated"}
-    scale, *_, noise = [event for event in events if event["event"] == "calibrated"]
+    scale, *_, rotation = [event for event in events if event["event"] == "calibrated"]
     assert (scale["passed"], scale["refusals"]) == (True, [])
     assert scale["estimates"]["scale"]["uncertainty"] < 1.5e-4
-    assert noise == events[-1]
+    assert rotation == events[-1]
 
 
 def test_a_failure_says_why_ends_with_6_and_leaves_what_is_in_force(rig, tmp_path):
-    assert rig("calibrate", "imu", "--turns", "4", "--minutes", "3").exit_code == 0
+    assert rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4").exit_code == 0
     done = rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert done.exit_code == 6
     assert "FAIL imu.scale" in done.stdout
     assert "imu.axis" in done.stdout
     passed = [Fact.from_file(path).passed for path in sorted((tmp_path / "facts" / "sim").iterdir())]
-    assert passed == [True, True, True, False]
+    assert passed == [True, True, True, True, False]
     assert json.loads(rig("goto", "90", "--json").stdout)["bound_deg"] < 1.5
 
 
@@ -82,11 +88,110 @@ def test_what_is_in_force_and_what_was_kept_can_be_looked_up(rig):
     assert "No calibration of imu.scale was kept" in rig("calibrate", "history", "imu.scale").output
     rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert "imu.scale never passed" in rig("calibrate", "show").output
-    rig("calibrate", "imu", "--turns", "4", "--minutes", "3")
+    rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4")
     assert "✓ imu.scale was calibrated 0 days ago" in rig("calibrate", "show").output
     assert "conditions.seed was 0, is 9" in rig("calibrate", "show", "--seed", "9").output
     failed, passed = rig("calibrate", "history", "imu.scale").output.splitlines()
     assert "FAIL" in failed
     assert "scale " in passed
     told = json.loads(rig("calibrate", "history", "--json").stdout)
-    assert [fact["name"] for fact in told["calibrations"]] == ["imu.scale", "imu.scale", "imu.mounting", "imu.noise"]
+    assert [fact["name"] for fact in told["calibrations"]] == [
+        "imu.scale",
+        "imu.scale",
+        "imu.mounting",
+        "imu.noise",
+        "imu.rotation",
+    ]
+
+
+def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_path, monkeypatch):
+    # Fewer sides, one turn: what the procedures find is proved elsewhere.
+    monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::2])
+    monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
+    refused = rig("calibrate", "table")
+    assert refused.exit_code == 2
+    assert "camera.intrinsics is not calibrated" in refused.stderr
+    assert "rig calibrate camera" in " ".join(refused.stderr.split())
+    done = rig("calibrate", "all", "--minutes", "3")
+    assert done.exit_code == 0, done.output
+    assert "[O] camera" in done.stderr, "a picture of what to do"
+    assert "rig calibrate noise NAME" in done.stderr
+    facts = [Fact.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
+    assert [fact.name for fact in facts] == [
+        "servo.backlash",
+        "servo.encoder",
+        "servo.motion",
+        "imu.scale",
+        "imu.mounting",
+        "imu.noise",
+        "imu.rotation",
+        "camera.sharpness",
+        "camera.noise",
+        "camera.flat_field",
+        "camera.drift",
+        "camera.intrinsics",
+        "table.axis",
+    ]
+    assert facts[-1].evidence["intrinsics"] == facts[-2].id
+    pictures = [plot(fact) for fact in facts]
+    assert None not in pictures
+    assert rig("calibrate", "report", "--out", "page.html").exit_code == 0
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page.count("<svg") == len(facts)
+    for fact, picture in zip(facts, pictures, strict=True):
+        assert f'id="{fact.name}"' in page
+        assert picture.svg() in page
+    assert "src=" not in page, "one file, and nothing from elsewhere"
+    assert rig("calibrate", "report", "--out", "no/where.html").exit_code == 2
+
+
+def test_json_keeps_the_pictures_to_itself(rig, monkeypatch):
+    monkeypatch.setattr(table_axis, "ANGLES_DEG", (0.0,))
+    nothing = camera_model.from_data([], Board(), (640, 480), when_utc=SystemClock().utc(), device={})
+    monkeypatch.setattr("calibration.command._in_force", lambda *_: nothing)
+    done = rig("calibrate", "table", "--json")
+    assert done.exit_code == 6, "views from one side are too few"
+    assert "Put the calibration board upright" in done.stderr
+    assert "[O] camera" not in done.output
+    assert json.loads(done.stdout.splitlines()[-1])["passed"] is False
+
+
+def test_the_board_is_printed_without_a_bench(rig, tmp_path):
+    done = rig("calibrate", "table", "--print-board", "board.pdf", "--bench", "hardware")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+
+
+def kept(tmp_path, days: float, **device: str) -> None:
+    FactStore(tmp_path / "facts" / "sim").keep(
+        Fact(
+            name=encoder.NAME,
+            estimates={"cos1": Estimate(0.0, 0.01, "°")},
+            residual=None,
+            limit=None,
+            residual_unit="°",
+            refusals=(),
+            when_utc=SystemClock().utc() - timedelta(days=days),
+            valid_days=30.0,
+            device=device,
+            evidence={"steps": [], "turn_deg": 360.0},
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("days", "device", "words"),
+    [
+        (100.0, {}, "servo.encoder was calibrated 100 days ago; it holds for 30"),
+        (1.0, {"bench": "another"}, "servo.encoder was calibrated on another device: bench was another, is sim"),
+    ],
+)
+def test_an_enrollment_says_what_has_expired_or_belongs_to_another_device(rig, tmp_path, days, device, words):
+    kept(tmp_path, days, **device)
+    done = rig("enroll", "mug-star", "--views", "4")
+    assert done.exit_code == 0, done.output
+    told = " ".join(done.stderr.split())
+    assert f"Note: {words}" in told
+    assert "`rig calibrate servo`" in told
+    stored = json.loads(rig("catalog", "show", "mug-star", "--json").stdout)
+    assert words in json.dumps(stored, ensure_ascii=False)
