@@ -159,7 +159,8 @@ def _title(results: dict[str, Any]) -> str:
     if condition["rotation_deg"]:
         words.append(f"turned by up to {condition['rotation_deg']:g}°")
     if condition["perturbations"] != "none":
-        words.append(condition["perturbations"])
+        kinds = condition["perturbations"].split("+")
+        words.append("+".join(kinds) if len(kinds) <= 2 else f"{len(kinds)} perturbations")
     if protocol["enrolled"]:
         words.append(f"{protocol['enrolled']} views enrolled")
     if condition["descriptor"] != "cedd":
