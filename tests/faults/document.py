@@ -27,6 +27,7 @@ COLUMNS = (
     "what the operator reads",
     "how it goes on",
     "an identification",
+    "test",
 )
 
 HEAD = f"""# Faults
@@ -62,6 +63,7 @@ def row(scenario: Scenario, outcome: Outcome, identified: Outcome) -> tuple[str,
         message(outcome),
         goes_on(scenario),
         identification_cell(identified),
+        f"`test_every_fault.py[{scenario.name}]`",
     )
 
 
