@@ -13,7 +13,7 @@ from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import Wire, open_serial
 from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.head.head import RigHead
-from rig.devices.head.opening import open_head, switch_on
+from rig.devices.head.opening import open_head, powered, switch_on
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu
 from rig.devices.open_imu import open_imu
@@ -63,6 +63,7 @@ class HardwareBench:
         with ExitStack() as wires:
             with suppress(StateNotKept):
                 wires.callback(BenchLock(config.state_path("hardware"), clock).close)
+            wires.enter_context(powered(config, lambda: open_serial(config.head.port, BAUD, "head"), clock))
             wire = open_serial(config.servo.port, config.servo.baud)
             wires.callback(wire.close)
             yield open_servo(wire, config.servo, clock, config.table.mode)

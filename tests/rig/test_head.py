@@ -244,6 +244,21 @@ def test_a_program_that_hangs_on_the_head_is_restarted_by_its_watchdog(opened):
         opened.imu.check()
 
 
+def test_outputs_and_faults_do_not_depend_on_the_sensor(opened):
+    opened.head.detach(0x68)
+    opened.clock.sleep(2.0)
+    with pytest.raises(DeviceSilent):
+        opened.imu.read_samples()
+    opened.imu.set_power(True)
+    opened.head.estop_open = True
+    opened.clock.sleep(0.1)
+    with pytest.raises(EmergencyStop):
+        opened.imu.check()
+    opened.head.estop_open = False
+    opened.clock.sleep(0.1)
+    opened.imu.acknowledge()
+
+
 # -- a bad line ---------------------------------------------------------------------------------------------------
 
 

@@ -49,7 +49,7 @@ def test_garbage_raises_nothing_but_frame_errors(line):
     assert encode(frame) == line + b"\0"
 
 
-@fuzz_settings()
+@fuzz_settings(0.4)
 @given(st.lists(FRAMES | st.binary(min_size=1, max_size=60), max_size=12), st.data())
 def test_frames_come_out_of_a_stream_however_it_is_cut(parts, data):
     stream, expected = b"\0", []

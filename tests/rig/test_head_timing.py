@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.devices.head.timing import HeadClock
@@ -52,6 +52,7 @@ def test_an_even_line_tells_the_time_to_microseconds(drift, start_us):
     assert line.clock.drift_ppm == pytest.approx(drift * 1e6, abs=20)
 
 
+@settings(max_examples=40)
 @given(drift=st.floats(-5e-3, 5e-3), seed=st.integers(0, 10_000), typical_us=st.floats(10, 1500))
 def test_on_an_uneven_line_the_error_stays_within_what_is_stated(drift, seed, typical_us):
     line = Line(drift, 0, seed)

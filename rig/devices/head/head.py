@@ -232,6 +232,7 @@ class RigHead:
         """
         with self._alone():
             self._go_on()
+            self._heed_sensor()
             return self._collect()
 
     def read_gravity_g(self) -> NDArray[np.float64]:
@@ -477,6 +478,9 @@ class RigHead:
         if self._down:
             self._reconnect()
         self._pump()
+
+    def _heed_sensor(self) -> None:
+        """Raise what is wrong with the sensor, once the head has had its time to get it back."""
         if self._status.imu_status == ImuStatus.WRONG_ID or (
             self._status.imu_status != ImuStatus.RUNNING
             and seconds_between(self._troubled_ns, self._clock.now_ns()) > max(RECOVERY_S, self._sensor.start_s)
@@ -619,6 +623,7 @@ class RigHead:
         while True:
             with self._alone():
                 self._go_on()
+                self._heed_sensor()
                 sample, now_ns = self._newest, self._clock.now_ns()
                 if sample is not None and seconds_between(self._newest_ns, now_ns) <= oldest_s:
                     return sample

@@ -1,6 +1,7 @@
 """Opens the rig head that the configuration describes, and switches on what it carries."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from rig.clock import Clock
 from rig.config import HeadConfig, RigConfig
@@ -34,6 +35,30 @@ def open_head(config: RigConfig, open_port: Callable[[], Wire], clock: Clock) ->
     except BaseException:
         wire.close()
         raise
+
+
+@contextmanager
+def powered(config: RigConfig, open_port: Callable[[], Wire], clock: Clock) -> Iterator[None]:
+    """Feed the servo for the length of a ``with`` block, where its supply goes through a rig head.
+
+    Raises
+    ------
+    EmergencyStop, HostWasSilent, HeadRestarted
+        The head keeps the supply open until that is acknowledged.
+    DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent
+        See `RigHead`.
+    """
+    if not (config.imu.connection == "head" and config.head.power):
+        yield
+        return
+    head = open_head(config, open_port, clock)
+    try:
+        head.check()
+        head.set_power(True)
+        clock.sleep(config.head.power_up_s)
+        yield
+    finally:
+        head.close()
 
 
 def switch_on(head: RigHead, config: HeadConfig, clock: Clock) -> RigError | None:

@@ -6,7 +6,9 @@ from hbr import ViewIndex
 from hbr.angles import wrap180
 from rig.catalog import Catalog
 from rig.config import load_config
-from rig.errors import DeviceSilent, EmergencyStop, FaultLatched, ViewRejected
+from rig.devices.head.opening import powered
+from rig.devices.head.protocol import Reset
+from rig.errors import DeviceSilent, EmergencyStop, FaultLatched, HeadRestarted, ViewRejected
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted
 from rig.plans.identify import identify
@@ -14,6 +16,7 @@ from rig.safety import State
 from rig.turntable import Turntable
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
+from sim.parts import SimParts
 from sim.world import World
 from tests.contract.heads import needs
 
@@ -141,6 +144,19 @@ def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
         assert second.safety.fault is None
         assert second.head.fault is None
     wires.close()
+
+
+def test_the_servo_alone_is_fed_as_long_as_it_is_asked_unless_a_fault_is_latched():
+    needs("memory")
+    world, config = World(seed=4), load_config(None, WIRED)
+    with SimParts.connected(config, world) as parts:
+        with powered(config, parts.head_port, world.clock):
+            assert parts.servo.powered
+        assert not parts.servo.powered
+        parts.head.reset(Reset.BROWN_OUT)
+        with pytest.raises(HeadRestarted), powered(config, parts.head_port, world.clock):
+            pass
+        assert not parts.servo.powered
 
 
 def test_a_bench_whose_estop_is_pressed_says_what_to_do():
