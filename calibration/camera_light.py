@@ -36,6 +36,8 @@ PAIRS = 24
 """Frames of the scene at rest."""
 CARD_FRAMES, CARD_SECONDS = 40, 240.0
 BINS = 24
+MIN_PIXELS = 50
+REGIONS = (3, 4)
 LEVELS = (8.0, 235.0)
 """Between them a pixel is neither cut off at black nor saturated."""
 MIN_SPAN = 80.0
@@ -130,7 +132,7 @@ def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Ma
     green *= (brightness.mean() / np.maximum(brightness, 1e-9))[:, None, None]
     mean, variance = green.mean(axis=0).ravel(), green.var(axis=0, ddof=1).ravel()
     usable = (mean > LEVELS[0]) & (mean < LEVELS[1])
-    mean, variance = mean[usable], variance[usable]
+    mean, variance, region = mean[usable], variance[usable], _regions(green.shape[1:])[usable]
     refusals = []
     estimates = {}
     residual = None
@@ -143,18 +145,18 @@ def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Ma
         )
     else:
         edges = np.linspace(low, high, BINS + 1)
-        which = np.clip(np.digitize(mean, edges) - 1, 0, BINS - 1)
-        filled = [b for b in range(BINS) if (which == b).sum() >= 50]
-        at = np.array([mean[which == b].mean() for b in filled])
-        noise = np.array([variance[which == b].mean() for b in filled])
-        count = np.array([(which == b).sum() for b in filled])
-        # Scatter of a bin's variance: of n pixels and N frames each, relative √(2 / n(N−1)).
-        sigma = noise * np.sqrt(2 / (count * (len(frames) - 1)))
-        design = np.column_stack([at, np.ones_like(at)]) / sigma[:, None]
-        (gain, floor), *_ = np.linalg.lstsq(design, noise / sigma, rcond=None)
-        scatter = noise / sigma - design @ (gain, floor)
-        birge = max(float((scatter**2).sum()) / max(len(filled) - 2, 1), 1.0)
-        covariance = np.linalg.inv(design.T @ design) * birge
+        cell = region * BINS + np.clip(np.digitize(mean, edges) - 1, 0, BINS - 1)
+        cells = REGIONS[0] * REGIONS[1] * BINS
+        # Pixels, and the sums of their means and variances: float64 (3, regions, bins).
+        sums = np.stack([np.bincount(cell, weights, cells) for weights in (np.ones_like(mean), mean, variance)])
+        sums = sums.reshape(3, -1, BINS)
+        whole = sums.sum(axis=1)
+        gain, floor = _line(whole, len(frames))
+        # Neighbouring pixels are not strangers to each other: the uncertainty is what leaving out a region changes.
+        jackknife = np.array([_line(whole - sums[:, r], len(frames)) for r in range(sums.shape[1])])
+        covariance = np.cov(jackknife.T, ddof=0) * (len(jackknife) - 1)
+        filled = whole[0] >= MIN_PIXELS
+        at, noise = whole[1:, filled] / whole[0, filled]
         dark = max(float(floor) - 1 / 12, 0.0)
         curve = np.column_stack([at, noise]).round(4).tolist()
         residual = float(np.max(np.abs(noise - (gain * at + floor)) / noise))
@@ -215,9 +217,11 @@ def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any
     values = card.mean.ravel()
     found, *_ = np.linalg.lstsq(design, values, rcond=None)
     residuals = values - design @ found
-    scatter = float((residuals**2).sum()) / (values.size - 4)
-    covariance = np.linalg.inv(design.T @ design) * scatter
     level = float(found[0])
+    # Neighbouring blocks are not strangers to each other: the uncertainty is what leaving out a region changes.
+    region = _regions(card.mean.shape)
+    without = (np.linalg.lstsq(design[region != r], values[region != r])[0] for r in range(region.max() + 1))
+    sigma = np.array([fit[1:] / max(fit[0], 1e-9) for fit in without]).std(axis=0) * sqrt(region.max())
     residual = float(np.abs(residuals).max()) / max(level, 1e-9)
     loss = float(found[3]) / max(level, 1e-9)
     refusals = []
@@ -238,9 +242,9 @@ def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any
     return Fact(
         name=FLAT_FIELD,
         estimates={
-            "vignetting": Estimate(loss, sqrt(covariance[3, 3]) / max(level, 1e-9), "of the light in the corners"),
-            "gradient_x": Estimate(float(found[1]) / max(level, 1e-9), sqrt(covariance[1, 1]) / max(level, 1e-9), ""),
-            "gradient_y": Estimate(float(found[2]) / max(level, 1e-9), sqrt(covariance[2, 2]) / max(level, 1e-9), ""),
+            "vignetting": Estimate(loss, float(sigma[2]), "of the light in the corners"),
+            "gradient_x": Estimate(float(found[1]) / max(level, 1e-9), float(sigma[0]), ""),
+            "gradient_y": Estimate(float(found[2]) / max(level, 1e-9), float(sigma[1]), ""),
         },
         residual=residual,
         limit=0.05,
@@ -397,13 +401,30 @@ def plot(fact: Fact) -> Figure | None:
             )
 
 
+def _regions(shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return in which region of the frame a pixel is, int (n,)."""
+    rows, columns = (np.arange(side) * parts // side for side, parts in zip(shape, REGIONS, strict=True))
+    return (rows[:, None] * REGIONS[1] + columns).ravel()
+
+
+def _line(sums: NDArray[np.float64], frames: int) -> tuple[float, float]:
+    """Return slope and offset of variance over mean; ``sums`` of pixels, means and variances, float64 (3, bins)."""
+    count, mean, variance = sums[:, sums[0] >= MIN_PIXELS]
+    at, noise = mean / count, variance / count
+    # Scatter of a bin's variance: of n pixels and N frames each, relative √(2 / n(N−1)).
+    sigma = noise * np.sqrt(2 / (count * (frames - 1)))
+    design = np.column_stack([at, np.ones_like(at)]) / sigma[:, None]
+    (gain, floor), *_ = np.linalg.lstsq(design, noise / sigma, rcond=None)
+    return float(gain), float(floor)
+
+
 def _shading(shape: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the squared distance of blocks from the middle, 1 in the corners, and their x and y, −1 to 1 across."""
-    rows, columns = shape
-    y, x = np.mgrid[0:rows, 0:columns]
-    x = (x + 0.5) / columns * 2 - 1
-    y = ((y + 0.5) / rows * 2 - 1) * (rows / columns)
-    return (x**2 + y**2) / (1 + (rows / columns) ** 2), x, y
+    """Return the squared distance of blocks from the middle, 1 in the corner pixels, and x and y, −1 to 1 across."""
+    height, width = (side * BLOCK for side in shape)
+    y, x = ((np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5) * BLOCK * 2 - np.array([height, width])[:, None, None]) / (
+        width - 1
+    )
+    return (x**2 + y**2) / (1 + ((height - 1) / (width - 1)) ** 2), x, y
 
 
 def _blocks(image: NDArray[np.uint8]) -> NDArray[np.float64]:

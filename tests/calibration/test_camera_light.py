@@ -73,10 +73,11 @@ def test_frames_that_a_camera_smoothed_are_refused():
 
 @pytest.mark.parametrize("loss", [0.0, 0.12, 0.35])
 def test_the_loss_in_the_corners_is_found_beside_a_lamp_that_lights_from_one_side(loss):
-    y, x = np.mgrid[0:30, 0:40]
-    x, y = (x + 0.5) / 20 - 1, ((y + 0.5) / 15 - 1) * 0.75
-    noise = np.random.default_rng(3).normal(0, 0.2, x.shape)
-    fact = flat_field(card(mean=170 * (1 + 0.05 * x - loss * (x**2 + y**2) / 1.5625) + noise), **KEPT)
+    y, x = np.mgrid[0:480, 0:640]
+    x, y = (x - 319.5) / 319.5, (y - 239.5) / 319.5
+    light = 1 + 0.05 * x - loss * (x**2 + y**2) / (1 + (239.5 / 319.5) ** 2)
+    blocks = (170 * light).reshape(30, 16, 40, 16).mean(axis=(1, 3))
+    fact = flat_field(card(mean=blocks + np.random.default_rng(3).normal(0, 0.2, blocks.shape)), **KEPT)
     assert fact.passed, fact.refusals
     for name, value in (("vignetting", loss), ("gradient_x", 0.05), ("gradient_y", 0.0)):
         estimate = fact.estimates[name]
