@@ -27,7 +27,7 @@ Removal = Literal["near", "paper79", "queries"]
 #: As for `Belief.posterior`.
 BETA: Final = 60.0
 #: Probability of the best object that ends a search by the dense filter.
-CERTAINTY: Final = 0.95
+CERTAINTY: Final = 0.9
 _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
 
