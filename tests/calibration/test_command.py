@@ -6,7 +6,7 @@ from datetime import timedelta
 import pytest
 from typer.testing import CliRunner
 
-from calibration import camera_model, encoder, table_axis
+from calibration import camera_light, camera_model, encoder, table_axis
 from calibration.report import plot
 from rig.cli.main import app
 from rig.clock import SystemClock
@@ -105,7 +105,9 @@ def test_what_is_in_force_and_what_was_kept_can_be_looked_up(rig):
 
 
 def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_path, monkeypatch):
-    # Fewer sides, one turn: what the procedures find is proved elsewhere.
+    # Fewer frames and sides: what the procedures find is proved elsewhere.
+    monkeypatch.setattr(camera_light, "CARD_FRAMES", 12)
+    monkeypatch.setattr(camera_light, "PAIRS", 12)
     monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::2])
     monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
     refused = rig("calibrate", "table")
