@@ -31,7 +31,7 @@ PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, 
 
 
 def without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have nothing but the database wait for the disk; what is durable when is the matter of test_catalog_durability."""
+    """Have nothing but the database wait for the disk: what is durable is proved in test_catalog_durability."""
     monkeypatch.setattr(os, "fsync", lambda _: None)
     monkeypatch.setattr(os, "sync", lambda: None)
 
