@@ -112,6 +112,10 @@ def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterat
         head.close()
 
 
+TERMINAL_BYTES = 4095
+"""What a terminal holds ready for its reader; the rest waits in the kernel until some is read."""
+
+
 class _PacedWire:
     """pyserial on a simulated line in this very thread: time goes on before each look at the port.
 
@@ -150,11 +154,11 @@ class _PacedWire:
         self._port.close()
 
     def _settle(self) -> None:
-        self._until(lambda: self._taken + self._port.in_waiting >= self._terminal.sent)
+        self._until(lambda: self._port.in_waiting >= min(self._terminal.sent - self._taken, TERMINAL_BYTES))
 
     @staticmethod
     def _until(carried: Callable[[], bool]) -> None:
-        for _ in range(10_000):
+        for _ in range(50_000):
             if carried():
                 return
             SystemClock().sleep(0.0001)
