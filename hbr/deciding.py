@@ -11,13 +11,46 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hbr.arrays import FloatArray, LevelArray
+from hbr.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense import Belief, DenseIndex, believe
 
-#: What the lead over the second object counts beside the score.
-LEAD: Final = 0.5
+#: What the lead over the second object counts beside the score, and what its leader's usual score.
+_LEAD: Final = 0.5
+_USUAL: Final = 0.5
 #: The views of a rehearsed search are this far apart.
 _STEP_DEG: Final = 90.0
+
+
+@dataclass(frozen=True, eq=False)
+class Leaders:
+    """Who led after each view of each search, arrays (searches, views).
+
+    Attributes
+    ----------
+    object_index : integer array
+        The best object.
+    score, lead : float64 array
+        Its score a view, and by how much that is above the second's.
+    """
+
+    object_index: IndexArray
+    score: FloatArray
+    lead: FloatArray
+
+    def familiarity(self, usual: FloatArray) -> FloatArray:
+        """Return how much each search looks like one for an enrolled object, (searches, views).
+
+        The score and half of the lead: a stranger is a little like several objects, a known object much like one. Less
+        half of what its leader usually scores above others: what looks the same from all sides must be met better.
+
+        Parameters
+        ----------
+        usual : float64 array (objects, views)
+            As `usual_scores` returns it.
+        """
+        views = np.arange(self.score.shape[1])
+        typical = np.median(usual, axis=0)
+        return self.score + _LEAD * self.lead - _USUAL * (usual[self.object_index, views] - typical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,26 +59,29 @@ class Rehearsal:
 
     Attributes
     ----------
-    known : float64 array
-        Familiarity (`familiarity`), its own object among the enrolled ones.
-    stranger : float64 array
-        Familiarity, had its own object not been enrolled.
+    objects : int
+        Names in the model set.
+    known : Leaders
+        Among all enrolled objects.
+    stranger : Leaders
+        Had the object that was looked for not been enrolled.
     posterior : float64 array
-        Probability of the best object.
+        Probability of the best of all objects.
     correct : bool array
-        Whether that is its own.
+        Whether that is the one that was looked for.
     beta : float
         As for `Belief.posterior`.
     """
 
-    known: FloatArray
-    stranger: FloatArray
+    objects: int
+    known: Leaders
+    stranger: Leaders
     posterior: FloatArray
     correct: NDArray[np.bool_]
     beta: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rules:
     """When to stop and what to call unknown.
 
@@ -55,9 +91,11 @@ class Rules:
         As for `Belief.posterior`.
     certainty : float
         Probability of the best object that ends a search; above 1 where no search may end early.
+    usual : float64 array (objects, views)
+        What each object scores when it is looked for, after 1, 2, ... views.
     familiar : tuple of float
-        Familiarity after 1, 2, ... views below which the object is unknown; the last holds for all further views. -inf
-        where nothing may be called unknown.
+        Familiarity (`Leaders.familiarity`) after 1, 2, ... views below which the object is unknown; the last holds for
+        all further views. -inf where nothing may be called unknown.
     error_rate, false_reject : float
         What was asked for: wrong objects among those named, and enrolled objects called unknown.
     false_accept : float
@@ -70,6 +108,7 @@ class Rules:
 
     beta: float
     certainty: float
+    usual: FloatArray
     familiar: tuple[float, ...]
     error_rate: float
     false_reject: float
@@ -138,35 +177,37 @@ def rehearse(
             continue
         for start in np.unique(np.arange(searches) * len(rows) // searches).tolist():
             queries = _spread(azimuth_deg, start, views)
-            without = index.without(rows[queries])
-            so_far: DenseIndex | Belief = without
+            so_far: DenseIndex | Belief = index.without(rows[queries])
             for i in queries:
                 so_far = belief = believe(levels[rows[i]], float(azimuth_deg[i]), so_far, kept=len(index))
                 scores, odds = belief.scores(), belief.posterior(beta).sum(axis=1)
-                known.append(familiarity(scores))
-                stranger.append(familiarity(np.delete(scores, place)))
+                known.append(_leader(index.object_index, scores))
+                others = np.delete(index.object_index, place)
+                stranger.append(_leader(others, np.delete(scores, place)))
                 posterior.append(odds.max())
                 correct.append(odds.argmax() == place)
     if not known:
         raise ValueError(f"no object has more than {views} views; enroll more of each, or rehearse fewer views")
     shape = -1, views
     return Rehearsal(
-        np.reshape(known, shape),
-        np.reshape(stranger, shape),
+        len(index.views.object_names),
+        _leaders(known, shape),
+        _leaders(stranger, shape),
         np.reshape(posterior, shape),
         np.reshape(correct, shape),
         beta,
     )
 
 
-def familiarity(scores: FloatArray) -> float:
-    """Return how much a search looks like one for an enrolled object, of the scores of all objects that are considered.
-
-    The best score, and half of its lead over the second: a stranger is a little like several objects, a known object
-    much like one.
-    """
-    best = float(scores.max())
-    return best + LEAD * (best - float(np.partition(scores, -2)[-2])) if len(scores) > 1 else best
+def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> FloatArray:
+    """Return the median score of each object in searches that found it, (objects, views); of others the typical one."""
+    usual = np.full((objects, leaders.score.shape[1]), np.nan)
+    for n in range(usual.shape[1]):
+        for j in np.unique(leaders.object_index[correct[:, n], n]).tolist():
+            usual[j, n] = np.median(leaders.score[correct[:, n] & (leaders.object_index[:, n] == j), n])
+        found = usual[~np.isnan(usual[:, n]), n]
+        usual[np.isnan(usual[:, n]), n] = np.median(found) if len(found) else 0.0
+    return usual
 
 
 def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
@@ -209,8 +250,10 @@ def certainty_for(posterior: FloatArray, correct: NDArray[np.bool_], error_rate:
 
 def rules(rehearsal: Rehearsal, *, error_rate: float = 0.01, false_reject: float = 0.02) -> Rules:
     """Find the rules that keep the stated error rates in the rehearsed searches."""
-    searches, views = rehearsal.known.shape
-    familiar = tuple(conformal_threshold(rehearsal.known[:, n], false_reject) for n in range(views))
+    searches, views = rehearsal.posterior.shape
+    usual = usual_scores(rehearsal.known, rehearsal.correct, rehearsal.objects)
+    known, stranger = rehearsal.known.familiarity(usual), rehearsal.stranger.familiarity(usual)
+    familiar = tuple(conformal_threshold(known[:, n], false_reject) for n in range(views))
     certainty = certainty_for(rehearsal.posterior, rehearsal.correct, error_rate)
     promises = []
     if familiar[-1] == -inf:
@@ -223,8 +266,10 @@ def rules(rehearsal: Rehearsal, *, error_rate: float = 0.01, false_reject: float
             f"{searches} rehearsed searches cannot show an error rate of {error_rate:.2%}: no search ends early; at "
             f"least {ceil(1 / error_rate)} are needed, and objects that can be told apart"
         )
-    accepted = float((rehearsal.stranger[:, -1] >= familiar[-1]).mean())
-    return Rules(rehearsal.beta, certainty, familiar, error_rate, false_reject, accepted, searches, tuple(promises))
+    accepted = float((stranger[:, -1] >= familiar[-1]).mean())
+    return Rules(
+        rehearsal.beta, certainty, usual, familiar, error_rate, false_reject, accepted, searches, tuple(promises)
+    )
 
 
 def judge(belief: Belief, by: Rules, *, max_views: int = 8) -> Verdict:
@@ -235,10 +280,12 @@ def judge(belief: Belief, by: Rules, *, max_views: int = 8) -> Verdict:
     """
     odds = belief.posterior(by.beta).sum(axis=1)
     best = int(odds.argmax())
-    probability, known = float(odds[best]), familiarity(belief.scores())
+    n = min(belief.queries, len(by.familiar)) - 1
+    leaders = _leaders([_leader(belief.index.object_index, belief.scores())], (1, 1))
+    probability, known = float(odds[best]), float(leaders.familiarity(by.usual[:, n : n + 1])[0, 0])
     object_index = int(belief.index.object_index[best])
     name = belief.index.views.object_names[object_index]
-    least = by.familiar[min(belief.queries, len(by.familiar)) - 1]
+    least = by.familiar[n]
     says = f"{name} with a probability of {probability:.3f} and a familiarity of {known:.3f}"
     if known >= least and probability >= by.certainty:
         return Verdict("found", object_index, probability, known, f"{says}: sure enough")
@@ -248,6 +295,17 @@ def judge(belief: Belief, by: Rules, *, max_views: int = 8) -> Verdict:
     if known >= least:
         return Verdict("found", object_index, probability, known, f"{says}: the best after {max_views} views")
     return Verdict("unknown", object_index, probability, known, f"{says}: below {least:.3f}, so none of those enrolled")
+
+
+def _leader(object_index: IndexArray, scores: FloatArray) -> tuple[int, float, float]:
+    best = int(scores.argmax())
+    lead = scores[best] - np.partition(scores, -2)[-2] if len(scores) > 1 else scores[best]
+    return int(object_index[best]), float(scores[best]), float(lead)
+
+
+def _leaders(found: list[tuple[int, float, float]], shape: tuple[int, int]) -> Leaders:
+    objects, scores, leads = zip(*found, strict=True)
+    return Leaders(np.reshape(objects, shape), np.reshape(scores, shape), np.reshape(leads, shape))
 
 
 def _spread(azimuth_deg: FloatArray, start: int, count: int) -> list[int]:

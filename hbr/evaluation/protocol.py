@@ -99,8 +99,10 @@ class Runs:
         The same to the nearest orientation from which the object looks as it does from the true one.
     lead : float64
         `hbr.lead` of the best object, a view; by the dense filter, its score above the second's.
+    best : int32
+        The best object, by its index in the views' names.
     score : float64
-        Score of the best object, a view.
+        Its score, a view.
     posterior : float64
         Probability of the best object by the dense filter; nan of the paper's voting.
     travelled_deg : float64
@@ -113,6 +115,7 @@ class Runs:
     pose_error_deg: FloatArray
     alike_error_deg: FloatArray
     lead: FloatArray
+    best: NDArray[np.int32]
     score: FloatArray
     posterior: FloatArray
     travelled_deg: FloatArray
@@ -124,7 +127,15 @@ class Runs:
         shape = (methods, objects, trials, views)
         errors, alike, lead, score, posterior, travelled = np.full((6, *shape), np.nan)
         return cls(
-            np.full(shape, -1, np.int32), errors, alike, lead, score, posterior, travelled, np.zeros(shape, np.int64)
+            np.full(shape, -1, np.int32),
+            errors,
+            alike,
+            lead,
+            np.full(shape, -1, np.int32),
+            score,
+            posterior,
+            travelled,
+            np.zeros(shape, np.int64),
         )
 
     @classmethod
@@ -366,6 +377,7 @@ class _Trials:
     ) -> None:
         place = np.flatnonzero(objects == self._object)
         runs.rank[at] = place[0] + 1 if len(place) else 0
+        runs.best[at] = objects[0]
         if len(place):
             away_deg = np.abs(wrap180(pose_deg[place[0]] - self._azimuth_deg))
             runs.pose_error_deg[at] = away_deg[seen[-1]]

@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from hbr.arrays import BoolArray
-from hbr.deciding import LEAD, conformal_threshold
+from hbr.deciding import Leaders, conformal_threshold, usual_scores
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Protocol, Runs
 
@@ -56,13 +58,24 @@ def strangers(parts: list[tuple[Runs, BoolArray]], false_reject: float) -> tuple
     for n in range(views):
         rejects = accepts = known_trials = stranger_trials = 0
         for runs, absent in parts:
-            familiar = (runs.score + LEAD * runs.lead)[0, ..., n]
-            known, strange = familiar[~absent], familiar[absent]
-            half = known.shape[1] // 2
-            threshold = conformal_threshold(known[:, :half], false_reject)
-            rejects += int((known[:, half:] < threshold).sum())
-            accepts += int((strange >= threshold).sum())
-            known_trials += known[:, half:].size
-            stranger_trials += strange.size
+            half = runs.score.shape[2] // 2
+            first, second, strange = (
+                _leaders(runs, rows, trials)
+                for rows, trials in ((~absent, slice(half)), (~absent, slice(half, None)), (absent, slice(None)))
+            )
+            asked = np.repeat(np.flatnonzero(~absent), half)[:, None]
+            usual = usual_scores(first, first.object_index == asked, len(absent))
+            threshold = conformal_threshold(first.familiarity(usual)[:, n], false_reject)
+            known, stranger = second.familiarity(usual)[:, n], strange.familiarity(usual)[:, n]
+            rejects += int((known < threshold).sum())
+            accepts += int((stranger >= threshold).sum())
+            known_trials += known.size
+            stranger_trials += stranger.size
         rows.append(Stranger(n + 1, false_reject, known_trials, rejects, stranger_trials, accepts))
     return tuple(rows)
+
+
+def _leaders(runs: Runs, objects: BoolArray, trials: slice) -> Leaders:
+    """Of these objects' trials, (objects * trials, views)."""
+    parts = (part[0, objects][:, trials] for part in (runs.best, runs.score, runs.lead))
+    return Leaders(*(part.reshape(-1, part.shape[-1]) for part in parts))

@@ -8,7 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hbr import Belief, DenseIndex, Views, believe
-from hbr.deciding import Rules, certainty_for, conformal_threshold, judge, rehearse, rules
+from hbr.deciding import (
+    Leaders,
+    Rules,
+    certainty_for,
+    conformal_threshold,
+    judge,
+    rehearse,
+    rules,
+    usual_scores,
+)
 
 BETA = 60.0
 
@@ -64,16 +73,30 @@ def test_certainty_is_the_least_that_keeps_the_error_rate() -> None:
 def test_a_rehearsal_looks_for_each_object_without_the_views_it_is_looked_for_by() -> None:
     views = catalog()
     rehearsal = rehearse(DenseIndex(views), beta=BETA, views=3, searches=2)
-    assert rehearsal.known.shape == rehearsal.stranger.shape == (16, 3)
-    assert (rehearsal.stranger < rehearsal.known).all()
+    assert rehearsal.known.score.shape == rehearsal.stranger.score.shape == rehearsal.correct.shape == (16, 3)
+    np.testing.assert_array_equal(rehearsal.known.object_index, np.repeat(np.arange(8), 2)[:, None] * [1, 1, 1])
+    assert (rehearsal.stranger.object_index != rehearsal.known.object_index).all()
+    assert (rehearsal.stranger.score < rehearsal.known.score).all()
     assert rehearsal.correct.mean() == 1
     # the first search once more
     rows = views.of(0)
     belief = believe(views.descriptors[rows[0]], 0.0, DenseIndex(views).without(rows[[0, 4, 9]]))
     scores = np.sort(belief.scores())
-    assert rehearsal.known[0, 0] == pytest.approx(scores[-1] + (scores[-1] - scores[-2]) / 2)
+    assert rehearsal.known.score[0, 0] == pytest.approx(scores[-1])
+    assert rehearsal.known.lead[0, 0] == pytest.approx(scores[-1] - scores[-2])
     others = np.sort(belief.scores()[1:])
-    assert rehearsal.stranger[0, 0] == pytest.approx(others[-1] + (others[-1] - others[-2]) / 2)
+    assert rehearsal.stranger.score[0, 0] == pytest.approx(others[-1])
+    assert rehearsal.stranger.lead[0, 0] == pytest.approx(others[-1] - others[-2])
+
+
+def test_familiarity_is_relative_to_what_the_leader_usually_scores() -> None:
+    known = Leaders(np.array([[0], [0], [1], [1]]), np.array([[0.9], [0.8], [0.7], [0.2]]), np.full((4, 1), 0.1))
+    usual = usual_scores(known, np.array([[True], [True], [True], [False]]), 3)
+    np.testing.assert_allclose(usual[:, 0], [0.85, 0.7, 0.775])  # of the third nothing is known
+    np.testing.assert_allclose(
+        known.familiarity(usual)[:, 0],
+        [0.9 + 0.05 - 0.0375, 0.8 + 0.05 - 0.0375, 0.7 + 0.05 + 0.0375, 0.2 + 0.05 + 0.0375],
+    )
 
 
 def test_rules_of_a_catalog_find_its_objects_and_not_others() -> None:
@@ -111,7 +134,7 @@ def test_a_small_catalog_promises_nothing_and_says_how_much_it_takes() -> None:
 
 
 def test_a_score_that_no_enrolled_object_has_ends_as_unknown_and_never_early() -> None:
-    by = Rules(BETA, 0.9, (1.4, 1.4), 0.01, 0.02, 0.0, 100)
+    by = Rules(BETA, 0.9, np.full((4, 2), 0.9), (1.4, 1.4), 0.01, 0.02, 0.0, 100)
     index = DenseIndex(catalog(4))
     stranger = catalog(1, seed=99).descriptors[0]
     belief = believe(stranger, 0.0, index)
