@@ -3,10 +3,10 @@
 Beside the paper's voting (`hbr.retrieve`), which follows the few views on its lists, this one keeps a score for every
 hypothesis (j, φ): object j, with azimuth φ at the first query. A query i, turned by r_i since the first, adds
 
-    s_i(j, φ + r_i) = max_k [T(q_i, c_jk) - ω · max(0, |φ + r_i - o_jk| - h) / 360]
+    s_i(j, φ + r_i) = max_k [T(q_i, c_jk) - ω · away(φ + r_i, k) / 360]
 
-where k runs over all views of the object and h, half the spacing of its views, is a dead zone: an azimuth between two
-enrolled views is as good as one on a view.
+where k runs over all views of the object and away is how far the azimuth lies outside the arc of view k, which reaches
+half-way to its neighbours: an azimuth between two enrolled views is as good as one on a view, also where a view lacks.
 """
 
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ _BIN_DEG: Final = 360 / BINS
 KEPT: Final = 500
 #: How fast a bin's weight in the mean azimuth falls with its support.
 _POSE_SHARPNESS: Final = 60.0
-#: Degrees between the keys of two objects.
-_APART: Final = 4000.0
+#: Degrees that no azimuth reaches.
+_FAR_DEG: Final = 2000.0
 
 Floats = NDArray[np.float32]
 
@@ -65,18 +65,11 @@ class DenseIndex:
         #: Where `rows` is padding, or a view that was left out.
         self.left_out = ~inside
         self.azimuth_deg: FloatArray = views.azimuth_deg[self.rows]
-        #: Half the usual spacing of each object's views.
-        self.dead_deg: FloatArray = np.array(
-            [_spacing(own[ok]) / 2 for own, ok in zip(self.azimuth_deg, inside, strict=True)]
+        #: The usual spacing of each object's views.
+        self.spacing_deg: FloatArray = np.array(
+            [_spacing(own[ok]) for own, ok in zip(self.azimuth_deg, inside, strict=True)]
         )
-        # three turns of every object's views, each object far from the others: one sorted row of keys for all
-        turns_deg = np.where(inside, self.azimuth_deg, np.inf)
-        unrolled_deg = np.concatenate([turns_deg - 360, turns_deg, turns_deg + 360], axis=1)
-        self._copies = np.argsort(unrolled_deg, axis=1, kind="stable")
-        unrolled_deg = np.take_along_axis(unrolled_deg, self._copies, axis=1)
-        self._copies %= count.max()
-        self._ring_deg = np.where(np.isinf(unrolled_deg), 1000.0, unrolled_deg)
-        self._keys = (self._ring_deg + _APART * np.arange(len(count))[:, None]).ravel()
+        self._arrange()
 
     def __len__(self) -> int:
         return len(self.object_index)
@@ -87,6 +80,7 @@ class DenseIndex:
         fewer.left_out = self.left_out | np.isin(self.rows, views)
         if fewer.left_out.all(axis=1).any():
             raise ValueError("an object would be left without any view; leave out fewer")
+        fewer._arrange()
         return fewer
 
     def only(self, places: IndexArray) -> "DenseIndex":
@@ -97,10 +91,26 @@ class DenseIndex:
         fewer.compared = self.compared.only(rows)
         fewer.object_index = self.object_index[places]
         fewer.rows = np.searchsorted(rows, self.rows[places])
-        for name in ("left_out", "azimuth_deg", "dead_deg", "_copies", "_ring_deg"):
-            setattr(fewer, name, getattr(self, name)[places])
-        fewer._keys = (fewer._ring_deg + _APART * np.arange(len(places))[:, None]).ravel()
+        fewer.left_out, fewer.azimuth_deg = self.left_out[places], self.azimuth_deg[places]
+        fewer.spacing_deg = self.spacing_deg[places]
+        fewer._arrange()
         return fewer
+
+    def _arrange(self) -> None:
+        """Lay three turns of every object's views out in rows, each with the arc on which it is the nearest."""
+        turns_deg = np.where(self.left_out, np.inf, self.azimuth_deg)
+        unrolled_deg = np.concatenate([turns_deg - 360, turns_deg, turns_deg + 360], axis=1)
+        places = np.argsort(unrolled_deg, axis=1, kind="stable")
+        ring_deg = np.take_along_axis(unrolled_deg, places, axis=1)
+        self._copies = places % self.rows.shape[1]
+        with np.errstate(invalid="ignore"):  # what was left out stands at infinity, behind all others
+            middle_deg = (ring_deg[:, 1:] + ring_deg[:, :-1]) / 2
+        count = 3 * (~self.left_out).sum(axis=1)
+        inside = np.arange(middle_deg.shape[1]) < (count - 1)[:, None]
+        #: Where the arc of each view ends and the next one's begins; far away behind the last.
+        self._ends_deg = np.where(inside, middle_deg, _FAR_DEG)
+        self._count = count
+        self._keys = (self._ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
 
     def support(self, similar: FloatArray, turned_deg: float) -> Floats:
         """Return what one query adds to every hypothesis.
@@ -118,26 +128,21 @@ class DenseIndex:
             For azimuths 0, 5, 10, ... at the first query.
         """
         slope = self.omega / 360
-        own = similar[self.rows]
-        own[self.left_out] = -np.inf
-        own = np.take_along_axis(own, self._copies, axis=1)
-        ring_deg, width = self._ring_deg, own.shape[1]
+        own = np.take_along_axis(similar[self.rows], self._copies, axis=1)
+        own[np.arange(own.shape[1]) >= self._count[:, None]] = -np.inf
         seen_deg = np.mod(np.arange(BINS) * _BIN_DEG + turned_deg, 360.0)
-        dead_deg, place = self.dead_deg[:, None], np.arange(len(self))[:, None]
-        at = seen_deg + _APART * place
-        # views [first, last) see the azimuth within their dead zone
-        first = np.searchsorted(self._keys, at - dead_deg, side="left") - width * place
-        last = np.searchsorted(self._keys, at + dead_deg, side="right") - width * place
-        # of those before and behind a running maximum knows the best: the penalty is a straight line
-        before = np.maximum.accumulate(own + slope * ring_deg, axis=1)
-        behind = np.maximum.accumulate((own - slope * ring_deg)[:, ::-1], axis=1)[:, ::-1]
-        risen = np.where(first > 0, np.take_along_axis(before, np.maximum(first - 1, 0), axis=1), -np.inf)
-        fallen = np.where(last < width, np.take_along_axis(behind, np.minimum(last, width - 1), axis=1), -np.inf)
-        best = np.maximum(risen - slope * seen_deg, fallen + slope * seen_deg) + slope * dead_deg
-        for step in range(int((last - first).max(initial=0))):
-            at_step = np.minimum(first + step, width - 1)
-            within = np.where(first + step < last, np.take_along_axis(own, at_step, axis=1), -np.inf)
-            np.maximum(best, within, out=best)
+        ends_deg, width = self._ends_deg, self._ends_deg.shape[1]
+        place = np.arange(len(self))[:, None]
+        # the view on whose arc the azimuth lies; an object's three turns reach beyond all azimuths
+        nearest = np.searchsorted(self._keys, seen_deg + 2 * _FAR_DEG * place) - width * place
+        best = np.take_along_axis(own, nearest, axis=1)
+        # of the views before and behind a running maximum knows the best: the penalty is a straight line from its arc
+        before = np.maximum.accumulate(own[:, :-1] + slope * ends_deg, axis=1)
+        behind = np.maximum.accumulate((own[:, 1:] - slope * ends_deg)[:, ::-1], axis=1)[:, ::-1]
+        risen = np.take_along_axis(before, np.maximum(nearest - 1, 0), axis=1) - slope * seen_deg
+        fallen = np.take_along_axis(behind, np.minimum(nearest, width - 1), axis=1) + slope * seen_deg
+        np.maximum(best, risen, out=best, where=nearest > 0)
+        np.maximum(best, fallen, out=best, where=nearest < width)
         support: Floats = best.astype(np.float32)
         return support
 
@@ -188,7 +193,7 @@ class Belief:
         """
         support = self.support[which].astype(np.float64)
         best = support.argmax(axis=1)
-        reach = np.maximum(1, np.rint(2.5 * self.index.dead_deg[which] / _BIN_DEG)).astype(int)
+        reach = np.maximum(1, np.rint(1.25 * self.index.spacing_deg[which] / _BIN_DEG)).astype(int)
         offset = np.arange(-BINS // 2, BINS // 2)
         near = np.take_along_axis(support, (best[:, None] + offset) % BINS, axis=1)
         weight = np.exp(_POSE_SHARPNESS * (near - near.max(axis=1, keepdims=True)))
