@@ -1,11 +1,11 @@
 """What an inertial sensor on the platter feels and how it errs, whatever chip it is."""
 
 from functools import cache
-from math import cos, radians, sin, sqrt
+from math import cos, pi, radians, sin, sqrt, tan
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, lfilter, lfilter_zi
+from scipy.linalg.lapack import dtbtrs
 
 from sim.motion import Floats
 from sim.world import World
@@ -59,7 +59,7 @@ class InertialModel:
         """Begin to sample now, with an empty filter: the chip was asleep, or its settings have changed."""
         self._last_ns = self._world.clock.now_ns()
         self._last_deg = self._world.table_deg()
-        self._filter_state: Floats | None = None
+        self._filter_state: tuple[Floats, Floats] | None = None
 
     def warmth_c(self, times_ns: NDArray[np.int64]) -> Floats:
         """Return how much warmer than its surroundings the sensor is at the given times, (n,)."""
@@ -87,10 +87,13 @@ class InertialModel:
         felt[:, :3] = rate_dps[:, None] * (self.gyro_gain * self.up) + bias
         felt[:, :3] += self.warmth_c(times_ns)[:, None] * self.gyro_slope_dps_c
         felt[:, 3:] = self.up + self.accel_bias_g
-        b, a, settled = _low_pass(rate_hz, bandwidth_hz)
-        state = settled * felt[0] if self._filter_state is None else self._filter_state
+        settled = np.tile(felt[0], (2, 1))
+        before, filtered_before = (settled, settled) if self._filter_state is None else self._filter_state
         felt += self._density * sqrt(rate_hz / 2) * draws[:, :6]
-        filtered, self._filter_state = lfilter(b, a, felt, axis=0, zi=state)
+        felt = np.concatenate([before, felt])
+        filtered = np.concatenate([filtered_before, _filtered(felt, filtered_before, rate_hz, bandwidth_hz)])
+        self._filter_state = felt[-2:], filtered[-2:]
+        filtered = filtered[2:]
 
         self.gyro_bias_dps = bias[-1]
         self._last_ns, self._last_deg = int(times_ns[-1]), float(angle_deg[-1])
@@ -98,10 +101,28 @@ class InertialModel:
 
 
 @cache
-def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[Floats, Floats, Floats]:
-    """Return numerator, denominator, and the state (2, 1) that has settled at an input of 1."""
-    b, a = butter(2, bandwidth_hz, fs=rate_hz)
-    return b, a, lfilter_zi(b, a)[:, None]
+def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[float, float, float]:
+    """Return b₀, a₁ and a₂ of a Butterworth low-pass of second order (bilinear transform); b₁ = 2b₀, b₂ = b₀."""
+    k = tan(pi * bandwidth_hz / rate_hz)
+    norm = 1 / (1 + sqrt(2) * k + k * k)
+    return k * k * norm, 2 * (k * k - 1) * norm, (1 - sqrt(2) * k + k * k) * norm
+
+
+def _filtered(felt: Floats, filtered_before: Floats, rate_hz: float, bandwidth_hz: float) -> Floats:
+    """Return the low-pass of ``felt`` (n + 2, 6) from its third row on, (n, 6); two rows came out before.
+
+    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]) is a triangular band matrix, which LAPACK solves in place
+    of scipy.signal, whose import takes longer than all else of the simulator together.
+    """
+    b0, a1, a2 = _low_pass(rate_hz, bandwidth_hz)
+    right = b0 * (felt[2:] + 2 * felt[1:-1] + felt[:-2])
+    right[0] -= a1 * filtered_before[1] + a2 * filtered_before[0]
+    if len(right) > 1:
+        right[1] -= a2 * filtered_before[1]
+    band = np.empty((3, len(right)))
+    band[0], band[1], band[2] = 1.0, a1, a2
+    solved, _ = dtbtrs(band, right, uplo="L", diag="U")
+    return np.asarray(solved, dtype=np.float64)
 
 
 def _steps(before: float, values: NDArray[np.int64] | Floats) -> Floats:
