@@ -111,8 +111,8 @@ def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[float, float, float]
 def _filtered(felt: Floats, filtered_before: Floats, rate_hz: float, bandwidth_hz: float) -> Floats:
     """Return the low-pass of ``felt`` (n + 2, 6) from its third row on, (n, 6); two rows came out before.
 
-    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]) is a triangular band matrix, which LAPACK solves in place
-    of scipy.signal, whose import takes longer than all else of the simulator together.
+    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]) is a triangular band matrix, which LAPACK solves; the
+    import of scipy.signal would take longer than all else of the simulator together.
     """
     b0, a1, a2 = _low_pass(rate_hz, bandwidth_hz)
     right = b0 * (felt[2:] + 2 * felt[1:-1] + felt[:-2])
