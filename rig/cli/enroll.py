@@ -256,4 +256,4 @@ def _rehearse(settings: Settings, names: list[str], views: int | None, *, resume
         return
     screen = console()
     for line in rehearsal_lines(found):
-        screen.print(line, markup=False, highlight=False, soft_wrap=True)
+        screen.print(line, markup=False, highlight=False, soft_wrap=not screen.is_terminal)

@@ -190,7 +190,7 @@ def evaluate(
     console.print(decision_rows(results).terminal())
     console.print()
     for sentence in contest_sentences(results):
-        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+        console.print(sentence, markup=False, highlight=False, soft_wrap=not console.is_terminal)
     print(f"Written: {out / 'report.html'}, results.json, results.csv and the figures beside it.", file=sys.stderr)
 
 
