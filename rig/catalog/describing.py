@@ -43,25 +43,6 @@ def region_of(settings: JsonObject) -> Region | None:
     )
 
 
-def within(image_bgr: NDArray[np.uint8], region: Region | None) -> NDArray[np.uint8]:
-    """Return the part of an image, uint8 (h, w, 3).
-
-    Raises
-    ------
-    UsageError
-        The region does not lie within the image.
-    """
-    if region is None:
-        return image_bgr
-    x, y, width, height = region
-    if min(x, y) < 0 or min(width, height) < 1 or x + width > image_bgr.shape[1] or y + height > image_bgr.shape[0]:
-        raise UsageError(
-            f"the region {list(region)} does not lie within an image of {image_bgr.shape[1]}x{image_bgr.shape[0]}",
-            next_step="give a region within the images: x, y, width, height in pixels",
-        )
-    return image_bgr[y : y + height, x : x + width]
-
-
 def packed_rows(
     levels: NDArray[np.uint8], further: Mapping[str, NDArray[np.uint8]], default: str, region: Region | None
 ) -> Iterator[dict[str, Any]]:

@@ -199,7 +199,7 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
         .order_by(objects.c.id, views.c.view_index)
     ).all()
     if not rows:
-        return hbr.Views.empty(), np.empty(0, np.int64)
+        return hbr.Views.empty(kind.name), np.empty(0, np.int64)
     object_ids, names, view_ids, azimuths_deg, packed = zip(*rows, strict=True)
     if None in packed:
         raise _outdated(connection, kind, {name for name, levels in zip(names, packed, strict=True) if levels is None})
@@ -209,6 +209,7 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
         azimuth_deg=np.array(azimuths_deg, np.float64),
         object_index=object_index,
         object_names=tuple(names[i] for i in first),
+        descriptor=kind.name,
     )
     return loaded, np.array(view_ids, np.int64)
 

@@ -11,10 +11,11 @@ from sqlalchemy import and_, delete, insert, select
 
 from rig.catalog import images
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import known_descriptor, region_of, settings_of, within
+from rig.catalog.describing import known_descriptor, region_of, settings_of
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
+from rig.describer import within
 from rig.errors import CatalogError, UsageError
 from rig.processes import over_processes
 

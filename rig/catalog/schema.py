@@ -26,6 +26,7 @@ from sqlalchemy import (
 )
 
 from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
+from rig.describer import PAPER_DESCRIPTOR
 
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
@@ -33,7 +34,7 @@ APPLICATION_ID: Final = 0x48425247
 SCHEMA_VERSION: Final = 2
 """Version of the tables below (`PRAGMA user_version`); `rig.catalog.migrations` has a step from each one before."""
 
-DESCRIPTOR: Final = "cedd"
+DESCRIPTOR: Final = PAPER_DESCRIPTOR
 """What objects are retrieved by where nobody says otherwise (`hbr.descriptors`)."""
 
 

@@ -13,10 +13,11 @@ from sqlalchemy import Connection, delete, null, select, update
 from hbr.descriptors import descriptor, names
 from rig.catalog import audit, images
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import region_of, within
+from rig.catalog.describing import region_of
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.schema import descriptors, enrollments, objects, sittings, views
 from rig.catalog.upkeep import LOST
+from rig.describer import within
 from rig.errors import RigError
 from rig.files import make_folder, write
 from rig.processes import over_processes

@@ -21,9 +21,9 @@ from sqlalchemy import Engine, event
 
 import hbr
 from rig.catalog import Catalog, Provenance, ViewRecord
-from rig.catalog.describing import within
 from rig.catalog.jobs import Progressed
 from rig.clock import SystemClock
+from rig.describer import within
 
 _T = TypeVar("_T")
 

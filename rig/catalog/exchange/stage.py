@@ -9,11 +9,12 @@ from typing import NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 from rig.catalog import images
-from rig.catalog.describing import known_descriptor, within
+from rig.catalog.describing import known_descriptor
 from rig.catalog.exchange.package import ImageSource
 from rig.catalog.exchange.plan import Plan
 from rig.catalog.records import Region
 from rig.catalog.schema import DESCRIPTOR
+from rig.describer import within
 from rig.errors import UsageError
 
 
