@@ -34,7 +34,7 @@ _BORDER: Final = tuple((y, x) for y in range(4) for x in range(4) if y in (0, 3)
 #: A cell agrees when this share of its pixels do.
 _CELL_SHARE: Final = 0.6
 #: A reference is trusted when this share of the border cells agree.
-_TRUSTED: Final = 0.65
+TRUSTED: Final = 0.65
 #: How unlike the border cells of a plain backdrop may be, and how far from grey, in logarithms.
 _PLAIN: Final = 0.12
 _NEAR_GREY: Final = 0.35
@@ -94,7 +94,7 @@ class Difference:
 
     @property
     def trusted(self) -> bool:
-        return self.agreement >= _TRUSTED
+        return self.agreement >= TRUSTED
 
 
 class Background:
