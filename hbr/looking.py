@@ -33,6 +33,8 @@ class Look:
     rotations_deg, confusion, cost : float64 arrays (a,)
         All turns that were weighed; logarithm of the probability of still confusing two objects after each; what the
         motion costs, in the same unit.
+    alike : float64 array (a,), or None
+        How alike the pair looks after each turn; None where there is no pair.
     words : str
         The decision for people.
     """
@@ -43,6 +45,7 @@ class Look:
     rotations_deg: FloatArray
     confusion: FloatArray
     cost: FloatArray
+    alike: FloatArray | None
     words: str
 
 
@@ -103,25 +106,25 @@ def next_look(
         confusion = -sharpness * novelty
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
+    alike: FloatArray | None = None
     if rivals.any():
         gained = rivals - remaining[chosen]
         first, second = np.unravel_index(int(gained.argmax()), gained.shape)
         objects = belief.index.object_index
         ordered = sorted((first, second), key=lambda i: -probability[i])
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
-        alike = float(similar[chosen, first, second])
-        best_alike, worst_alike = float(similar[:, first, second].min()), float(similar[:, first, second].max())
+        alike = similar[:, first, second]
     turn = float(turns_deg[chosen])
     names = belief.index.views.object_names
     side = "left" if turn > 0 else "right"
-    if pair is None:
+    if pair is None or alike is None:
         words = f"turn {abs(turn):.0f}° to the {side}: only {names[_leader(belief)]} is left, and that side is new"
     else:
         words = (
-            f"turn {abs(turn):.0f}° to the {side}, where {names[pair[0]]} and {names[pair[1]]} are {alike:.2f} alike "
-            f"(from {best_alike:.2f} to {worst_alike:.2f} all around)"
+            f"turn {abs(turn):.0f}° to the {side}, where {names[pair[0]]} and {names[pair[1]]} are {alike[chosen]:.2f} "
+            f"alike (from {alike.min():.2f} to {alike.max():.2f} all around)"
         )
-    return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, words)
+    return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike, words)
 
 
 def most_informative_turn(belief: Belief, *, beta: float, rotations_deg: ArrayLike | None = None) -> float:

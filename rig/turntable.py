@@ -80,6 +80,18 @@ def motion_seconds(distance_deg: float, profile: MotionProfile) -> float:
     return distance / v + v / a
 
 
+def equivalent_within(target_deg: float, rest_deg: float, limits_deg: tuple[float, float]) -> float | None:
+    """Return the angle that shows the same as ``target_deg`` within the cable's limits; None where none is.
+
+    ``target_deg`` itself where it is within them, else the one, whole turns away, that is nearest to ``rest_deg``.
+    """
+    low, high = limits_deg
+    if low <= target_deg <= high:
+        return target_deg
+    turns = range(ceil((low - target_deg) / 360), floor((high - target_deg) / 360) + 1)
+    return min((target_deg + 360 * k for k in turns), key=lambda angle: abs(angle - rest_deg), default=None)
+
+
 class Turntable(AbstractContextManager["Turntable"]):
     """The table of an open bench, with torque on for the length of a ``with`` block.
 
@@ -171,13 +183,11 @@ class Turntable(AbstractContextManager["Turntable"]):
         ``target_deg`` itself where it is within the limits: the cable is unwound only when it must be. Of a servo that
         pans over less than a turn, the limit that comes nearest to an angle which it does not reach.
         """
-        low, high = self._config.limits_deg
-        if low <= target_deg <= high:
-            return target_deg
-        turns = range(ceil((low - target_deg) / 360), floor((high - target_deg) / 360) + 1)
-        if not turns:
+        low, high = limits_deg = self._config.limits_deg
+        reached_deg = equivalent_within(target_deg, self._rest_deg, limits_deg)
+        if reached_deg is None:
             return min((low, high), key=lambda limit: abs(remainder(limit - target_deg, 360.0)))
-        return min((target_deg + 360 * k for k in turns), key=lambda angle: abs(angle - self._rest_deg))
+        return reached_deg
 
     def turns_back(self, target_deg: float) -> int:
         """Return by how many whole turns the cable is unwound on the way to ``target_deg``, which could be shorter."""
