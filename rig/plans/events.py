@@ -20,7 +20,8 @@ class Started:
     """A plan begins: ``plan`` is "enroll" or "identify", ``views`` how many views it takes at most.
 
     ``angles_deg`` are the table angles that an enrollment goes to; ``strategy`` and ``seed`` decide where an
-    identification looks.
+    identification looks, ``descriptor`` is what it compares views by, and ``notes`` say, for people, what its answer
+    will be worth.
     """
 
     plan: str
@@ -31,6 +32,8 @@ class Started:
     seed: int | None = None
     angles_deg: tuple[float, ...] = ()
     schema: int = SCHEMA
+    descriptor: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,33 +81,58 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """A view was taken (and, when enrolling, is durable)."""
+    """A view was taken (and, when enrolling, is durable).
+
+    ``front_end`` says how the object was found in it and lit (`hbr.Sighting.evidence`); None where nothing looked.
+    """
 
     index: int
     azimuth_deg: float
     evidence: ViewEvidence
     image_bgr: NDArray[np.uint8] = field(metadata=_OUTSIDE, repr=False)
+    front_end: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """An object with its Hough score per view and its pose: the azimuth at which the camera sees it now."""
+    """An object with its score per view and its pose: the azimuth at which the camera sees it now.
+
+    ``probability`` is that of being what stands there, among the enrolled objects; None where the search has none.
+    """
 
     name: str
     score: float
     pose_deg: float
+    probability: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
     """What is thought after a view; ``margin`` is how far, in score per view, the first candidate surely leads.
 
-    It leads any other enrolled object by at least that (`hbr.lead`); it may be negative.
+    It leads any other enrolled object by at least that (`hbr.lead`); it may be negative. ``verdict`` is what the rules
+    of the dense search say of it, in words.
     """
 
     index: int
     candidates: tuple[Candidate, ...]
     margin: float
+    verdict: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Weighed:
+    """All turns that were weighed before one was decided on.
+
+    ``rotations_deg`` are the camera's, positive to the left; ``confusion`` is the logarithm of the probability of still
+    taking one object for another after each, ``cost`` what its motion costs, in the same unit: the lowest sum was
+    chosen. ``alike`` is how alike the two rivals look there; None where only one object is left.
+    """
+
+    rotations_deg: tuple[float, ...]
+    confusion: tuple[float, ...]
+    cost: tuple[float, ...]
+    alike: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +140,8 @@ class Decided:
     """Where to look next, and ``why`` in words: of AHBR, the side on which the ``rivals`` look less alike (Eq. 6-7).
 
     ``rotation_deg`` is the camera's around the object, positive to the left; the table turns the other way, to
-    ``target_deg``. ``s_left`` and ``s_right`` are None where the sides were not compared.
+    ``target_deg``. ``s_left`` and ``s_right`` are None where the sides were not compared, ``weighed`` where not all
+    turns were.
     """
 
     index: int
@@ -123,6 +152,7 @@ class Decided:
     s_right: float | None
     rivals: tuple[str, ...]
     why: str = ""
+    weighed: Weighed | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +233,9 @@ class Identified:
 
     ``score``, ``margin`` and ``min_score`` (below which an object counts as unknown) are per view; ``pose_deg`` the
     azimuth the camera sees last, in the catalog's frame, ``yaw_deg`` how far the object stands turned counter-clockwise
-    against its enrollment; ``reason`` why the search ended.
+    against its enrollment; ``reason`` why the search ended. Of the dense search ``probability`` is the first
+    candidate's, ``familiarity`` how much this looks like an enrolled object, and ``min_familiarity`` the least that
+    those have; None where nothing may be called unknown.
     """
 
     name: str | None
@@ -217,6 +249,9 @@ class Identified:
     travelled_deg: float
     seconds: float
     reason: str
+    probability: float | None = None
+    familiarity: float | None = None
+    min_familiarity: float | None = None
 
 
 Event = (

@@ -13,7 +13,7 @@ from rig.devices.camera import CameraLocks
 from rig.errors import ViewRejected
 from rig.heading import Stillness
 from rig.plans.enroll import enroll
-from rig.plans.events import SCHEMA, Candidate, Event, Failed, Resemblance, Unwinding, Waiting, event_dict
+from rig.plans.events import SCHEMA, Candidate, Event, Failed, Resemblance, Unwinding, Waiting, Weighed, event_dict
 from rig.plans.identify import identify
 from rig.plans.insight import insight
 from rig.plans.tray import TrayItem, enroll_tray
@@ -24,6 +24,7 @@ PLAIN = {"string": str, "integer": int, "number": (int, float), "boolean": bool,
 PARTS = {
     "candidate": Candidate,
     "resemblance": Resemblance,
+    "weighed": Weighed,
     "evidence": ViewEvidence,
     "locks": CameraLocks,
     "stillness": Stillness,
