@@ -92,7 +92,7 @@ class ShelfOperator:
         self.parts: SimParts | None = None
         self.faults: Faults | None = None
         self.state: StateStore = MemoryStore()
-        self.optics = Optics.drawn(world.rng("optics"))
+        self.optics = Optics.of(world)
         self._rng = world.rng("operator")
 
     def place(self, name: str | None) -> None:

@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.objects.board import BoardOnPlatter
 from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
+from sim.optics import Optics
 from sim.sensor import Gains, Sensor, white_balance
 from sim.world import HISTORY_S, Happening, Scene, World
 
@@ -99,6 +101,8 @@ class SimCapture:
         self._binning = 1
         self._sensor = Sensor(world.noise, world.rng("camera"))
         self._backdrop = empty_platter()
+        # A camera that was mounted with care sees the things as they are drawn; boards are drawn through its lens.
+        self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
         self._open = self._plugged = True
         self._queue: deque[int] = deque()
         self._next = _frame_after(self._clock.now_ns())
@@ -297,13 +301,20 @@ class SimCapture:
         table_deg = -table_deg if self.orbits else table_deg
         image = self._backdrop.copy()
         if scene.thing is None:
-            return image
+            return self._as_mounted(image)
         if not isinstance(scene.thing, Visible):
             raise TypeError(f"{scene.thing!r} cannot be seen: put something with a method draw on the platter")
         x, y = scene.offset_mm
         c, s = cos(radians(table_deg)), sin(radians(table_deg))
         scene.thing.draw(image, table_deg + scene.yaw_deg, (c * x - s * y, s * x + c * y))
-        return image
+        return image if isinstance(scene.thing, BoardOnPlatter) else self._as_mounted(image)
+
+    def _as_mounted(self, image: Image) -> Image:
+        """Return what is drawn as the camera sees it from where it stands."""
+        if self._moved is None:
+            return image
+        seen = cv2.warpPerspective(image, self._moved, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(seen, dtype=np.uint8)
 
     def _meter(self) -> None:
         """Let the automatics that are on act on the frames since the last look.

@@ -64,6 +64,9 @@ class NoiseModel:
     light_flicker: float = 0.004
     """Standard deviation of the relative brightness from frame to frame."""
 
+    camera_mount: float = 0.0
+    """How far the camera stands and looks from where it should: at 1 some millimetres and degrees (`sim.optics`)."""
+
     # The hand that places the objects.
     placement_mm: float = 1.0
     """Standard deviation of an object's distance from the axis, along each axis of the platter."""

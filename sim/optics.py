@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.objects.projection import CENTRE_PX, COS, HEIGHT, SIN, WIDTH, Floats
+from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Floats
+from sim.world import World
 
 FOCAL_PX = 1000.0
 DISTANCE_MM = 500.0
@@ -48,20 +49,33 @@ class Optics:
     wobble_deg: float = 0.0
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, *, wobble_deg: float = 0.0) -> Self:
-        """Return a camera as they are: focal length ±5 %, principal point ±10 px, mounted askew by some degrees."""
+    def of(cls, world: World) -> Self:
+        """Return the camera of a world: its lens drawn by the seed, mounted as its noise model says."""
+        return cls.drawn(world.rng("optics"), mount=world.noise.camera_mount)
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, *, wobble_deg: float = 0.0, mount: float = 1.0) -> Self:
+        """Return a camera as they are: focal length ±5 %, principal point ±10 px, mounted askew by some degrees.
+
+        ``mount`` is how carelessly it was mounted; at 0 it looks as it should, and the platter's middle is seen where
+        `sim.objects.projection` draws it, and as large.
+        """
         plain = cls()
         fx = FOCAL_PX * (1 + 0.05 * float(rng.standard_normal()))
         fy = fx * (1 + 0.002 * float(rng.standard_normal()))
         cx, cy = plain.centre_px[0] + 10 * rng.standard_normal(), plain.centre_px[1] + 10 * rng.standard_normal()
         k1, k2 = 0.08 * rng.standard_normal(), 0.1 * rng.standard_normal()
         p1, p2 = 0.0005 * rng.standard_normal(2)
-        askew = cv2.Rodrigues(np.radians([3.0, 1.0, 1.5]) * rng.standard_normal(3))[0]
+        askew = cv2.Rodrigues(mount * np.radians([3.0, 1.0, 1.5]) * rng.standard_normal(3))[0]
         rotation = askew @ np.array(plain.rotation).reshape(3, 3)
-        shift = np.array([6.0, 6.0, 20.0]) * rng.standard_normal(3)
-        translation = askew @ np.array(plain.translation_mm) + shift
-        # The platter stays in view however the camera looks.
-        translation[:2] = np.array(plain.translation_mm[:2]) + shift[:2]
+        shift = mount * np.array([6.0, 6.0, 20.0]) * rng.standard_normal(3)
+        if mount == 0.0:  # whoever mounts a camera with care aims it by its picture
+            distance = DISTANCE_MM * fx / FOCAL_PX
+            translation = distance * np.array([(CENTRE_PX[0] - cx) / fx, (CENTRE_PX[1] - cy) / fy, 1.0])
+        else:
+            translation = askew @ np.array(plain.translation_mm) + shift
+            # The platter stays in view however the camera looks.
+            translation[:2] = np.array(plain.translation_mm[:2]) + shift[:2]
         return cls(
             (fx, fy),
             (float(cx), float(cy)),
@@ -86,6 +100,17 @@ class Optics:
             around = 2 * radians(table_deg)
             rotation = rotation @ cv2.Rodrigues(np.array([lean * cos(around), lean * sin(around), 0.0]))[0]
         return rotation @ _about_vertical(table_deg), np.array(self.translation_mm)
+
+    def from_drawn(self) -> Floats:
+        """Return the homography (3, 3) by which this camera sees what `sim.objects.projection` draws.
+
+        It is exact for what stands in the plane through the axis that faces the drawing; the lens' distortion, some
+        pixels at the frame's edges, is left out.
+        """
+        rotation = np.array(self.rotation).reshape(3, 3)
+        seen = self.matrix @ np.column_stack([rotation[:, 0], rotation[:, 2], np.array(self.translation_mm)])
+        drawn = np.array([[PX_PER_MM, 0.0, CENTRE_PX[0]], [0.0, -PX_PER_MM * COS, CENTRE_PX[1]], [0.0, 0.0, 1.0]])
+        return np.asarray(seen @ np.linalg.inv(drawn))
 
     def rays(self, factor: int = SUPERSAMPLING) -> NDArray[np.float32]:
         """Return where the ray of each sub-pixel passes the plane one unit before the lens, float32 (n, 2)."""
