@@ -1,6 +1,6 @@
 """Views of the calibration board on the turning table: it is the manipulator, a person only changes the stand."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from math import degrees
 from typing import Any
@@ -53,11 +53,12 @@ class BoardView:
 
 
 def look(
-    bench: Bench, board: Board, stands: Sequence[str], angles_deg: Sequence[float]
+    bench: Bench, board: Board, stands: Mapping[str, str], angles_deg: Sequence[float]
 ) -> Generator[Event | Ask | Progress, None, tuple[list[BoardView], list[str]]]:
     """Have the board put on each of the ``stands``, go to each of the ``angles_deg``, and find its corners.
 
-    Returns the views, and what was odd about what was seen.
+    The stands come with how the board is to stand, as in `STANDS`. Returns the views, and what was odd about what was
+    seen.
 
     Raises
     ------
@@ -69,8 +70,8 @@ def look(
     index, planned = 0, len(stands) * len(angles_deg)
     known = set(np.asarray(board.layout().getIds()).ravel().tolist())
     viewer = Viewer(bench.camera, bench.config.view)
-    for number, stand in enumerate(stands):
-        yield Ask(f"Put the calibration board {STANDS[stand]}; fix it there, and take your hands off.", PICTURES[stand])
+    for number, (stand, words) in enumerate(stands.items()):
+        yield Ask(f"Put the calibration board {words}; fix it there, and take your hands off.", PICTURES[stand])
         bench.operator.place(stand)
         with Turntable(bench) as table:
             for angle_deg in angles_deg:

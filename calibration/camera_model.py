@@ -51,7 +51,7 @@ def live(bench: Bench, board: Board | None = None) -> Generator[Event | Ask | Pr
     """
     board = board or Board()
     when_utc = bench.clock.utc()
-    views, troubles = yield from look(bench, board, list(STANDS), ANGLES_DEG)
+    views, troubles = yield from look(bench, board, STANDS, ANGLES_DEG)
     identity = bench.camera.identity
     fact = from_data(
         views,

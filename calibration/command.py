@@ -24,6 +24,12 @@ BoardColumns = Annotated[int, typer.Option(min=3, max=20, help="Squares across t
 BoardRows = Annotated[int, typer.Option(min=3, max=20, help="Squares down the board.")]
 SquareMm = Annotated[float, typer.Option(min=2, max=100, help="Side of a square, as measured on the print, in mm.")]
 
+RadiusMm = Annotated[float, typer.Option(min=5, max=1000, help="Radius of the largest object about the axis, in mm.")]
+HeightMm = Annotated[float, typer.Option(min=5, max=2000, help="Height of the tallest object, in mm.")]
+MiddleMm = Annotated[
+    float, typer.Option(min=0, max=1000, help="Height of the board's middle above the platter, upright, in mm.")
+]
+
 app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 
 
@@ -110,6 +116,9 @@ def table(
     columns: BoardColumns = 8,
     rows: BoardRows = 6,
     square_mm: SquareMm = 15.0,
+    radius_mm: RadiusMm = 80.0,
+    height_mm: HeightMm = 150.0,
+    middle_mm: MiddleMm = 75.0,
     print_board: Annotated[
         Path | None,
         typer.Option(
@@ -119,9 +128,12 @@ def table(
 ) -> None:
     """Calibrate where the table's axis is in the camera's frame, and how truly it turns; the camera comes first.
 
+    From then on the region of interest (view.roi) is where objects of that radius and height are seen.
+
     Example: rig calibrate table --print-board board.pdf
     """
     from calibration import table_axis
+    from calibration.table_axis import Room
     from rig.markers import Board
 
     board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
@@ -130,7 +142,8 @@ def table(
 
         print(write_board(board, print_board))
         return
-    run(settings, lambda bench: table_axis.live(bench, _in_force(bench, "camera.intrinsics"), board))
+    room = Room(radius_mm, height_mm, middle_mm)
+    run(settings, lambda bench: table_axis.live(bench, _in_force(bench, "camera.intrinsics"), board, room))
 
 
 @app.command("noise")
@@ -160,6 +173,9 @@ def everything(
     columns: BoardColumns = 8,
     rows: BoardRows = 6,
     square_mm: SquareMm = 15.0,
+    radius_mm: RadiusMm = 80.0,
+    height_mm: HeightMm = 150.0,
+    middle_mm: MiddleMm = 75.0,
     thing: Annotated[
         str | None,
         typer.Option("--object", metavar="NAME", help="An object by which repeated views are compared last."),
@@ -184,9 +200,11 @@ def everything(
         repeatability,
         table_axis,
     )
+    from calibration.table_axis import Room
     from rig.markers import Board
 
     board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
+    room = Room(radius_mm, height_mm, middle_mm)
     last = [] if thing is None else [lambda bench: repeatability.live(bench, thing)]
     run(
         settings,
@@ -200,7 +218,7 @@ def everything(
         camera_light.live_scene,
         camera_light.live_card,
         lambda bench: camera_model.live(bench, board),
-        lambda bench: table_axis.live(bench, _in_force(bench, camera_model.NAME), board),
+        lambda bench: table_axis.live(bench, _in_force(bench, camera_model.NAME), board, room),
         *last,
     )
     if thing is None:

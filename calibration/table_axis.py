@@ -6,10 +6,13 @@ fit to their centres a point on it. From there one fit of all corners, with the 
     x = project(a + L(θ)·R(u, θ)·(X₀ − a)),    X₀ the board's points at θ = 0
 
 by `least_squares(loss="soft_l1")`, with L the lean of a bearing out of true, to a side that goes round twice a turn.
+
+In force it sets ``view.roi``: the part of the frame in which the objects stay while they turn, wherever the camera
+stands.
 """
 
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from math import degrees, hypot, radians, sqrt
 from typing import Any
@@ -19,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from calibration.board_views import STANDS as ALL_STANDS
 from calibration.board_views import BoardView, as_json, look, points, turned_otherwise
 from calibration.camera_model import PARAMETERS, matrix_of
 from calibration.charts import LIMIT, MODEL, Axis, Series, chart
@@ -39,6 +43,8 @@ MIN_SPAN_DEG = 60.0
 MAX_RMS_PX = 0.4
 MAX_WOBBLE_DEG = 0.5
 MAX_UNCERTAINTY_PX = 0.3
+MAX_CUT_PX = 2
+"""Of what the objects take up, the frame may cut off so much."""
 ROBUST_PX = 0.3
 CORNER_PX = 0.1
 """How well a corner is found: what is known of the camera weighs against the corners by it."""
@@ -52,8 +58,25 @@ FIRST_POSE = 15
 Floats = NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True)
+class Room:
+    """The cylinder about the axis that holds the objects, and where the board stands in it.
+
+    Attributes
+    ----------
+    radius_mm, height_mm
+        Of the cylinder, which stands on the platter.
+    board_mm
+        How far the board's middle is above the platter on the first stand.
+    """
+
+    radius_mm: float = 80.0
+    height_mm: float = 150.0
+    board_mm: float = 75.0
+
+
 def live(
-    bench: Bench, intrinsics: Fact, board: Board | None = None
+    bench: Bench, intrinsics: Fact, board: Board | None = None, room: Room | None = None
 ) -> Generator[Event | Ask | Progress | Fact, None, Fact]:
     """Have the board put on two stands, look at it from thirteen sides each, and find the axis.
 
@@ -65,6 +88,8 @@ def live(
         The camera's calibration.
     board
         Its layout, as printed.
+    room
+        What the region of interest is to hold.
 
     Raises
     ------
@@ -72,10 +97,19 @@ def live(
         See `rig.view` and `rig.turntable`.
     """
     board = board or Board()
+    room = room or Room()
     when_utc = bench.clock.utc()
-    views, troubles = yield from look(bench, board, STANDS, ANGLES_DEG)
+    stands = {stand: ALL_STANDS[stand] for stand in STANDS}
+    stands[STANDS[0]] += f", its middle {room.board_mm:g} mm above the platter"
+    views, troubles = yield from look(bench, board, stands, ANGLES_DEG)
     fact = from_data(
-        views, board, intrinsics, troubles=troubles, when_utc=when_utc, device=bench.apparatus("camera", "servo")
+        views,
+        board,
+        intrinsics,
+        room=room,
+        troubles=troubles,
+        when_utc=when_utc,
+        device=bench.apparatus("camera", "servo"),
     )
     yield fact
     return fact
@@ -86,6 +120,7 @@ def from_data(
     board: Board,
     intrinsics: Fact,
     *,
+    room: Room = Room(),
     troubles: Sequence[str] = (),
     when_utc: datetime,
     device: Mapping[str, Any],
@@ -94,7 +129,8 @@ def from_data(
     refusals = list(troubles)
     estimates: dict[str, Estimate] = {}
     rms = None
-    evidence: dict[str, Any] = {"intrinsics": intrinsics.id, "views": as_json(views)}
+    region: list[int] = []
+    evidence: dict[str, Any] = {"intrinsics": intrinsics.id, "views": as_json(views), "room": asdict(room)}
     span = max((v.table_deg for v in views), default=0.0) - min((v.table_deg for v in views), default=0.0)
     if len(views) < MIN_VIEWS or span < MIN_SPAN_DEG:
         refusals.append(
@@ -110,6 +146,8 @@ def from_data(
         estimates, rms = axis.fit()
         evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
         refusals += _judge(estimates, rms)
+        region, cut = _region(region_of_interest(estimates, intrinsics, room), intrinsics.evidence["size"], room)
+        refusals += [cut] if cut else []
     return Fact(
         name=NAME,
         estimates=estimates,
@@ -117,6 +155,7 @@ def from_data(
         limit=MAX_RMS_PX,
         residual_unit="px",
         refusals=tuple(refusals),
+        settings={} if refusals else {"view.roi": region},
         valid_days=VALID_DAYS,
         when_utc=when_utc,
         device=device,
@@ -124,37 +163,43 @@ def from_data(
     )
 
 
-def region_of_interest(
-    axis: Fact, intrinsics: Fact, *, radius_mm: float, height_mm: float, below_mm: float, size: tuple[int, int]
-) -> tuple[int, int, int, int]:
-    """Return x, y, width, height of the part of the frame in which an object on the table stays while it turns.
+def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: Fact, room: Room) -> Floats:
+    """Return the corners in the image of what the ``room`` takes up, float64 (2, 2): x and y, lowest and highest.
 
-    Parameters
-    ----------
-    axis, intrinsics
-        What was calibrated.
-    radius_mm, height_mm
-        Of a cylinder about the axis that holds the object.
-    below_mm
-        How far the platter's top is below the calibrated point on the axis, which is at the height of the board's
-        middle.
-    size
-        Width and height of the frame.
+    They may lie outside the frame.
     """
-    value = {name: estimate.value for name, estimate in axis.estimates.items()}
+    value = {name: estimate.value for name, estimate in estimates.items()}
     up = np.array([value["ux"], value["uy"], value["uz"]])
-    foot = np.array([value["x"], value["y"], value["z"]]) - up * below_mm
+    foot = np.array([value["x"], value["y"], value["z"]]) - up * room.board_mm
     side = np.cross(up, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     depth = np.cross(side, up)
     around = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    ring = radius_mm * (np.cos(around)[:, None] * side + np.sin(around)[:, None] * depth)
-    cylinder = np.concatenate([foot + ring, foot + ring + up * height_mm])
+    ring = room.radius_mm * (np.cos(around)[:, None] * side + np.sin(around)[:, None] * depth)
+    cylinder = np.concatenate([foot + ring, foot + ring + up * room.height_mm])
     matrix, distortion = matrix_of(intrinsics)
     seen = cv2.projectPoints(cylinder, np.zeros(3), np.zeros(3), matrix, np.array(distortion))[0].reshape(-1, 2)
-    low = np.clip(np.floor(seen.min(axis=0)), 0, np.array(size) - 1).astype(int)
-    high = np.clip(np.ceil(seen.max(axis=0)), low + 1, size).astype(int)
-    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+    return np.stack([seen.min(axis=0), seen.max(axis=0)]).astype(np.float64)
+
+
+def _region(corners: Floats, size: Sequence[int], room: Room) -> tuple[list[int], str]:
+    """Return x, y, width and height of the region within a frame of ``size``, and what the frame cuts off; "" if none.
+
+    The outermost pixels may be missing.
+    """
+    low, high = np.floor(corners[0] + 0.5).astype(int), np.ceil(corners[1] + 0.5).astype(int)
+    over = dict(zip(("left", "top", "right", "bottom"), [*(-low).tolist(), *(high - size).tolist()], strict=True))
+    cut = [f"{side} by {px} px" for side, px in over.items() if px > MAX_CUT_PX]
+    low, high = np.clip(low, 0, np.array(size) - 1), np.clip(high, 1, size)
+    region = [*low.tolist(), *(high - low).tolist()]
+    if not cut:
+        return region, ""
+    return region, (
+        f"Objects of {room.radius_mm:g} mm radius and {room.height_mm:g} mm height would be cut off by the frame: "
+        f"{', '.join(cut)}. Aim the camera anew or move it away, and run `rig calibrate camera` where the lens was "
+        "touched; or give what your objects need, by --radius-mm and --height-mm. Is the middle of the board "
+        f"{room.board_mm:g} mm above the platter (--middle-mm)?"
+    )
 
 
 def plot(fact: Fact) -> Figure | None:

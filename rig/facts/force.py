@@ -31,7 +31,7 @@ def put_in_force(config: RigConfig, facts: Iterable[Fact]) -> tuple[RigConfig, t
                 for part in path[:-1]:
                     here = here.setdefault(part, {})
                 here[path[-1]] = value
-            elif written != value:
+            elif _plain(written) != _plain(value):
                 findings.append(f"{key} = {written} of the configuration wins over {value}, calibrated as {fact.id}")
     return validate(RigConfig, values, where="the calibrations in force"), tuple(findings)
 
@@ -44,3 +44,8 @@ def _written(config: RigConfig, path: list[str]) -> Any:
             return None
         here = getattr(here, part)
     return here
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as a file has it, where there are no tuples."""
+    return list(value) if isinstance(value, tuple) else value

@@ -10,6 +10,7 @@ import pytest
 
 from calibration import camera_model, table_axis
 from calibration.board_views import STANDS, BoardView
+from calibration.table_axis import Room
 from rig.facts import Fact
 from rig.markers import Board
 from sim.objects.board import boards
@@ -67,20 +68,28 @@ def test_the_true_axis_lies_within_the_stated_uncertainty(seed, wobble_deg):
 
 
 def test_the_region_of_interest_holds_the_turning_object():
-    true, intrinsics = optics(0), calibrated(0)
-    fact = axis(seen(true, table_axis.STANDS[:1], table_axis.ANGLES_DEG), intrinsics)
-    x, y, width, height = table_axis.region_of_interest(
-        fact, intrinsics, radius_mm=40.0, height_mm=100.0, below_mm=75.0, size=(640, 480)
-    )
+    true, room = optics(0), Room(radius_mm=40.0, height_mm=100.0)
+    views = seen(true, table_axis.STANDS[:1], table_axis.ANGLES_DEG)
+    fact = table_axis.from_data(views, Board(), calibrated(0), room=room, when_utc=WHEN, device={})
+    x, y, width, height = fact.settings["view.roi"]
     rotation, translation = true.to_camera(0.0)
     around = np.linspace(0, 2 * np.pi, 100)
     side = np.array([[40 * np.cos(a), 40 * np.sin(a), h] for a in around for h in np.linspace(0, 100, 5)])
     drawn = cv2.projectPoints(side, cv2.Rodrigues(rotation)[0], translation, true.matrix, np.array(true.distortion))[
         0
     ].reshape(-1, 2)
-    low, high = drawn.min(axis=0), drawn.max(axis=0)
-    assert np.allclose([x, y], np.maximum(low, 0), atol=4)
-    assert np.allclose([x + width, y + height], np.minimum(high, (640, 480)), atol=4)
+    assert np.allclose([x, y], drawn.min(axis=0), atol=4)
+    assert np.allclose([x + width, y + height], drawn.max(axis=0), atol=4)
+
+
+def test_objects_that_the_frame_cuts_off_are_refused():
+    views = seen(optics(0), table_axis.STANDS, ANGLES)
+    room = Room(radius_mm=80.0, height_mm=260.0)
+    fact = table_axis.from_data(views, Board(), calibrated(0), room=room, when_utc=WHEN, device={})
+    (refusal,) = fact.refusals
+    assert "cut off by the frame: top by" in refusal
+    assert "--height-mm" in refusal
+    assert not fact.settings
 
 
 ANGLES = camera_model.ANGLES_DEG[::2]
