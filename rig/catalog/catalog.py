@@ -279,8 +279,11 @@ class Catalog:
         with self._database.read() as connection:
             return ModelSet(*model_set(connection, kind))
 
-    def regions(self, bench: str) -> set[Region | None]:
-        """Return the parts of its images that a bench's views are described within; None is all of an image."""
+    def regions(self, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
+        """Return the parts of its images that a bench's views are described within; None is all of an image.
+
+        Each comes with the ids of the calibrations in force when its views were taken.
+        """
         with self._database.read() as connection:
             return regions(connection, bench)
 

@@ -26,6 +26,7 @@ from rig.catalog.records import (
 )
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
 from rig.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
+from rig.facts.store import CALIBRATIONS
 
 
 def in_use(name: str) -> ColumnElement[bool]:
@@ -235,10 +236,10 @@ def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> Desc
     )
 
 
-def regions(connection: Connection, bench: str) -> set[Region | None]:
-    """Return the regions that the retrieved views of a bench are described within."""
-    rows = connection.scalars(
-        select(cast(descriptors.c.settings, Text))
+def regions(connection: Connection, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
+    """Return the regions that a bench's retrieved views are described within, and what was calibrated meanwhile."""
+    rows = connection.execute(
+        select(cast(descriptors.c.settings, Text), cast(sittings.c.conditions, Text))
         .select_from(objects)
         .join(enrollments)
         .join(views, views.c.enrollment_id == enrollments.c.id)
@@ -247,7 +248,10 @@ def regions(connection: Connection, bench: str) -> set[Region | None]:
         .where(retrieved(), sittings.c.bench == bench)
         .distinct()
     )
-    return {region_of(json.loads(settings)) for settings in rows}
+    return {
+        (region_of(json.loads(settings)), tuple(json.loads(conditions).get(CALIBRATIONS, ())))
+        for settings, conditions in rows
+    }
 
 
 def _sitting(row: Row[Any]) -> Sitting:

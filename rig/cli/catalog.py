@@ -11,6 +11,9 @@ from rig.cli.complete import object_names
 from rig.cli.jobs import confirm, print_table, size_words
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rig.bench import Bench
     from rig.catalog import Catalog
 
 app = typer.Typer(help="Look after the enrolled objects.", no_args_is_help=True)
@@ -233,16 +236,35 @@ def stats(settings: Settings) -> None:
         )
 
 
-def tell_other_regions(settings: Settings, catalog: "Catalog") -> None:
-    """Say on stderr where the bench looks at another part of its images than when the objects were enrolled."""
-    region = settings.load().view.roi
-    others = catalog.regions(settings.bench_name) - {region}
+def tell_other_regions(settings: Settings, catalog: "Catalog", bench: "Bench") -> None:
+    """Say on stderr where the bench looks at another part of its images than when the objects were enrolled.
+
+    Regions that followed the object then and now, by calibrations of the axis, show the same of it wherever they are.
+    """
+    from rig.facts import FactStore
+    from rig.facts.store import CALIBRATIONS
+
+    known = FactStore(bench.config.calibration_path(bench.name)).history("table.axis")
+    followed = {(fact.id, tuple(fact.settings["view.roi"])) for fact in known if "view.roi" in fact.settings}
+
+    def follows(region: Any, calibrations: "Iterable[str]") -> bool:
+        return any((id_, region) in followed for id_ in calibrations)
+
+    region = bench.config.view.roi
+    follows_now = follows(region, bench.conditions.get(CALIBRATIONS, ()))
+    others = {
+        other
+        for other, calibrations in catalog.regions(settings.bench_name)
+        if other != region and not (follows_now and follows(other, calibrations))
+    }
     if others:
         seen = " and ".join(sorted("the whole image" if other is None else str(list(other)) for other in others))
+        argument = "whole" if region is None else ",".join(map(str, region))
         print(
             f"Note: objects of this bench are described within {seen}, view.roi is "
-            f"{'the whole image' if region is None else list(region)}. "
-            "If that was changed: rig catalog redescribe --region config.",
+            f"{'the whole image' if region is None else list(region)}"
+            f"{' since the axis was calibrated' if follows_now else ''}. If the camera stands where it stood: "
+            f"rig catalog redescribe --region {argument}. If it was moved: enroll those objects again, with --replace.",
             file=sys.stderr,
         )
 

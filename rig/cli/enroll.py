@@ -78,10 +78,12 @@ def enroll(
 
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
         from rig.bench import ObjectStandsThere
+        from rig.cli.catalog import tell_other_regions
         from rig.cli.hands import Person
         from rig.plans.enroll import enroll as enroll_one
         from rig.plans.tray import Hands, enroll_tray
 
+        tell_other_regions(settings, catalog, bench)
         job = _Job(settings, bench, catalog)
         if name is not None:
             events = enroll_one(

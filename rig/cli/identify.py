@@ -64,8 +64,8 @@ def identify(
     with settings.open_catalog(read_only=True) as catalog:
         model = _Model(catalog)
         index = model()
-        tell_other_regions(settings, catalog)
         with settings.open_bench() as bench, IdentifyView(screen) as view:
+            tell_other_regions(settings, catalog, bench)
             seed = settings.seed or 0
             if watch:
                 _bring_by_camera(bench)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -78,15 +79,15 @@ class FactStore:
         """Return all facts, of all kinds or one, in the order in which they were kept."""
         self.unreadable = []
         facts = []
-        for path in self._files():
+        for path in self._files(name or ""):
             try:
                 facts.append(Fact.from_file(path))
             except ConfigError as error:
                 self.unreadable.append(error)
         return [fact for fact in facts if name in (None, fact.name)]
 
-    def _files(self) -> list[Path]:
-        return sorted(self.folder.glob("[0-9]*-*.json"))
+    def _files(self, name: str = "") -> list[Path]:
+        return sorted(self.folder.glob(f"[0-9]*-{escape(name)}*.json"))
 
     def standings(self, device: Mapping[str, Any], now_utc: datetime) -> list[Standing]:
         """Return how the bench with these devices stands with each kind of calibration, by name.
