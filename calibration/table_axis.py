@@ -43,8 +43,8 @@ MIN_SPAN_DEG = 60.0
 MAX_RMS_PX = 0.4
 MAX_WOBBLE_DEG = 0.5
 MAX_UNCERTAINTY_PX = 0.3
-MAX_CUT_PX = 2
-"""Of what the objects take up, the frame may cut off so much."""
+MAX_CUT = 0.1
+"""Share of the room's height or width that the frame may cut off on a side: objects seldom fill its corners."""
 ROBUST_PX = 0.3
 CORNER_PX = 0.1
 """How well a corner is found: what is known of the camera weighs against the corners by it."""
@@ -111,6 +111,10 @@ def live(
         when_utc=when_utc,
         device=bench.apparatus("camera", "servo"),
     )
+    if fact.passed:
+        cut = ", ".join(fact.evidence["cut_off"])
+        words = f"Objects are seen within {fact.settings['view.roi']} (x, y, width, height)"
+        yield Progress(1.0, f"{words}; the frame cuts off {cut} of the room for them" if cut else words)
     yield fact
     return fact
 
@@ -146,8 +150,10 @@ def from_data(
         estimates, rms = axis.fit()
         evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
         refusals += _judge(estimates, rms)
-        region, cut = _region(region_of_interest(estimates, intrinsics, room), intrinsics.evidence["size"], room)
-        refusals += [cut] if cut else []
+        corners = region_of_interest(estimates, intrinsics, room)
+        region, cut, too_much = _region(corners, intrinsics.evidence["size"], room)
+        refusals += [too_much] if too_much else []
+        evidence["cut_off"] = cut
     return Fact(
         name=NAME,
         estimates=estimates,
@@ -182,23 +188,29 @@ def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: Fact, room
     return np.stack([seen.min(axis=0), seen.max(axis=0)]).astype(np.float64)
 
 
-def _region(corners: Floats, size: Sequence[int], room: Room) -> tuple[list[int], str]:
-    """Return x, y, width and height of the region within a frame of ``size``, and what the frame cuts off; "" if none.
+def _region(corners: Floats, size: Sequence[int], room: Room) -> tuple[list[int], list[str], str]:
+    """Return the region within a frame of ``size`` (x, y, width, height), what the frame cuts off, and a refusal.
 
-    The outermost pixels may be missing.
+    The refusal is "" where it does not cut off too much.
     """
     low, high = np.floor(corners[0] + 0.5).astype(int), np.ceil(corners[1] + 0.5).astype(int)
-    over = dict(zip(("left", "top", "right", "bottom"), [*(-low).tolist(), *(high - size).tolist()], strict=True))
-    cut = [f"{side} by {px} px" for side, px in over.items() if px > MAX_CUT_PX]
+    over = np.array([-low, high - size])  # left, top; right, bottom
+    cut = [
+        f"{over[i, j]} px at the {side}"
+        for (i, j), side in (((0, 0), "left"), ((0, 1), "top"), ((1, 0), "right"), ((1, 1), "bottom"))
+        if over[i, j] > 0
+    ]
+    too_much = bool((over > MAX_CUT * (high - low)).any())
     low, high = np.clip(low, 0, np.array(size) - 1), np.clip(high, 1, size)
     region = [*low.tolist(), *(high - low).tolist()]
-    if not cut:
-        return region, ""
-    return region, (
+    if not too_much:
+        return region, cut, ""
+    return (
+        region,
+        cut,
         f"Objects of {room.radius_mm:g} mm radius and {room.height_mm:g} mm height would be cut off by the frame: "
-        f"{', '.join(cut)}. Aim the camera anew or move it away, and run `rig calibrate camera` where the lens was "
-        "touched; or give what your objects need, by --radius-mm and --height-mm. Is the middle of the board "
-        f"{room.board_mm:g} mm above the platter (--middle-mm)?"
+        f"{', '.join(cut)}. Aim the camera anew or move it away; or give what your objects need, by --radius-mm and "
+        f"--height-mm. Is the middle of the board {room.board_mm:g} mm above the platter (--middle-mm)?",
     )
 
 
