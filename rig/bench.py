@@ -37,6 +37,15 @@ class Operator(Protocol):
         ...
 
 
+@runtime_checkable
+class TableClearer(Protocol):
+    """An operator who empties the table without being asked by anybody."""
+
+    def clear(self) -> bool:
+        """Have nothing on the table, and the hands away, on return; False where that cannot be."""
+        ...
+
+
 class ObjectStandsThere:
     """The operator of a bench where the object is on the table before the command is given."""
 

@@ -271,6 +271,13 @@ class ReplayMismatch(RigError):
     title = "replay mismatch"
 
 
+class TableNotEmpty(RigError):
+    """Something on the table turns with it where nothing should stand."""
+
+    code = 603
+    title = "table not empty"
+
+
 class CatalogError(RigError):
     """The catalog cannot do what was asked."""
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.clock import seconds_between
+from rig.config import ViewConfig
 from rig.view import region
 
 GRID: Final = 48
@@ -75,12 +76,21 @@ class TableWatcher:
 
     def _look(self) -> Picture:
         frame = self._bench.camera.capture(self._bench.clock.now_ns())
-        seen = region(frame.image_bgr, self._bench.config.view)
-        return cv2.resize(seen, (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
+        return picture(frame.image_bgr, self._bench.config.view)
+
+
+def picture(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Picture:
+    """Return the region of a frame as it is compared, float32 (`GRID`, `GRID`, 3)."""
+    return cv2.resize(region(image_bgr, config), (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def changed_cells(a: Picture, b: Picture) -> int:
+    """Return how many of the cells of two pictures are another, beyond other light."""
+    difference = b - a
+    difference -= np.median(difference, axis=(0, 1))
+    return int(np.count_nonzero(np.abs(difference).max(axis=2) > STEP_LEVELS))
 
 
 def changed(a: Picture, b: Picture) -> bool:
     """Return whether something in the picture, float32 (`GRID`, `GRID`, 3), is another; other light alone is not."""
-    difference = b - a
-    difference -= np.median(difference, axis=(0, 1))
-    return int(np.count_nonzero(np.abs(difference).max(axis=2) > STEP_LEVELS)) >= CELLS
+    return changed_cells(a, b) >= CELLS

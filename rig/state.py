@@ -99,6 +99,30 @@ class StateStore(Protocol):
         """Take the request back: it was heeded, or came from a time before."""
         ...
 
+    def read_file(self, name: str) -> bytes | None:
+        """Return what was kept beside the state under ``name``; None where nothing was.
+
+        Raises
+        ------
+        StateNotKept
+            It is there and cannot be read.
+        """
+        ...
+
+    def keep_file(self, name: str, content: bytes) -> None:
+        """Keep something beside the state; on return it outlives a power cut.
+
+        Raises
+        ------
+        StateNotKept
+            The disk is full, or may not be written to.
+        """
+        ...
+
+    def remove_file(self, name: str) -> None:
+        """Let go of what was kept under ``name``, if anything was."""
+        ...
+
 
 class MemoryStore:
     """A state that ends with its program: a simulated bench's."""
@@ -106,6 +130,7 @@ class MemoryStore:
     def __init__(self) -> None:
         self.state = BenchState()
         self.stop = False
+        self.files: dict[str, bytes] = {}
 
     def load(self) -> BenchState:
         return self.state
@@ -118,6 +143,15 @@ class MemoryStore:
 
     def clear_stop(self) -> None:
         self.stop = False
+
+    def read_file(self, name: str) -> bytes | None:
+        return self.files.get(name)
+
+    def keep_file(self, name: str, content: bytes) -> None:
+        self.files[name] = content
+
+    def remove_file(self, name: str) -> None:
+        self.files.pop(name, None)
 
 
 class FileStore:
@@ -164,6 +198,33 @@ class FileStore:
             self._stop.touch()
         except OSError as error:
             raise _not_kept(self._stop, error) from error
+
+    def read_file(self, name: str) -> bytes | None:
+        try:
+            return (self.path / name).read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise StateNotKept(
+                f"{self.path / name} cannot be read.",
+                next_step="Give yourself the right to read it, or remove it.",
+                evidence={"reason": error.strerror or str(error)},
+            ) from error
+
+    def keep_file(self, name: str, content: bytes) -> None:
+        try:
+            _make_folder(self.path)
+            files.write(self.path / name, content)
+        except OSError as error:
+            raise StateNotKept(
+                f"{name} cannot be kept in {self.path}.",
+                next_step="Make room on the disk, or set state_dir to a folder that you may write to.",
+                evidence={"reason": error.strerror or str(error)},
+            ) from error
+
+    def remove_file(self, name: str) -> None:
+        with suppress(OSError):
+            (self.path / name).unlink()
 
 
 class BenchLock:

@@ -23,7 +23,7 @@ from sim.faults.schedule import read_faults
 from sim.host import simulated_host
 from sim.noise import NoiseModel
 from sim.objects.board import utensils
-from sim.objects.photographs import photographs
+from sim.objects.photographs import Photographed, photographs
 from sim.objects.shelf import shelf
 from sim.optics import Optics
 from sim.parts import SimParts
@@ -122,6 +122,13 @@ class ShelfOperator:
                 evidence={"objects": list(self.things)},
             )
         self.world.put(self.things[name], yaw_deg, (dx_mm, dy_mm))
+
+    def clear(self) -> bool:
+        """Take what is there off the table; a photograph holds its own table, which nobody can clear."""
+        if any(isinstance(thing, Photographed) for thing in self.things.values()):
+            return False
+        self.world.put(None)
+        return True
 
 
 def open_sim_bench(

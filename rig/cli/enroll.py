@@ -51,9 +51,13 @@ def enroll(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a page with all views and what was measured.")
     ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask for an empty table: go on with its picture, or without.")
+    ] = False,
 ) -> None:
     """Enroll an object: one turn of the table, a checked view at every step.
 
+    Once a day the table is to be left empty first, for the picture that objects are found by (rig empty-table).
     p or the space bar pauses and goes on, Ctrl+Z too; Ctrl+C stops and keeps the views.
 
     Example: rig enroll mug-white --bench sim --views 36 --report mug.html
@@ -79,11 +83,13 @@ def enroll(
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
         from rig.bench import ObjectStandsThere
         from rig.cli.catalog import tell_other_regions
+        from rig.cli.empty_table import see_to_empty_table
         from rig.cli.hands import Person
         from rig.plans.enroll import enroll as enroll_one
         from rig.plans.tray import Hands, enroll_tray
 
         tell_other_regions(settings, catalog, bench)
+        see_to_empty_table(settings, bench, ask=not yes, then=name)
         job = _Job(settings, bench, catalog)
         if name is not None:
             events = enroll_one(

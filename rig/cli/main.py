@@ -11,6 +11,7 @@ from rig.cli import (
     catalog,
     config,
     doctor,
+    empty_table,
     enroll,
     evaluate,
     exchange,
@@ -76,6 +77,7 @@ app.command("enroll", rich_help_panel=OBJECTS)(enroll.enroll)
 app.command("identify", rich_help_panel=OBJECTS)(identify.identify)
 app.command("replay", rich_help_panel=OBJECTS)(runs.replay)
 app.command("report", rich_help_panel=OBJECTS)(runs.report)
+app.command("empty-table", rich_help_panel=BENCH)(empty_table.empty_table)
 app.command("goto", rich_help_panel=BENCH, context_settings={"ignore_unknown_options": True})(table.goto)
 app.command("home", rich_help_panel=BENCH)(table.home)
 app.command("status", rich_help_panel=BENCH)(table.status)

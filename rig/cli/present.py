@@ -23,8 +23,10 @@ from rig.plans.events import (
     Ranked,
     Rejected,
     Started,
+    TablePicture,
     Unwinding,
     Waiting,
+    Warned,
 )
 from rig.plans.words import (
     answer_words,
@@ -90,6 +92,11 @@ def line(event: Event) -> str:
             return ""
         case Insight():
             return "\n".join(f"  {words}" for words in insight_words(event))
+        case TablePicture():
+            turning = "" if event.turning_share is None else f", {event.turning_share:.1%} of it turns with the table"
+            return f"Picture of the empty table: {event.width} x {event.height} pixels{turning}"
+        case Warned():
+            return f"Warning: {event.what}.\nNext step: {event.next_step}"
         case Waiting():
             return f"Waiting for {event.why}; Ctrl+C ends."
         case Failed():

@@ -9,10 +9,12 @@ from hbr.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.clock import seconds_between
+from rig.describer import DESCRIPTORS, PAPER_DESCRIPTOR, Describer
+from rig.empty_table import COMMAND, Drift, EmptyTables
 from rig.errors import ObjectMoved, RigError, RotationDisagreement
 from rig.plans.capture import announced, capture, moved
 from rig.plans.estimate import even_azimuths, table_angles
-from rig.plans.events import Accepted, Enrolled, Event, Started, plain
+from rig.plans.events import Accepted, Enrolled, Event, Started, Warned, plain
 from rig.turntable import Move, Turntable
 from rig.view import Viewer, likeness
 
@@ -38,6 +40,9 @@ def enroll(
     pans over less than a turn takes the views that it reaches. An interrupted enrollment keeps its views: ``resume``
     takes the missing ones, of an object that nobody has moved since. Closing the generator takes the torque off.
 
+    Every view is described by `rig.describer.DESCRIPTORS`. The object is found by what differs from the bench's picture
+    of the empty table, if it has one (`rig.plans.photograph_table`), which is kept with the enrollment.
+
     Raises
     ------
     ObjectExists, CatalogError, CatalogBusy
@@ -51,6 +56,7 @@ def enroll(
         See `rig.view` and `rig.turntable`; views stored so far stay.
     """
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
+    standing = EmptyTables.standing(bench)
     provenance = Provenance(
         bench=bench.name,
         devices=bench.devices(),
@@ -58,6 +64,7 @@ def enroll(
             **bench.conditions,
             **bench.config.model_dump(mode="json", include={"table", "imu", "camera", "view"}),
             "findings": list(bench.findings),
+            "empty_table": standing.words,
         },
     )
     if resume:
@@ -87,16 +94,24 @@ def enroll(
             if not resume:
                 enrollment.discard()  # a mistyped name leaves nothing behind
             raise
-        retakes = yield from _take_views(bench, enrollment, to_go)
+        empty_table = None if standing.table is None else standing.table.image_bgr
+        if empty_table is not None:
+            enrollment.set_reference_image(empty_table)
+        retakes = yield from _take_views(
+            bench, enrollment, to_go, Describer(bench.config.view, DESCRIPTORS, empty_table)
+        )
     enrollment.finish()
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done
     return done
 
 
-def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float]) -> Generator[Event, None, int]:
+def _take_views(
+    bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: Describer
+) -> Generator[Event, None, int]:
     """Take and store the views at these table angles, turn back to 0, and return how many frames were taken again."""
     viewer = Viewer(bench.camera, bench.config.view)
+    drift = Drift()
     sign = bench.config.table.orientation_sign
     retakes = 0
     imu = _ImuAngle()
@@ -113,20 +128,27 @@ def _take_views(bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, f
             imu.add(move)
             shot = yield from capture(index, viewer, table, move.settled_ns)
             retakes += shot.number - 1
+            described = describe(shot.image_bgr)
+            levels = dict(described.levels)
             record = ViewRecord(
                 index=index,
                 commanded_deg=move.commanded_deg,
                 encoder_deg=move.encoder_deg,
                 azimuth_deg=float(wrap360(sign * (imu.angle_deg if move.by_gyro else move.encoder_deg))),
-                descriptor=viewer.describe(shot.image_bgr),
+                descriptor=levels.pop(PAPER_DESCRIPTOR),
                 captured_ns=shot.evidence.exposed_ns,
                 imu_deg=imu.angle_deg,
                 imu_sigma_deg=imu.sigma_deg,
                 evidence=plain(shot.evidence),
                 region=bench.config.view.roi,
+                front_end=described.front_end,
+                further=levels,
             )
             enrollment.add(record, shot.image_bgr)
             yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr)
+            if drifted := drift.look(described.front_end):
+                EmptyTables.doubt(bench, drifted)
+                yield Warned(index, drifted, f"Go on, these views do without it; then take a new one: {COMMAND}")
             first = first or (index, angle_deg, shot.image_bgr)
         if first and first[0] != index:
             yield from _look_again(bench, enrollment, table, viewer, *first)

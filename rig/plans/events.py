@@ -210,6 +210,34 @@ class Insight:
 
 
 @dataclass(frozen=True, slots=True)
+class TablePicture:
+    """The empty table was photographed, and the picture is kept: objects are found by what differs from it.
+
+    ``turning_share`` is how much of the picture changed as the table turned a little, ``agreement`` how much of its
+    border did not; None where the table could not turn. ``replaced`` says why the picture was taken anew.
+    """
+
+    taken_utc: str
+    width: int
+    height: int
+    turning_share: float | None
+    agreement: float | None
+    evidence: ViewEvidence
+    replaced: tuple[str, ...]
+    seconds: float
+    image_bgr: NDArray[np.uint8] = field(metadata=_OUTSIDE, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """Something that a person should see to; the plan goes on meanwhile. ``index`` is the view that it was seen at."""
+
+    index: int | None
+    what: str
+    next_step: str
+
+
+@dataclass(frozen=True, slots=True)
 class Waiting:
     """Nothing happens until somebody does something: ``why`` says what."""
 
@@ -266,6 +294,8 @@ Event = (
     | Identified
     | Item
     | Insight
+    | TablePicture
+    | Warned
     | Waiting
     | Failed
 )

@@ -13,9 +13,21 @@ from rig.devices.camera import CameraLocks
 from rig.errors import ViewRejected
 from rig.heading import Stillness
 from rig.plans.enroll import enroll
-from rig.plans.events import SCHEMA, Candidate, Event, Failed, Resemblance, Unwinding, Waiting, Weighed, event_dict
+from rig.plans.events import (
+    SCHEMA,
+    Candidate,
+    Event,
+    Failed,
+    Resemblance,
+    Unwinding,
+    Waiting,
+    Warned,
+    Weighed,
+    event_dict,
+)
 from rig.plans.identify import identify
 from rig.plans.insight import insight
+from rig.plans.photograph_table import photograph_table
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.view import ViewEvidence
 
@@ -90,6 +102,8 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for event in enroll(s.bench, catalog, "dice", views=20):
             seen.add(check_event(event))
+        for event in photograph_table(s.bench):
+            seen.add(check_event(event))
         items = [TrayItem(2, "dice"), TrayItem(3, "lamp", label="light")]
         for event in enroll_tray(s.bench, catalog, items, views=6):
             seen.add(check_event(event))
@@ -103,6 +117,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
                 seen.add(check_event(event))
     error = caught.value.as_dict()
     seen |= {check_event(Failed(**error)), check_event(Waiting("the next object"))}
+    seen.add(check_event(Warned(3, "the table is another", "Take a new picture.")))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == {kind.__name__.lower() for kind in get_args(Event)}
 
