@@ -1,0 +1,69 @@
+"""The region of interest follows the object: on a bench whose camera was moved, from calibration to identification."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from calibration import camera_model, table_axis
+from rig.cli.main import app
+
+MOVED = "bench.sim.noise={camera_mount=1.0}"
+BEFORE = [80, 0, 480, 480]
+
+
+@pytest.fixture
+def rig(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = 'default_bench = "sim"\ncalibration_dir = "facts"\n[catalog]\npath = "catalog"\n'
+    (tmp_path / "rig.toml").write_text(config, encoding="utf-8")
+    # Fewer sides: what the procedures find is proved elsewhere.
+    monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::3])
+    monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
+
+    def run(*arguments: str, seed: int = 2):
+        return CliRunner().invoke(app, [*arguments, "--seed", str(seed), "--set", MOVED])
+
+    return run
+
+
+def region(rig, name: str) -> list[int]:
+    """Return what the object's first view is described within."""
+    told = json.loads(rig("catalog", "show", name, "--json").stdout)
+    return told["views"][0]["record"]["region"]
+
+
+def test_the_region_follows_the_object_of_a_camera_that_was_moved(rig):
+    assert rig("enroll", "mug-star", "--views", "4").exit_code == 0
+    assert region(rig, "mug-star") == BEFORE
+    assert rig("calibrate", "camera").exit_code == 0
+    done = rig("calibrate", "table")
+    assert done.exit_code == 0, done.output
+    assert "its middle 75 mm above the platter" in done.stderr
+    (fact,) = json.loads(rig("calibrate", "history", "table.axis", "--json").stdout)["calibrations"]
+    follows = fact["settings"]["view.roi"]
+    x, _, width, _ = follows
+    assert x + width / 2 == pytest.approx(fact["estimates"]["px"]["value"], abs=12), "it holds the axis in its middle"
+
+    note = " ".join(rig("enroll", "mug-dots", "--views", "8").stderr.split())
+    assert region(rig, "mug-dots") == follows
+    assert f"described within {BEFORE}, view.roi is {follows} since the axis was calibrated" in note
+    assert f"rig catalog redescribe --region {','.join(map(str, follows))}" in note
+    assert "with --replace" in note
+    rig("catalog", "redescribe", "--region", ",".join(map(str, follows)))
+    found = rig("identify", "--set", "bench.sim.object=mug-dots", "--json")
+    assert "described within" not in found.stderr
+    assert json.loads(found.stdout.splitlines()[-1])["name"] == "mug-dots"
+
+    written = rig("identify", "--set", "bench.sim.object=mug-dots", "--set", f"view.roi={BEFORE}").stderr
+    assert "of the configuration wins over" in written
+    assert f"described within {follows}, view.roi is {BEFORE}" in " ".join(written.split())
+    other = rig("identify", "--set", "bench.sim.object=mug-dots", seed=3).stderr
+    assert "table.axis was calibrated on another device: conditions.seed was 2, is 3" in " ".join(other.split())
+
+    assert rig("enroll", "mug-star", "--views", "4", "--replace").exit_code == 0
+    taller = rig("calibrate", "table", "--height-mm", "120")
+    assert taller.exit_code == 0, taller.output
+    assert "described within" not in rig("identify").stderr, (
+        "regions that followed the objects then and follow them now"
+    )
