@@ -222,8 +222,13 @@ class EnrollConfig(Section):
 class IdentifyConfig(Section):
     """How an object is found."""
 
+    strategy: str | None = Field(
+        None, description="how the next view is chosen; none: dense where the catalog is described for it, else ahbr"
+    )
     max_views: int = Field(8, ge=1, le=72, description="give the best answer after this many views")
-    min_views: int = Field(2, ge=1, le=72, validate_default=True, description="never decide before")
+    min_views: int = Field(
+        2, ge=1, le=72, validate_default=True, description="never decide before; dense goes by its rules"
+    )
     first_step_deg: float = Field(
         90.0, ge=-180, le=180, description="rotation between the first two views, + to the left"
     )

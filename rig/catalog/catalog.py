@@ -40,7 +40,7 @@ from rig.catalog.records import (
     check_text,
     clean_name,
 )
-from rig.catalog.schema import DESCRIPTOR, enrollments, objects, sittings, views
+from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
 from rig.clock import Clock
 from rig.errors import CatalogError, ObjectExists, UsageError
 from rig.files import make_folder
@@ -278,6 +278,12 @@ class Catalog:
         kind = known_descriptor(descriptor)
         with self._database.read() as connection:
             return ModelSet(*model_set(connection, kind))
+
+    def describes(self, descriptor: str) -> bool:
+        """Whether any view is described by a descriptor; `views` tells whether all of those in use are."""
+        with self._database.read() as connection:
+            named = descriptors.c.name == descriptor
+            return connection.scalar(select(descriptors.c.view_id).where(named).limit(1)) is not None
 
     def regions(self, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
         """Return the parts of its images that a bench's views are described within; None is all of an image.

@@ -35,4 +35,4 @@ def bench_names(incomplete: str) -> list[str]:
 def strategy_names(incomplete: str) -> list[str]:
     """Return the names of the strategies of a search."""
     plugged = [point.name for point in entry_points(group="rig.strategies")]
-    return [name for name in ("ahbr", "hbr", "sweep", "random", *plugged) if name.startswith(incomplete)]
+    return [name for name in ("dense", "ahbr", "hbr", "sweep", "random", *plugged) if name.startswith(incomplete)]

@@ -11,10 +11,10 @@ from rig.cli.command import Settings, command
 from rig.cli.complete import strategy_names
 
 if TYPE_CHECKING:
-    from hbr import ViewIndex
     from rig.bench import Bench
     from rig.catalog import Catalog
     from rig.plans.events import Event
+    from rig.plans.model import Model
     from rig.plans.saved_run import RunWriter
 
 EXIT_UNKNOWN = 8
@@ -27,11 +27,13 @@ def identify(
         int | None, typer.Option(min=1, max=72, help="Views at most; identify.max_views otherwise.")
     ] = None,
     strategy: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="How the next view is chosen: ahbr, hbr, sweep, random, or a plug-in's.", autocompletion=strategy_names
+            help="How the object is searched: dense, ahbr, hbr, sweep, random, or a plug-in's; identify.strategy "
+            "otherwise.",
+            autocompletion=strategy_names,
         ),
-    ] = "ahbr",
+    ] = None,
     top: Annotated[int, typer.Option(min=1, max=100, help="Candidates that are named.")] = 5,
     save_run: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Keep frames and decisions, for rig replay and rig report.")
@@ -42,6 +44,8 @@ def identify(
 ) -> None:
     """Find out what stands on the table; ends with exit code 8 if it is unknown.
 
+    By default the bench's own search, which turns to where the likeliest objects differ most and stops by rules that
+    were rehearsed on the catalog (rig catalog calibrate); the paper's where the catalog is not described for it.
     p or the space bar pauses and goes on, Ctrl+Z too; Ctrl+C stops.
 
     Example: rig identify --bench sim --seed 3 --strategy sweep --save-run runs/1
@@ -52,18 +56,20 @@ def identify(
     from rig.cli.present import console
     from rig.plans.events import Identified, Waiting, event_dict
     from rig.plans.identify import identify as identify_one
+    from rig.plans.strategies import descriptor_for
     from rig.plans.strategies import strategy as strategy_named
     from rig.plans.watch import watch as watch_table
 
-    chosen = strategy_named(strategy)
     if max_views is not None:
         settings = settings.merged(None, None, [f"identify.max_views={max_views}"], None, False)
+    name = strategy or settings.load().identify.strategy
+    chosen = None if name is None else strategy_named(name)
     screen = console(stderr=settings.json)
     answer = None
     events: Generator[Event, None, object]
     with settings.open_catalog(read_only=True) as catalog:
-        model = _Model(catalog)
-        index = model()
+        model = _Model(catalog, None if chosen is None else descriptor_for(chosen))
+        model()  # before anything moves
         with settings.open_bench() as bench, IdentifyView(screen) as view:
             tell_other_regions(settings, catalog, bench)
             seed = settings.seed or 0
@@ -71,8 +77,8 @@ def identify(
                 _bring_by_camera(bench)
                 events = watch_table(bench, model, strategy=chosen, seed=seed, top=top)
             else:
-                events = identify_one(bench, index, strategy=chosen, seed=seed, top=top)
-            keeper = _Keeper(save_run, bench, lambda: model.index, several=watch)
+                events = identify_one(bench, model(), strategy=chosen, seed=seed, top=top)
+            keeper = _Keeper(save_run, bench, model, several=watch)
             try:
                 with keeper:
                     for event in events:
@@ -91,29 +97,30 @@ def identify(
 
 
 class _Model:
-    """The enrolled views, loaded again when something was enrolled or deleted meanwhile."""
+    """What is enrolled, loaded again when something was enrolled or deleted meanwhile."""
 
-    def __init__(self, catalog: "Catalog") -> None:
+    def __init__(self, catalog: "Catalog", descriptor: str | None = None) -> None:
         self._catalog = catalog
+        self._descriptor = descriptor
         self._seen: object = None
-        self.index: ViewIndex
+        self._model: Model
 
-    def __call__(self) -> "ViewIndex":
-        from hbr import ViewIndex
+    def __call__(self) -> "Model":
+        from rig.plans.model import load_model
 
         now = [(summary.name, summary.enrolled_utc, summary.views) for summary in self._catalog.objects()]
         if now != self._seen:
-            self.index, self._seen = ViewIndex(self._catalog.views().views), now
-        return self.index
+            self._model, self._seen = load_model(self._catalog, descriptor=self._descriptor), now
+        return self._model
 
 
 class _Keeper:
     """Keeps runs in a folder, where one is given; ``several`` in folders within it, 0001, 0002, ..."""
 
-    def __init__(self, folder: Path | None, bench: "Bench", index: Callable[[], "ViewIndex"], *, several: bool) -> None:
+    def __init__(self, folder: Path | None, bench: "Bench", model: Callable[[], "Model"], *, several: bool) -> None:
         self._folder = folder
         self._bench = bench
-        self._index = index
+        self._model = model
         self._several = several
         self._writer: RunWriter | None = None
 
@@ -133,7 +140,7 @@ class _Keeper:
             return
         if isinstance(event, Started):
             folder = self._next() if self._several else self._folder
-            self._writer = RunWriter(folder, self._bench, self._index().views)
+            self._writer = RunWriter(folder, self._bench, self._model())
         if self._writer is not None:
             self._writer.add(event)
             if isinstance(event, Identified | Failed):

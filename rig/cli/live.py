@@ -17,6 +17,7 @@ from rig.config import RigConfig
 from rig.plans.estimate import MotionModel, TimeLeft
 from rig.plans.events import (
     Accepted,
+    Candidate,
     Decided,
     Enrolled,
     Event,
@@ -27,7 +28,16 @@ from rig.plans.events import (
     Rejected,
     Started,
 )
-from rig.plans.words import azimuth_words, counted, decision_words, duration_words, insight_words, move_words, signed
+from rig.plans.words import (
+    azimuth_words,
+    counted,
+    decision_words,
+    duration_words,
+    insight_words,
+    move_words,
+    odds_words,
+    signed,
+)
 from rig.view import ViewEvidence
 
 ROWS: Final = 12
@@ -270,6 +280,7 @@ class IdentifyView(LiveView):
             case Started():
                 self._ranked, self._taken, self._of, self._ended = None, 0, event.views, False
                 self._start()
+                self.note(line(event))
             case Moved() if plain:
                 self.note(line(event))
             case Moved(agrees=False):
@@ -285,9 +296,11 @@ class IdentifyView(LiveView):
                 if plain:
                     self.note(line(event))
             case Decided() if plain:
+                self.note(f"  {self._verdict}" if self._verdict else "")
                 self.note(line(event))
             case Decided():
-                self.note(f"view {self._taken}  {self._leading}  {decision_words(event)}")
+                verdict = f"{self._verdict}; " if self._verdict else ""
+                self.note(f"view {self._taken}  {self._leading}  {verdict}{decision_words(event)}")
             case Identified():
                 self._ended = True
                 self._stop()
@@ -300,7 +313,12 @@ class IdentifyView(LiveView):
     def _leading(self) -> str:
         if self._ranked is None:
             return ""
-        return f"{self._ranked.candidates[0].name} {signed(self._ranked.margin, 3)}"
+        best = self._ranked.candidates[0]
+        return f"{best.name} {_odds(best) or signed(self._ranked.margin, 3)}"
+
+    @property
+    def _verdict(self) -> str:
+        return "" if self._ranked is None else self._ranked.verdict
 
     def render(self) -> RenderableType:
         table = Table(box=None, pad_edge=False, expand=False)
@@ -308,22 +326,27 @@ class IdentifyView(LiveView):
             table.add_column(heading)
         for heading in ("score", "behind", "pose"):
             table.add_column(heading, justify="right")
+        candidates = self._ranked.candidates if self._ranked else ()
+        likely = any(one.probability is not None for one in candidates)
+        if likely:
+            table.add_column("probability", justify="right")
         wide = self._console.width >= NARROW
         if wide:
             table.add_column("")
-        candidates = self._ranked.candidates if self._ranked else ()
         for place, one in enumerate(candidates, 1):
-            behind = "" if place == 1 else f"−{candidates[0].score - one.score:.3f}"
+            behind = "" if place == 1 else signed(one.score - candidates[0].score, 3)
             cells: list[RenderableType] = [
                 str(place),
                 Text(one.name, style="bold" if place == 1 else ""),
                 f"{one.score:.3f}",
                 behind,
                 f"{azimuth_words(one.pose_deg)}°",
+                *([_odds(one)] if likely else []),
             ]
             if wide:
+                share = one.score if one.probability is None else one.probability
                 cells.append(
-                    ProgressBar(total=1.0, completed=max(0.0, min(1.0, one.score)), width=24, complete_style="cyan")
+                    ProgressBar(total=1.0, completed=max(0.0, min(1.0, share)), width=24, complete_style="cyan")
                 )
             table.add_row(*cells)
         if self._ended:
@@ -332,7 +355,12 @@ class IdentifyView(LiveView):
         lead = f", sure lead {signed(self._ranked.margin, 3)}" if self._ranked else ""
         status = Text(f"view {self._taken} of {self._of} at most{where}{lead}", style="bold")
         status.append(f"   {self._hint}", style="dim")
-        return Group(table, status) if candidates else Group(status)
+        verdict = [Text(self._verdict)] if self._verdict else []
+        return Group(table, *verdict, status) if candidates else Group(status)
+
+
+def _odds(one: Candidate) -> str:
+    return "" if one.probability is None else odds_words(one.probability)
 
 
 def _angle(angle_deg: float | None) -> str:

@@ -17,6 +17,7 @@ from rig.cli import (
     exchange,
     find,
     identify,
+    rules,
     runs,
     safety,
     servo,
@@ -89,6 +90,7 @@ app.command("setup", rich_help_panel=BENCH)(setup.setup)
 app.command("import", rich_help_panel=OBJECTS)(exchange.import_)
 app.command("export", rich_help_panel=OBJECTS)(exchange.export)
 app.command("log", rich_help_panel=OBJECTS)(upkeep.log)
+catalog.app.command("calibrate")(rules.calibrate)
 app.add_typer(catalog.app, name="catalog", rich_help_panel=OBJECTS)
 app.add_typer(config.app, name="config", rich_help_panel=BENCH)
 app.add_typer(servo.app, name="servo", rich_help_panel=BENCH)

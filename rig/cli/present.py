@@ -12,6 +12,7 @@ from rich.progress import Progress as RichProgress
 from rig.plans.estimate import Rehearsal
 from rig.plans.events import (
     Accepted,
+    Candidate,
     Decided,
     Enrolled,
     Event,
@@ -36,6 +37,7 @@ from rig.plans.words import (
     duration_words,
     insight_words,
     move_words,
+    odds_words,
     signed,
     unwinding_words,
 )
@@ -60,7 +62,7 @@ def line(event: Event) -> str:
     """Return what an event means to the person at the bench; empty where there is nothing to say."""
     match event:
         case Started():
-            return ""
+            return "\n".join(f"Note: {note}." for note in event.notes)
         case Moved():
             return f"  at {event.encoder_deg:.2f}° (asked {event.commanded_deg:.2f}°): {move_words(event)}"
         case Unwinding():
@@ -70,9 +72,7 @@ def line(event: Event) -> str:
         case Accepted():
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():
-            leaders = ", ".join(
-                f"{c.name} {c.score:.3f} at {azimuth_words(c.pose_deg)}°" for c in event.candidates[:SHOWN]
-            )
+            leaders = ", ".join(_leader(c) for c in event.candidates[:SHOWN])
             return f"  leading: {leaders} (sure lead {signed(event.margin, 3)})"
         case Decided():
             return f"  {decision_words(event)} The table goes to {event.target_deg:.1f}°."
@@ -83,7 +83,8 @@ def line(event: Event) -> str:
         case Identified():
             return (
                 f"{answer_words(event)}\n  score {event.score:.3f} a view (unknown below {event.min_score:.3f}), "
-                f"sure lead {signed(event.margin, 3)}, {counted(event.views, 'view')}, "
+                + ("" if event.probability is None else f"probability {odds_words(event.probability)}, ")
+                + f"sure lead {signed(event.margin, 3)}, {counted(event.views, 'view')}, "
                 f"{event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
             )
         case Item(action="skip"):
@@ -101,6 +102,11 @@ def line(event: Event) -> str:
             return f"Waiting for {event.why}; Ctrl+C ends."
         case Failed():
             return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
+
+
+def _leader(one: Candidate) -> str:
+    odds = "" if one.probability is None else f" ({odds_words(one.probability)})"
+    return f"{one.name} {one.score:.3f}{odds} at {azimuth_words(one.pose_deg)}°"
 
 
 def rehearsal_lines(found: Sequence[Rehearsal]) -> list[str]:

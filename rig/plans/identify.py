@@ -2,65 +2,88 @@
 
 from collections.abc import Generator
 
+import numpy as np
+from numpy.typing import NDArray
+
 import hbr
 from hbr.angles import wrap360
 from rig.bench import Bench
 from rig.clock import seconds_between
+from rig.describer import Describer
+from rig.empty_table import COMMAND, Drift, EmptyTables
 from rig.errors import RigError
 from rig.plans.capture import announced, capture, moved, unwind
-from rig.plans.events import Accepted, Decided, Event, Identified, Started
-from rig.plans.search import SHOWN, Search
-from rig.plans.strategies import Stop, Strategy, Turn
-from rig.plans.strategies import strategy as strategy_named
+from rig.plans.events import Accepted, Decided, Event, Identified, Started, Warned
+from rig.plans.model import Model
+from rig.plans.search import SHOWN, begin_search
+from rig.plans.strategies import AnyStrategy, Stop, Turn, is_dense
 from rig.turntable import Turntable
 from rig.view import Viewer
 
 
 def identify(
     bench: Bench,
-    index: hbr.ViewIndex,
+    model: Model | hbr.ViewIndex,
     *,
-    strategy: Strategy | str = "ahbr",
+    strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
+    empty_table: NDArray[np.uint8] | None = None,
 ) -> Generator[Event, None, Identified]:
     """Identify the object on the table against the enrolled views; yields events and returns the answer.
 
     The strategy decides after each view where to look next, or that it is enough; `rig.plans.strategies` has those that
-    come with the rig, ``ahbr`` among them: the first two views are a fixed step apart, every later one lies where the
-    rivals look less alike (Eq. 5-7), until a known object leads all others by ``identify.margin`` a view, or
-    ``identify.max_views`` were taken. An object whose score a view stays below ``identify.min_score`` is unknown; where
-    that is not given, below what the enrolled views let expect (`hbr.familiar_score`). Closing the generator takes the
-    torque off.
+    come with the rig. ``dense`` is the bench's own: it turns to where the likeliest objects differ most, until one is
+    probable enough, or unknown, by rules that were rehearsed on the catalog. ``ahbr`` is the paper's: the first two
+    views are a fixed step apart, every later one lies where the rivals look less alike (Eq. 5-7), until a known object
+    leads all others by ``identify.margin`` a view, or ``identify.max_views`` were taken. Its object is unknown when its
+    score a view stays below ``identify.min_score``; where that is not given, below what the enrolled views let expect
+    (`hbr.familiar_score`). Closing the generator takes the torque off.
 
     Parameters
     ----------
     bench
         An open bench.
-    index : hbr.ViewIndex
-        The enrolled views.
+    model : Model or hbr.ViewIndex
+        What is enrolled, as `rig.plans.model.load_model` has it; a ViewIndex is for the paper's strategies.
     strategy
-        Its name, or a strategy of your own.
+        Its name, or a strategy of your own; None takes the one that the model is for.
     seed
         For strategies that draw.
     top
         How many candidates the events name.
+    empty_table : uint8 array (H, W, 3), optional
+        The bench without an object: the object is found by what differs from it. The bench's own picture, if it has
+        one, where none is given.
 
     Raises
     ------
     CatalogError
         Nothing is enrolled.
     UsageError
-        There is no such strategy.
+        There is no such strategy, or the model is not for it.
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.view` and `rig.turntable`.
     """
     config = bench.config.identify
-    if isinstance(strategy, str):
-        strategy = strategy_named(strategy)
-    search = Search(index, config, strategy, seed=seed, top=top)
+    search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
     viewer = Viewer(bench.camera, bench.config.view)
-    yield Started("identify", None, config.max_views, dict(bench.conditions), strategy=strategy.name, seed=seed)
+    notes = model.notes if isinstance(model, Model) else ()
+    if empty_table is None and is_dense(chosen):
+        standing = EmptyTables.standing(bench)
+        empty_table = None if standing.table is None else standing.table.image_bgr
+        notes += (f"{standing.words}; {COMMAND} takes one",) if standing.doubts else ()
+    describe, drift = Describer(bench.config.view, (search.descriptor,), empty_table), Drift()
+    yield Started(
+        "identify",
+        None,
+        config.max_views,
+        dict(bench.conditions),
+        strategy=chosen.name,
+        seed=seed,
+        descriptor=search.descriptor,
+        notes=notes,
+    )
     bench.operator.place(None)
     started_ns = bench.clock.now_ns()
     travelled_deg = 0.0
@@ -74,13 +97,12 @@ def identify(
             yield moved(number, move)
             shot = yield from capture(number, viewer, table, move.settled_ns)
             azimuth_deg = float(wrap360(orientation_deg))
-            yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr)
-            ranked, step = search.look(
-                viewer.describe(shot.image_bgr),
-                azimuth_deg,
-                table_deg=table.rest_deg,
-                limits_deg=bench.config.table.limits_deg,
-            )
+            seen = describe(shot.image_bgr)
+            yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr, seen.front_end)
+            if drifted := drift.look(seen.front_end):
+                EmptyTables.doubt(bench, drifted)
+                yield Warned(number, drifted, f"The search goes on without it; then take a new one: {COMMAND}")
+            ranked, step = search.look(seen.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
             yield ranked
             if isinstance(step, Stop):
                 break
@@ -96,20 +118,7 @@ def identify(
             yield from unwind(number, table)
         except RigError as error:
             trouble = error  # the answer is known, and must not be lost
-    best = ranked.candidates[0]
-    answer = Identified(
-        name=best.name if best.score >= search.min_score else None,
-        candidates=ranked.candidates,
-        score=best.score,
-        margin=ranked.margin,
-        min_score=search.min_score,
-        pose_deg=best.pose_deg,
-        yaw_deg=search.yaw_deg(ranked),
-        views=number + 1,
-        travelled_deg=travelled_deg,
-        seconds=seconds,
-        reason=step.why,
-    )
+    answer = search.answer(ranked, step.why, travelled_deg=travelled_deg, seconds=seconds)
     yield answer
     if trouble:
         raise trouble
@@ -126,4 +135,5 @@ def _decided(number: int, turn: Turn, target_deg: float, top: int) -> Decided:
         s_right=turn.s_right,
         rivals=turn.rivals[:top],
         why=turn.why,
+        weighed=turn.weighed,
     )

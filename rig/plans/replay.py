@@ -1,16 +1,15 @@
 """Compute a saved run again, from its frames: the same program must decide the same."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isclose
-from typing import Any
+from typing import Any, Final
 
-import hbr
+from rig.describer import Describer
 from rig.plans.events import Accepted, Decided, Identified, Moved, Ranked, plain
 from rig.plans.saved_run import SavedRun
-from rig.plans.search import Search
-from rig.plans.strategies import Stop, Strategy, Turn, strategy
-from rig.view import describe
+from rig.plans.search import Search, begin_search
+from rig.plans.strategies import AnyStrategy, Stop, Turn
 
 TOLERANCE = 1e-9
 """Numbers that differ less are equal: another machine may sum in another order."""
@@ -38,7 +37,7 @@ class Check:
     differences: list[Difference] = field(default_factory=list)
 
 
-def check(run: SavedRun, *, by: Strategy | None = None) -> Check:
+def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     """Describe every frame again, vote again and decide again, and compare with what was saved.
 
     Parameters
@@ -54,9 +53,9 @@ def check(run: SavedRun, *, by: Strategy | None = None) -> Check:
         The run cannot be read, or its strategy is not known.
     """
     started = run.started
-    chosen = by or strategy(started.strategy or "ahbr")
     found = Check()
     search: Search | None = None
+    describe = Describer(run.config.view, (run.views.descriptor,), run.empty_table)
     ranked: Ranked | None = None
     step: Turn | Stop | None = None
     table_deg = 0.0
@@ -65,17 +64,24 @@ def check(run: SavedRun, *, by: Strategy | None = None) -> Check:
             case Moved():
                 table_deg = event.encoder_deg
             case Accepted():
-                levels = describe(event.image_bgr, run.config.view)
+                seen = describe(event.image_bgr)
                 if search is None:
-                    search = _search(run, chosen)
-                ranked, step = search.look(
-                    levels, event.azimuth_deg, table_deg=table_deg, limits_deg=run.config.table.limits_deg
-                )
+                    search, _ = begin_search(
+                        run.model,
+                        run.config,
+                        by or started.strategy,
+                        seed=started.seed or 0,
+                        top=len(run.views.object_names),
+                    )
+                levels = seen.levels[search.descriptor]
+                ranked, step = search.look(levels, event.azimuth_deg, table_deg=table_deg)
                 found.views += 1
+                if event.front_end is not None:
+                    found.differences += _compare(found.views, "front_end", event.front_end, plain(seen.front_end))
             case Ranked() if ranked is not None:
                 # As many candidates as the run was asked to name.
                 top = len(event.candidates)
-                again = Ranked(ranked.index, ranked.candidates[:top], ranked.margin)
+                again = replace(ranked, candidates=ranked.candidates[:top])
                 found.differences += _compare(found.views, "", plain(event), plain(again))
             case Decided():
                 found.decisions += 1
@@ -90,11 +96,6 @@ def check(run: SavedRun, *, by: Strategy | None = None) -> Check:
     return found
 
 
-def _search(run: SavedRun, chosen: Strategy) -> Search:
-    everything = len(run.views.object_names)
-    return Search(hbr.ViewIndex(run.views), run.config.identify, chosen, seed=run.started.seed or 0, top=everything)
-
-
 def _saved_step(event: Decided) -> dict[str, Any]:
     return {
         "what": "turn",
@@ -103,6 +104,7 @@ def _saved_step(event: Decided) -> dict[str, Any]:
         "s_right": event.s_right,
         "rivals": list(event.rivals),
         "why": event.why,
+        "weighed": plain(event.weighed),
     }
 
 
@@ -113,22 +115,29 @@ def _computed_step(step: Turn | Stop | None, saved: Decided) -> dict[str, Any]:
     return {"what": "turn", **plain(step), "rivals": rivals}
 
 
+_ANSWER: Final = (
+    "name",
+    "score",
+    "margin",
+    "min_score",
+    "pose_deg",
+    "yaw_deg",
+    "reason",
+    "probability",
+    "familiarity",
+    "min_familiarity",
+)
+
+
 def _saved_answer(event: Identified) -> dict[str, Any]:
-    keys = ("name", "score", "margin", "min_score", "pose_deg", "yaw_deg", "reason")
-    return {"what": "stop", **{key: getattr(event, key) for key in keys}}
+    return {"what": "stop", **{key: getattr(event, key) for key in _ANSWER}}
 
 
 def _computed_answer(search: Search, ranked: Ranked, step: Turn | Stop | None) -> dict[str, Any]:
-    best = ranked.candidates[0]
+    answer = search.answer(ranked, step.why if step else "")
     return {
         "what": "stop" if isinstance(step, Stop) else "turn",
-        "name": best.name if best.score >= search.min_score else None,
-        "score": best.score,
-        "margin": ranked.margin,
-        "min_score": search.min_score,
-        "pose_deg": best.pose_deg,
-        "yaw_deg": search.yaw_deg(ranked),
-        "reason": step.why if step else "",
+        **{key: getattr(answer, key) for key in _ANSWER},
     }
 
 

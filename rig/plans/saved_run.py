@@ -1,7 +1,8 @@
 """A retrieval kept in a folder of open formats: what is needed to look at it again, and to compute it again.
 
 ``run.json`` has the conditions and settings, ``model.jsonl`` the enrolled views, an object a line, ``events.jsonl``
-what happened, an event a line, and ``frames/000.png``, ... the accepted frames, lossless.
+what happened, an event a line, and ``frames/000.png``, ... the accepted frames, lossless. Of a dense search
+``search_rules.json`` has the rules that it went by, ``empty_table.png`` the picture that the object was found with.
 """
 
 import json
@@ -23,13 +24,18 @@ from rig.bench import Bench
 from rig.catalog import images
 from rig.config import RigConfig
 from rig.config_values import validate
-from rig.errors import RigError, UsageError
+from rig.empty_table import EmptyTables
+from rig.errors import CatalogError, RigError, UsageError
 from rig.files import write
 from rig.plans.events import Accepted, Event, Started, event_dict
+from rig.plans.model import Model, model_of
+from rig.plans.rules import FILE as RULES
+from rig.plans.rules import read_rules, write_rules
 
 FORMAT: Final = "hbr-rig run"
-VERSION: Final = 1
-DESCRIPTOR: Final = "cedd"
+VERSION: Final = 2
+"""Raised when a program that knows less could not compute a run again; version 1 knew no dense search."""
+EMPTY_TABLE: Final = "empty_table.png"
 
 _KINDS: Final[dict[str, type]] = {kind.__name__.lower(): kind for kind in get_args(Event)}
 
@@ -43,8 +49,10 @@ class RunWriter:
         New or empty; missing folders above it are made.
     bench
         The bench that the retrieval runs on.
-    views : hbr.Views
-        The enrolled views.
+    model : Model or hbr.ViewIndex
+        What is enrolled.
+    empty_table : uint8 array (H, W, 3), optional
+        As `rig.plans.identify.identify` is given it; the bench's own picture for a dense search, where none is given.
 
     Raises
     ------
@@ -52,8 +60,19 @@ class RunWriter:
         The folder holds something already, or cannot be written to.
     """
 
-    def __init__(self, folder: Path, bench: Bench, views: hbr.Views) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        bench: Bench,
+        model: Model | hbr.ViewIndex,
+        *,
+        empty_table: NDArray[np.uint8] | None = None,
+    ) -> None:
         self._folder = folder
+        model = Model(model) if isinstance(model, hbr.ViewIndex) else model
+        views = model.views
+        kind = descriptor(views.descriptor)
+        started_utc = bench.clock.utc().isoformat()
         try:
             (folder / "frames").mkdir(parents=True, exist_ok=True)
             if len(list(folder.iterdir())) > 1:
@@ -61,16 +80,23 @@ class RunWriter:
                     f"The folder {folder} is not empty.", next_step="Give a new folder for each run with --save-run."
                 )
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
+            if model.rules is not None:
+                write_rules(folder / RULES, model.rules, views, made_utc=started_utc)
+            if empty_table is None and isinstance(model.index, hbr.DenseIndex):
+                standing = EmptyTables.current(bench)
+                empty_table = None if standing is None else standing.image_bgr
+            if empty_table is not None:
+                write(folder / EMPTY_TABLE, images.encode(empty_table))
             about = {
                 "format": FORMAT,
                 "version": VERSION,
                 "software": f"hbr-rig {version('hbr-rig')}",
-                "started_utc": bench.clock.utc().isoformat(),
+                "started_utc": started_utc,
                 "bench": bench.name,
                 "devices": bench.devices(),
                 "conditions": dict(bench.conditions),
                 "findings": list(bench.findings),
-                "descriptor": {"name": DESCRIPTOR, "version": descriptor(DESCRIPTOR).version},
+                "descriptor": {"name": kind.name, "version": kind.version},
                 "config": bench.config.model_dump(mode="json"),
             }
             write(folder / "run.json", (json.dumps(about, indent=2, default=str) + "\n").encode())
@@ -123,8 +149,10 @@ class SavedRun:
         Bench, devices, conditions and software, as JSON values.
     config
         The settings it ran under.
-    views : hbr.Views
-        The enrolled views it was decided by.
+    model : Model
+        The enrolled views, and the rules, that it was decided by.
+    empty_table : uint8 array (H, W, 3), or None
+        The bench without an object.
     error
         What ended it, where that was an error, as `RigError.as_dict` tells it.
     """
@@ -132,9 +160,15 @@ class SavedRun:
     folder: Path
     about: dict[str, Any]
     config: RigConfig
-    views: hbr.Views
+    model: Model
+    empty_table: NDArray[np.uint8] | None
     error: dict[str, Any] | None
     _lines: tuple[dict[str, Any], ...]
+
+    @property
+    def views(self) -> hbr.Views:
+        """The enrolled views it was decided by."""
+        return self.model.views
 
     def events(self) -> Iterator[Event]:
         """Yield the events in their order, frames included.
@@ -165,11 +199,7 @@ class SavedRun:
         return first
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
-        path = frame_path(self.folder, index)
-        image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise _damaged(self.folder, f"{path.name} is no image")
-        return np.asarray(image, np.uint8)
+        return _image(frame_path(self.folder, index))
 
 
 def load_run(folder: Path) -> SavedRun:
@@ -184,9 +214,9 @@ def load_run(folder: Path) -> SavedRun:
         about = json.loads(_bytes(folder / "run.json"))
         if about.get("format") != FORMAT:
             raise ValueError("run.json is not that of a saved run")
-        if about["version"] != VERSION:
+        if about["version"] not in range(1, VERSION + 1):
             raise UsageError(
-                f"The run {folder} has the format version {about['version']}; this program reads {VERSION}.",
+                f"The run {folder} has the format version {about['version']}; this program reads 1 to {VERSION}.",
                 next_step="Use the program that saved it, or a newer one.",
             )
         used = about["descriptor"]
@@ -194,11 +224,16 @@ def load_run(folder: Path) -> SavedRun:
             raise ValueError(f"it was described by {used['name']} {used['version']}, which this program has not")
         config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
         views = _views(_json_lines(_bytes(folder / "model.jsonl")), used["name"])
+        stored = read_rules(folder)
+        model = model_of(views, rules=None if stored is None else stored.adapted(views))
+        empty_table = _image(folder / EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
         lines = _json_lines(_bytes(folder / "events.jsonl"), cut=True)
+    except CatalogError as error:
+        raise _damaged(folder, f"{error.what}: {error.evidence['reason']}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder, str(error)) from error
     failed = lines.pop() if lines and "event" not in lines[-1] else None
-    return SavedRun(folder, about, config, views, failed, tuple(lines))
+    return SavedRun(folder, about, config, model, empty_table, failed, tuple(lines))
 
 
 def frame_path(folder: Path, index: int) -> Path:
@@ -248,7 +283,7 @@ def built(kind: Any, value: Any) -> Any:
 
 
 def _model_lines(views: hbr.Views) -> Iterator[str]:
-    pack = descriptor(DESCRIPTOR).pack
+    pack = descriptor(views.descriptor).pack
     for number, name in enumerate(views.object_names):
         rows = views.of(number)
         line = {
@@ -268,10 +303,18 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
                 -1, descriptor(kind).length
             ),
             line["azimuth_deg"],
+            kind,
         )
         for line in lines
     ]
-    return hbr.Views.concatenate(parts)
+    return hbr.Views.concatenate(parts) if parts else hbr.Views.empty(kind)
+
+
+def _image(path: Path) -> NDArray[np.uint8]:
+    image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(f"{path.name} is no image")
+    return np.asarray(image, np.uint8)
 
 
 def _json_lines(content: bytes, *, cut: bool = False) -> list[dict[str, Any]]:

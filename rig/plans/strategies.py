@@ -1,25 +1,34 @@
 """What to do next in a search: turn on, and how far, or stop; each time in words.
 
-`identify` asks one `Strategy` after every view. Four come with the rig; others plug in by an object of their own, or by
-name through the entry-point group `rig.strategies`.
+`identify` asks one strategy after every view. Five come with the rig; others plug in by an object of their own, or by
+name through the entry-point group `rig.strategies`. Which views a strategy is shown it says by its attribute
+``descriptor``: the paper's where it has none (`Strategy`, `Look`), the bench's own for the dense search
+(`DenseStrategy`, `DenseLook`).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import entry_points
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hbr
 from hbr.angles import wrap180
-from rig.config import IdentifyConfig
+from rig.config import IdentifyConfig, RigConfig
+from rig.describer import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 from rig.errors import UsageError
-from rig.plans.words import likeness_words
+from rig.plans.estimate import MotionModel
+from rig.plans.events import Weighed
+from rig.plans.words import likeness_words, separation_words
+from rig.turntable import equivalent_within
 
 GROUP: Final = "rig.strategies"
+
+TURN_STEP_DEG: Final = 5.0
+"""Turns that the dense search weighs are so far apart."""
 
 _REVISIT_DEG: Final = 10.0
 _DRAWS: Final = 20
@@ -66,11 +75,49 @@ class Look:
         return len(self.queries)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DenseLook:
+    """What the dense search knows after a view.
+
+    Attributes
+    ----------
+    belief : hbr.Belief
+        How much every object, from every azimuth, is supported.
+    verdict : hbr.Verdict
+        What the rules say of it.
+    rules : hbr.Rules
+        When to stop and what to call unknown.
+    rotations_deg, seconds : float64 arrays (a,)
+        Turns of the camera around the object that the cable allows, every 5°, and how long each takes on this bench.
+    table_deg
+        Where the table stands, unwrapped.
+    config
+        The settings of a search.
+    rng
+        For strategies that draw: seeded, so that a saved run can be computed again.
+    """
+
+    belief: hbr.Belief
+    verdict: hbr.Verdict
+    rules: hbr.Rules
+    rotations_deg: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    table_deg: float
+    config: IdentifyConfig
+    rng: np.random.Generator
+
+    @property
+    def views(self) -> int:
+        """How many views there are."""
+        return self.belief.queries
+
+
 @dataclass(frozen=True, slots=True)
 class Turn:
     """Look again, ``rotation_deg`` further around the object, positive to the left; ``why`` in words.
 
-    ``s_left`` and ``s_right`` say how alike the ``rivals`` (names) look from either side, where that was asked.
+    ``s_left`` and ``s_right`` say how alike the ``rivals`` (names) look from either side, where that was asked;
+    ``weighed`` has all turns that were, where they were.
     """
 
     rotation_deg: float
@@ -78,6 +125,7 @@ class Turn:
     s_left: float | None = None
     s_right: float | None = None
     rivals: tuple[str, ...] = ()
+    weighed: Weighed | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +146,58 @@ class Strategy(Protocol):
     def next(self, look: Look) -> Turn | Stop:
         """Return where to look next, or that it is enough. The same look and draws give the same answer."""
         ...
+
+
+class DenseStrategy(Protocol):
+    """Decides after each view, by what the dense search believes."""
+
+    @property
+    def name(self) -> str:
+        """By which it is asked for, and which is kept with a run."""
+        ...
+
+    @property
+    def descriptor(self) -> str:
+        """By which views are described for it: ``edges+colours``, the bench's own."""
+        ...
+
+    def next(self, look: DenseLook) -> Turn | Stop:
+        """Return where to look next, or that it is enough. The same look and draws give the same answer."""
+        ...
+
+
+AnyStrategy = Strategy | DenseStrategy
+
+
+def descriptor_for(strategy: AnyStrategy) -> str:
+    """Return what views are described by for a strategy; the paper's where it does not say."""
+    return str(getattr(strategy, "descriptor", PAPER_DESCRIPTOR))
+
+
+def is_dense(strategy: AnyStrategy) -> TypeGuard[DenseStrategy]:
+    """Whether a strategy is shown what the dense search believes."""
+    return descriptor_for(strategy) != PAPER_DESCRIPTOR
+
+
+def strategy_for(descriptor: str) -> AnyStrategy:
+    """Return the strategy that is taken for views by a descriptor where nobody asks for one."""
+    return Active() if descriptor == PAPER_DESCRIPTOR else Dense()
+
+
+def reachable_turns(config: RigConfig, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the turns of the camera that the cable allows, and how long each takes by the bench's motion model.
+
+    Where the short way exceeds the cable, the table goes the long way round, which takes its time.
+    """
+    model = MotionModel(config)
+    rotations_deg, seconds = [], []
+    for rotation_deg in (np.arange(TURN_STEP_DEG - 180, 180 + TURN_STEP_DEG, TURN_STEP_DEG)).tolist():
+        asked_deg = table_deg + config.table.orientation_sign * rotation_deg
+        target_deg = equivalent_within(asked_deg, table_deg, config.table.limits_deg)
+        if rotation_deg and target_deg is not None:
+            rotations_deg.append(rotation_deg)
+            seconds.append(model.move_s(target_deg - table_deg))
+    return np.array(rotations_deg), np.array(seconds)
 
 
 def enough(look: Look) -> Stop | None:
@@ -164,8 +264,30 @@ class Passive:
         return spent(look) or Turn(_draw(look), f"view {look.views + 1} of {look.config.max_views}, drawn at random")
 
 
-BUILT_IN: Final[dict[str, Callable[[], Strategy]]] = {
-    strategy.name: strategy for strategy in (Passive, Active, Sweep, Random)
+class Dense:
+    """The bench's own: turn to where the likeliest objects differ most, the motion counted, until the rules end it."""
+
+    name = "dense"
+    descriptor = BENCH_DESCRIPTOR
+
+    def next(self, look: DenseLook) -> Turn | Stop:
+        if look.verdict.kind != "look":
+            return Stop(look.verdict.words)
+        if not len(look.rotations_deg):
+            return Stop("the cable leaves no other view")
+        ahead = hbr.next_look(look.belief, beta=look.rules.beta, rotations_deg=look.rotations_deg, seconds=look.seconds)
+        names = look.belief.index.views.object_names
+        rivals = () if ahead.pair is None else tuple(names[i] for i in ahead.pair)
+        alike = None if ahead.alike is None else tuple(ahead.alike.tolist())
+        chosen = ahead.rotations_deg.tolist().index(ahead.rotation_deg)
+        weighed = Weighed(
+            tuple(ahead.rotations_deg.tolist()), tuple(ahead.confusion.tolist()), tuple(ahead.cost.tolist()), alike
+        )
+        return Turn(ahead.rotation_deg, separation_words(rivals, alike, chosen), rivals=rivals, weighed=weighed)
+
+
+BUILT_IN: Final[dict[str, Callable[[], AnyStrategy]]] = {
+    strategy.name: strategy for strategy in (Dense, Active, Passive, Sweep, Random)
 }
 
 
@@ -174,7 +296,7 @@ def names() -> list[str]:
     return [*BUILT_IN, *sorted({point.name for point in entry_points(group=GROUP)} - set(BUILT_IN))]
 
 
-def strategy(name: str) -> Strategy:
+def strategy(name: str) -> AnyStrategy:
     """Return the strategy of that name.
 
     Raises
@@ -187,7 +309,7 @@ def strategy(name: str) -> Strategy:
     for point in entry_points(group=GROUP):
         if point.name == name:
             try:
-                plugged: Strategy = point.load()()
+                plugged: AnyStrategy = point.load()()
             except (ImportError, AttributeError, TypeError) as error:
                 raise UsageError(
                     f"The strategy {name!r} of {point.value} cannot be loaded.",

@@ -2,24 +2,29 @@
 
 from collections.abc import Callable, Generator
 
+import numpy as np
+from numpy.typing import NDArray
+
 import hbr
 from rig.bench import Bench
 from rig.errors import ViewRejected
 from rig.plans.capture import moved
 from rig.plans.events import Event, Failed, Waiting
 from rig.plans.identify import identify
+from rig.plans.model import Model
 from rig.plans.search import SHOWN
-from rig.plans.strategies import Strategy
+from rig.plans.strategies import AnyStrategy
 from rig.turntable import Turntable
 
 
 def watch(
     bench: Bench,
-    model: Callable[[], hbr.ViewIndex],
+    model: Callable[[], Model | hbr.ViewIndex],
     *,
-    strategy: Strategy | str = "ahbr",
+    strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
+    empty_table: NDArray[np.uint8] | None = None,
 ) -> Generator[Event, None, None]:
     """Identify one object after the other, endlessly; yields a `Waiting` before the events of each.
 
@@ -32,8 +37,8 @@ def watch(
     bench
         An open one.
     model
-        Gives the enrolled views, before each search: what was enrolled meanwhile is found.
-    strategy, seed, top
+        Gives what is enrolled, before each search: what was enrolled meanwhile is found.
+    strategy, seed, top, empty_table
         As for `identify`.
 
     Raises
@@ -48,7 +53,7 @@ def watch(
         yield Waiting("the next object" if begun else "the first object, on the empty table")
         begun = True
         try:
-            answer = yield from identify(bench, model(), strategy=strategy, seed=seed, top=top)
+            answer = yield from identify(bench, model(), strategy=strategy, seed=seed, top=top, empty_table=empty_table)
             views = answer.views
         except ViewRejected as error:
             yield Failed(**{key: error.as_dict()[key] for key in ("error", "code", "what", "evidence", "next_step")})

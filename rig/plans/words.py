@@ -1,7 +1,9 @@
 """What happened, in words: the same on the terminal and in the report."""
 
 from collections.abc import Iterable, Sequence
+from math import isfinite
 
+from hbr import Verdict
 from rig.plans.events import Decided, Identified, Insight, Moved, Resemblance, Unwinding
 
 
@@ -25,6 +27,52 @@ def likeness_words(side: str, s_left: float, s_right: float, rivals: Sequence[st
     if side == "left":
         return f"{leading} look less alike there: S_left {left} < S_right {right}"
     return f"{leading} look less alike there: S_right {right} < S_left {left}"
+
+
+def separation_words(rivals: Sequence[str], alike: Sequence[float] | None, chosen: int) -> str:
+    """Return what a turn of the dense search is to show: which two objects it separates, and how well."""
+    if len(rivals) < 2 or alike is None:
+        return "only one object is left, and that side is new"
+    here = alike[chosen]
+    least, most = min(alike), max(alike)
+    return f"to tell {rivals[0]} from {rivals[1]}, {here:.2f} alike there ({least:.2f} to {most:.2f} all around)"
+
+
+def verdict_words(verdict: Verdict, *, certainty: float, least: float, views: int) -> str:
+    """Return what the rules of the dense search say after ``views`` views, and why.
+
+    Parameters
+    ----------
+    verdict
+        Theirs.
+    certainty
+        Probability that ends a search.
+    least
+        Familiarity that enrolled objects reach; not finite where nothing may be called unknown.
+    views
+        That were taken.
+    """
+    probability, familiarity = odds_words(verdict.probability), f"{verdict.familiarity:.3f}"
+    familiar = not isfinite(least) or verdict.familiarity >= least
+    known = f" and a familiarity of {familiarity} the {least:.3f} of enrolled objects" if isfinite(least) else ""
+    if verdict.kind == "unknown":
+        return f"a familiarity of {familiarity} stays below the {least:.3f} that enrolled objects reach"
+    if verdict.kind == "look" and not familiar:
+        return f"not familiar yet: {familiarity}, and enrolled objects reach {least:.3f}"
+    if verdict.kind == "look":
+        return f"not sure yet: a probability of {probability}, and {odds_words(certainty)} ends the search"
+    if verdict.probability >= certainty:
+        return f"a probability of {probability} reaches {odds_words(certainty)}{known}"
+    return (
+        f"the best after {counted(views, 'view')}, with a probability of {probability}; {odds_words(certainty)} is sure"
+    )
+
+
+def odds_words(probability: float) -> str:
+    """Return a probability in percent; what is nearly none or nearly all as such."""
+    if probability > 0.999:
+        return ">99.9%"
+    return "<0.1%" if probability < 0.001 else f"{probability:.1%}"
 
 
 def move_words(moved: Moved) -> str:

@@ -38,7 +38,17 @@ def enrolled(tmp_path_factory):
         for name, words in {
             "lamp": ["enroll", "lamp", "--label", "kitchen", "--label", "brass", "--report", "lamp.html"],
             "dice": ["enroll", "dice", "--json"],
-            "run": ["identify", "--set", "bench.sim.object=dice", "--seed", "4", "--save-run", "runs/1"],
+            "run": [
+                "identify",
+                "--strategy",
+                "ahbr",
+                "--set",
+                "bench.sim.object=dice",
+                "--seed",
+                "4",
+                "--save-run",
+                "runs/1",
+            ],
         }.items():
             done = CliRunner().invoke(app, words)
             assert done.exit_code == 0, done.output

@@ -39,7 +39,7 @@ def saved(tmp_path_factory):
         index = hbr.ViewIndex(catalog.views().views)
         for number, strategy in enumerate(("ahbr", "hbr", "sweep", "random")):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number
-            with RunWriter(home / strategy, bench, index.views) as writer:
+            with RunWriter(home / strategy, bench, index) as writer:
                 events = []
                 for event in identify(bench, index, strategy=strategy, seed=number, top=2):
                     writer.add(event)
@@ -169,9 +169,9 @@ def test_what_is_no_run_or_taken_already_is_said(saved, tmp_path, simulated):
     folder, _ = saved["ahbr"]
     bench = simulated().bench
     with pytest.raises(UsageError, match="not empty"):
-        RunWriter(folder, bench, hbr.Views.empty())
+        RunWriter(folder, bench, hbr.ViewIndex(hbr.Views.empty()))
     with pytest.raises(UsageError, match="cannot be saved"):
-        RunWriter(Path("/proc/run"), bench, hbr.Views.empty())
+        RunWriter(Path("/proc/run"), bench, hbr.ViewIndex(hbr.Views.empty()))
 
 
 def test_a_number_that_was_not_finite_comes_back_as_unknown(saved):

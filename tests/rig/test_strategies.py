@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 import hbr
 from hbr.angles import wrap180
-from rig.config import IdentifyConfig
+from rig.config import IdentifyConfig, RigConfig
 from rig.errors import CatalogError, UsageError
 from rig.plans import strategies
-from rig.plans.search import Search
+from rig.plans.search import Search, begin_search
 from rig.plans.strategies import Look, Stop, Strategy, Turn, enough, strategy
 
-LIMITS = (-400.0, 400.0)
+PAPERS = ["ahbr", "hbr", "sweep", "random"]
 
 
 def model(objects: int = 4, views: int = 12) -> hbr.Views:
@@ -28,44 +28,48 @@ def model(objects: int = 4, views: int = 12) -> hbr.Views:
     )
 
 
-def run(chosen: Strategy, *, seed: int = 0, **config: float) -> tuple[list[Turn], Stop, list[float]]:
+def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, top: int = 5, **config: float) -> Search:
+    settings = RigConfig(identify=IdentifyConfig(**config))  # type: ignore[arg-type]
+    return begin_search(hbr.ViewIndex(known), settings, chosen, seed=seed, top=top)[0]
+
+
+def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list[Turn], Stop, list[float]]:
     """Search with queries that fit nothing; return the turns, the stop, and where the views were taken."""
-    views = model()
-    search = Search(hbr.ViewIndex(views), IdentifyConfig(**config), chosen, seed=seed)  # type: ignore[arg-type]
+    search = searching(model(), chosen, seed=seed, **config)
     rng = np.random.default_rng(2)
     here_deg, taken_deg, turns = 0.0, [], []
     while True:
         taken_deg.append(here_deg)
         levels = rng.integers(0, 8, 144, np.uint8)
-        _, step = search.look(levels, here_deg % 360, table_deg=-here_deg, limits_deg=LIMITS)
+        _, step = search.look(levels, here_deg % 360, table_deg=-here_deg)
         if isinstance(step, Stop):
             return turns, step, taken_deg
         turns.append(step)
         here_deg += step.rotation_deg
 
 
-@pytest.mark.parametrize("name", strategies.names())
+@pytest.mark.parametrize("name", PAPERS)
 @settings(max_examples=25)
 @given(max_views=st.integers(1, 12), seed=st.integers(0, 3))
 def test_every_strategy_takes_all_views_that_are_allowed_where_nothing_is_clear(name, max_views, seed):
-    turns, stop, _ = run(strategy(name), seed=seed, max_views=max_views, min_views=1, margin=1.0)
+    turns, stop, _ = run(name, seed=seed, max_views=max_views, min_views=1, margin=1.0)
     assert len(turns) == max_views - 1
     assert stop.why == f"{max_views} views were taken"
     assert all(turn.why for turn in turns)
-    again, *_ = run(strategy(name), seed=seed, max_views=max_views, min_views=1, margin=1.0)
+    again, *_ = run(name, seed=seed, max_views=max_views, min_views=1, margin=1.0)
     assert again == turns
 
 
 def test_what_each_strategy_does():
-    sweep, _, _ = run(strategy("sweep"), max_views=6, margin=1.0)
+    sweep, _, _ = run("sweep", max_views=6, margin=1.0)
     assert [turn.rotation_deg for turn in sweep] == [60.0] * 5
     for name in ("random", "hbr"):
-        turns, _, taken_deg = run(strategy(name), max_views=8, margin=1.0)
+        turns, _, taken_deg = run(name, max_views=8, margin=1.0)
         assert len({turn.rotation_deg for turn in turns}) == 7
         apart = np.abs(wrap180(np.subtract.outer(taken_deg, taken_deg)))[~np.eye(8, dtype=bool)]
         assert apart.min() > 10
-        assert run(strategy(name), max_views=8, margin=1.0, seed=1)[0] != turns
-    active, _, _ = run(strategy("ahbr"), max_views=4, margin=1.0, first_step_deg=70.0)
+        assert run(name, max_views=8, margin=1.0, seed=1)[0] != turns
+    active, _, _ = run("ahbr", max_views=4, margin=1.0, first_step_deg=70.0)
     assert active[0] == Turn(70.0, "the first turn is fixed")
     assert all(turn.s_left is not None and turn.rivals for turn in active[1:])
 
@@ -73,33 +77,32 @@ def test_what_each_strategy_does():
 @pytest.mark.parametrize(("name", "views"), [("ahbr", 2), ("sweep", 2), ("random", 2), ("hbr", 5)])
 def test_a_clear_answer_ends_all_but_the_passive_search(name, views):
     known = model()
-    search = Search(hbr.ViewIndex(known), IdentifyConfig(max_views=5), strategy(name))
+    search = searching(known, name, max_views=5)
     for number in range(views):
-        ranked, step = search.look(known.descriptors[0], 0.0, table_deg=0.0, limits_deg=LIMITS)
+        ranked, step = search.look(known.descriptors[0], 0.0, table_deg=0.0)
         assert isinstance(step, Stop) == (number == views - 1)
     assert ranked.candidates[0].name == "o0"
 
 
 def test_an_unknown_object_is_not_clear_however_far_it_leads():
     known = model()
-    config = IdentifyConfig(max_views=5, min_score=1.0, margin=0.0)
-    search = Search(hbr.ViewIndex(known), config, strategy("sweep"))
+    search = searching(known, "sweep", max_views=5, min_score=1.0, margin=0.0)
     other = np.roll(known.descriptors[0], 1)
-    steps = [search.look(other, 0.0, table_deg=0.0, limits_deg=LIMITS)[1] for _ in range(5)]
+    steps = [search.look(other, 0.0, table_deg=0.0)[1] for _ in range(5)]
     assert [isinstance(step, Stop) for step in steps] == [False] * 4 + [True]
 
 
 def test_only_so_many_candidates_are_named_as_asked():
     known = model(objects=9)
     for top in (1, 3, 9):
-        search = Search(hbr.ViewIndex(known), IdentifyConfig(list_length=200), strategy("ahbr"), top=top)
-        ranked, _ = search.look(known.descriptors[0], 0.0, table_deg=0.0, limits_deg=LIMITS)
+        search = searching(known, "ahbr", list_length=200, top=top)
+        ranked, _ = search.look(known.descriptors[0], 0.0, table_deg=0.0)
         assert len(ranked.candidates) == top
 
 
 def test_an_empty_catalog_and_an_unknown_strategy_are_said():
     with pytest.raises(CatalogError, match="empty"):
-        Search(hbr.ViewIndex(hbr.Views.empty()), IdentifyConfig(), strategy("ahbr"))
+        searching(hbr.Views.empty(), "ahbr")
     with pytest.raises(UsageError) as caught:
         strategy("swep")
     assert "sweep" in caught.value.next_step
@@ -118,8 +121,8 @@ def test_others_plug_in_by_an_entry_point(monkeypatch):
     broken = EntryPoint("broken", "no.such.module:Thing", strategies.GROUP)
     mine = EntryPoint("once", f"{__name__}:Once", strategies.GROUP)
     monkeypatch.setattr(strategies, "entry_points", lambda **_: [broken, mine])
-    assert strategies.names() == ["hbr", "ahbr", "sweep", "random", "broken", "once"]
-    turns, stop, _ = run(strategy("once"))
+    assert strategies.names() == ["dense", "ahbr", "hbr", "sweep", "random", "broken", "once"]
+    turns, stop, _ = run("once")
     assert turns == []
     assert stop.why.startswith("one view says it")
     with pytest.raises(UsageError, match="cannot be loaded"):
