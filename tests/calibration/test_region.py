@@ -1,12 +1,16 @@
 """The region of interest follows the object: on a bench whose camera was moved, from calibration to identification."""
 
 import json
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from calibration import camera_model, table_axis
+from rig.bench import open_bench
 from rig.cli.main import app
+from rig.config import load_config
+from rig.facts import FactStore
 
 MOVED = "bench.sim.noise={camera_mount=1.0}"
 BEFORE = [80, 0, 480, 480]
@@ -36,7 +40,10 @@ def region(rig, name: str) -> list[int]:
 def test_the_region_follows_the_object_of_a_camera_that_was_moved(rig):
     assert rig("enroll", "mug-star", "--views", "4").exit_code == 0
     assert region(rig, "mug-star") == BEFORE
-    assert rig("calibrate", "camera").exit_code == 0
+    config = load_config(Path("rig.toml"), [MOVED])
+    with open_bench("sim", config, seed=2) as bench:  # of the camera, what the axis needs
+        *_, intrinsics = camera_model.live(bench)
+    FactStore(config.calibration_path("sim")).keep(intrinsics)
     done = rig("calibrate", "table")
     assert done.exit_code == 0, done.output
     assert "its middle 75 mm above the platter" in done.stderr
