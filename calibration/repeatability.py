@@ -4,8 +4,9 @@ An object is placed several times at the same mark; each time the table goes rou
 views of the same azimuth differ by the camera's noise and the table's repeatability where they are of one placing, and
 by the hand and the light besides where they are of two. From the latter follow
 
-- ``identify.repeatability``: the similarity that a known object falls below with the stated error rate α, the
-  conformal quantile ⌊α(n+1)⌋ of the n comparisons; and
+- ``identify.repeatability``: the similarity a view that a known object falls below with the stated error rate α when
+  it is decided about: the conformal quantile ⌊α(n+1)⌋ of the n comparisons, each averaged over the N views of the
+  shortest decision. A single view falls much lower, and by its quantile strangers would be taken for known; and
 - ``identify.margin``: how far two scores of equal truth are apart by chance in a decision of N views,
   z(1−α)·√2·σ/√N, with σ the scatter about the mean of the azimuth.
 """
@@ -102,6 +103,7 @@ def live(
         sittings,
         error_rate=error_rate,
         views=bench.config.identify.min_views,
+        first_step_deg=bench.config.identify.first_step_deg,
         when_utc=when_utc,
         device=bench.apparatus("camera"),
         name=name,
@@ -121,6 +123,7 @@ def from_data(
     *,
     error_rate: float,
     views: int,
+    first_step_deg: float = 90.0,
     when_utc: datetime,
     device: Mapping[str, Any],
     name: str = "",
@@ -134,8 +137,8 @@ def from_data(
         Placings of the same object at the same mark.
     error_rate
         Share of known objects that may fall below ``identify.repeatability``.
-    views
-        Of the shortest decision, for the margin.
+    views, first_step_deg
+        Of the shortest decision, and the turn between them.
     when_utc, device
         Kept with the fact.
     name
@@ -151,6 +154,8 @@ def from_data(
             f"{len(sittings)} placements are too few to promise an error rate of {error_rate:.1%}: "
             f"{needed_placements(error_rate)} are needed. Give --placements, or a larger --error-rate."
         )
+    turn = round(first_step_deg * AZIMUTHS / 360.0)
+    decided = np.mean([np.roll(between, -turn * view, axis=1) for view in range(views)], axis=0)
     low = float(np.median(between))
     if low < MIN_SIMILARITY:
         refusals.append(
@@ -169,7 +174,7 @@ def from_data(
 
     def figures(chosen: NDArray[np.int64]) -> tuple[float, float, float, float]:
         some_within, some_between = within[:, chosen], between[:, chosen]
-        ordered = np.sort(some_between.ravel())
+        ordered = np.sort(decided[:, chosen].ravel())
         quantile = float(ordered[max(floor(error_rate * (ordered.size + 1)) - 1, 0)])
         # Scatter about the mean of its azimuth: the mean itself depends on the object, and is in every score.
         scatter = float(np.sqrt(some_between.var(axis=0, ddof=min(1, len(between) - 1)).mean()))

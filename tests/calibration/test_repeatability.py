@@ -44,9 +44,10 @@ def test_the_promised_share_of_later_placings_falls_below():
         *known, late = sittings
         fact = fit(known, 0.05)
         assert fact.passed, fact.refusals
-        later = [np.diag(hbr.tanimoto(s.descriptors[0], late.descriptors[0])) for s in known]
-        below += int((np.array(later) < fact.settings["identify.repeatability"]).sum())
-        n += np.size(later)
+        later = np.array([np.diag(hbr.tanimoto(s.descriptors[0], late.descriptors[0])) for s in known])
+        decided = (later + np.roll(later, -3, axis=1)) / 2  # the shortest decision: two views, 90° apart
+        below += int((decided < fact.settings["identify.repeatability"]).sum())
+        n += decided.size
     assert 0.02 < below / n < 0.08
 
 
