@@ -33,12 +33,14 @@ _HUES: Final[tuple[Trapezoid, ...]] = (
 )
 _LEVELS: Final = np.arange(256, dtype=np.float64)
 
-#: (2, 256): saturation s0, s1 of the first fuzzy system.
-SATURATION: Final = np.stack([_membership(_LEVELS, t) for t in ((0, 0, 10, 75), (10, 75, 255, 255))])
-#: (3, 256): value v0 (black), v1 (grey), v2 (white) of the first fuzzy system.
-VALUE: Final = np.stack([_membership(_LEVELS, t) for t in ((0, 0, 10, 75), (10, 75, 180, 220), (180, 220, 255, 255))])
-#: (2, 256): low and high, of saturation and value alike, of the second fuzzy system.
-LOW_HIGH: Final = np.stack([_membership(_LEVELS, t) for t in ((0, 0, 68, 188), (68, 188, 255, 255))])
+_S0, _S1 = (_membership(_LEVELS, t) for t in ((0, 0, 10, 75), (10, 75, 255, 255)))
+_V0, _V1, _V2 = (_membership(_LEVELS, t) for t in ((0, 0, 10, 75), (10, 75, 180, 220), (180, 220, 255, 255)))
+_LOW, _HIGH = (_membership(_LEVELS, t) for t in ((0, 0, 68, 188), (68, 188, 255, 255)))
+
+#: (256, 10) each: memberships of every saturation and of every value in the ten rules. Six are of the first fuzzy
+#: system (white, grey, black, black, colour, colour) and four of the second (light, pure, dark, dark).
+SATURATION: Final = np.stack([_S0, _S0, _S0, _S1, _S1, _S1, _LOW, _HIGH, _LOW, _HIGH], axis=1)
+VALUE: Final = np.stack([_V2, _V1, _V0, _V0, _V1, _V2, _HIGH, _HIGH, _LOW, _LOW], axis=1)
 
 
 def _hue_tables() -> tuple[FloatArray, IndexArray]:
@@ -49,12 +51,14 @@ def _hue_tables() -> tuple[FloatArray, IndexArray]:
     weights = np.stack([memberships[first, hues], np.where(second > first, memberships[second, hues], 0.0)])
     shades = 3 + 3 * (np.stack([first, second], axis=1) % 7)[:, :, None] + np.arange(3)  # class 7 is red, like class 0
     neutrals = np.broadcast_to(np.arange(3), (hues.size, 3))
-    return weights, np.concatenate([neutrals, shades.reshape(-1, 6)], axis=1)
+    bins = np.concatenate([neutrals, shades.reshape(-1, 6)], axis=1)
+    return weights, np.concatenate([24 * texture + bins for texture in range(6)])
 
 
 #: (2, 360): memberships of the two neighbouring hue classes that can be active at each hue.
-#: (360, 9): bins of white, grey, black and of the light, pure and dark shade of these two classes' colours.
-HUE_WEIGHT, HUE_BINS = _hue_tables()
+#: (6 * 360, 9): bins of white, grey, black and of the light, pure and dark shade of these two classes' colours, in row
+#: 360 * texture + hue.
+HUE_WEIGHT, VOTE_BINS = _hue_tables()
 
 _REPRESENTATIVES: Final = (
     # class 0 (no edge); class 1 (non-directional); classes 2, 3 (horizontal, vertical); classes 4, 5 (diagonals)

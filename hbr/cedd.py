@@ -6,13 +6,14 @@ Indexing and Retrieval", ICVS 2008, in the reading of LIRE's ``features.global.C
 Vectors over the blocks are laid out component first, ``(k, blocks)``, so that every operation runs along memory.
 """
 
-from typing import Final
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 
-from hbr._cedd_tables import HUE_BINS, HUE_WEIGHT, LOW_HIGH, REPRESENTATIVES, SATURATION, VALUE
-from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr._cedd_tables import HUE_WEIGHT, REPRESENTATIVES, SATURATION, VALUE, VOTE_BINS
+from hbr.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray
 from hbr.checks import check_image
 
 #: Bins of the descriptor: 6 texture classes of 24 colours, bin = 24 * texture + colour.
@@ -24,8 +25,8 @@ LONGEST_SIDE: Final = 640
 
 _EDGE_THRESHOLD: Final = 14.0
 _CLASS_THRESHOLDS: Final = np.array([[0.68], [0.98], [0.98], [0.98], [0.98]])
-#: Of a pixel B, G, R: the three channels, and the luminance in thousandths.
-_CHANNELS: Final = np.column_stack([np.eye(3), [114.0, 587.0, 299.0]])
+#: Luminance of a pixel B, G, R, in thousandths.
+_LUMINANCE: Final = np.array([114, 587, 299])
 _SQRT2: Final = np.sqrt(2.0)
 #: Non-directional, horizontal and vertical edge, of the quarters a, b, c, d.
 _FILTERS: Final = np.array([[2.0, -2.0, -2.0, 2.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
@@ -57,12 +58,12 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
     grid = _grid(*image.shape[:2])
     if 0 in grid[:2]:
         return np.zeros(BINS, np.uint8)
-    quarter_sums = _quarter_sums(image, grid)
-    textures, blocks = _texture_votes(_areas(image, quarter_sums, grid))
-    bins, outputs = _colour_outputs(*_block_colours(quarter_sums, grid))
+    row_sums = _row_sums(image, grid)
+    textures, blocks = _texture_votes(_areas(image, _luminance(row_sums, grid), grid))
+    hue, outputs = _colour_outputs(_block_colours(row_sums, grid))
     # bincount adds in the order given: raster order in every bin, so the sums equal the reference's to the last bit
     histogram = np.bincount(
-        (bins.take(blocks, axis=0) + 24 * textures[:, None]).ravel(),
+        VOTE_BINS.take(360 * textures + hue.take(blocks), axis=0).ravel(),
         weights=outputs.take(blocks, axis=0).ravel(),
         minlength=BINS,
     )
@@ -127,34 +128,59 @@ def _resize(image: ImageArray, width: int, height: int) -> ImageArray:
     return image
 
 
-_Grid = tuple[int, int, int, int]
+class _Grid(NamedTuple):
+    """Rows and columns of blocks, height and width of a quarter of a block in pixels."""
+
+    rows: int
+    columns: int
+    height: int
+    width: int
 
 
 def _grid(height: int, width: int) -> _Grid:
-    """Rows and columns of blocks, then rows and columns of pixels in a quarter of a block."""
     shortest = min(height, width)
     if shortest < 40:
-        return height // 2, width // 2, 1, 1
+        return _Grid(height // 2, width // 2, 1, 1)
     blocks = 40 if shortest >= 80 else 20
-    return blocks, blocks, height // blocks // 2, width // blocks // 2
+    return _Grid(blocks, blocks, height // blocks // 2, width // blocks // 2)
 
 
-def _quarter_sums(image: ImageArray, grid: _Grid) -> FloatArray:
-    """Sums of B, G, R and luminance in thousandths over the quarters of the blocks, exact whole numbers.
-
-    Of shape (4, 2 * rows, 2 * columns).
-    """
+def _strips(image: ImageArray, grid: _Grid) -> ImageArray:
+    """The rows of pixels of every row of quarters, (2 * rows, height of a quarter, 3 * pixels)."""
     rows, columns, height, width = grid
-    strips = image[: 2 * rows * height, : 2 * columns * width].reshape(2 * rows, height, -1)
-    if height > 1:
-        # 257 * 255 still fits 16 bits
-        strips = np.add.reduce(strips, axis=1, dtype=np.uint16 if height <= 257 else np.uint32)
-    pixels = strips.reshape(-1, 3 * width).astype(np.float64)
-    sums: FloatArray = np.ascontiguousarray((pixels @ np.tile(_CHANNELS, (width, 1))).T)
-    return sums.reshape(4, 2 * rows, 2 * columns)
+    return image[: 2 * rows * height, : 2 * columns * width].reshape(2 * rows, height, -1)
 
 
-def _areas(image: ImageArray, quarter_sums: FloatArray, grid: _Grid) -> FloatArray:
+def _row_sums(image: ImageArray, grid: _Grid) -> RealArray:
+    """The rows of pixels of every row of quarters, added up: whole numbers, (2 * rows, 3 * pixels)."""
+    strips = _strips(image, grid)
+    sums = np.zeros((2 * grid.rows, strips.shape[2]), _weights(grid)[0].dtype)
+    for k in range(grid.height):
+        cv2.accumulate(strips[:, k], sums)
+    return sums
+
+
+@lru_cache(maxsize=64)
+def _weights(grid: _Grid) -> tuple[RealArray, RealArray]:
+    """What a row of the pixels of a quarter and one of a block are multiplied with: to luminance, and to B, G, R."""
+    # float32 holds whole numbers up to 2 ** 24
+    dtype = np.float32 if 255_000 * grid.height * grid.width < 2**24 else np.float64
+    return np.tile(_LUMINANCE, grid.width).astype(dtype), np.tile(np.eye(3), (2 * grid.width, 1)).astype(dtype)
+
+
+def _luminance(row_sums: RealArray, grid: _Grid) -> RealArray:
+    """Luminance of the quarters in thousandths, summed over their pixels, (2 * rows, 2 * columns)."""
+    luminance: RealArray = row_sums.reshape(-1, 3 * grid.width) @ _weights(grid)[0]
+    return luminance.reshape(2 * grid.rows, 2 * grid.columns)
+
+
+def _block_colours(row_sums: RealArray, grid: _Grid) -> RealArray:
+    """Mean B, G, R of the blocks, cut to whole numbers, (blocks, 3), float32."""
+    sums = cv2.add(row_sums[::2], row_sums[1::2]).reshape(-1, 6 * grid.width) @ _weights(grid)[1]
+    return np.floor(sums / (4 * grid.height * grid.width)).astype(np.float32, copy=False)
+
+
+def _areas(image: ImageArray, luminance: RealArray, grid: _Grid) -> FloatArray:
     """Luminance of the quarters (a top left, b top right, c, d) of the blocks, (4, blocks), whole numbers 0..255.
 
     The reference sums ``0.114 B + 0.587 G + 0.299 R`` pixel by pixel in double and truncates the mean. Exact arithmetic
@@ -162,76 +188,99 @@ def _areas(image: ImageArray, quarter_sums: FloatArray, grid: _Grid) -> FloatArr
     """
     rows, columns, height, width = grid
     count = height * width
-    mean = quarter_sums[3].ravel() / (1000.0 * count)
+    mean = luminance / (1000 * count)
     area = np.floor(mean)
-    area[mean == 255] = np.trunc(255.0 * count * (4.0 / (4 * count)))  # white adds up without rounding; 254 at times
+    white = np.trunc(255.0 * count * (4.0 / (4 * count)))
+    if white < 255:  # white adds up without rounding, but the reciprocal of the number of pixels may round down
+        area[mean == 255] = white
     undecided = np.flatnonzero((mean == area) & (mean > 0) & (mean < 255))
     if len(undecided):
-        i, j = np.divmod(undecided, 2 * columns)
-        pixels, stride = image.reshape(-1, 3), image.shape[1]
-        total = np.zeros(len(undecided))
-        for offset in (y * stride + x for y in range(height) for x in range(width)):
-            blue, green, red = pixels.take(i * height * stride + j * width + offset, axis=0).T
-            total += (0.114 * blue + 0.587 * green) + 0.299 * red
-        area[undecided] = np.trunc(total * (4.0 / (4 * count)))
-    by_quarter: FloatArray = area.reshape(rows, 2, columns, 2).transpose(1, 3, 0, 2).reshape(4, -1)
-    return by_quarter
+        area.put(undecided, _areas_as_rounded(image, luminance, undecided, grid))
+    by_quarter = area.astype(np.float64).reshape(rows, 2, columns, 2).transpose(1, 3, 0, 2)
+    return by_quarter.reshape(4, -1)
+
+
+def _areas_as_rounded(image: ImageArray, luminance: RealArray, quarters: IndexArray, grid: _Grid) -> FloatArray:
+    """Luminance of some quarters in raster order, with the rounding errors of the reference."""
+    # drawings and other flat images: most are equal to the one on their left, which then is among them too
+    repeats = _repeats(image, luminance, grid).take(quarters)
+    strips = _strips(image, grid).view(f"V{3 * grid.width}")
+    i, j = np.divmod(quarters[~repeats], luminance.shape[1])
+    count = grid.height * grid.width
+    step = max(1, 50_000 // count)  # what the cache holds
+    totals = []
+    for some in (slice(k, k + step) for k in range(0, len(i), step)):
+        pixels = cv2.transpose(strips[i[some], :, j[some]].view(np.uint8).reshape(-1, count, 3))
+        blue, green, red = cv2.split(pixels)
+        total = np.zeros(pixels.shape[1])
+        for pixel in (0.114 * blue + 0.587 * green) + 0.299 * red:
+            total += pixel
+        totals.append(total)
+    areas: FloatArray = np.trunc(np.concatenate(totals) * (4.0 / (4 * count))).take(np.cumsum(~repeats) - 1)
+    return areas
+
+
+def _repeats(image: ImageArray, luminance: RealArray, grid: _Grid) -> BoolArray:
+    """Which quarters are pixel by pixel equal to the one on their left, (4 * blocks,).
+
+    That is only looked for where there may be many.
+    """
+    repeats = np.zeros(luminance.shape, np.bool_)
+    np.equal(luminance[:, 1:], luminance[:, :-1], out=repeats[:, 1:])
+    if 8 * np.count_nonzero(repeats) < repeats.size:
+        return np.zeros(repeats.size, np.bool_)
+    difference = image.copy()
+    difference[:, grid.width :] = cv2.absdiff(image[:, grid.width :], image[:, : -grid.width])
+    repeats &= _luminance(_row_sums(difference, grid), grid) == 0
+    return repeats.ravel()
 
 
 def _texture_votes(areas: FloatArray) -> tuple[IndexArray, IndexArray]:
     """Texture class and block of every vote, blocks ascending in each class; a block may be of several classes."""
     scaled = areas * _SQRT2
-    magnitudes = np.concatenate([_FILTERS @ areas, scaled[:2] - scaled[:1:-1]])  # the diagonals: a - d, b - c
+    magnitudes = np.empty((5, areas.shape[1]))
+    np.matmul(_FILTERS, areas, out=magnitudes[:3])
+    np.subtract(scaled[:2], scaled[:1:-1], out=magnitudes[3:])  # the diagonals: a - d, b - c
     np.abs(magnitudes, out=magnitudes)
     strongest = magnitudes.max(axis=0)
     is_edge = strongest >= _EDGE_THRESHOLD
+    magnitudes /= np.maximum(strongest, _EDGE_THRESHOLD)
     votes = np.empty((6, areas.shape[1]), np.bool_)
     np.logical_not(is_edge, out=votes[0])
-    np.greater(magnitudes / np.maximum(strongest, _EDGE_THRESHOLD), _CLASS_THRESHOLDS, out=votes[1:])
+    np.greater(magnitudes, _CLASS_THRESHOLDS, out=votes[1:])
     votes[1:] &= is_edge
     textures, blocks = np.divmod(np.flatnonzero(votes), areas.shape[1])
     return textures, blocks
 
 
-def _block_colours(quarter_sums: FloatArray, grid: _Grid) -> FloatArray:
-    """Mean B, G, R of the blocks, cut to whole numbers, (3, blocks)."""
-    *_, height, width = grid
-    halves = quarter_sums[:3, ::2] + quarter_sums[:3, 1::2]
-    sums = halves[:, :, ::2] + halves[:, :, 1::2]
-    return np.floor(sums / (4 * height * width)).reshape(3, -1)
+def _hsv(colours: RealArray) -> IndexArray:
+    """Hue 0..358, saturation 0..255 and value 0..255, (3, blocks), of whole numbers B, G, R, (blocks, 3) float32.
+
+    The fractions that are cut off have denominators of at most 255: a thousandth more keeps whole what OpenCV's single
+    precision leaves a hair below a whole number, and carries nothing else over one.
+    """
+    hsv = cv2.cvtColor(colours.reshape(1, -1, 3), cv2.COLOR_BGR2HSV)[0]
+    hsv[:, 1] *= 255
+    whole: IndexArray = (hsv + 0.001).T.astype(np.intp)
+    # green, blue and the far side of red count from 119, 239 and 359, not 120, 240 and 360: the fuzzy sets expect it
+    whole[0] -= hsv[:, 0] > 60.001
+    return whole
 
 
-def _hsv(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[IndexArray, ...]:
-    """Hue 0..358, saturation 0..255 and value 0..255 of whole-number colours."""
-    value = np.maximum(np.maximum(red, green), blue)
-    spread = value - np.minimum(np.minimum(red, green), blue)
-    saturation = 255 * spread / np.maximum(value, 1)
-    is_red, is_green = red == value, green == value
-    difference = np.where(is_red, green - blue, np.where(is_green, blue - red, red - green))
-    # 359, 119, 239 and not 360, 120, 240: the fuzzy sets are tuned to these
-    offset = np.where(is_red, 359.0 * (difference < 0), np.where(is_green, 119.0, 239.0))
-    hue = offset + 60 * difference / np.maximum(spread, 1)
-    return hue.astype(np.intp), saturation.astype(np.intp), value.astype(np.intp)
-
-
-def _colour_outputs(blue: FloatArray, green: FloatArray, red: FloatArray) -> tuple[IndexArray, FloatArray]:
-    """Votes of the two fuzzy systems: the bins 0..23 each block votes for and the weights, (blocks, 9) each.
+def _colour_outputs(colours: RealArray) -> tuple[IndexArray, FloatArray]:
+    """Hue of whole-number colours B, G, R, (blocks, 3), and votes of the two fuzzy systems, (blocks, 9).
 
     At most two hue classes are active, so nine of the 24 outputs can differ from 0: white, grey, black, and the light,
-    pure and dark shade of two colours.
+    pure and dark shade of two colours. `VOTE_BINS` has their bins.
     """
-    hue, saturation, value = _hsv(blue, green, red)
-
-    # rules of the first system: saturation (2), value (3); then with the hue class (2)
-    rules = np.minimum(SATURATION.take(saturation, axis=1)[:, None], VALUE.take(value, axis=1))
-    active = np.minimum(HUE_WEIGHT.take(hue, axis=1)[:, None, None], rules)
-    black = ((active[0, 0, 0] + active[0, 1, 0]) + active[1, 0, 0]) + active[1, 1, 0]
-    grey, white = active[0, 0, 1:] + active[1, 0, 1:]
-    coloured = active[:, 1, 1] + active[:, 1, 2]
-
-    # the second system: saturation (2), value (2), each low and high
-    shade = np.minimum(LOW_HIGH.take(saturation, axis=1)[:, None], LOW_HIGH.take(value, axis=1))
-    shades = np.stack([shade[0, 1], shade[1, 1], shade[0, 0] + shade[1, 0]])
-
-    outputs = np.concatenate([[white, grey, black], *(coloured[:, None] * shades)])
-    return HUE_BINS.take(hue, axis=0), np.ascontiguousarray(outputs.T)
+    hue, saturation, value = _hsv(colours)
+    rules = cv2.transpose(np.minimum(SATURATION.take(saturation, axis=0), VALUE.take(value, axis=0)))
+    first, second = np.minimum(HUE_WEIGHT.take(hue, axis=1)[:, None], rules[:6])
+    outputs = np.empty((9, len(hue)))
+    np.add(first[:3], second[:3], out=outputs[:3])
+    outputs[2] = ((first[2] + first[3]) + second[2]) + second[3]  # black
+    shades = rules[6:9]
+    shades[2] += rules[9]
+    np.multiply(first[4] + first[5], shades, out=outputs[3:6])
+    np.multiply(second[4] + second[5], shades, out=outputs[6:])
+    return hue, cv2.transpose(outputs).astype(np.float64, copy=False)

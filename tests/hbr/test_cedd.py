@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hbr import cedd, describe
-from hbr.cedd import _areas, _colour_outputs, _covered_size, _grid, _hsv, _quarter_sums, _texture_votes
+from hbr._cedd_tables import VOTE_BINS
+from hbr.cedd import _areas, _colour_outputs, _covered_size, _grid, _hsv, _luminance, _row_sums, _texture_votes
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
 
@@ -24,6 +25,11 @@ def flat(bgr: tuple[int, int, int], height: int = 80, width: int = 80) -> Image:
 
 def noise(height: int, width: int, seed: int = 0) -> Image:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def areas(image: Image) -> np.ndarray[Any, np.dtype[np.float64]]:
+    grid = _grid(*image.shape[:2])
+    return _areas(image, _luminance(_row_sums(image, grid), grid), grid)
 
 
 def test_equals_the_golden_vectors(rig_test_data: Path) -> None:
@@ -85,21 +91,58 @@ def test_areas_with_a_whole_mean_round_like_the_reference() -> None:
     """Colours whose luminance is a whole number: the order of the additions decides it."""
     colours_bgr = np.random.default_rng(4).integers(0, 256, (800_000, 3), dtype=np.uint8)
     whole = colours_bgr[(colours_bgr @ np.array([114, 587, 299])) % 1000 == 0][:800].reshape(2, -1, 3)
-    quarters = _areas(whole, _quarter_sums(whole, grid := _grid(*whole.shape[:2])), grid)
+    quarters = areas(whole)
     assert quarters.shape == (4, 200)
     found = quarters.reshape(2, 2, 200).transpose(0, 2, 1).reshape(2, -1)
     expected = [[area(whole[i : i + 1, j : j + 1], 2, 2) for j in range(400)] for i in range(2)]
     assert found.tolist() == expected
 
 
+def drawing(name: str, height: int, width: int) -> Image:
+    """Greys of which most sums are whole numbers, and many quarters of blocks repeat."""
+    y, x = np.mgrid[:height, :width]
+    grey = {
+        "flat": 127 + 0 * x,
+        "two halves": np.where(x < width // 2, 118, 241),
+        "gradient along x": x * 255 // width,
+        "gradient along y": y * 255 // height,
+        "stripes as wide as a quarter": np.where(x // (width // 80) % 2, 57, 228),
+        "chequers": (x // 5 + y // 5) % 2 * 100 + 27,
+        "one dot": 205 + (x == width // 3) * (y == height // 3),
+        "same sums, other pixels": np.where((x + x // (width // 80)) % 2, 127, 46),
+    }[name]
+    return np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "flat",
+        "two halves",
+        "gradient along x",
+        "gradient along y",
+        "stripes as wide as a quarter",
+        "chequers",
+        "one dot",
+        "same sums, other pixels",
+    ],
+)
+@pytest.mark.parametrize(("height", "width"), [(80, 80), (160, 240), (203, 170), (320, 320)])
+def test_areas_of_drawings_round_like_the_reference(name: str, height: int, width: int) -> None:
+    image = drawing(name, height, width)
+    y, x = height // 80, width // 80
+    expected = [[area(image[i * y :, j * x :][:y, :x], 2 * x, 2 * y) for j in range(80)] for i in range(80)]
+    assert areas(image).reshape(2, 2, 40, 40).transpose(2, 0, 3, 1).reshape(80, 80).tolist() == expected
+
+
 def test_texture_classes_equal_the_literal_definition() -> None:
     """Small areas, so that ratios fall on the thresholds (49 / 50 is not above 0.98)."""
-    areas = np.random.default_rng(3).integers(0, 60, (4, 20_000))
-    areas[:, 0] = 50, 0, 1, 0
-    found: list[list[int]] = [[] for _ in areas.T]
-    for texture, block in zip(*_texture_votes(areas.astype(np.float64)), strict=True):
+    quarters = np.random.default_rng(3).integers(0, 60, (4, 20_000))
+    quarters[:, 0] = 50, 0, 1, 0
+    found: list[list[int]] = [[] for _ in quarters.T]
+    for texture, block in zip(*_texture_votes(quarters.astype(np.float64)), strict=True):
         found[block].append(int(texture))
-    expected = [texture_classes(*column) for column in areas.T.tolist()]
+    expected = [texture_classes(*column) for column in quarters.T.tolist()]
     assert found == expected
 
 
@@ -109,8 +152,7 @@ def test_white_follows_the_rounding_of_the_reference(height: int) -> None:
     image = noise(height, height)
     image[:, height // 3 :] = 255
     assert cedd(image).tolist() == cedd_reference(image)
-    grid = _grid(height, height)
-    (luminance,) = set(_areas(image, _quarter_sums(image, grid), grid)[:, -1].tolist())
+    (luminance,) = set(areas(image)[:, -1].tolist())
     assert luminance == area(image[-7:, -7:], 14, 14)
 
 
@@ -120,7 +162,8 @@ def test_all_colour_outputs_equal_the_literal_definition() -> None:
     rng = np.random.default_rng(1)
     near_grey = np.clip(rng.integers(0, 256, 2000) + rng.integers(-12, 13, (3, 2000)), 0, 255)
     bgr = np.concatenate([lattice, near_grey, rng.integers(0, 256, (3, 4000)), [range(256)] * 3], axis=1)
-    bins, outputs = _colour_outputs(*bgr.astype(np.float64))
+    hue, outputs = _colour_outputs(np.ascontiguousarray(bgr.T, np.float32))
+    bins = VOTE_BINS[hue]
     for column, (b, g, r) in enumerate(bgr.T.tolist()):
         dense = np.zeros(24)
         np.add.at(dense, bins[column], outputs[column])
@@ -132,7 +175,7 @@ def test_hue_saturation_value_of_every_shade_equal_the_literal_definition() -> N
     high, low = (x.ravel() for x in np.triu_indices(256)[::-1])
     middle = np.random.default_rng(2).integers(low, high + 1)
     for order in itertools.permutations((high, middle, low)):
-        found = np.stack(_hsv(*np.array(order, np.float64)))[:, ::7]
+        found = _hsv(np.column_stack(order).astype(np.float32))[:, ::7]
         blue, green, red = (channel[::7].tolist() for channel in order)
         assert found.T.tolist() == [list(hsv(*rgb)) for rgb in zip(red, green, blue, strict=True)]
 
