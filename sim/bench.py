@@ -16,6 +16,7 @@ from rig.errors import ObjectNotFound, UsageError
 from rig.hardware import assemble
 from rig.host import Host
 from rig.state import BenchLock, FileStore, MemoryStore, StateStore
+from sim.change import Change
 from sim.clock import VirtualClock
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
@@ -89,11 +90,13 @@ class ShelfOperator:
         self.next_object = next_object
         self.yaw_deg = yaw_deg
         self.queue: deque[str] = deque()
+        self.change: Change | None = None
         self.parts: SimParts | None = None
         self.faults: Faults | None = None
         self.state: StateStore = MemoryStore()
         self.optics = Optics.of(world)
         self._rng = world.rng("operator")
+        self._days = world.rng("days")
 
     def place(self, name: str | None) -> None:
         """Put the thing called ``name`` on the table, or the next one to be identified.
@@ -121,7 +124,18 @@ class ShelfOperator:
                 next_step="Choose one of those listed, or give a folder of photographs: --set bench.sim.objects=FOLDER",
                 evidence={"objects": list(self.things)},
             )
+        if self.change is not None:
+            self.world.change(light=self.change.light(self._days))
+            further_mm = self.change.offset_mm(self._days)
+            dx_mm, dy_mm = dx_mm + further_mm[0], dy_mm + further_mm[1]
         self.world.put(self.things[name], yaw_deg, (dx_mm, dy_mm))
+
+    def another_day(self, change: Change) -> None:
+        """Have the bench changed from now on; it must be open."""
+        assert self.parts is not None
+        self.change = change
+        self.world.change(light=change.light(self._days))
+        change.come_about(self.parts)
 
     def clear(self) -> bool:
         """Take what is there off the table; a photograph holds its own table, which nobody can clear."""

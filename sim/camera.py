@@ -84,6 +84,8 @@ class SimCapture:
         Whether the table takes the camera around the object, instead of turning the object.
     blur_px
         Width of the blur of a lens that was knocked; the camera does not know.
+    backdrop
+        What is behind and below the things: wall, table and platter, uint8 (480, 640, 3).
     tampers
         Called with each frame that is fetched and its number, one after the other; returns the one that goes on.
     """
@@ -100,7 +102,7 @@ class SimCapture:
         self._clock = world.clock
         self._binning = 1
         self._sensor = Sensor(world.noise, world.rng("camera"))
-        self._backdrop = empty_platter()
+        self.backdrop = empty_platter()
         # A camera that was mounted with care sees the things as they are drawn; boards are drawn through its lens.
         self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
         self._open = self._plugged = True
@@ -135,6 +137,11 @@ class SimCapture:
     def exposure(self) -> float:
         """The exposure in force, in V4L2's unit."""
         return self._controls[-1][1].exposure
+
+    @property
+    def kelvin(self) -> float:
+        """The white balance in force."""
+        return self._controls[-1][1].kelvin
 
     def drift(self, **values: Any) -> None:
         """Change settings (fields of `Controls`) from inside, as a camera does that forgets its locks."""
@@ -299,7 +306,7 @@ class SimCapture:
     def _picture(self, scene: Scene, table_deg: float) -> Image:
         """Return what the lens sees of a scene under nominal light."""
         table_deg = -table_deg if self.orbits else table_deg
-        image = self._backdrop.copy()
+        image = self.backdrop.copy()
         if scene.thing is None:
             return self._as_mounted(image)
         if not isinstance(scene.thing, Visible):

@@ -17,6 +17,15 @@ def demo(
         Path | None, typer.Option(metavar="FOLDER", help="Photographs obj{N}__{A}.png instead of the built-in objects.")
     ] = None,
     count: Annotated[int | None, typer.Option(min=2, help="Objects to enroll: 16, or the folder's first 20.")] = None,
+    change: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--change",
+            metavar="NAME",
+            help="What is another when objects are looked for: light (exposure and white balance, too), placement, or "
+            "bench, all of it before another table and wall. Repeatable.",
+        ),
+    ] = None,
     fault: Annotated[
         list[str] | None,
         typer.Option("--fault", metavar="NAME[@TIME]", help="Let a fault happen, e.g. jam@move3+2s. See rig faults."),
@@ -29,12 +38,17 @@ def demo(
     """Enroll objects on the simulated bench, then find each of them again, and two that were never enrolled.
 
     Example: rig demo --seed 7 --out /tmp/demo
+
+    Example: rig demo --change light
     """
+    from sim.change import Change
     from sim.demo.run import run_demo
     from sim.faults import Fault, load_faults
 
     planned = [*(load_faults(faults) if faults else ()), *(Fault.parse(text) for text in fault or ())]
-    result = run_demo(settings, objects=objects, count=count, out=out, faults=planned)
+    result = run_demo(
+        settings, objects=objects, count=count, out=out, change=Change.named(change or ()), faults=planned
+    )
     if settings.json:
         settings.print_json(result.as_dict())
     if not result.good:

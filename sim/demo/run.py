@@ -26,9 +26,11 @@ from rig.errors import UsageError
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted
 from rig.plans.identify import identify
+from rig.plans.photograph_table import photograph_table
 from rig.plans.words import signed
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
+from sim.change import Change
 from sim.demo.lines import MoveLines
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import Fault, read_faults
@@ -110,11 +112,17 @@ class DemoResult:
 
 
 def run_demo(
-    settings: Settings, *, objects: Path | None, count: int | None, out: Path, faults: Sequence[Fault] = ()
+    settings: Settings,
+    *,
+    objects: Path | None,
+    count: int | None,
+    out: Path,
+    change: Change | None = None,
+    faults: Sequence[Fault] = (),
 ) -> DemoResult:
     """Enroll a shelf, find each object again and two strangers, print what happens, and write ``out/report.html``.
 
-    The ``faults``, and those of the configuration, happen meanwhile.
+    The ``change`` comes about when all are enrolled. The ``faults``, and those of the configuration, happen meanwhile.
 
     Raises
     ------
@@ -141,9 +149,13 @@ def run_demo(
         _folder_within(out) as folder,
         open_sim_bench(config, operator, faults=[*read_faults(options.faults), *faults], heard=heard) as bench,
     ):
+        _photograph(bench, operator)
         with Catalog.open(folder, clock=bench.clock) as catalog:
             enrollments = _enroll_all(bench, catalog, list(enrolled), say=not settings.json)
             index = hbr.ViewIndex(catalog.views().views)
+        if change is not None:
+            operator.another_day(change)
+            _photograph(bench, operator)
         trials = [
             _identify(bench, index, operator, thing, enrolled=name in enrolled, say=number == 0 and not settings.json)
             for number, (name, thing) in enumerate({**enrolled, **strangers}.items())
@@ -158,6 +170,7 @@ def run_demo(
             "software": f"hbr-rig {version('hbr-rig')}",
             "identify": config.identify.model_dump(mode="json"),
             "noise model": asdict(world.noise),
+            **({} if change is None else {"changed between enrollment and query": asdict(change)}),
             **{f"device: {name}": facts for name, facts in devices.items()},
         },
         wall_clock={"run at": f"{begun:%Y-%m-%d %H:%M} UTC", "took": f"{wall_s:.1f} s"},
@@ -208,6 +221,13 @@ def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":
             next_step="Give another one with --out.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
+
+
+def _photograph(bench: Bench, operator: ShelfOperator) -> None:
+    """Take the picture of the empty table, at the start of a day, where the shelf leaves it empty."""
+    if operator.clear():
+        for _ in photograph_table(bench):
+            pass
 
 
 def _enroll_all(bench: Bench, catalog: Catalog, names: Sequence[str], *, say: bool) -> list[EnrollmentRecord]:

@@ -1,0 +1,107 @@
+"""Another day at the bench: what differs between enrollment and query, on purpose."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import Self
+
+import cv2
+import numpy as np
+
+from rig.errors import UsageError
+from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, SIN, WIDTH, Image
+from sim.parts import SimParts
+from sim.sensor import Gains
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """How strongly the bench changes; all by the world's seed, evenly distributed up to these strengths both ways.
+
+    The light is another for every object that is put on the table, as daylight is; the camera's settings and the
+    surroundings change once.
+    """
+
+    brightness: float = 0.0
+    """Relative brightness of the light."""
+    colour: float = 0.0
+    """Relative brightness of each of blue, green and red besides."""
+    exposure: float = 0.0
+    """Relative exposure time of the camera."""
+    white_balance_k: float = 0.0
+    """White balance of the camera, in kelvin."""
+    placement_mm: float = 0.0
+    """Distance from the table's axis, along each axis of the platter."""
+    background: float = 0.0
+    """How far table and wall become those of another bench, with patterns: 1 altogether."""
+
+    @classmethod
+    def named(cls, names: Iterable[str]) -> Self | None:
+        """Return the changes of these names together; None of no names.
+
+        Raises
+        ------
+        UsageError
+            One of them is unknown.
+        """
+        wanted = list(dict.fromkeys(names))
+        for name in wanted:
+            if name not in CHANGES:
+                raise UsageError(
+                    f"There is no change {name!r}.", next_step=f"Give --change one of {', '.join(CHANGES)}."
+                )
+        if not wanted:
+            return None
+        return cls(**{f.name: max(getattr(CHANGES[name], f.name) for name in wanted) for f in fields(cls)})
+
+    def light(self, rng: np.random.Generator) -> Gains:
+        """Draw the light on the next object."""
+        whole = 1 + self.brightness * rng.uniform(-1, 1)
+        blue, green, red = (whole * (1 + self.colour * rng.uniform(-1, 1, 3))).tolist()
+        return blue, green, red
+
+    def offset_mm(self, rng: np.random.Generator) -> tuple[float, float]:
+        """Draw how much farther off the axis the next object stands."""
+        x, y = (self.placement_mm * rng.uniform(-1, 1, 2)).tolist()
+        return x, y
+
+    def come_about(self, parts: SimParts) -> None:
+        """Change the camera's settings and what stands around, from now on."""
+        rng, camera = parts.world.rng("another day"), parts.camera
+        exposure, kelvin = rng.uniform(-1, 1, 2).tolist()
+        camera.drift(
+            exposure=camera.exposure * (1 + self.exposure * exposure),
+            kelvin=camera.kelvin + self.white_balance_k * kelvin,
+        )
+        if self.background:
+            other = another_bench(rng)
+            camera.backdrop = cv2.addWeighted(camera.backdrop, 1 - self.background, other, self.background, 0.0).astype(
+                np.uint8
+            )
+
+
+CHANGES: Mapping[str, Change] = MappingProxyType(
+    {
+        "light": Change(brightness=0.3, colour=0.1, exposure=0.25, white_balance_k=900.0),
+        "placement": Change(placement_mm=14.0),
+        "bench": Change(
+            brightness=0.3, colour=0.1, exposure=0.25, white_balance_k=900.0, placement_mm=14.0, background=1.0
+        ),
+    }
+)
+"""By name: light, exposure and white balance; where objects stand; and all of it before another table and wall."""
+
+
+def another_bench(rng: np.random.Generator) -> Image:
+    """Draw a wall with patches of colour, a table with a grain, and a platter, uint8 (480, 640, 3)."""
+    patches = rng.uniform(50, 150, (7, 9, 1)) + rng.uniform(-25, 25, (7, 9, 3))
+    wall = cv2.resize(patches.astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    horizon = int(rng.uniform(0.55, 0.7) * HEIGHT)
+    wood = np.array([60, 85, 110]) * rng.uniform(0.7, 1.2, 3)
+    grain = cv2.GaussianBlur(rng.normal(0, 60, (HEIGHT - horizon, WIDTH)).astype(np.float32), (0, 0), 25, sigmaY=1.5)
+    wall[horizon:] = wood + grain[:, :, None] * 3
+    image = np.clip(wall, 0, 255).astype(np.uint8)
+    axes = int(105 * PX_PER_MM), int(105 * PX_PER_MM * SIN)
+    grey = int(rng.uniform(60, 140))
+    cv2.ellipse(image, CENTRE_PX, axes, 0, 0, 360, (grey, grey, grey), -1, cv2.LINE_AA)
+    return image

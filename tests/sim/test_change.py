@@ -1,0 +1,69 @@
+"""Another day at the simulated bench: what differs, by how much, and by which seed."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rig.bench import Bench
+from rig.config import RigConfig
+from rig.errors import UsageError
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.change import CHANGES, Change
+from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
+from sim.world import World
+
+
+def _frame(bench: Bench) -> NDArray[np.uint8]:
+    bench.clock.sleep(0.2)
+    return bench.camera.capture(bench.clock.now_ns()).image_bgr
+
+
+def _seen(change: Change, seed: int, name: str | None = "toy-house") -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Frames of one thing before and after a change."""
+    world = World(noise=NoiseModel.none(), seed=seed)
+    operator = ShelfOperator(world, shelf(), next_object=name, yaw_deg=0.0)
+    with open_sim_bench(RigConfig(), operator) as bench:
+        frames = []
+        for number in range(2):
+            operator.clear() if name is None else operator.place(None)
+            frames.append(_frame(bench))
+            if not number:
+                operator.another_day(change)
+        return frames[0], frames[1]
+
+
+def test_light_changes_exposure_and_colour_and_nothing_else() -> None:
+    before, after = _seen(CHANGES["light"], seed=1)
+    lit = (before.min(axis=2) > 40) & (before.max(axis=2) < 150)
+    gains = after[lit].astype(float) / before[lit]
+    middle = np.median(gains, axis=0)
+    assert np.abs(gains - middle).max() < 0.1  # one factor a channel, everywhere
+    assert np.abs(middle - 1).max() > 0.05
+
+
+def test_placement_moves_the_thing_and_leaves_the_light() -> None:
+    before, after = _seen(CHANGES["placement"], seed=1)
+    assert np.array_equal(before[:20], after[:20])
+    assert not np.array_equal(before, after)
+
+
+def test_another_bench_has_another_wall() -> None:
+    before, after = _seen(CHANGES["bench"], seed=1, name=None)
+    assert before[:100].std(axis=(0, 1)).max() < 2
+    assert after[:100].std(axis=(0, 1)).max() > 8
+
+
+def test_the_seed_decides_how_it_changes() -> None:
+    one, again, other = (_seen(CHANGES["bench"], seed)[1] for seed in (1, 1, 2))
+    assert np.array_equal(one, again)
+    assert not np.array_equal(one, other)
+
+
+def test_changes_come_together_by_name() -> None:
+    assert Change.named([]) is None
+    both = Change.named(["light", "placement"])
+    assert both is not None
+    assert (both.brightness, both.placement_mm) == (CHANGES["light"].brightness, CHANGES["placement"].placement_mm)
+    with pytest.raises(UsageError, match="weather"):
+        Change.named(["weather"])
