@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.command import Settings, command
+from rig.cli.complete import strategy_names
 
 EXIT_QUALITY = 6
 
@@ -25,6 +26,10 @@ def demo(
             help="What is another when objects are looked for: light (exposure and white balance, too), placement, or "
             "bench, all of it before another table and wall. Repeatable.",
         ),
+    ] = None,
+    strategy: Annotated[
+        str | None,
+        typer.Option(help="How objects are searched: dense, ahbr, ...", autocompletion=strategy_names),
     ] = None,
     fault: Annotated[
         list[str] | None,
@@ -47,7 +52,13 @@ def demo(
 
     planned = [*(load_faults(faults) if faults else ()), *(Fault.parse(text) for text in fault or ())]
     result = run_demo(
-        settings, objects=objects, count=count, out=out, change=Change.named(change or ()), faults=planned
+        settings,
+        objects=objects,
+        count=count,
+        out=out,
+        strategy=strategy,
+        change=Change.named(change or ()),
+        faults=planned,
     )
     if settings.json:
         settings.print_json(result.as_dict())

@@ -15,7 +15,6 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-import hbr
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.cli.command import Settings
@@ -26,7 +25,10 @@ from rig.errors import UsageError
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted
 from rig.plans.identify import identify
+from rig.plans.model import Model, load_model
 from rig.plans.photograph_table import photograph_table
+from rig.plans.strategies import AnyStrategy, descriptor_for
+from rig.plans.strategies import strategy as strategy_named
 from rig.plans.words import signed
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
@@ -117,12 +119,14 @@ def run_demo(
     objects: Path | None,
     count: int | None,
     out: Path,
+    strategy: str | None = None,
     change: Change | None = None,
     faults: Sequence[Fault] = (),
 ) -> DemoResult:
     """Enroll a shelf, find each object again and two strangers, print what happens, and write ``out/report.html``.
 
-    The ``change`` comes about when all are enrolled. The ``faults``, and those of the configuration, happen meanwhile.
+    Objects are searched by ``strategy``, or as ``identify.strategy`` says. The ``change`` comes about when all are
+    enrolled. The ``faults``, and those of the configuration, happen meanwhile.
 
     Raises
     ------
@@ -139,6 +143,8 @@ def run_demo(
     system = SystemClock()
     wall_ns, begun = system.now_ns(), system.utc()
     config = settings.load()
+    asked = strategy or config.identify.strategy
+    chosen = None if asked is None else strategy_named(asked)
     options = validate(SimOptions, config.bench.get("sim", {}), where="the configuration", prefix="bench.sim")
     enrolled, strangers = _choose(objects or options.objects, count)
     seed = settings.seed or 0
@@ -152,12 +158,20 @@ def run_demo(
         _photograph(bench, operator)
         with Catalog.open(folder, clock=bench.clock) as catalog:
             enrollments = _enroll_all(bench, catalog, list(enrolled), say=not settings.json)
-            index = hbr.ViewIndex(catalog.views().views)
+            model = load_model(catalog, descriptor=None if chosen is None else descriptor_for(chosen))
         if change is not None:
             operator.another_day(change)
             _photograph(bench, operator)
         trials = [
-            _identify(bench, index, operator, thing, enrolled=name in enrolled, say=number == 0 and not settings.json)
+            _identify(
+                bench,
+                model,
+                chosen,
+                operator,
+                thing,
+                enrolled=name in enrolled,
+                say=number == 0 and not settings.json,
+            )
             for number, (name, thing) in enumerate({**enrolled, **strangers}.items())
         ]
         bench_s = bench.clock.now_ns() * 1e-9
@@ -247,7 +261,14 @@ def _enroll_all(bench: Bench, catalog: Catalog, names: Sequence[str], *, say: bo
 
 
 def _identify(
-    bench: Bench, index: hbr.ViewIndex, operator: ShelfOperator, thing: Thing, *, enrolled: bool, say: bool
+    bench: Bench,
+    model: Model,
+    strategy: AnyStrategy | None,
+    operator: ShelfOperator,
+    thing: Thing,
+    *,
+    enrolled: bool,
+    say: bool,
 ) -> IdentificationRecord:
     """Put a thing on the table anyhow, and let the bench find out which it is."""
     operator.next_object = thing.name
@@ -255,7 +276,7 @@ def _identify(
     moves = MoveLines()
     if say:
         print(f"\nWhat stands on the table? (it is {thing.name})\n{MoveLines.HEADING}")
-    for event in identify(bench, index):
+    for event in identify(bench, model, strategy=strategy):
         if isinstance(event, Accepted) and record.truth is None:
             record.truth = Truth(
                 name=thing.name if enrolled else None,
