@@ -11,9 +11,13 @@ from hbr.frontend.background import Mask
 #: A pixel differs when it does by this many grey levels, or by this share of what the object differs.
 _LEAST_LEVELS: Final = 12.0
 _SHARE: Final = 0.25
-#: A background is plain where no more than this share of it is off by so many grey levels.
-_ROUGH: Final = 0.25
-_ROUGH_LEVELS: Final = 20.0
+#: A backdrop is plain where three corners of the frame have one colour, within so many grey levels each, or two if they
+#: are as dark as this,
+_ONE_COLOUR: Final = 12.0
+_DARK: Final = 40.0
+#: and the smoothest of them is off by no more than this and its noise.
+_SMOOTH: Final = 3.0
+_NOISE: Final = 1.5
 
 
 def plain_difference(small: ImageArray) -> Mask | None:
@@ -33,7 +37,7 @@ def plain_difference(small: ImageArray) -> Mask | None:
     away = cv2.max(cv2.max(apart[0], apart[1]), apart[2])
     border = np.concatenate([away[:edge].ravel(), away[:, :edge].ravel(), away[:, -edge:].ravel()])
     threshold = max(_LEAST_LEVELS, 4 * float(np.median(border)))
-    if not (_even(left, right) or _quiet(away[:, edge + 2 : -edge - 2])):
+    if not _backdrop(image, away, cv2.absdiff(small, image), edge + 2):
         return None
     # the object's own contrast: what a twentieth of the frame exceeds, of every third pixel each way
     sample = np.sort(away[::3, ::3], axis=None)
@@ -42,16 +46,18 @@ def plain_difference(small: ImageArray) -> Mask | None:
     return differs
 
 
-def _even(left: cv2.typing.MatLike, right: cv2.typing.MatLike) -> bool:
-    """Whether the frame's two sides are of one colour, as far as no object reaches there."""
-    sides = np.concatenate([left, right]).reshape(-1, 3)
-    off = np.abs(sides - np.median(sides, axis=0)).max(axis=1)
-    return bool((off > 1.5 * _ROUGH_LEVELS).mean() < 1.5 * _ROUGH)
-
-
-def _quiet(away: cv2.typing.MatLike) -> bool:
-    """Whether at least two corners look like the sides beside them."""
-    height, width = (side // 4 for side in away.shape)
-    corners = (away[:height, :width], away[:height, -width:], away[-height:, :width], away[-height:, -width:])
-    rough = sorted(float((corner > _ROUGH_LEVELS).mean()) for corner in corners)
-    return rough[0] < _ROUGH and rough[1] < 1.5 * _ROUGH
+def _backdrop(image: cv2.typing.MatLike, away: cv2.typing.MatLike, noise: cv2.typing.MatLike, edge: int) -> bool:
+    """Whether the corners show one smooth backdrop; not so a wall and a table, nor a pattern."""
+    height, width = (max(1, side // 8) for side in away.shape)
+    corners = [(rows, part) for rows in (np.s_[:height], np.s_[-height:]) for part in (np.s_[:width], np.s_[-width:])]
+    colours = np.array([np.median(image[corner].reshape(-1, 3), axis=0) for corner in corners])
+    alike = (np.abs(colours[:, None] - colours).max(axis=2) <= _ONE_COLOUR).sum(axis=1)
+    dark = colours.max(axis=1) < _DARK
+    if not (alike >= np.where(dark, 2, 3)).any():
+        return False
+    edge = min(edge, (away.shape[1] - 1) // 2)
+    inner = away[:, edge : -edge or None], noise[:, edge : -edge or None]  # the edges are what is compared with
+    unrest, grain = min(
+        (float(np.median(inner[0][corner])), float(inner[1][corner].max(axis=2).mean())) for corner in corners
+    )
+    return unrest <= _SMOOTH + _NOISE * grain
