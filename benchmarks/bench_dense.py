@@ -17,7 +17,6 @@ from hbr import Background, DenseIndex, ViewIndex, Views, believe, descriptor, n
 from hbr.arrays import ImageArray, IndexArray
 from hbr.dense import Belief
 from hbr.descriptors import names
-from hbr.evaluation.protocol import BETA
 from hbr.evaluation.scenes import plain_bench
 
 #: The views that a search has seen, as places on an object's ring of 72.
@@ -77,7 +76,7 @@ def _step_s(views: Views, index: DenseIndex, rows: IndexArray) -> float:
     for i in rows[:-1].tolist():
         so_far = believe(views.descriptors[i], float(views.azimuth_deg[i]), so_far)
     last, angle_deg = views.descriptors[rows[-1]], float(views.azimuth_deg[rows[-1]])
-    return timeit.timeit(lambda: next_look(believe(last, angle_deg, so_far), beta=BETA), timer=process_time, number=1)
+    return timeit.timeit(lambda: next_look(believe(last, angle_deg, so_far)), timer=process_time, number=1)
 
 
 def bench_describe(name: str, frame: ImageArray, empty: ImageArray | None) -> None:

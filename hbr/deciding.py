@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hbr.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense import Belief, DenseIndex, believe
+from hbr.dense import BETA, Belief, DenseIndex, believe
 
 #: What the lead over the second object counts beside the score, and what its leader's usual score.
 _LEAD: Final = 0.5
@@ -141,7 +141,7 @@ class Verdict:
 
 
 def rehearse(
-    index: DenseIndex, *, beta: float, views: int = 4, seen: LevelArray | None = None, searches: int = 4
+    index: DenseIndex, *, beta: float = BETA, views: int = 4, seen: LevelArray | None = None, searches: int = 4
 ) -> Rehearsal:
     """Look for every object by its own enrolled views, a quarter of a turn apart, with those views left out.
 

@@ -3,10 +3,11 @@
 Beside the paper's voting (`hbr.retrieve`), which follows the few views on its lists, this one keeps a score for every
 hypothesis (j, φ): object j, with azimuth φ at the first query. A query i, turned by r_i since the first, adds
 
-    s_i(j, φ + r_i) = max_k [T(q_i, c_jk) - ω · away(φ + r_i, k) / 360]
+    s_i(j, φ + r_i) = max_k [T(q_i, c_jk)^p - ω · away(φ + r_i, k) / 360]
 
 where k runs over all views of the object and away is how far the azimuth lies outside the arc of view k, which reaches
 half-way to its neighbours: an azimuth between two enrolled views is as good as one on a view, also where a view lacks.
+The power p lets a query that meets an enrolled view well say more than one that lies between two.
 """
 
 from collections.abc import Sequence
@@ -22,6 +23,8 @@ from hbr.arrays import FloatArray, IndexArray, LevelArray
 from hbr.descriptors import descriptor
 from hbr.views import Views
 
+#: As for `Belief.posterior`: fits the similarities of the bench's own descriptor.
+BETA: Final = 30.0
 #: Azimuths at the first query that are told apart.
 BINS: Final = 72
 _BIN_DEG: Final = 360 / BINS
@@ -29,6 +32,9 @@ _BIN_DEG: Final = 360 / BINS
 KEPT: Final = 500
 #: How fast a bin's weight in the mean azimuth falls with its support.
 _POSE_SHARPNESS: Final = 60.0
+#: An azimuth leans to what lies so many degrees aside at most, and where the support falls by so much at least.
+_FARTHEST_LEAN_DEG: Final = 90.0
+_LEAST_FALL: Final = 1e-6
 #: Degrees that no azimuth reaches.
 _FAR_DEG: Final = 2000.0
 
@@ -44,15 +50,20 @@ class DenseIndex:
         Of any descriptor. Objects without views are left out.
     omega : float
         Weight ω of the orientation, a turn.
+    power : float
+        p, of the similarities; 1 for the plain sum.
     """
 
-    def __init__(self, views: Views, *, omega: float = 2.0) -> None:
+    def __init__(self, views: Views, *, omega: float = 2.0, power: float = 4.0) -> None:
         if not (np.isfinite(omega) and omega >= 0):
             raise ValueError(f"omega is {omega}; a finite weight of at least 0 is needed, 2 by default")
+        if not (np.isfinite(power) and power >= 1):
+            raise ValueError(f"power is {power}; a finite one of at least 1 is needed, 4 by default")
         if not len(views):
             raise ValueError("there are no views; enroll at least one object first")
         self.views = views
         self.omega = omega
+        self.power = power
         self.object_index: IndexArray = np.unique(views.object_index)
         self.compared = descriptor(views.descriptor).prepared(views.descriptors)
         rows, begin = views.of_each(self.object_index)
@@ -102,15 +113,16 @@ class DenseIndex:
         unrolled_deg = np.concatenate([turns_deg - 360, turns_deg, turns_deg + 360], axis=1)
         places = np.argsort(unrolled_deg, axis=1, kind="stable")
         ring_deg = np.take_along_axis(unrolled_deg, places, axis=1)
-        self._copies = places % self.rows.shape[1]
         with np.errstate(invalid="ignore"):  # what was left out stands at infinity, behind all others
             middle_deg = (ring_deg[:, 1:] + ring_deg[:, :-1]) / 2
         count = 3 * (~self.left_out).sum(axis=1)
-        inside = np.arange(middle_deg.shape[1]) < (count - 1)[:, None]
+        own = np.arange(places.shape[1]) < count[:, None]
+        #: The view at each place of the three turns; behind them one beyond all.
+        self._ring = np.where(own, np.take_along_axis(self.rows, places % self.rows.shape[1], axis=1), len(self.views))
         #: Where the arc of each view ends and the next one's begins; far away behind the last.
-        self._ends_deg = np.where(inside, middle_deg, _FAR_DEG)
-        self._count = count
-        self._keys = (self._ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
+        ends_deg = np.where(own[:, 1:], middle_deg, _FAR_DEG)
+        self._keys = (ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
+        self._penalty = (ends_deg * (self.omega / 360)).astype(np.float32)
 
     def support(self, similar: FloatArray, turned_deg: float) -> Floats:
         """Return what one query adds to every hypothesis.
@@ -127,24 +139,23 @@ class DenseIndex:
         float32 array (k, 72)
             For azimuths 0, 5, 10, ... at the first query.
         """
-        slope = self.omega / 360
-        own = np.take_along_axis(similar[self.rows], self._copies, axis=1)
-        own[np.arange(own.shape[1]) >= self._count[:, None]] = -np.inf
-        seen_deg = np.mod(np.arange(BINS) * _BIN_DEG + turned_deg, 360.0)
-        ends_deg, width = self._ends_deg, self._ends_deg.shape[1]
+        whole, part_deg = divmod(turned_deg % 360.0, _BIN_DEG)
+        seen_deg = part_deg + np.arange(BINS) * _BIN_DEG  # in this order the search below is quicker
+        slope_at = (seen_deg * (self.omega / 360)).astype(np.float32)
+        levels = np.append(np.maximum(similar, 0) ** self.power, -np.inf).astype(np.float32)
+        own, penalty, width = levels[self._ring], self._penalty, self._penalty.shape[1]
         place = np.arange(len(self))[:, None]
         # the view on whose arc the azimuth lies; an object's three turns reach beyond all azimuths
         nearest = np.searchsorted(self._keys, seen_deg + 2 * _FAR_DEG * place) - width * place
-        best = np.take_along_axis(own, nearest, axis=1)
+        best: Floats = np.take_along_axis(own, nearest, axis=1)
         # of the views before and behind a running maximum knows the best: the penalty is a straight line from its arc
-        before = np.maximum.accumulate(own[:, :-1] + slope * ends_deg, axis=1)
-        behind = np.maximum.accumulate((own[:, 1:] - slope * ends_deg)[:, ::-1], axis=1)[:, ::-1]
-        risen = np.take_along_axis(before, np.maximum(nearest - 1, 0), axis=1) - slope * seen_deg
-        fallen = np.take_along_axis(behind, np.minimum(nearest, width - 1), axis=1) + slope * seen_deg
+        before = np.maximum.accumulate(own[:, :-1] + penalty, axis=1)
+        behind = np.maximum.accumulate((own[:, 1:] - penalty)[:, ::-1], axis=1)[:, ::-1]
+        risen = np.take_along_axis(before, np.maximum(nearest - 1, 0), axis=1) - slope_at
+        fallen = np.take_along_axis(behind, np.minimum(nearest, width - 1), axis=1) + slope_at
         np.maximum(best, risen, out=best, where=nearest > 0)
         np.maximum(best, fallen, out=best, where=nearest < width)
-        support: Floats = best.astype(np.float32)
-        return support
+        return np.roll(best, -int(whole), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +186,10 @@ class Belief:
         return float(self.orientation_deg[-1] - self.orientation_deg[0])
 
     def scores(self) -> FloatArray:
-        """Score of every object considered: the best azimuth's support, a query; at most 1."""
-        best: FloatArray = self.support.max(axis=1).astype(np.float64) / self.queries
-        return best
+        """Score of every object considered: the power mean of the similarities at the best azimuth, 0..1."""
+        mean = self.support.max(axis=1).astype(np.float64) / self.queries
+        scores: FloatArray = np.maximum(mean, 0) ** (1 / self.index.power)
+        return scores
 
     def ranking(self) -> "DenseRanking":
         """The objects considered, best first."""
@@ -187,21 +199,28 @@ class Belief:
         return DenseRanking(self.index.object_index[order], scores[order], wrap360(azimuth_deg))
 
     def _azimuth_deg(self, which: IndexArray) -> FloatArray:
-        """Azimuth at the first query of these objects: the mean around the best bin, weighted by the support.
+        """Azimuth at the first query of these objects, finer than the bins and than the enrolled views.
 
-        In the dead zone around an enrolled view all bins are equal, and their middle is the best guess.
+        In the dead zone around an enrolled view all bins are equal: first their middle, the mean weighted by the
+        support. Then the support a step to either side tells to which of the neighbours it leans, as if it fell off
+        evenly on both sides of the true azimuth.
         """
         support = self.support[which].astype(np.float64)
         best = support.argmax(axis=1)
+        step = np.minimum(self.index.spacing_deg[which], _FARTHEST_LEAN_DEG) / _BIN_DEG
         reach = np.maximum(1, np.rint(1.25 * self.index.spacing_deg[which] / _BIN_DEG)).astype(int)
         offset = np.arange(-BINS // 2, BINS // 2)
         near = np.take_along_axis(support, (best[:, None] + offset) % BINS, axis=1)
         weight = np.exp(_POSE_SHARPNESS * (near - near.max(axis=1, keepdims=True)))
         weight *= np.abs(offset) <= reach[:, None]
-        mean: FloatArray = (best + (weight * offset).sum(axis=1) / weight.sum(axis=1)) * _BIN_DEG
-        return mean
+        middle = best + (weight * offset).sum(axis=1) / weight.sum(axis=1)
+        before, here, behind = (_between(support, middle + side * step) for side in (-1, 0, 1))
+        fall = here - np.minimum(before, behind)
+        lean = np.divide(behind - before, fall, out=np.zeros_like(fall), where=fall > _LEAST_FALL)
+        azimuth_deg: FloatArray = (middle + np.clip(lean, -1, 1) * step / 2) * _BIN_DEG
+        return azimuth_deg
 
-    def posterior(self, beta: float) -> FloatArray:
+    def posterior(self, beta: float = BETA) -> FloatArray:
         """Probability of every hypothesis, (k, 72): proportional to exp(β A / √n).
 
         The root tempers it: views of one object are not independent, and none says as much as the one before.
@@ -221,7 +240,7 @@ class DenseRanking:
     object_index : integer array (k,)
         Equal scores by lower index.
     scores : float64 array (k,)
-        Support of the best azimuth, a query: at most 1.
+        As `Belief.scores`.
     pose_deg : float64 array (k,)
         Orientation of the camera around each object at the last query, in [0, 360).
     """
@@ -282,6 +301,15 @@ def believe_all(queries: Sequence[LevelArray] | LevelArray, orientation_deg: Arr
     for query, angle_deg in zip(queries[1:], orientations[1:].tolist(), strict=True):
         belief = believe(query, angle_deg, belief)
     return belief
+
+
+def _between(support: FloatArray, bins: FloatArray) -> FloatArray:
+    """Support of each object, a row, at its place between two bins."""
+    rows, low = np.arange(len(support)), np.floor(bins)
+    share = bins - low
+    at = low.astype(int)
+    value: FloatArray = support[rows, at % BINS] * (1 - share) + support[rows, (at + 1) % BINS] * share
+    return value
 
 
 def _spacing(azimuth_deg: FloatArray) -> float:

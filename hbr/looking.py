@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from hbr.angles import wrap180, wrap360
 from hbr.arrays import FloatArray, IndexArray
-from hbr.dense import BINS, Belief
+from hbr.dense import BETA, BINS, Belief
 
 #: Hypotheses that are compared at most, and the share of the belief that need not be compared.
 _STRONGEST: Final = 16
@@ -52,7 +52,7 @@ class Look:
 def next_look(
     belief: Belief,
     *,
-    beta: float,
+    beta: float = BETA,
     sharpness: float = 30.0,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
@@ -127,11 +127,11 @@ def next_look(
     return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike, words)
 
 
-def most_informative_turn(belief: Belief, *, beta: float, rotations_deg: ArrayLike | None = None) -> float:
+def most_informative_turn(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
     """Choose the turn whose view is expected to leave the least entropy of the object: a baseline for `next_look`.
 
     If hypothesis h is true, the view after a turn is the one that was enrolled there, and hypothesis h' is then as
-    likely as exp(β T(view_h, view_h')) says.
+    likely as exp(β T(view_h, view_h')^p) says.
 
     Parameters
     ----------
@@ -141,7 +141,9 @@ def most_informative_turn(belief: Belief, *, beta: float, rotations_deg: ArrayLi
     turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     probability, place, bin_of = _strongest(belief.posterior(beta))
     similar = _expected(belief, place, bin_of, turns_deg)
-    weights = probability * np.exp(beta / np.sqrt(belief.queries + 1) * (similar - 1))
+    weights = probability * np.exp(
+        beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
+    )
     weights /= weights.sum(axis=2, keepdims=True)
     objects = (place[:, None] == np.unique(place)).astype(np.float64)
     shares = weights @ objects

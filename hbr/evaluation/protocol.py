@@ -24,8 +24,6 @@ from hbr.looking import most_informative_turn, next_look
 from hbr.views import Views
 
 Removal = Literal["near", "paper79", "queries"]
-#: As for `Belief.posterior`.
-BETA: Final = 60.0
 #: Probability of the best object that ends a search by the dense filter.
 CERTAINTY: Final = 0.9
 _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
@@ -298,7 +296,7 @@ class _Trials:
             self._judge(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
             runs.score[*at, n] = ranking.scores[0]
             runs.lead[*at, n] = ranking.scores[0] - ranking.scores[1] if len(ranking.scores) > 1 else ranking.scores[0]
-            runs.posterior[*at, n] = belief.posterior(BETA).sum(axis=1).max()
+            runs.posterior[*at, n] = belief.posterior().sum(axis=1).max()
             runs.travelled_deg[*at, n] = travelled_deg
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
@@ -306,12 +304,12 @@ class _Trials:
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], belief: Belief) -> int:
         match method.walk:
             case "look":
-                return self._nearest(seen, next_look(belief, beta=BETA).rotation_deg)
+                return self._nearest(seen, next_look(belief).rotation_deg)
             case "look-coin":
-                turn_deg = abs(next_look(belief, beta=BETA).rotation_deg)
+                turn_deg = abs(next_look(belief).rotation_deg)
                 return self._nearest(seen, turn_deg if draws.coins[len(seen)] else -turn_deg)
             case "mutual":
-                return self._nearest(seen, most_informative_turn(belief, beta=BETA))
+                return self._nearest(seen, most_informative_turn(belief))
             case "oracle":
                 return self._told(seen, belief)
             case _:

@@ -16,6 +16,7 @@ import numpy as np
 
 import hbr
 from hbr.deciding import Rehearsal, conformal_threshold
+from hbr.dense import BETA
 from hbr.descriptors import descriptor
 from rig.errors import CatalogError
 from rig.files import write
@@ -27,8 +28,6 @@ FORMAT: Final = "hbr-rig search rules"
 VERSION: Final = 1
 ERROR_RATE: Final = 0.01
 FALSE_REJECT: Final = 0.02
-BETA: Final = 60.0
-"""Fits the similarities of the bench's own descriptor (`hbr.Belief.posterior`)."""
 VIEWS: Final = 4
 """Views of a rehearsed search, where the objects have enough."""
 ENOUGH: Final = 400

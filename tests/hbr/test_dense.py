@@ -20,7 +20,7 @@ def catalog(seed: int, objects: int = 4, *, ragged: bool = True) -> Views:
     return Views.concatenate(parts)
 
 
-def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: float) -> np.ndarray:
+def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: float, power: float = 4.0) -> np.ndarray:
     """A_n(j, φ), object by object, bin by bin, view by view."""
     total = np.zeros((len(views.object_names), BINS))
     for j in range(len(views.object_names)):
@@ -34,24 +34,30 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
                     turned = (b * 5 + angle - angles[0] - views.azimuth_deg[k]) % 360
                     away = max(0.0, min(turned - left, 360 - turned - right))
                     similar = float(tanimoto(query, views.descriptors[k])[0, 0])
-                    best = max(best, similar - omega * away / 360)
+                    best = max(best, similar**power - omega * away / 360)
                 total[j, b] += best
     return total
 
 
 @settings(max_examples=12)
-@given(st.integers(0, 10**6), st.floats(0, 8), st.lists(st.floats(-720, 720), min_size=1, max_size=3))
+@given(
+    st.integers(0, 10**6),
+    st.floats(0, 8),
+    st.sampled_from([1.0, 2.5, 4.0]),
+    st.lists(st.floats(-720, 720), min_size=1, max_size=3),
+)
 def test_support_is_the_formula_s_at_every_azimuth_of_every_object(
-    seed: int, omega: float, angles: list[float]
+    seed: int, omega: float, power: float, angles: list[float]
 ) -> None:
     views = catalog(seed, objects=3)
     queries = catalog(seed + 1, ragged=False).descriptors[: len(angles)]
-    belief = believe_all(queries, angles, DenseIndex(views, omega=omega))
-    wanted = written_out(queries, angles, views, omega)
+    belief = believe_all(queries, angles, DenseIndex(views, omega=omega, power=power))
+    wanted = written_out(queries, angles, views, omega, power)
     np.testing.assert_allclose(belief.support, wanted, atol=2e-5)
     ranking = belief.ranking()
     assert ranking.object_index[0] in np.flatnonzero(wanted.max(axis=1) >= wanted.max() - 1e-4)
-    np.testing.assert_allclose(np.sort(ranking.scores), np.sort(wanted.max(axis=1)) / len(angles), atol=2e-5)
+    mean = np.maximum(wanted.max(axis=1), 0) / len(angles)
+    np.testing.assert_allclose(np.sort(ranking.scores) ** power, np.sort(mean), atol=2e-5)
     assert belief.posterior(30.0).sum() == pytest.approx(1)
 
 
@@ -115,3 +121,5 @@ def test_what_is_no_query_is_refused() -> None:
         DenseIndex(Views.empty())
     with pytest.raises(ValueError, match="2 queries and orientations"):
         believe_all([query, query], [0.0], index)
+    with pytest.raises(ValueError, match=r"power is 0\.5"):
+        DenseIndex(catalog(1), power=0.5)

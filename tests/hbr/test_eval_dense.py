@@ -10,7 +10,7 @@ from hbr import DenseIndex, believe, next_look
 from hbr.angles import wrap180
 from hbr.dense import believe_all
 from hbr.evaluation.methods import METHODS, choose_methods
-from hbr.evaluation.protocol import BETA, Protocol, Runs, _Trials, run_object
+from hbr.evaluation.protocol import Protocol, Runs, _Trials, run_object
 from hbr.evaluation.results import contests, method_results
 
 PROTOCOL = Protocol(trials=3, max_views=4, enrolled=8, removal="queries")
@@ -45,12 +45,12 @@ def test_a_trial_equals_the_protocol_written_out(name: str, protocol: Protocol) 
             ranking = belief.ranking()
             assert runs.rank[0, 0, t, n] == ranking.object_index.tolist().index(j) + 1
             assert runs.score[0, 0, t, n] == ranking.scores[0]
-            assert runs.posterior[0, 0, t, n] == belief.posterior(BETA).sum(axis=1).max()
+            assert runs.posterior[0, 0, t, n] == belief.posterior().sum(axis=1).max()
             match name:
                 case "dense":
-                    turn = next_look(belief, beta=BETA).rotation_deg
+                    turn = next_look(belief).rotation_deg
                 case "dense-coin":
-                    turn = abs(next_look(belief, beta=BETA).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
+                    turn = abs(next_look(belief).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
                 case "dense-90":
                     turn = 90.0
                 case _:
