@@ -162,6 +162,11 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
+def short(words: str, letters: int) -> str:
+    """Return words cut to so many letters, the last of them "…"."""
+    return words if len(words) <= letters else f"{words[: letters - 1]}…"
+
+
 def listed(items: Iterable[str]) -> str:
     """Return distinct items, in the order of their first appearance, separated by semicolons."""
     return "; ".join(dict.fromkeys(items))

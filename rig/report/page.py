@@ -14,9 +14,21 @@ from markupsafe import Markup
 
 from hbr.angles import wrap360
 from rig.errors import UsageError
-from rig.plans.words import answer_words, azimuth_words, counted, decision_words, listed, move_words, sentence, signed
+from rig.plans.events import Candidate
+from rig.plans.words import (
+    answer_words,
+    azimuth_words,
+    counted,
+    decision_words,
+    listed,
+    move_words,
+    odds_words,
+    sentence,
+    signed,
+)
 from rig.report.azimuth_ring import RingView, azimuth_ring
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
+from rig.report.decision_chart import decision_chart
 from rig.report.polar_path import polar_path
 from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
 from rig.report.score_chart import score_chart
@@ -120,8 +132,9 @@ class _Frame(NamedTuple):
     picture: str
     where: str
     refused: str
-    leading: list[tuple[str, str]]
+    leading: list[tuple[str, str, str]]
     margin: str
+    verdict: str
     moved: str
     decision: str
 
@@ -141,6 +154,8 @@ class _Retrieval(NamedTuple):
     path: Markup
     compared: bool
     scores: Markup
+    notes: list[str]
+    decisions: list[Markup]
     frames: list[_Frame]
     unfold: bool
 
@@ -191,6 +206,8 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         path=path,
         compared=any(event.s_left is not None for event in record.decided),
         scores=scores,
+        notes=[sentence(note) for note in record.notes],
+        decisions=_decisions(record),
         frames=_frames(record),
         unfold=unfold or record.correct is False,
     )
@@ -209,6 +226,29 @@ def _as_drawn(record: IdentificationRecord, azimuth_deg: float) -> float:
     return wrap360(azimuth_deg - (record.yaw_deg or 0.0))
 
 
+def _leading(one: Candidate) -> tuple[str, str, str]:
+    return one.name, f"{one.score:.3f}", "" if one.probability is None else odds_words(one.probability)
+
+
+def _decisions(record: IdentificationRecord) -> list[Markup]:
+    """A chart for each turn before which all were weighed."""
+    seen_deg = {view.index: _as_drawn(record, view.azimuth_deg) for view in record.views}
+    return [
+        Markup(
+            decision_chart(
+                seen_deg[event.index],
+                event.weighed,
+                event.rotation_deg,
+                rivals=event.rivals,
+                seen_deg=[azimuth_deg for index, azimuth_deg in seen_deg.items() if index <= event.index],
+                number=event.index + 1,
+            )
+        )
+        for event in record.decided
+        if event.weighed is not None and event.weighed.rotations_deg and event.index in seen_deg
+    ]
+
+
 def _frames(record: IdentificationRecord) -> list[_Frame]:
     ranked = {event.index: event for event in record.ranked}
     decided = {event.index: event for event in record.decided}
@@ -222,7 +262,8 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
                 picture=_data_uri(view.picture_bgr),
                 where=f"{azimuth_words(_as_drawn(record, view.azimuth_deg))}°",
                 refused=listed(view.refused),
-                leading=[(c.name, f"{c.score:.3f}") for c in thought.candidates[:3]] if thought else [],
+                leading=[_leading(c) for c in thought.candidates[:3]] if thought else [],
+                verdict=sentence(thought.verdict) if thought and thought.verdict else "",
                 margin=signed(thought.margin, 3) if thought else "",
                 moved=sentence(move_words(view.move)) if view.move and view.index else "",
                 decision=decision_words(decision) if decision else "",

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from math import atan2, ceil, cos, hypot, sin
 from typing import Final, NamedTuple
 
-from rig.plans.words import azimuth_words, distinct
+from rig.plans.words import azimuth_words, distinct, short
 from rig.report import svg
 from rig.report.compass import CENTRE, SIZE, polar, rim
 from rig.report.svg import Point
@@ -21,14 +21,19 @@ _LIST_X: Final = SIZE + 14
 _LIST_WIDTH: Final = 206.0
 _LIST_TOP: Final = 66.0
 _LIST_ROW: Final = 38.0
+_NOTE_LETTERS: Final = 28
 
 
 class Turn(NamedTuple):
-    """A rotation of the camera around the object, positive to the left, and the sums it was decided on (Eq. 6)."""
+    """A rotation of the camera around the object, positive to the left, and the sums it was decided on (Eq. 6).
+
+    Where there are none, the two ``rivals`` that it is to tell apart, or nothing: the turn was fixed.
+    """
 
     rotation_deg: float
     s_left: float | None = None
     s_right: float | None = None
+    rivals: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
@@ -133,7 +138,7 @@ def _list(turns: Sequence[Turn], scale: str) -> list[str]:
         parts.append(svg.text(f"{k + 1} → {k + 2}", (_LIST_X, y), "small", anchor="start"))
         parts.append(svg.text(turn.words, (_LIST_X + 44, y), "turn-name", anchor="start"))
         if turn.s_left is None or turn.s_right is None:
-            why = "fixed"
+            why = short(" or ".join(turn.rivals), _NOTE_LETTERS) or "fixed"
         else:
             left, right = distinct(turn.s_left, turn.s_right)
             why = f"S left {left}, right {right}"

@@ -147,6 +147,7 @@ class IdentificationRecord:
     def __init__(self, *, truth: Truth | None = None, region: Region | None = None) -> None:
         self.truth = truth
         self.conditions: Mapping[str, Any] = {}
+        self.notes: tuple[str, ...] = ()
         self.ranked: list[Ranked] = []
         self.decided: list[Decided] = []
         self.answer: Identified | None = None
@@ -162,7 +163,7 @@ class IdentificationRecord:
         self._looks.add(event)
         match event:
             case Started():
-                self.conditions = event.conditions
+                self.conditions, self.notes = event.conditions, event.notes
             case Ranked():
                 self.ranked.append(event)
             case Decided():
@@ -210,5 +211,5 @@ class IdentificationRecord:
             if after.move is not None:
                 rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
             decided = self.decided[k - 1]  # every view but the last is followed by a decision
-            turns.append(Turn(rotation_deg, decided.s_left, decided.s_right))
+            turns.append(Turn(rotation_deg, decided.s_left, decided.s_right, decided.rivals[:2]))
         return turns

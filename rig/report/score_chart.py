@@ -65,7 +65,7 @@ def score_chart(
             _BOTTOM - (_BOTTOM - _TOP) * (score - low) / (high - low),
         )
 
-    parts = [svg.text("Hough score per view", (2, 11), "small", anchor="start")]
+    parts = [svg.text("score per view", (2, 11), "small", anchor="start")]
     for tick in ticks:
         y = at(0, tick)[1]
         parts.append(svg.line((_LEFT, y), (_RIGHT, y), "grid"))
