@@ -47,9 +47,9 @@ def calibrate(
     index = DenseIndex(views)
     found = rehearse(index, error_rate=error_rate, false_reject=false_reject)
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
-    write_rules(path, found.rules, views, made_utc=made_utc)
+    write_rules(path, found.rules, index, made_utc=made_utc)
     if settings.json:
-        values = rules_values(found.rules, views, made_utc=made_utc)
+        values = rules_values(found.rules, index, made_utc=made_utc)
         outcome = {key: value for key, value in plain(found).items() if key != "rules"}
         settings.print_json({"file": str(path), "rehearsed": outcome, **values})
         return

@@ -162,7 +162,7 @@ def _with_what_is_known(
             f"{wrong} of {len(at)} were wrong"
         )
     accepted: int | None = int((stranger[:, -1] >= familiar[-1]).sum())
-    if len(index) < 3:
+    if of < 3:
         accepted = None
         promises.append("strangers cannot be rehearsed with fewer than three objects; enroll more")
     rules = replace(
@@ -244,10 +244,12 @@ class Stored:
         )
 
 
-def digest(views: hbr.Views) -> str:
-    """Return a digest of a model: its objects, their views' levels and azimuths, and the descriptor's version."""
+def digest(index: hbr.DenseIndex) -> str:
+    """Return a digest of a model: its objects, their views, the descriptor's version, and how they are searched."""
+    views = index.views
     kind = descriptor(views.descriptor)
-    found = sha256(json.dumps([kind.name, kind.version, views.object_names], ensure_ascii=False).encode())
+    searched = [kind.name, kind.version, index.omega, index.power, BETA]
+    found = sha256(json.dumps([searched, views.object_names], ensure_ascii=False).encode())
     for column in (views.object_index.astype("<i8"), views.azimuth_deg.astype("<f8"), views.descriptors):
         found.update(np.ascontiguousarray(column).data)
     return found.hexdigest()
@@ -266,7 +268,7 @@ def rules_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.Rules, tuple[str,
     except CatalogError as error:
         stored = None
         notes.append(f"{error.what}; {error.next_step}")
-    if stored is not None and stored.sha256 == digest(index.views):
+    if stored is not None and stored.sha256 == digest(index):
         return stored.rules, _unpromised(stored.rules)
     if stored is None:
         found = rehearse(index, quick=True).rules
@@ -299,8 +301,9 @@ def _changes(before: tuple[str, ...], now: tuple[str, ...]) -> str:
     return ", ".join(parts) or "other views"
 
 
-def rules_values(rules: hbr.Rules, views: hbr.Views, *, made_utc: str) -> dict[str, Any]:
+def rules_values(rules: hbr.Rules, index: hbr.DenseIndex, *, made_utc: str) -> dict[str, Any]:
     """Return rules as JSON values; what is not finite is null."""
+    views = index.views
     kind = descriptor(views.descriptor)
     return {
         "format": FORMAT,
@@ -311,7 +314,7 @@ def rules_values(rules: hbr.Rules, views: hbr.Views, *, made_utc: str) -> dict[s
             "descriptor": {"name": kind.name, "version": kind.version},
             "objects": len(views.object_names),
             "views": len(views),
-            "sha256": digest(views),
+            "sha256": digest(index),
         },
         "error_rate": rules.error_rate,
         "false_reject": rules.false_reject,
@@ -325,7 +328,7 @@ def rules_values(rules: hbr.Rules, views: hbr.Views, *, made_utc: str) -> dict[s
     }
 
 
-def write_rules(path: Path, rules: hbr.Rules, views: hbr.Views, *, made_utc: str) -> None:
+def write_rules(path: Path, rules: hbr.Rules, index: hbr.DenseIndex, *, made_utc: str) -> None:
     """Keep rules in a file, whole or not at all.
 
     Raises
@@ -333,7 +336,7 @@ def write_rules(path: Path, rules: hbr.Rules, views: hbr.Views, *, made_utc: str
     CatalogError
         The disk is full, or the folder may not be written to.
     """
-    values = rules_values(rules, views, made_utc=made_utc)
+    values = rules_values(rules, index, made_utc=made_utc)
     text = json.dumps(values, ensure_ascii=False, indent=1, allow_nan=False)
     try:
         write(path, (text + "\n").encode())

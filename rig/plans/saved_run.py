@@ -80,8 +80,8 @@ class RunWriter:
                     f"The folder {folder} is not empty.", next_step="Give a new folder for each run with --save-run."
                 )
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
-            if model.rules is not None:
-                write_rules(folder / RULES, model.rules, views, made_utc=started_utc)
+            if model.rules is not None and isinstance(model.index, hbr.DenseIndex):
+                write_rules(folder / RULES, model.rules, model.index, made_utc=started_utc)
             if empty_table is None and isinstance(model.index, hbr.DenseIndex):
                 standing = EmptyTables.current(bench)
                 empty_table = None if standing is None else standing.image_bgr
