@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import pictures
+from calibration.charts import LIMIT, MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
+from rig.evaluation.drawing import Figure
+from rig.facts import Fact
 from rig.markers import Board, Sighting, sight
 from rig.plans.capture import capture, moved
 from rig.plans.events import Event
@@ -150,6 +153,40 @@ def as_json(views: Sequence[BoardView]) -> list[dict[str, Any]]:
         }
         for view in views
     ]
+
+
+def by_stand(views: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[Mapping[str, Any]]]]:
+    """Return the views of each stand, as in the evidence, with its name and colour in every chart."""
+    numbers = sorted({view["stand"] for view in views})
+    return [
+        (f"stand {number + 1}", colour, [view for view in views if view["stand"] == number])
+        for number, colour in zip(numbers, (MEASURED, MODEL, OTHER, "#cc79a7"), strict=False)
+    ]
+
+
+def plot_views(fact: Fact, limit_px: float) -> Figure | None:
+    """Return how far the corners of each view are off the fit (RMS); the title names the worst."""
+    views, rms = fact.evidence["views"], fact.evidence.get("view_rms_px")
+    if not rms:
+        return None
+    numbered = [{**view, "number": i + 1, "rms": value} for i, (view, value) in enumerate(zip(views, rms, strict=True))]
+    worst = sorted(numbered, key=lambda view: -view["rms"])[:2]
+    named = ", ".join(
+        f"{view['number']} (stand {view['stand'] + 1} at {view['table_deg']:.0f}°) {view['rms']:.2f} px"
+        for view in worst
+    )
+    return chart(
+        f"Worst views: {named}",
+        Axis("view", whole=True),
+        Axis("corners off the fit, px (RMS)", span=(0.0, limit_px)),
+        [
+            *(
+                Series(name, [view["number"] for view in of_stand], [view["rms"] for view in of_stand], colour)
+                for name, colour, of_stand in by_stand(numbered)
+            ),
+            Series("limit of all", [1, len(views)], [limit_px] * 2, LIMIT, dots=False, curve=True, dashed=True),
+        ],
+    )
 
 
 def _words(seen: Sighting, board: Board, views: Sequence[BoardView], bench: Bench) -> str:

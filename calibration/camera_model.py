@@ -11,8 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration.board_views import STANDS, BoardView, as_json, coverage, look, points, turned_otherwise
-from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
+from calibration.board_views import STANDS, BoardView, as_json, by_stand, coverage, look, points, turned_otherwise
+from calibration.board_views import plot_views as plot_views_of
+from calibration.charts import Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
 from rig.evaluation.drawing import Figure
@@ -29,6 +30,8 @@ MIN_COVERAGE = 0.5
 MAX_RMS_PX = 0.3
 """A sharp camera at rest reaches a tenth: more is blur, a board that is not flat, or one that moved."""
 MAX_FOCAL_UNCERTAINTY = 0.005
+ENLARGED = 100
+"""By how much residuals are drawn longer than they are: a tenth of a pixel is 10."""
 PARAMETERS = (
     ("fx", "px"),
     ("fy", "px"),
@@ -92,6 +95,7 @@ def from_data(
     refusals = list(troubles)
     estimates: dict[str, Estimate] = {}
     rms = None
+    each: Any = ()
     cells = coverage(views, size)
     if len(views) < MIN_VIEWS:
         refusals.append(
@@ -132,6 +136,7 @@ def from_data(
             "board": {"columns": board.columns, "rows": board.rows, "square_mm": board.square_mm},
             "coverage": cells.tolist(),
             "views": as_json(views),
+            "view_rms_px": np.ravel(each).round(3).tolist(),
         },
     )
 
@@ -148,25 +153,55 @@ def plot(fact: Fact) -> Figure | None:
     views = fact.evidence["views"]
     if not views:
         return None
-    width, height = fact.evidence["size"]
-    frame = Series("frame", [0, width, width, 0, 0], [0, 0, height, height, 0], "#8a8f96", dots=False, curve=True)
-    stands = sorted({view["stand"] for view in views})
-    corners = [np.array([p for view in views if view["stand"] == s for p in view["corners_px"]]) for s in stands]
     covered = float((np.array(fact.evidence["coverage"]) > 0).mean())
     rms = "" if fact.residual is None else f", {fact.residual:.2f} px off (RMS)"
+    seen = []
+    for name, colour, of_stand in by_stand(views):
+        x, y = np.concatenate([view["corners_px"] for view in of_stand]).T.tolist()
+        seen.append(Series(name, x, y, colour))
     return chart(
         f"Corners seen: {covered:.0%} of the frame{rms}",
         Axis("x, px"),
         Axis("y, px", falling=True),
-        [
-            frame,
-            *(
-                Series(f"stand {s + 1}", c[:, 0].tolist(), c[:, 1].tolist(), colour)
-                for s, c, colour in zip(stands, corners, (MEASURED, MODEL, OTHER, "#cc79a7"), strict=False)
-            ),
-        ],
+        [_frame(fact), *seen],
         square=True,
     )
+
+
+def plot_residuals(fact: Fact) -> Figure | None:
+    """Return by how much and where to each corner is off the fit, enlarged; every stand has its colour."""
+    views = fact.evidence["views"]
+    if not views or not fact.estimates:
+        return None
+    matrix, distortion = matrix_of(fact)
+    board = Board(**fact.evidence["board"])
+    vectors = []
+    for name, colour, of_stand in by_stand(views):
+        for view in of_stand:
+            points_mm, corners = board.points_mm()[view["ids"]], np.array(view["corners_px"])
+            _, rotation, translation = cv2.solvePnP(points_mm, corners, matrix, np.array(distortion))
+            fitted = cv2.projectPoints(points_mm, rotation, translation, matrix, np.array(distortion))[0].reshape(-1, 2)
+            ends = corners + ENLARGED * (corners - fitted)
+            for x, y in np.stack([corners, ends], axis=2).tolist():
+                vectors.append(Series("", x, y, colour, dots=False, curve=True))
+        vectors.append(Series(name, [], [], colour, dots=False, curve=True))
+    return chart(
+        f"Corners less the fit, {ENLARGED} times enlarged: without a pattern they are noise",
+        Axis("x, px"),
+        Axis("y, px", falling=True),
+        [_frame(fact), *vectors],
+        square=True,
+    )
+
+
+def plot_views(fact: Fact) -> Figure | None:
+    """Return how far the corners of each view are off the fit; see `calibration.board_views.plot_views`."""
+    return plot_views_of(fact, MAX_RMS_PX)
+
+
+def _frame(fact: Fact) -> Series:
+    width, height = fact.evidence["size"]
+    return Series("frame", [0, width, width, 0, 0], [0, 0, height, height, 0], "#8a8f96", dots=False, curve=True)
 
 
 def _judge(estimates: Mapping[str, Estimate], rms_px: float, each: Any, covered: float) -> list[str]:

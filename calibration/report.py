@@ -47,6 +47,11 @@ PLOTS: Mapping[str, Callable[[Fact], Figure | None]] = {
     ),
 }
 
+FURTHER: Mapping[str, Sequence[Callable[[Fact], Figure | None]]] = {
+    camera_model.NAME: (camera_model.plot_views, camera_model.plot_residuals),
+    table_axis.NAME: (table_axis.plot_views,),
+}
+
 
 class _Shown(NamedTuple):
     fact: Fact
@@ -55,14 +60,14 @@ class _Shown(NamedTuple):
     words: str
     command: str
     refusals: Sequence[str]
-    picture: Markup | None
+    pictures: Sequence[Markup]
     devices: Sequence[tuple[str, str]]
 
 
-def plot(fact: Fact) -> Figure | None:
-    """Return the plot of a fact; None where its kind has none, or nothing could be estimated."""
-    draw = PLOTS.get(fact.name)
-    return draw(fact) if draw else None
+def plots(fact: Fact) -> list[Figure]:
+    """Return the plots of a fact, the main one first; none where its kind has none, or nothing could be estimated."""
+    draw = [*([PLOTS[fact.name]] if fact.name in PLOTS else []), *FURTHER.get(fact.name, ())]
+    return [figure for figure in (one(fact) for one in draw) if figure]
 
 
 def write_page(
@@ -127,7 +132,6 @@ def _shown(standing: Standing, history: Sequence[Fact]) -> _Shown:
     refused = (
         [] if latest.passed else [f"Refused on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {r}" for r in latest.refusals]
     )
-    figure = plot(fact)
     return _Shown(
         fact,
         standing.state is State.IN_FORCE,
@@ -136,7 +140,7 @@ def _shown(standing: Standing, history: Sequence[Fact]) -> _Shown:
         standing.command,
         refused,
         # Markup of our own making: its words are escaped where it is made.
-        Markup(figure.svg()) if figure else None,
+        [Markup(figure.svg()) for figure in plots(fact)],
         [(part, _words(identity)) for part, identity in fact.device.items() if part in ("servo", "imu", "camera")],
     )
 

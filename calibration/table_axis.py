@@ -24,6 +24,7 @@ from scipy.optimize import least_squares
 
 from calibration.board_views import STANDS as ALL_STANDS
 from calibration.board_views import BoardView, as_json, look, points, turned_otherwise
+from calibration.board_views import plot_views as plot_views_of
 from calibration.camera_model import PARAMETERS, matrix_of
 from calibration.charts import LIMIT, MODEL, Axis, Series, chart
 from calibration.events import Ask, Progress
@@ -149,6 +150,7 @@ def from_data(
         axis = _Axis(views, board, intrinsics, poses)
         estimates, rms = axis.fit()
         evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
+        evidence["view_rms_px"] = axis.view_rms_px
         refusals += _judge(estimates, rms)
         corners = region_of_interest(estimates, intrinsics, room)
         region, cut, too_much = _region(corners, intrinsics.evidence["size"], room)
@@ -241,6 +243,11 @@ def plot(fact: Fact) -> Figure | None:
     )
 
 
+def plot_views(fact: Fact) -> Figure | None:
+    """Return how far the corners of each view are off the fit; see `calibration.board_views.plot_views`."""
+    return plot_views_of(fact, MAX_RMS_PX)
+
+
 class _Axis:
     """The fit: two angles of the axis, two offsets of a point on it, its lean, the camera, and a pose for each stand.
 
@@ -278,6 +285,7 @@ class _Axis:
             begin = FIRST_POSE + 6 * number
             self._start[begin : begin + 3] = cv2.Rodrigues(at_zero)[0].ravel()
             self._start[begin + 3 : begin + 6] = place
+        self.view_rms_px: list[float] = []
         self.centres_mm = np.array([cv2.Rodrigues(r)[0] @ self._middle + t.ravel() for r, t in poses])
         offset = self.centres_mm - self._origin
         radial = np.linalg.norm(offset - np.outer(offset @ self._up, self._up), axis=1)
@@ -295,8 +303,11 @@ class _Axis:
         tried = [self._solved(start, evaluations=15) for start in starts]
         solved = self._solved(min(tried, key=lambda found: float(found.cost)).x, evaluations=60)
         residuals = self._residuals(solved.x)[: -self._known.size]
+        squares = (residuals.reshape(-1, 2) ** 2).sum(axis=1)
+        ends = np.cumsum([len(part) for part in self._points])[:-1]
+        self.view_rms_px = [round(float(np.sqrt(part.mean())), 3) for part in np.split(squares, ends)]
         freedom = max(residuals.size - solved.x.size, 1)
-        rms = float(np.sqrt((residuals.reshape(-1, 2) ** 2).sum(axis=1).mean()))
+        rms = float(np.sqrt(squares.mean()))
         covariance = np.linalg.inv(solved.jac.T @ solved.jac) * float((residuals**2).sum()) / freedom
         # How everything told depends on the parameters, by differences.
         told = self._told(solved.x)

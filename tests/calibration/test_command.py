@@ -3,11 +3,12 @@
 import json
 from datetime import timedelta
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from calibration import camera_light, camera_model, encoder, table_axis
-from calibration.report import plot
+from calibration.report import plots
 from rig.cli.main import app
 from rig.clock import SystemClock
 from rig.facts import Estimate, Fact, FactStore
@@ -135,14 +136,17 @@ def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_p
         "table.axis",
     ]
     assert facts[-1].evidence["intrinsics"] == facts[-2].id
-    pictures = [plot(fact) for fact in facts]
-    assert None not in pictures
+    pictures = [plots(fact) for fact in facts]
+    assert [len(drawn) for drawn in pictures] == [1] * 11 + [3, 2]
     assert rig("calibrate", "report", "--out", "page.html").exit_code == 0
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert page.count("<svg") == len(facts)
-    for fact, picture in zip(facts, pictures, strict=True):
+    assert page.count("<svg") == sum(map(len, pictures))
+    for fact, drawn in zip(facts, pictures, strict=True):
         assert f'id="{fact.name}"' in page
-        assert picture.svg() in page
+        assert all(picture.svg() in page for picture in drawn)
+    for fact in facts[-2:]:
+        worst = int(np.argmax(fact.evidence["view_rms_px"]))
+        assert f"Worst views: {worst + 1} (stand {fact.evidence['views'][worst]['stand'] + 1} at" in page
     assert "src=" not in page, "one file, and nothing from elsewhere"
     assert rig("calibrate", "report", "--out", "no/where.html").exit_code == 2
 
