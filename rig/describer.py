@@ -1,6 +1,8 @@
 """What a bench keeps of a picture: the levels of several descriptors, and how the object was found and lit."""
 
-from collections.abc import Mapping
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -18,6 +20,9 @@ BENCH_DESCRIPTOR: Final = "edges+colours"
 """The bench's own: of the object alone, in the light of the empty table."""
 DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """What every view is described by when it is taken."""
+
+_NUMBER: Final = re.compile(r"\d+%")
+_GUESSED: Final = "guessed"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +58,53 @@ def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | Non
             next_step="give a region within the images: x, y, width, height in pixels",
         )
     return image_bgr[y : y + height, x : x + width]
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """How the objects of several views were found.
+
+    Attributes
+    ----------
+    views
+        In which they were looked for.
+    found, guessed, lit
+        In how many the object was found, and only guessed; and in how many its light was normalised.
+    refused
+        What could not be done, with a reason, and in how many views; the most frequent first.
+    """
+
+    views: int
+    found: int
+    guessed: int
+    lit: int
+    refused: Mapping[str, int]
+
+    @classmethod
+    def of(cls, front_ends: Iterable[Mapping[str, Any] | None]) -> "Sightings":
+        """Sum up what the front end left with views; None is a view in which nothing looked."""
+        seen = [one for one in front_ends if one is not None]
+        reasons = Counter(
+            _NUMBER.sub("…", words) for one in seen for words in dict.fromkeys(map(str, one.get("refused") or ()))
+        )
+        guesses = [any(_GUESSED in str(words) for words in one.get("refused") or ()) for one in seen]
+        boxes = [one.get("box_px") is not None for one in seen]
+        return cls(
+            views=len(seen),
+            found=sum(box and not guess for box, guess in zip(boxes, guesses, strict=True)),
+            guessed=sum(box and guess for box, guess in zip(boxes, guesses, strict=True)),
+            lit=sum(one.get("gains_bgr") is not None for one in seen),
+            refused=dict(reasons.most_common()),
+        )
+
+    @property
+    def words(self) -> str:
+        """Return it as a line; empty where nothing looked for an object."""
+        if not self.views:
+            return ""
+        guessed = f", guessed in {self.guessed}" if self.guessed else ""
+        refused = "".join(f"; {words} ({count})" for words, count in self.refused.items())
+        return f"object found in {self.found} of {self.views} views{guessed}, light normalised in {self.lit}{refused}"
 
 
 class Describer:

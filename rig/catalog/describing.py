@@ -1,14 +1,47 @@
 """From a stored image to the descriptors that the catalog keeps of it."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.descriptors import Descriptor, descriptor, names
+from hbr.descriptors import PAPERS, Descriptor, descriptor, names
+from rig.catalog import images
 from rig.catalog.records import JsonObject, Region
+from rig.config import ViewConfig
+from rig.describer import Describer
 from rig.errors import CatalogError, UsageError
+
+
+class Reference(NamedTuple):
+    """A sitting's picture of the empty table: where it is, relative to the catalog, and its SHA-256."""
+
+    image: str
+    sha256: str
+
+    @classmethod
+    def of(cls, image: str | None, sha256: str | None) -> "Reference | None":
+        return None if image is None or sha256 is None else cls(image, sha256)
+
+
+@lru_cache(maxsize=4)
+def stored_describer(
+    root: Path, names: tuple[str, ...], region: Region | None, reference: Reference | None
+) -> Describer:
+    """Return what describes stored images as the bench did that took them: with its picture of the empty table.
+
+    Raises
+    ------
+    CatalogError
+        That picture is missing or is not the one that was stored.
+    """
+    if all(name in PAPERS for name in names):
+        reference = None  # they look for no object
+    empty_table = None if reference is None else images.read(root / reference.image, reference.sha256)
+    return Describer(ViewConfig(roi=region), names, empty_table)
 
 
 def known_descriptor(name: str) -> Descriptor:

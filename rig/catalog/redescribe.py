@@ -7,15 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sqlalchemy import and_, delete, insert, select
+from sqlalchemy import and_, bindparam, delete, insert, select, update
 
 from rig.catalog import images
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import known_descriptor, region_of, settings_of
+from rig.catalog.describing import Reference, known_descriptor, region_of, settings_of, stored_describer
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
-from rig.describer import within
 from rig.errors import CatalogError, UsageError
 from rig.processes import over_processes
 
@@ -42,6 +41,15 @@ class _Item(NamedTuple):
     image: str
     sha256: str
     region: Region | None
+    reference: Reference | None
+
+
+class _Found(NamedTuple):
+    """What a descriptor says of a view, or the reason why it says nothing."""
+
+    packed: bytes | None
+    front_end: dict[str, Any] | None = None
+    reason: str = ""
 
 
 def redescribe(
@@ -54,7 +62,9 @@ def redescribe(
 ) -> Generator[Progressed, None, Redescribed]:
     """Describe the views of all objects in use that are not described by this descriptor, in its present version.
 
-    Portions are committed as they are done: whatever ends the call, the next one goes on there.
+    Portions are committed as they are done: whatever ends the call, the next one goes on there. A descriptor that looks
+    for the object does so by the sitting's picture of the empty table, where there is one, and what it found is stored
+    with the view.
 
     Parameters
     ----------
@@ -82,16 +92,18 @@ def redescribe(
     yield Progressed(0, len(items))
     work = partial(_describe, catalog.path, kind.name)
     for portion, found in over_processes(work, portions(items), processes(jobs, len(items))):
-        rows = []
-        for item, (packed, reason) in zip(portion, found, strict=True):
-            if packed is None:
-                failed.append((item.image, reason))
-            else:
-                settings = settings_of(item.region)
-                rows.append(
-                    {"view_id": item.view_id, "name": kind.name, "version": kind.version, "settings": settings}
-                    | {"packed": packed}
-                )
+        rows, sightings = [], []
+        for item, one in zip(portion, found, strict=True):
+            if one.packed is None:
+                failed.append((item.image, one.reason))
+                continue
+            settings = settings_of(item.region)
+            rows.append(
+                {"view_id": item.view_id, "name": kind.name, "version": kind.version, "settings": settings}
+                | {"packed": one.packed}
+            )
+            if one.front_end is not None:
+                sightings.append({"seen_id": item.view_id, "seen": one.front_end})
         with catalog.database.write() as connection:
             ids = [row["view_id"] for row in rows]
             alive = set(connection.scalars(select(views.c.id).where(views.c.id.in_(ids))))
@@ -106,6 +118,11 @@ def redescribe(
             )
             if alive:
                 connection.execute(insert(descriptors), [row for row in rows if row["view_id"] in alive])
+            if sightings:
+                connection.execute(
+                    update(views).where(views.c.id == bindparam("seen_id")).values(front_end=bindparam("seen")),
+                    sightings,
+                )
         done += len(portion)
         yield Progressed(done, len(items))
     if items:
@@ -120,7 +137,15 @@ def _items(
 ) -> tuple[list[_Item], int]:
     with catalog.database.read() as connection:
         wanted = connection.execute(
-            select(views.c.id, views.c.image, views.c.image_sha256, views.c.encoder_deg, sittings.c.conditions)
+            select(
+                views.c.id,
+                views.c.image,
+                views.c.image_sha256,
+                views.c.encoder_deg,
+                sittings.c.conditions,
+                sittings.c.reference_image,
+                sittings.c.reference_image_sha256,
+            )
             .join(enrollments, views.c.enrollment_id == enrollments.c.id)
             .join(objects)
             .join(sittings, views.c.sitting_id == sittings.c.id)
@@ -150,7 +175,8 @@ def _items(
         if not again and present.get(row.id) == settings_of(where):
             unchanged += 1
         else:
-            items.append(_Item(row.id, row.image, row.image_sha256, where))
+            reference = Reference.of(row.reference_image, row.reference_image_sha256)
+            items.append(_Item(row.id, row.image, row.image_sha256, where, reference))
     return items, unchanged
 
 
@@ -160,15 +186,16 @@ def _intended(conditions: JsonObject) -> Region | None:
     return None if roi is None else region_of({"region": roi})
 
 
-def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[tuple[bytes | None, str]]:
+def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[_Found]:
     kind = known_descriptor(name)
-    found: list[tuple[bytes | None, str]] = []
+    found = []
     for item in portion:
         try:
             image = images.read(root / item.image, item.sha256)
-            found.append((kind.pack(kind.describe(within(image, item.region))), ""))
+            described = stored_describer(root, (kind.name,), item.region, item.reference)(image)
+            found.append(_Found(kind.pack(described.levels[kind.name]), described.front_end))
         except (CatalogError, UsageError) as error:
-            found.append((None, error.what))
+            found.append(_Found(None, reason=error.what))
         except (OSError, ValueError) as error:  # ValueError: the descriptor cannot describe such an image
-            found.append((None, str(error)))
+            found.append(_Found(None, reason=str(error)))
     return found

@@ -2,25 +2,30 @@
 
 import json
 from collections.abc import Generator, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection, delete, null, select, update
 
-from hbr.descriptors import descriptor, names
+from hbr.descriptors import PAPERS, Descriptor, descriptor, names
 from rig.catalog import audit, images
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import region_of
+from rig.catalog.describing import Reference, region_of, stored_describer
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.schema import descriptors, enrollments, objects, sittings, views
 from rig.catalog.upkeep import LOST
-from rig.describer import within
-from rig.errors import RigError
+from rig.errors import CatalogError, UsageError
 from rig.files import make_folder, write
 from rig.processes import over_processes
+
+ROUNDED: Final = 0.02
+"""Share of a view's levels that may be rounded the other way."""
 
 
 class Problem(StrEnum):
@@ -73,6 +78,7 @@ class _Item(NamedTuple):
     image: str
     sha256: str
     file_bytes: int
+    reference: Reference | None = None
     described: tuple[tuple[str, int, str, bytes], ...] = ()
 
 
@@ -203,7 +209,13 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
                 (row.name, row.version, json.dumps(row.settings, sort_keys=True), row.packed)
             )
         items = [
-            _Item._make((*row, tuple(described.get(row.id, ()))))
+            _Item._make(
+                (
+                    *row[:7],
+                    Reference.of(row.reference_image, row.reference_image_sha256),
+                    tuple(described.get(row.id, ())),
+                )
+            )
             for row in connection.execute(
                 select(
                     views.c.id,
@@ -213,15 +225,18 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
                     views.c.image,
                     views.c.image_sha256,
                     views.c.image_bytes,
+                    sittings.c.reference_image,
+                    sittings.c.reference_image_sha256,
                 )
                 .select_from(objects)
                 .join(enrollments)
                 .join(views, views.c.enrollment_id == enrollments.c.id)
+                .join(sittings, views.c.sitting_id == sittings.c.id)
                 .order_by(views.c.id)
             )
         ]
         items += [
-            _Item._make((*row, ()))
+            _Item(*row)
             for row in connection.execute(
                 select(
                     null(),
@@ -242,12 +257,12 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
 
 
 def _look(root: Path, quick: bool, portion: tuple[_Item, ...]) -> list[_Looked]:
-    return [_look_at(root / item.image, item, quick) for item in portion]
+    return [_look_at(root, item, quick) for item in portion]
 
 
-def _look_at(path: Path, item: _Item, quick: bool) -> _Looked:
+def _look_at(root: Path, item: _Item, quick: bool) -> _Looked:
     try:
-        content = path.read_bytes()
+        content = (root / item.image).read_bytes()
     except OSError as error:
         return _Looked(None, reason=error.strerror or str(error))
     sha256 = images.digest(content)
@@ -264,13 +279,34 @@ def _look_at(path: Path, item: _Item, quick: bool) -> _Looked:
         if name not in names() or descriptor(name).version != version:
             continue  # of another program
         kind = descriptor(name)
+        right: NDArray[np.uint8] | None = None
         try:
-            right = kind.pack(kind.describe(within(image, region_of(json.loads(settings)))))
-        except (RigError, ValueError):
-            right = None
-        if right != packed:
-            different.append((name, version, right))
+            region = region_of(json.loads(settings))
+        except CatalogError:
+            different.append((name, version, None))
+            continue
+        try:
+            describe = stored_describer(root, (name,), region, item.reference)
+        except CatalogError:
+            continue  # the picture of the empty table is damaged, which is told by itself
+        with suppress(UsageError, ValueError):
+            right = describe(image).levels[name]
+        if right is None or not _as_stored(kind, packed, right):
+            different.append((name, version, None if right is None else kind.pack(right)))
     return _Looked(sha256, (image.shape[1], image.shape[0]), different=tuple(different))
+
+
+def _as_stored(kind: Descriptor, packed: bytes, right: NDArray[np.uint8]) -> bool:
+    """Whether stored levels are those of the image: to the bit, or of a descriptor that rounds, nearly so.
+
+    Another computer's arithmetic may have rounded a level the other way.
+    """
+    if kind.pack(right) == packed:
+        return True
+    if kind.name in PAPERS or len(packed) != kind.size_bytes:
+        return False
+    off = np.abs(kind.unpack(packed).astype(np.int16) - right)
+    return int(off.max()) <= 1 and float((off > 0).mean()) <= ROUNDED
 
 
 def _orphans(catalog: Catalog, files: Iterable[str]) -> list[str]:

@@ -73,6 +73,8 @@ def show(settings: Settings, name: NameArgument) -> None:
 
     Example: rig catalog show mug-white --bench sim
     """
+    from rig.describer import Sightings
+
     with settings.open_catalog(read_only=True) as catalog:
         details = catalog.object(name)
         folder = catalog.path
@@ -83,6 +85,7 @@ def show(settings: Settings, name: NameArgument) -> None:
         for view, told_view in zip(details.views, told["views"], strict=True):
             levels = view.record.descriptor
             told_view["record"]["descriptor"] = None if levels is None else levels.tolist()
+        told["sightings"] = plain(Sightings.of(view.record.front_end for view in details.views))
         settings.print_json(told)
         return
     summary = details.summary
@@ -101,6 +104,8 @@ def show(settings: Settings, name: NameArgument) -> None:
             print(f"    {_facts(provenance.conditions)}")
     if not details.views:
         return
+    if sighted := Sightings.of(view.record.front_end for view in details.views).words:
+        print(sighted)
     print(f"images in {(folder / details.views[0].image).parent}")
     print("view  azimuth  encoder      IMU   sharpness")
     for view in details.views:

@@ -12,6 +12,8 @@ from rig.cli.complete import object_names
 from rig.cli.jobs import run_job, size_words
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rig.catalog.exchange import Imported, Package
 
 SHOWN = 20
@@ -47,6 +49,14 @@ def import_(
         str, typer.Option(metavar="refuse|skip|replace", help="What to do about objects that are enrolled already.")
     ] = "refuse",
     strict: Annotated[bool, typer.Option("--strict", help="Take nothing if one file is refused.")] = False,
+    descriptor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Describe the images by this, too, such as edges+colours; rig catalog redescribe does so later. "
+            "Repeatable.",
+        ),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would come in.")] = False,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; one for each core otherwise.")] = None,
 ) -> None:
@@ -55,7 +65,16 @@ def import_(
     Example: rig import coil-100 --label coil --bench sim
     """
     package = _package(source, pattern, table_angles)
-    take_in(settings, package, on_conflict=on_conflict, label=label, strict=strict, dry_run=dry_run, jobs=jobs)
+    take_in(
+        settings,
+        package,
+        on_conflict=on_conflict,
+        label=label,
+        further=descriptor or (),
+        strict=strict,
+        dry_run=dry_run,
+        jobs=jobs,
+    )
 
 
 def take_in(
@@ -64,6 +83,7 @@ def take_in(
     *,
     on_conflict: str,
     label: str | None,
+    further: "Sequence[str]" = (),
     strict: bool,
     dry_run: bool,
     jobs: int | None,
@@ -91,7 +111,7 @@ def take_in(
     else:
         with settings.open_catalog(create=True) as catalog:
             plan = plan_import(catalog, package, conflict)
-            job = bring_in(catalog, plan, label=label, strict=strict, jobs=jobs)
+            job = bring_in(catalog, plan, label=label, further=further, strict=strict, jobs=jobs)
             done = run_job("importing", job, interrupted=nothing)
     _report(settings, done, seconds_between(begin_ns, clock.now_ns()), dry_run=dry_run)
 

@@ -15,7 +15,7 @@ from rig.catalog.exchange.package import Enrollment, Object
 from rig.catalog.exchange.plan import Plan, make_plan, names_in_use
 from rig.catalog.exchange.stage import Staged
 from rig.catalog.records import EnrollmentStatus, Region
-from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
+from rig.catalog.schema import descriptors, enrollments, objects, sittings, views
 from rig.catalog.upkeep import LOST
 from rig.files import make_folder, sync_folder
 
@@ -164,6 +164,7 @@ def _insert_views(
         rows.append(
             {
                 **row,
+                "front_end": row["front_end"] if one.front_end is None else one.front_end,
                 "enrollment_id": enrollment_id,
                 "view_index": view.index,
                 "sitting_id": sitting_ids[view.sitting],
@@ -181,13 +182,13 @@ def _insert_views(
             select(views.c.id, views.c.view_index).where(views.c.enrollment_id == enrollment_id)
         )
     }
-    kind = known_descriptor(DESCRIPTOR)
     described = []
     for view in enrollment.views:
-        packed = staged[view.image].packed
         levels = [(d.name, d.version, d.settings, bytes.fromhex(d.packed)) for d in view.descriptors]
-        if packed is not None:
-            levels.append((kind.name, kind.version, settings_of(regions.get(view.image)), packed))
+        levels += [
+            (name, known_descriptor(name).version, settings_of(regions.get(view.image)), packed)
+            for name, packed in staged[view.image].packed
+        ]
         described += [
             {"view_id": ids[view.index], "name": name, "version": version, "settings": settings, "packed": said}
             for name, version, settings, said in levels

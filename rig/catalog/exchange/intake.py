@@ -1,10 +1,11 @@
 """Into a catalog: images are checked and described aside, then all of it comes in at once."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from rig.catalog.catalog import Catalog
+from rig.catalog.describing import known_descriptor
 from rig.catalog.exchange.admit import admit
 from rig.catalog.exchange.package import Gap, Object, Package, Refused
 from rig.catalog.exchange.plan import Plan
@@ -30,7 +31,13 @@ class Imported:
 
 
 def bring_in(
-    catalog: Catalog, plan: Plan, *, label: str | None = None, strict: bool = False, jobs: int | None = None
+    catalog: Catalog,
+    plan: Plan,
+    *,
+    label: str | None = None,
+    further: Sequence[str] = (),
+    strict: bool = False,
+    jobs: int | None = None,
 ) -> Generator[Progressed, None, Imported]:
     """Import what was planned, all of it or nothing.
 
@@ -41,6 +48,8 @@ def bring_in(
     ----------
     label
         For the new objects that have none.
+    further
+        Descriptors besides CEDD (`hbr.descriptors`), of views that come without any; each takes its time.
     strict
         Refuse everything when one image is refused; a bundle is always taken like that.
     jobs
@@ -48,6 +57,8 @@ def bring_in(
 
     Raises
     ------
+    UsageError
+        There is no such descriptor.
     ImportRefused
         Nothing is left to import, or an image was refused and all are wanted.
     ObjectExists
@@ -55,13 +66,15 @@ def bring_in(
     CatalogError, CatalogBusy
         The catalog cannot be written.
     """
+    for name in further:
+        known_descriptor(name)
     package = plan.package
     strict = strict or package.strict
     refused = list(package.refused)
     if strict and refused:
         raise _not_whole(package, refused)
     with catalog.database.in_words(), staging(catalog.path) as folder:
-        items = list(items_of(plan))
+        items = list(items_of(plan, tuple(further)))
         staged: dict[str, Staged] = {}
         yield Progressed(0, len(items))
         work = partial(stage, folder)

@@ -5,7 +5,7 @@ import zlib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 from rig.catalog import images
@@ -14,7 +14,8 @@ from rig.catalog.exchange.package import ImageSource
 from rig.catalog.exchange.plan import Plan
 from rig.catalog.records import Region
 from rig.catalog.schema import DESCRIPTOR
-from rig.describer import within
+from rig.config import ViewConfig
+from rig.describer import Describer
 from rig.errors import UsageError
 
 
@@ -26,22 +27,27 @@ class Item(NamedTuple):
     sha256: str | None
     folder: str
     stem: str
-    describe: bool = False
+    descriptors: tuple[str, ...] = ()
     region: Region | None = None
 
 
 class Staged(NamedTuple):
-    """An image that is staged as ``file``, or the reason why not."""
+    """An image that is staged as ``file``, or the reason why not; ``packed`` are its levels by each descriptor."""
 
     file: str
     sha256: str = ""
     size: int = 0
-    packed: bytes | None = None
+    packed: tuple[tuple[str, bytes], ...] = ()
+    front_end: dict[str, Any] | None = None
     reason: str = ""
 
 
-def items_of(plan: Plan) -> Iterator[Item]:
-    """Yield every image that a plan takes; those of one enrollment go into one folder."""
+def items_of(plan: Plan, further: tuple[str, ...] = ()) -> Iterator[Item]:
+    """Yield every image that a plan takes; those of one enrollment go into one folder.
+
+    Views that come without descriptors are described by the paper's and the ``further`` ones.
+    """
+    wanted = tuple(dict.fromkeys((DESCRIPTOR, *further)))
     sources = plan.package.sources
     for i, item in enumerate(plan.wanted):
         for j, enrollment in enumerate(item.enrollments):
@@ -53,7 +59,7 @@ def items_of(plan: Plan) -> Iterator[Item]:
                     view.image_sha256,
                     folder,
                     f"{view.index:03d}",
-                    not view.descriptors,
+                    () if view.descriptors else wanted,
                     plan.package.regions.get(view.image),
                 )
             for k, sitting in enumerate(enrollment.sittings):
@@ -80,20 +86,23 @@ def _stage_one(root: Path | None, item: Item) -> Staged:
         return Staged("", reason="is not the image that was stored")
     if root is None:
         return Staged("", sha256, len(content))
-    packed = None
-    if item.describe:
-        kind = known_descriptor(DESCRIPTOR)
+    packed, front_end = [], None
+    if item.descriptors:
         try:
-            packed = kind.pack(kind.describe(within(image, item.region)))
+            described = Describer(ViewConfig(roi=item.region), item.descriptors)(image)
         except UsageError as error:
             return Staged("", reason=error.what)
+        except ValueError as error:
+            return Staged("", reason=str(error))
+        packed = [(name, known_descriptor(name).pack(levels)) for name, levels in described.levels.items()]
+        front_end = described.front_end
     file = f"{item.folder}/{item.stem}{images.suffix(content)}"
     try:
         (root / file).write_bytes(content)
     except FileNotFoundError:
         (root / item.folder).mkdir(exist_ok=True)
         (root / file).write_bytes(content)
-    return Staged(file, sha256, len(content), packed)
+    return Staged(file, sha256, len(content), tuple(packed), front_end)
 
 
 def _read(source: ImageSource) -> bytes:
