@@ -27,6 +27,8 @@ _EDGE_THRESHOLD: Final = 14.0
 _CLASS_THRESHOLDS: Final = np.array([[0.68], [0.98], [0.98], [0.98], [0.98]])
 #: Luminance of a pixel B, G, R, in thousandths.
 _LUMINANCE: Final = np.array([114, 587, 299])
+#: The same as the reference rounds it, of a grey pixel.
+_GREYS: Final = (0.114 * np.arange(256) + 0.587 * np.arange(256)) + 0.299 * np.arange(256)
 _SQRT2: Final = np.sqrt(2.0)
 #: Non-directional, horizontal and vertical edge, of the quarters a, b, c, d.
 _FILTERS: Final = np.array([[2.0, -2.0, -2.0, 2.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
@@ -212,8 +214,12 @@ def _areas_as_rounded(image: ImageArray, luminance: RealArray, quarters: IndexAr
     for some in (slice(k, k + step) for k in range(0, len(i), step)):
         pixels = cv2.transpose(strips[i[some], :, j[some]].view(np.uint8).reshape(-1, count, 3))
         blue, green, red = cv2.split(pixels)
+        if (blue == green).all() and (green == red).all():
+            each = cv2.LUT(blue, _GREYS)
+        else:
+            each = (0.114 * blue + 0.587 * green) + 0.299 * red
         total = np.zeros(pixels.shape[1])
-        for pixel in (0.114 * blue + 0.587 * green) + 0.299 * red:
+        for pixel in each:
             total += pixel
         totals.append(total)
     areas: FloatArray = np.trunc(np.concatenate(totals) * (4.0 / (4 * count))).take(np.cumsum(~repeats) - 1)
@@ -229,8 +235,8 @@ def _repeats(image: ImageArray, luminance: RealArray, grid: _Grid) -> BoolArray:
     np.equal(luminance[:, 1:], luminance[:, :-1], out=repeats[:, 1:])
     if 8 * np.count_nonzero(repeats) < repeats.size:
         return np.zeros(repeats.size, np.bool_)
-    difference = image.copy()
-    difference[:, grid.width :] = cv2.absdiff(image[:, grid.width :], image[:, : -grid.width])
+    difference = np.empty_like(image)
+    cv2.absdiff(image[:, grid.width :], image[:, : -grid.width], difference[:, grid.width :])
     repeats &= _luminance(_row_sums(difference, grid), grid) == 0
     return repeats.ravel()
 
