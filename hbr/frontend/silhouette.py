@@ -17,6 +17,8 @@ _LEAST: Final = 0.004
 _PART: Final = 0.08
 #: Radii of the bars that are cut off where something reaches into the frame, in pixels of the small image.
 _BARS: Final = (0, 2, 3, 4, 5)
+#: Rows at the foot that are narrower than this share of the usual row are the stump of a bar.
+_STUMP: Final = 0.35
 
 
 def silhouette(surely: Mask, perhaps: Mask | None = None, *, framed: bool) -> Mask | None:
@@ -38,13 +40,21 @@ def silhouette(surely: Mask, perhaps: Mask | None = None, *, framed: bool) -> Ma
         if kept is None:
             continue
         if radius:  # what was rounded off comes back
-            kept = cv2.dilate(kept, _disc(1)).astype(np.uint8) & everything
+            kept = _without_stump(cv2.dilate(kept, _disc(1)).astype(np.uint8) & everything)
         if perhaps is not None:
             hull = np.zeros_like(kept)
             cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(kept)), (1,))
             kept |= hull & perhaps
         return _filled(kept)
     return None
+
+
+def _without_stump(mask: Binary) -> Binary:
+    """What is left of a holder from below, where a bar was cut off: things stand on more than that."""
+    widths = np.count_nonzero(mask, axis=1)
+    foot = np.flatnonzero(widths >= _STUMP * np.median(widths[widths > 0]))[-1]
+    mask[foot + 1 :] = 0
+    return mask
 
 
 def _opened(mask: Binary, radius: int) -> Binary:
