@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from rig.cli.present import line
 from rig.plans.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
-from rig.plans.words import azimuth_words, distinct, signed
+from rig.plans.words import azimuth_words, distinct, odds_words, signed
 
 
 class MoveLines:
@@ -13,6 +13,10 @@ class MoveLines:
     HEADING: ClassVar = (
         "      camera     the table's rotation                    how alike the candidates look\n"
         "view  azimuth    asked    encoder               IMU      S_left  S_right  next        leading, score a view"
+    )
+    DENSE_HEADING: ClassVar = (
+        "      camera     the table's rotation                    how alike the rivals look\n"
+        "view  azimuth    asked    encoder               IMU       there  all round  next       leading, probability"
     )
 
     def __init__(self) -> None:
@@ -56,7 +60,14 @@ class MoveLines:
         if decided and decided.s_left is not None and decided.s_right is not None:
             left, right = distinct(decided.s_left, decided.s_right, decimals=3)
             likeness = f"{left:>12}{right:>9}  "
+        if decided and decided.weighed is not None and decided.weighed.alike is not None:
+            alike = decided.weighed.alike
+            there = alike[decided.weighed.rotations_deg.index(decided.rotation_deg)]
+            likeness = f"{there:>11.2f}{f'{min(alike):.2f}–{max(alike):.2f}':>11} "
         goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
-        leading = ", ".join(f"{c.name} {c.score:.3f}" for c in self._leading)
+        leading = ", ".join(
+            f"{c.name} {f'{c.score:.3f}' if c.probability is None else odds_words(c.probability)}"
+            for c in self._leading
+        )
         note = "" if move.agrees else "  ENCODER AND IMU DISAGREE"
         return f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{turned}{likeness}{goes:<11} {leading}{note}"

@@ -23,7 +23,7 @@ from rig.clock import SystemClock, seconds_between
 from rig.config_values import validate
 from rig.errors import UsageError
 from rig.plans.enroll import enroll
-from rig.plans.events import Accepted
+from rig.plans.events import Accepted, Started
 from rig.plans.identify import identify
 from rig.plans.model import Model, load_model
 from rig.plans.photograph_table import photograph_table
@@ -275,7 +275,7 @@ def _identify(
     record = IdentificationRecord(region=bench.config.view.roi)
     moves = MoveLines()
     if say:
-        print(f"\nWhat stands on the table? (it is {thing.name})\n{MoveLines.HEADING}")
+        print(f"\nWhat stands on the table? (it is {thing.name})")
     for event in identify(bench, model, strategy=strategy):
         if isinstance(event, Accepted) and record.truth is None:
             record.truth = Truth(
@@ -287,6 +287,8 @@ def _identify(
         record.add(event)
         if say and (text := moves.add(event)):
             print(text, flush=True)
+        if say and isinstance(event, Started):
+            print(MoveLines.HEADING if model.rules is None else MoveLines.DENSE_HEADING)
     return record
 
 
