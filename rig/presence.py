@@ -74,6 +74,10 @@ class TableWatcher:
                     return
             before = now
 
+    def clear(self) -> bool:
+        """Whether nothing stands on the table: so it does by agreement, until the first object was waited for."""
+        return self._empty is None
+
     def _look(self) -> Picture:
         frame = self._bench.camera.capture(self._bench.clock.now_ns())
         return picture(frame.image_bgr, self._bench.config.view)

@@ -79,6 +79,7 @@ def see_to_empty_table(settings: Settings, bench: "Bench", *, ask: bool, then: s
     """
     from rig.bench import ObjectStandsThere, TableClearer
     from rig.empty_table import COMMAND, EmptyTables
+    from rig.errors import TableNotEmpty, ViewRejected
     from rig.plans.words import sentence
 
     standing = EmptyTables.standing(bench)
@@ -86,7 +87,10 @@ def see_to_empty_table(settings: Settings, bench: "Bench", *, ask: bool, then: s
         return
     if isinstance(bench.operator, TableClearer):
         if bench.operator.clear():
-            _photograph(settings, bench, aside=True)
+            try:
+                _photograph(settings, bench, aside=True)
+            except (TableNotEmpty, ViewRejected) as error:  # nobody is asked, and the work goes on
+                print(f"Note: {error.what} {error.next_step}", file=sys.stderr)
         return
     consequence = WITHOUT if standing.table is None else STALE
     person = isinstance(bench.operator, ObjectStandsThere)

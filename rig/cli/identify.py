@@ -52,8 +52,11 @@ def identify(
 
     Example: rig identify --watch --bench sim --json
     """
+    from rig.bench import TableClearer
+    from rig.cli.empty_table import see_to_empty_table
     from rig.cli.live import IdentifyView
     from rig.cli.present import console
+    from rig.describer import PAPER_DESCRIPTOR
     from rig.plans.events import Identified, Waiting, event_dict
     from rig.plans.identify import identify as identify_one
     from rig.plans.strategies import descriptor_for
@@ -75,6 +78,9 @@ def identify(
             seed = settings.seed or 0
             if watch:
                 _bring_by_camera(bench)
+            if isinstance(bench.operator, TableClearer) and model().descriptor != PAPER_DESCRIPTOR:
+                see_to_empty_table(settings, bench, ask=False)
+            if watch:
                 events = watch_table(bench, model, strategy=chosen, seed=seed, top=top)
             else:
                 events = identify_one(bench, model(), strategy=chosen, seed=seed, top=top)

@@ -145,7 +145,7 @@ def _take_views(
                 further=levels,
             )
             enrollment.add(record, shot.image_bgr)
-            yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr)
+            yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr, described.front_end)
             if drifted := drift.look(described.front_end):
                 EmptyTables.doubt(bench, drifted)
                 yield Warned(index, drifted, f"Go on, these views do without it; then take a new one: {COMMAND}")

@@ -47,7 +47,7 @@ def test_enroll_list_show_identify(rig):
     assert "8 of 8 views" in shown.stdout
     assert Path("catalog/images").is_dir()
 
-    found = rig("identify", "--set", "bench.sim.object=lamp", "--json", "--seed", "5")
+    found = rig("identify", "--set", "bench.sim.object=lamp", "--json", "--seed", "5", "--strategy", "ahbr")
     events = lines(found.stdout)
     assert found.exit_code == 0
     assert events[0]["event"] == "started"
