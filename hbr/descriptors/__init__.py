@@ -2,5 +2,6 @@
 
 from hbr.descriptors.protocol import Comparison, Descriptor
 from hbr.descriptors.registry import PAPERS, descriptor, names
+from hbr.descriptors.rows import unpack_rows
 
-__all__ = ["PAPERS", "Comparison", "Descriptor", "descriptor", "names"]
+__all__ = ["PAPERS", "Comparison", "Descriptor", "descriptor", "names", "unpack_rows"]

@@ -2,7 +2,6 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Row, Text, and_, cast, func, select
 
 import hbr
-from hbr.descriptors import Descriptor, descriptor
+from hbr.descriptors import Descriptor, descriptor, unpack_rows
 from rig.catalog.describing import region_of
 from rig.catalog.records import (
     EnrollmentStatus,
@@ -206,19 +205,13 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
         raise _outdated(connection, kind, {name for name, levels in zip(names, packed, strict=True) if levels is None})
     _, first, object_index = np.unique(np.array(object_ids, np.int64), return_index=True, return_inverse=True)
     loaded = hbr.Views(
-        descriptors=_unpacked(kind, packed),
+        descriptors=unpack_rows(kind, b"".join(packed)),
         azimuth_deg=np.array(azimuths_deg, np.float64),
         object_index=object_index,
         object_names=tuple(names[i] for i in first),
         descriptor=kind.name,
     )
     return loaded, np.array(view_ids, np.int64)
-
-
-def _unpacked(kind: Descriptor, packed: Sequence[bytes]) -> NDArray[np.uint8]:
-    if kind.name == DESCRIPTOR:
-        return hbr.unpack_rows(b"".join(packed))
-    return np.stack([kind.unpack(levels) for levels in packed])
 
 
 def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> DescriptorOutdated:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.descriptors import descriptor
+from hbr.descriptors import descriptor, unpack_rows
 from rig.bench import Bench
 from rig.catalog import images
 from rig.config import RigConfig
@@ -295,13 +295,10 @@ def _model_lines(views: hbr.Views) -> Iterator[str]:
 
 
 def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
-    unpack = descriptor(kind).unpack
     parts = [
         hbr.Views.of_object(
             line["object"],
-            np.array([unpack(bytes.fromhex(packed)) for packed in line["descriptors"]], np.uint8).reshape(
-                -1, descriptor(kind).length
-            ),
+            unpack_rows(descriptor(kind), bytes.fromhex("".join(line["descriptors"]))),
             line["azimuth_deg"],
             kind,
         )

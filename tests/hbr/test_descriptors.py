@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hbr import DenseIndex, ViewIndex, Views, believe
-from hbr.descriptors import Descriptor, descriptor, names
+from hbr.descriptors import Descriptor, descriptor, names, unpack_rows
 
 
 @pytest.fixture(params=names())
@@ -140,3 +140,15 @@ def test_strength_of_the_light_and_gamma_hardly_matter_to_what_sees_the_object_a
     changed = (255 * (np.clip(image * gain, 0, 255) / 255) ** exponent).astype(np.uint8)
     same = own.similarity(own.describe(image.astype(np.uint8))[None], own.describe(changed)[None])
     assert same[0, 0] > 0.9
+
+
+@pytest.mark.parametrize("name", names())
+def test_many_packed_views_come_back_as_each_alone(name: str) -> None:
+    kind, rng = descriptor(name), np.random.default_rng(0)
+    images = rng.integers(0, 256, (5, 64, 64, 3), np.uint8)
+    packed = [kind.pack(kind.describe(image)) for image in images]
+    rows = unpack_rows(kind, b"".join(packed))
+    np.testing.assert_array_equal(rows, [kind.unpack(one) for one in packed])
+    assert unpack_rows(kind, b"").shape == (0, kind.length)
+    with pytest.raises(ValueError, match="no multiple"):
+        unpack_rows(kind, packed[0][1:])
