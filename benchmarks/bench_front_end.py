@@ -1,0 +1,85 @@
+"""What an empty-table picture is worth to the front end: hit-rates with the right one, the enrollment's, and none.
+
+    python -m benchmarks.bench_front_end FOLDER --objects 1-50
+
+Objects are enrolled on a plain bench with its picture, by 18 views, and looked for by the dense filter from four sides,
+90 degrees apart: on the same bench in another light, and on others where everything differs at once.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import process_time
+
+import cv2
+import numpy as np
+
+from hbr import DenseIndex, Views
+from hbr.arrays import ImageArray
+from hbr.evaluation.condition import Condition, Shot
+from hbr.evaluation.datasets import load_coil, read_photograph
+from hbr.evaluation.matrix import enrolled_few, hits
+from hbr.evaluation.perturb import Perturbations
+from hbr.evaluation.protocol import Protocol
+
+OTHER_LIGHT = "gain:2+white-balance:2+gradient:2+shift:2+scale:1+shadow:1"
+EVERYTHING = (
+    "shift:3+scale:3+elevation:2+occlusion:2+shadow:2+specular:2+gain:2+white-balance:3+gradient:2+gamma:2+defocus:2"
+)
+
+
+@dataclass(frozen=True)
+class Referenced(Condition):
+    """A condition whose queries come with one of three pictures of an empty table.
+
+    Attributes
+    ----------
+    reference : {"own", "enrollment", "none"}
+        The query bench's own in the query's light, the enrollment bench's, or none.
+    """
+
+    reference: str = "own"
+
+    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> Shot:
+        image, own = super().query(image_bgr, rng)
+        if self.reference == "none":
+            return Shot(image)
+        return Shot(image, own if self.reference == "own" else self.enrolled(image_bgr).empty)
+
+
+def cases(descriptor: str) -> Iterator[tuple[str, Referenced]]:
+    """Benches and references by name."""
+    for bench, condition in (
+        ("other light", Referenced(background="bench", perturbations=Perturbations.parse(OTHER_LIGHT))),
+        ("another bench", Referenced(background="other-bench", perturbations=Perturbations.parse(EVERYTHING))),
+    ):
+        for reference in ("own", "enrollment", "none"):
+            yield f"{bench}, {reference}", replace(condition, descriptor=descriptor, reference=reference)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="Photographs named as in COIL-100.")
+    parser.add_argument("--objects", default="1-50", metavar="FIRST-LAST")
+    parser.add_argument("--trials", type=int, default=6)
+    parser.add_argument("--descriptor", default="edges+colours")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    first, last = (int(number) for number in arguments.objects.split("-"))
+    dataset = load_coil(arguments.folder).subset(first, last)
+    size = read_photograph(dataset.objects[0].photographs[0].path).shape[1::-1]
+    protocol = Protocol(trials=arguments.trials, max_views=4, enrolled=18)
+    numbers = range(len(dataset.objects))
+    plain = Condition(background="bench", descriptor=arguments.descriptor)
+    index = DenseIndex(Views.concatenate([enrolled_few(dataset, j, plain, size, 18) for j in numbers]))
+    print(f"{'hit-rate, %, at N =':<28}     1     2     3     4  s CPU")
+    for name, condition in cases(arguments.descriptor):
+        began = process_time()
+        found = np.concatenate([hits(dataset, j, index, condition, size, protocol) for j in numbers])
+        rates = " ".join(f"{rate:5.1f}" for rate in 100 * found.mean(axis=0))
+        print(f"{name:<28} {rates} {process_time() - began:6.0f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
