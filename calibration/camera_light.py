@@ -8,7 +8,7 @@ so that a saturated pixel holds 255/K electrons. Flat field: a card that fills t
 the corners, beside a gradient that is the lamp's. Drift: the card's brightness over minutes.
 """
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from math import sqrt
@@ -38,6 +38,7 @@ CARD_FRAMES, CARD_SECONDS = 40, 240.0
 BINS = 24
 MIN_PIXELS = 50
 REGIONS = (3, 4)
+FRAME_GROUPS = 6
 LEVELS = (8.0, 235.0)
 """Between them a pixel is neither cut off at black nor saturated."""
 MIN_SPAN = 80.0
@@ -148,13 +149,20 @@ def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Ma
         cell = region * BINS + np.clip(np.digitize(mean, edges) - 1, 0, BINS - 1)
         cells = REGIONS[0] * REGIONS[1] * BINS
         # Pixels, and the sums of their means and variances: float64 (3, regions, bins).
-        sums = np.stack([np.bincount(cell, weights, cells) for weights in (np.ones_like(mean), mean, variance)])
+        ones = np.ones_like(mean)
+        sums = np.stack([np.bincount(cell, weights, cells) for weights in (ones, mean, variance)])
         sums = sums.reshape(3, -1, BINS)
         whole = sums.sum(axis=1)
         gain, floor = _line(whole, len(frames))
-        # Neighbouring pixels are not strangers to each other: the uncertainty is what leaving out a region changes.
-        jackknife = np.array([_line(whole - sums[:, r], len(frames)) for r in range(sums.shape[1])])
-        covariance = np.cov(jackknife.T, ddof=0) * (len(jackknife) - 1)
+        # Neighbouring pixels are not strangers to each other, and frames not always: the uncertainty is what leaving
+        # out a region changes, and what leaving out some frames does.
+        covariance = _jackknife([_line(whole - sums[:, r], len(frames)) for r in range(sums.shape[1])])
+        covariance += _jackknife(
+            [
+                _line(np.stack([np.bincount(cell % BINS, weights, BINS) for weights in (ones, few_mean, few)]), count)
+                for few_mean, few, count in _without_frames(green, usable)
+            ]
+        )
         filled = whole[0] >= MIN_PIXELS
         at, noise = whole[1:, filled] / whole[0, filled]
         dark = max(float(floor) - 1 / 12, 0.0)
@@ -416,6 +424,30 @@ def _line(sums: NDArray[np.float64], frames: int) -> tuple[float, float]:
     design = np.column_stack([at, np.ones_like(at)]) / sigma[:, None]
     (gain, floor), *_ = np.linalg.lstsq(design, noise / sigma, rcond=None)
     return float(gain), float(floor)
+
+
+def _jackknife(without: Sequence[tuple[float, float]]) -> NDArray[np.float64]:
+    """Return the covariance (2, 2) of a line, of which ``without`` has what it is without each part of the data."""
+    return np.asarray(np.cov(np.array(without).T, ddof=0) * (len(without) - 1))
+
+
+def _without_frames(
+    green: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], int]]:
+    """Yield mean and variance of the usable pixels without each group of frames, and how many frames are left.
+
+    A group is every ``FRAME_GROUPS``-th frame.
+    """
+    pixels = green.reshape(len(green), -1)[:, usable]
+    offset = pixels.mean(axis=0)
+    pixels = pixels - offset  # squares of small numbers keep their digits
+    total, squares = pixels.sum(axis=0), np.einsum("ij,ij->j", pixels, pixels)
+    for group in range(FRAME_GROUPS):
+        out = pixels[group::FRAME_GROUPS]
+        count = len(green) - len(out)
+        mean = (total - out.sum(axis=0)) / count
+        variance = (squares - np.einsum("ij,ij->j", out, out) - count * mean**2) / (count - 1)
+        yield mean + offset, variance, count
 
 
 def _shading(shape: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
