@@ -20,6 +20,7 @@ _BLUR: Final = 1.25
 _CLIP: Final = 0.25
 #: What the four levels stand for: the roots of a normalised histogram's entries, by Lloyd's method.
 _REPRESENTATIVES: Final = np.array([0.0114, 0.1062, 0.2173, 0.3713])
+_TABLE: Final = np.pad(_REPRESENTATIVES, (0, 252)).astype(np.float32)
 _BORDERS: Final = ((_REPRESENTATIVES[1:] + _REPRESENTATIVES[:-1]) / 2).astype(np.float32)
 
 
@@ -112,6 +113,7 @@ class _Cosine:
 
 
 def _unit(levels: LevelArray) -> NDArray[np.float32]:
-    rows: NDArray[np.float32] = _REPRESENTATIVES.astype(np.float32)[levels]
+    # of a large catalog several times as fast as numpy's indexing
+    rows = cv2.LUT(np.ascontiguousarray(levels), _TABLE).astype(np.float32, copy=False).reshape(levels.shape)
     rows /= np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))[:, None]
     return rows
