@@ -212,13 +212,13 @@ def _areas_as_rounded(image: ImageArray, luminance: RealArray, quarters: IndexAr
     step = max(1, 50_000 // count)  # what the cache holds
     totals = []
     for some in (slice(k, k + step) for k in range(0, len(i), step)):
-        pixels = cv2.transpose(strips[i[some], :, j[some]].view(np.uint8).reshape(-1, count, 3))
-        blue, green, red = cv2.split(pixels)
+        pixels = strips[i[some], :, j[some]].view(np.uint8).reshape(-1, count, 3)
+        blue, green, red = (cv2.transpose(channel) for channel in cv2.split(pixels))
         if (blue == green).all() and (green == red).all():
             each = cv2.LUT(blue, _GREYS)
         else:
             each = (0.114 * blue + 0.587 * green) + 0.299 * red
-        total = np.zeros(pixels.shape[1])
+        total = np.zeros(len(pixels))
         for pixel in each:
             total += pixel
         totals.append(total)
