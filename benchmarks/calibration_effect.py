@@ -28,6 +28,7 @@ from hbr.evaluation.statistics import wilson
 from rig.bench import Bench, calibrate
 from rig.catalog import Catalog
 from rig.config import load_config
+from rig.errors import RigError
 from rig.facts import Fact, FactStore
 from rig.plans.enroll import enroll
 from rig.plans.events import Identified, Moved
@@ -43,7 +44,7 @@ LEVELS = {
     "poor": NoiseModel(
         encoder_harmonic_deg=0.8,
         backlash_deg=1.5,
-        gyro_scale_error=0.03,
+        gyro_scale_error=0.015,
         camera_mount=1.2,
         light_flicker=0.01,
         placement_mm=2.0,
@@ -117,7 +118,12 @@ def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder
             rng = np.random.default_rng(seed)
             for name in names * TRIALS:
                 operator.next_object, operator.yaw_deg = name, float(rng.uniform(0, 360))
-                *_, answer = identify(bench, index, strategy="ahbr", seed=seed)
+                try:
+                    *_, answer = identify(bench, index, strategy="ahbr", seed=seed)
+                except RigError:  # e.g. encoder and gyro that do not agree
+                    told["broken off"].append(True)
+                    told["right" if name in names[:OBJECTS] else "unknown"].append(False)
+                    continue
                 assert isinstance(answer, Identified)
                 told["views"].append(answer.views)
                 if name in names[:OBJECTS]:
@@ -166,7 +172,7 @@ def main() -> None:
                     flush=True,
                 )
                 for key, values in told.items():
-                    if key.startswith("refused ") and any(values):
+                    if key.startswith(("refused ", "broken off")) and any(values):
                         print(f"| {level} | {key} | {sum(values):.0f}/{len(values)} | | | | | | | |")
 
 
