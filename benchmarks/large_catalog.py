@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
-from hbr import Views, pack
+from hbr import Views, descriptor, pack
 from rig.catalog import Catalog, EnrollmentStatus, images
 from rig.catalog.exchange import Package, bring_in, plan_import
 from rig.catalog.exchange.package import Enrollment, ImageSource, Levels, Object, Sitting, View
 from rig.clock import SystemClock
+from rig.describer import BENCH_DESCRIPTOR
 
 OBJECTS = 1_000
 _NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -71,8 +72,10 @@ def build(folder: Path, objects: int = OBJECTS) -> Views:
 
 def _objects(views: Views) -> Iterator[Object]:
     settings = {"region": [80, 0, 480, 480]}
+    own = descriptor(BENCH_DESCRIPTOR)
     for j, name in enumerate(views.object_names):
         rows = views.of(j)
+        turning = _turning(own.size_bytes, len(rows), j)
         azimuths_deg = views.azimuth_deg[rows].tolist()
         yield Object(
             name=name,
@@ -102,6 +105,7 @@ def _objects(views: Views) -> Iterator[Object]:
                                 Levels(
                                     name="cedd", version=1, settings=settings, packed=pack(views.descriptors[row]).hex()
                                 ),
+                                Levels(name=own.name, version=own.version, settings=settings, packed=turning[i]),
                             ),
                         )
                         for i, row in enumerate(rows.tolist())
@@ -109,6 +113,15 @@ def _objects(views: Views) -> Iterator[Object]:
                 ),
             ),
         )
+
+
+def _turning(size: int, views: int, seed: int) -> list[str]:
+    """Packed levels of an object's views, as hexadecimal: a third of them changes slowly as it turns."""
+    rng = np.random.default_rng(seed)
+    base, other = rng.integers(0, 256, (2, size), np.uint8)
+    begins = np.where(rng.random(size) < 1 / 3, rng.random(size), 2.0)
+    share = np.arange(views)[:, None] / views
+    return [row.tobytes().hex() for row in np.where((share - begins) % 1.0 < 0.5 * (begins <= 1), other, base)]
 
 
 if __name__ == "__main__":
