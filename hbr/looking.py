@@ -53,7 +53,7 @@ def next_look(
     belief: Belief,
     *,
     beta: float = BETA,
-    sharpness: float = 30.0,
+    sharpness: float = 100.0,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
     second_costs: float = 0.02,
@@ -61,8 +61,10 @@ def next_look(
     """Choose the turn with the lowest expected confusion, and what it costs.
 
     For hypotheses p, p' of different objects, a turn a leaves the confusion
-    Σ p p' exp(-λ ν(a) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 25°)²) discounts a view at the distance
-    d from the nearest one had. Its logarithm and μ · time(a) are added up; equal sums go to the earlier turn.
+    Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 25°)²) discounts a view
+    at the distance d from the nearest one had, and κ(a) = exp(-½ (e / 25°)²) one at the distance e from the view that
+    is enrolled nearest to it: nothing is known of what lies between. Its logarithm and μ · time(a) are added up; equal
+    sums go to the earlier turn.
 
     Parameters
     ----------
@@ -99,8 +101,9 @@ def next_look(
     cost = second_costs * times_s
     rivals = probability[:, None] * probability * (place[:, None] != place)
     if rivals.any():
-        similar = _expected(belief, place, bin_of, turns_deg)
-        remaining = rivals * np.exp(-sharpness * novelty[:, None, None] * (1 - similar))
+        similar, known = _expected(belief, place, bin_of, turns_deg)
+        tells = novelty[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :])
+        remaining = rivals * np.exp(-sharpness * tells * (1 - similar))
         confusion = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
     else:  # one object alone: what is new helps its azimuth
         confusion = -sharpness * novelty
@@ -140,7 +143,7 @@ def most_informative_turn(belief: Belief, *, beta: float = BETA, rotations_deg: 
     """
     turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     probability, place, bin_of = _strongest(belief.posterior(beta))
-    similar = _expected(belief, place, bin_of, turns_deg)
+    similar, _ = _expected(belief, place, bin_of, turns_deg)
     weights = probability * np.exp(
         beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
     )
@@ -177,11 +180,15 @@ def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArra
     return weight[best], place, bin_of
 
 
-def _expected(belief: Belief, place: IndexArray, bin_of: IndexArray, turns_deg: FloatArray) -> FloatArray:
-    """Similarity of what the hypotheses would show after each turn, (a, m, m)."""
+def _expected(
+    belief: Belief, place: IndexArray, bin_of: IndexArray, turns_deg: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Similarity of what the hypotheses would show after each turn, (a, m, m), and how well that is known, (a, m)."""
     index = belief.index
     seen_deg = bin_of * (360.0 / BINS) + belief.turned_deg + turns_deg[:, None]
     own_deg = index.azimuth_deg[place]
     away_deg = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None]))
-    nearest = np.where(index.left_out[place], np.inf, away_deg).argmin(axis=2)
-    return index.compared.among(index.rows[place[None], nearest])
+    away_deg[:, index.left_out[place]] = np.inf
+    nearest = away_deg.argmin(axis=2)
+    known = np.exp(-0.5 * (np.take_along_axis(away_deg, nearest[:, :, None], axis=2)[:, :, 0] / _NEAR_DEG) ** 2)
+    return index.compared.among(index.rows[place[None], nearest]), known

@@ -25,7 +25,7 @@ from hbr.views import Views
 
 Removal = Literal["near", "paper79", "queries"]
 #: Probability of the best object that ends a search by the dense filter.
-CERTAINTY: Final = 0.9
+CERTAINTY: Final = 0.98
 _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
 

@@ -95,9 +95,9 @@ def test_the_oracle_leads_at_least_as_much_as_a_fixed_step() -> None:
 def test_a_search_by_the_filter_ends_by_its_probability_and_methods_are_compared() -> None:
     methods = choose_methods(["dense", "dense-90", "dense-mutual", "hbr"])
     runs = Runs.concatenate([run("dense,dense-90,dense-mutual,hbr", j) for j in range(6)])
-    runs.posterior[0] = np.linspace(0.85, 0.94, 4)
+    runs.posterior[0] = np.linspace(0.96, 0.99, 4)
     stopping = method_results(runs, methods, margin=10.0)[0].stopping
-    assert stopping.views_mean == 3  # 0.85, 0.88, 0.91
+    assert stopping.views_mean == 3  # 0.96, 0.97, 0.98
     assert method_results(runs, methods, margin=10.0)[3].stopping.views_mean == 4
     asked = {(c.first, c.first_views, c.second) for c in contests(runs, methods, np.random.default_rng(0))}
     assert {("dense", 3, "dense-90"), ("dense", 2, "dense-mutual")} <= asked
