@@ -38,7 +38,9 @@ UNPROMISED: Final = 0.95
 """Probability that ends a search where no error rate can be promised."""
 
 _QUICK_S: Final = 0.4
-"""What a rehearsal may take that nobody asked for."""
+_LEAST_QUICK_S: Final = 0.08
+_LOADED_S: Final = 5e-6
+"""What a rehearsal may take that nobody asked for, and at least; less by so much for each view that was loaded."""
 _SEARCH_S, _VIEW_S = 1.4e-3, 1.3e-6
 """What a rehearsed search takes, and how much more for each enrolled view."""
 _KEEP_SHARE: Final = 0.5
@@ -98,12 +100,14 @@ def rehearse(
     """
     views = rehearsed_views(index)
     places = np.arange(len(index))
-    most = _affordable(len(index.views)) if quick else ENOUGH
+    budget_s = max(_QUICK_S - _LOADED_S * len(index.views), _LEAST_QUICK_S)
+    most = _affordable(len(index.views), budget_s) if quick else ENOUGH
     searches = min(most // len(index), int(index.rows.shape[1]))
     sampled = not searches
     if sampled and quick:
         # a sample of the objects, each looked for once among the others of the sample
-        few = max(2, next(n for n in range(len(index), 0, -1) if n <= _affordable(len(index.views) * n // len(index))))
+        each = len(index.views) // len(index)
+        few = max(2, next(n for n in range(len(index), 0, -1) if n <= _affordable(n * each, budget_s)))
         places = np.unique(np.linspace(0, len(index) - 1, few).astype(int))
     searches = max(1, searches)
     if len(index) < 2 or not views:
@@ -112,9 +116,9 @@ def rehearse(
     return _with_what_is_known(rehearsed, index, error_rate, false_reject, of=len(places))
 
 
-def _affordable(views: int) -> int:
-    """Searches among so many enrolled views that nobody waits for."""
-    return int(_QUICK_S / (_SEARCH_S + _VIEW_S * views))
+def _affordable(views: int, budget_s: float) -> int:
+    """Searches among so many enrolled views within the time."""
+    return int(budget_s / (_SEARCH_S + _VIEW_S * views))
 
 
 def rehearsed_views(index: hbr.DenseIndex) -> int:
@@ -274,7 +278,7 @@ def rules_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.Rules, tuple[str,
         found = rehearse(index, quick=True).rules
         return found, (*notes, *_unpromised(found))
     asked = stored.rules
-    if _affordable(len(index.views)) >= len(index):
+    if _affordable(len(index.views), _QUICK_S) >= len(index):
         found = rehearse(index, error_rate=asked.error_rate, false_reject=asked.false_reject, quick=True).rules
         return found, (*notes, *_unpromised(found))
     changed = _changes(stored.objects, index.views.object_names)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.angles import wrap360
+from hbr.dense import KEPT
 from rig.config import RigConfig
 from rig.errors import CatalogError, UsageError
 from rig.plans.events import Candidate, Identified, Ranked
@@ -31,6 +32,8 @@ from rig.plans.words import verdict_words
 
 SHOWN: Final = 5
 """Candidates that an event names at most, unless more are asked for."""
+
+_WORTH_IT: Final = 2
 
 
 class Search(ABC):
@@ -162,6 +165,8 @@ class DenseSearch(Search):
         super().__init__(index.views, config, seed=seed, top=top)
         self._rules = rules
         self._strategy = strategy
+        # to take a part of the views out costs more than it saves where a search ends after one or two
+        self._kept = KEPT if len(index) > _WORTH_IT * KEPT else len(index)
         self._so_far: hbr.DenseIndex | hbr.Belief = index
         self._belief: hbr.Belief
         self._verdict: hbr.Verdict
@@ -178,7 +183,9 @@ class DenseSearch(Search):
         return self._rules.familiar[min(self._belief.queries, len(self._rules.familiar)) - 1]
 
     def _vote(self, levels: NDArray[np.uint8]) -> Ranked:
-        self._so_far = self._belief = belief = hbr.believe(levels, self._orientations[-1], self._so_far)
+        self._so_far = self._belief = belief = hbr.believe(
+            levels, self._orientations[-1], self._so_far, kept=self._kept
+        )
         self._verdict = verdict = judged(belief, self._rules, max_views=self._config.identify.max_views)
         self._words = verdict_words(verdict, certainty=self._rules.certainty, least=self._least, views=belief.queries)
         odds = belief.posterior(self._rules.beta).sum(axis=1)
