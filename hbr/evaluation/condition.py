@@ -15,6 +15,7 @@ from hbr.evaluation.perturb import Perturbations
 from hbr.evaluation.scenes import Picture, other_bench, plain_bench
 
 Background = Literal["same", "uniform", "textured", "bench", "other-bench"]
+Reference = Literal["own", "enrollment", "none"]
 _T = TypeVar("_T", np.uint8, np.float32)
 
 #: COIL's black background has sensor noise and the glow of its surroundings up to about here.
@@ -23,7 +24,7 @@ _TEXTURE_OCTAVES: Final = (4, 8, 16, 32)
 
 
 class Shot(NamedTuple):
-    """An image, and the empty bench in the same light where there is one."""
+    """An image, and the picture of an empty bench that is there to compare it with, if any."""
 
     image: ImageArray
     empty: ImageArray | None = None
@@ -51,6 +52,11 @@ class Condition:
         Of the queries.
     descriptor : str
         What enrolled views and queries are described by.
+    reference : {"own", "enrollment", "none"}
+        The picture of the empty bench that queries on a bench have: of their own bench in their own light, or of the
+        enrollment's; or neither they nor the enrolled views have one.
+    enrolled_noise : Noise
+        Of the enrolled views: what describing them under the bench's known noise is worth.
     """
 
     size_px: int | None = None
@@ -60,6 +66,8 @@ class Condition:
     prefilter_px: float = 0.0
     perturbations: Perturbations = field(default_factory=Perturbations)
     descriptor: str = "cedd"
+    reference: Reference = "own"
+    enrolled_noise: Noise = field(default_factory=Noise)
 
     def __post_init__(self) -> None:
         if self.size_px is not None and self.size_px < 2:
@@ -70,6 +78,8 @@ class Condition:
             raise ValueError(f"a prefilter of {self.prefilter_px} pixels; at least 0 is needed")
         if self.background not in get_args(Background):
             raise ValueError(f"background {self.background!r} is unknown; use one of {', '.join(get_args(Background))}")
+        if self.reference not in get_args(Reference):
+            raise ValueError(f"reference {self.reference!r} is unknown; use one of {', '.join(get_args(Reference))}")
         if (self.on_bench or self.perturbations) and (self.rotation_deg or self.background in ("uniform", "textured")):
             raise ValueError(
                 "neither a rotation in the plane nor a uniform or textured background goes with perturbations or a "
@@ -82,15 +92,16 @@ class Condition:
         """Whether objects stand on a drawn bench."""
         return self.background in ("bench", "other-bench")
 
-    def enrolled(self, image_bgr: ImageArray) -> Shot:
-        """The image as it is enrolled, and the empty bench."""
+    def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> Shot:
+        """The image as it is enrolled, and the empty bench; `rng` draws the enrolled noise."""
         image = self._sized(image_bgr)
         empty: ImageArray | None = None
         if self.on_bench:
             image, empty = Perturbations().photograph(
                 image, object_mask(image), np.random.default_rng(0), _benches()[0]
             )
-        return Shot(self._prefiltered(image), empty)
+        noisy = self.enrolled_noise.apply(image, rng or np.random.default_rng(0))
+        return Shot(self._prefiltered(noisy), None if self.reference == "none" else empty)
 
     def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> Shot:
         """The image as a query sees it, and the empty bench; the same draws for the same generator state."""
@@ -99,6 +110,8 @@ class Condition:
             first, *others = _benches()
             bench = {"bench": first, "other-bench": others[int(rng.integers(len(others)))]}.get(self.background)
             image, empty = self.perturbations.photograph(image, object_mask(image), rng, bench)
+            if self.reference != "own":
+                empty = _shown(first) if self.on_bench and self.reference == "enrollment" else None
             return Shot(self._prefiltered(self.noise.apply(image, rng)), empty)
         if self.rotation_deg or self.background != "same":
             mask = object_mask(image).astype(np.float32)
@@ -142,6 +155,10 @@ def _benches() -> tuple[Picture, ...]:
     """The plain bench, and eight others."""
     rng = np.random.default_rng(801)
     return (plain_bench(rng), *(other_bench(rng) for _ in range(8)))
+
+
+def _shown(bench: Picture) -> ImageArray:
+    return np.clip(np.rint(bench), 0, 255).astype(np.uint8)
 
 
 def _turned(image: NDArray[_T], angle_deg: float) -> NDArray[_T]:

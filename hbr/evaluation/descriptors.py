@@ -19,7 +19,11 @@ def enrolled_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[
     DatasetError
         A photograph cannot be used; `size` is the width and height that all must have.
     """
-    shots = (condition.enrolled(image) for image in _images(dataset, j, size))
+    name = dataset.objects[j].name
+    shots = (
+        condition.enrolled(image, generator(0, name, "enrolled", i))
+        for i, image in enumerate(_images(dataset, j, size))
+    )
     return np.stack([describe(image, descriptor=condition.descriptor, reference=empty) for image, empty in shots])
 
 

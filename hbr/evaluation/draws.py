@@ -5,11 +5,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-_PURPOSES: Final = {"trial": 0, "photograph": 1, "bootstrap": 2}
+_PURPOSES: Final = {"trial": 0, "photograph": 1, "bootstrap": 2, "enrolled": 3}
 
 
 def generator(
-    seed: int, name: str, purpose: Literal["trial", "photograph", "bootstrap"], number: int
+    seed: int, name: str, purpose: Literal["trial", "photograph", "bootstrap", "enrolled"], number: int
 ) -> np.random.Generator:
     """Return the generator of, say, the third trial of an object: the same whichever other objects are evaluated."""
     key = (_PURPOSES[purpose], number)

@@ -65,7 +65,10 @@ def enrolled_few(dataset: Dataset, j: int, condition: Condition, size: tuple[int
     """
     item = dataset.objects[j]
     kept = np.flatnonzero(views_enrolled(item.azimuth_deg, count))
-    shots = [condition.enrolled(read_photograph(item.photographs[i].path, size)) for i in kept]
+    shots = [
+        condition.enrolled(read_photograph(item.photographs[i].path, size), generator(0, item.name, "enrolled", i))
+        for i in kept.tolist()
+    ]
     levels = np.stack([describe(image, descriptor=condition.descriptor, reference=empty) for image, empty in shots])
     return Views.of_object(item.name, levels, item.azimuth_deg[kept], condition.descriptor)
 

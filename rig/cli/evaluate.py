@@ -70,6 +70,16 @@ def evaluate(
     background: Annotated[
         str, typer.Option(help="Behind a query's object: same, uniform, textured; bench, other-bench (drawn benches).")
     ] = "same",
+    reference: Annotated[
+        str,
+        typer.Option(
+            help="Picture of the empty table for queries on a bench: own, enrollment (of the bench enrolled on), none "
+            "(nor for enrolled views)."
+        ),
+    ] = "own",
+    enrolled_noise: Annotated[
+        str, typer.Option(metavar="NOISE", help="Describe enrolled views under noise, too; as for --noise.")
+    ] = "none",
     prefilter: Annotated[
         float, typer.Option(min=0, metavar="PIXELS", help="Blur all images by a Gaussian of this standard deviation.")
     ] = 0.0,
@@ -129,6 +139,8 @@ def evaluate(
                 prefilter,
                 Perturbations.parse(perturb),
                 descriptor,
+                reference,  # type: ignore[arg-type]
+                Noise.parse(enrolled_noise),
             ),
             choose_methods((methods or ("all" if descriptor in PAPERS else "beyond")).split(",")),
             Protocol(

@@ -12,7 +12,7 @@ from hbr.evaluation.protocol import Protocol
 from rig.catalog import Catalog
 
 #: Changes when the same settings would give other numbers.
-FORMAT: Final = 2
+FORMAT: Final = 3
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,8 @@ class Plan:
                 "background": condition.background,
                 "prefilter_px": condition.prefilter_px,
                 "perturbations": str(condition.perturbations),
+                "reference": condition.reference,
+                "enrolled_noise": str(condition.enrolled_noise),
                 "descriptor": condition.descriptor,
                 "descriptor_version": descriptor(condition.descriptor).version,
             },

@@ -5,6 +5,7 @@ import pytest
 
 from hbr import describe, descriptor
 from hbr.evaluation.condition import Condition, object_mask
+from hbr.evaluation.noise import Noise
 from hbr.evaluation.perturb import STRENGTHS, Perturbations
 from hbr.evaluation.scenes import HEIGHT, WIDTH, other_bench, plain_bench
 
@@ -113,3 +114,32 @@ def test_the_bench_s_own_descriptor_knows_a_thing_on_another_bench_where_cedd_do
 def test_conditions_that_exclude_each_other_are_refused(setting: dict) -> None:
     with pytest.raises(ValueError, match="leave one of them away"):
         Condition(perturbations=Perturbations.parse("gain"), **setting)
+
+
+def test_queries_on_another_bench_have_its_picture_or_the_enrollment_s_or_none() -> None:
+    shots = {}
+    for reference in ("own", "enrollment", "none"):
+        condition = Condition(background="other-bench", reference=reference)  # type: ignore[arg-type]
+        enrolled, query = condition.enrolled(ball()), condition.query(ball(), np.random.default_rng(4))
+        shots[reference] = query
+        assert (enrolled.empty is None) == (reference == "none")
+        if reference == "enrollment":
+            assert query.empty is not None
+            assert enrolled.empty is not None
+            np.testing.assert_array_equal(query.empty, enrolled.empty)
+    np.testing.assert_array_equal(shots["own"].image, shots["none"].image)
+    assert shots["own"].empty is not None
+    assert shots["none"].empty is None
+    border = np.s_[:40, :, :]
+    np.testing.assert_array_equal(shots["own"].empty[border], shots["own"].image[border])
+    with pytest.raises(ValueError, match="reference 'some'"):
+        Condition(reference="some")  # type: ignore[arg-type]
+
+
+def test_enrolled_views_may_carry_noise_of_their_own() -> None:
+    condition = Condition(enrolled_noise=Noise(gaussian_variance=0.012))
+    image = np.full((64, 64, 3), 128, np.uint8)
+    first, second = (condition.enrolled(image, np.random.default_rng(seed)).image for seed in (0, 1))
+    assert first.std() == pytest.approx(255 * 0.012**0.5, rel=0.05)
+    assert (first != second).any()
+    np.testing.assert_array_equal(condition.query(image, np.random.default_rng(0)).image, image)
