@@ -103,7 +103,7 @@ def identify(
 
 
 class _Model:
-    """What is enrolled, loaded again when something was enrolled or deleted meanwhile."""
+    """What is enrolled, loaded again when something was enrolled, deleted or calibrated meanwhile."""
 
     def __init__(self, catalog: "Catalog", descriptor: str | None = None) -> None:
         self._catalog = catalog
@@ -113,8 +113,13 @@ class _Model:
 
     def __call__(self) -> "Model":
         from rig.plans.model import load_model
+        from rig.plans.rules import FILE
 
-        now = [(summary.name, summary.enrolled_utc, summary.views) for summary in self._catalog.objects()]
+        rules = self._catalog.path / FILE
+        now = (
+            [(summary.name, summary.enrolled_utc, summary.views) for summary in self._catalog.objects()],
+            rules.stat().st_mtime_ns if rules.exists() else None,
+        )
         if now != self._seen:
             self._model, self._seen = load_model(self._catalog, descriptor=self._descriptor), now
         return self._model

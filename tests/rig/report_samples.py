@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.angles import wrap360
+from hbr.angles import wrap180, wrap360
 from rig.devices.camera import CameraLocks
 from rig.heading import Stillness
 from rig.plans.events import (
@@ -19,8 +19,9 @@ from rig.plans.events import (
     Ranked,
     Rejected,
     Started,
+    Weighed,
 )
-from rig.plans.words import likeness_words
+from rig.plans.words import likeness_words, separation_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.view import ViewEvidence
 
@@ -93,6 +94,56 @@ def identifying(
         travelled_deg,
         9.5,
         "the lead passes",
+    )
+
+
+def searching_densely(
+    answer: str | None = "mug-star", rotations_deg: Sequence[float] = (80.0, -115.0), *, pair: bool = True
+) -> Iterator[Event]:
+    """The dense search turns by ``rotations_deg``, the best of all, to tell the first two of `NAMES` apart."""
+    rng = np.random.default_rng(6)
+    yield Started("identify", None, 8, {}, strategy="dense", descriptor="edges+colours", notes=("rehearse them",))
+    turns_deg = tuple(float(turn) for turn in range(-175, 185, 5) if turn)
+    orientation_deg = 0.0
+    for k in range(len(rotations_deg) + 1):
+        rotation_deg = rotations_deg[k - 1] if k else 0.0
+        orientation_deg += rotation_deg
+        yield moved(k, -orientation_deg, -rotation_deg)
+        yield Accepted(k, float(wrap360(orientation_deg)), evidence(), noise(rng, (48, 64)), {"agreement": 0.9})
+        pose_deg = float(wrap360(orientation_deg - 30))
+        odds = (0.6 + 0.2 * k, 0.4 - 0.2 * k, 0.0005, 0.0, 0.0)
+        candidates = tuple(
+            Candidate(n, 0.9 - 0.1 * i, pose_deg, p) for i, (n, p) in enumerate(zip(NAMES, odds, strict=True))
+        )
+        yield Ranked(k, candidates, 0.1, "not sure yet: a probability of 60.0%, and 95.0% ends the search")
+        if k < len(rotations_deg):
+            step_deg = rotations_deg[k]
+            away = tuple(abs(float(wrap180(turn - step_deg))) for turn in turns_deg)
+            weighed = Weighed(
+                turns_deg,
+                tuple(-8.0 + a / 30 for a in away),
+                tuple(0.02 + abs(turn) / 4500 for turn in turns_deg),
+                tuple(0.5 + a / 400 for a in away) if pair else None,
+            )
+            rivals = NAMES[:2] if pair else ()
+            why = separation_words(rivals, weighed.alike, turns_deg.index(step_deg))
+            side = "left" if step_deg >= 0 else "right"
+            yield Decided(k, side, step_deg, -orientation_deg - step_deg, None, None, rivals, why, weighed)
+    yield Identified(
+        answer,
+        candidates,
+        candidates[0].score,
+        0.1,
+        0.75,
+        pose_deg,
+        30.0,
+        k + 1,
+        195.0,
+        7.5,
+        "a probability of 97.0% reaches 95.0%",
+        probability=odds[0],
+        familiarity=1.02,
+        min_familiarity=0.95,
     )
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from report_samples import enrolling, identifying
+from report_samples import enrolling, identifying, searching_densely
 from rich.console import Console
 
 from rig.catalog import ObjectSummary
@@ -102,6 +102,28 @@ def test_a_search_in_a_pipe_reads_as_lines():
     assert "leading: mug-white 0.910 at 60.0°" in text
     assert "turning 47.3°" in text
     assert max(map(len, text.splitlines())) > 100  # no line is broken for a terminal that is not there
+
+
+@pytest.mark.parametrize("width", [30, 60, 120])
+@pytest.mark.parametrize("answer", ["mug-white", None])
+def test_a_dense_search_shows_probabilities_and_what_the_rules_say(width, answer):
+    console = screen(width)
+    text = shown(console, IdentifyView(console), list(searching_densely(answer)))
+    flat = " ".join(text.split())
+    assert "Note: rehearse them." in flat
+    assert "mug-white 60.0% not sure yet: a probability of 60.0%" in flat
+    assert "to tell mug-white from mug-star, 0.50 alike there (0.50 to 0.95 all around); turning 80.0°" in flat
+    assert "probability 100.0%" in flat or "probability >99.9%" in flat
+    assert ("Unknown: the nearest are mug-white 0.900, mug-star 0.800, teapot 0.700" in flat) == (answer is None)
+
+
+def test_a_dense_search_in_a_pipe_reads_as_lines():
+    console = screen(80, terminal=False)
+    lines = shown(console, IdentifyView(console), list(searching_densely())).splitlines()
+    assert lines[0] == "Note: rehearse them."
+    assert "  leading: mug-white 0.900 (60.0%) at 330.0°, mug-star 0.800 (40.0%) at 330.0°" in lines[3]
+    assert lines[4] == "  not sure yet: a probability of 60.0%, and 95.0% ends the search"
+    assert lines[5].startswith("  left: to tell mug-white from mug-star")
 
 
 class Keyboard:

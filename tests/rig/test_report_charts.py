@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rig.plans.events import Weighed
 from rig.report.azimuth_ring import RingView, azimuth_ring
 from rig.report.compass import CENTRE, polar
+from rig.report.decision_chart import decision_chart
 from rig.report.polar_path import Turn, polar_path
 from rig.report.score_chart import score_chart
 from rig.report.svg import number
@@ -241,3 +243,35 @@ def test_numbers_are_short_and_close(value: float) -> None:
     assert float(number(value)) == pytest.approx(value, abs=0.00501)
     assert number(value) != "-0"
     assert "e" not in number(value)
+
+
+TURNS = tuple(float(turn) for turn in range(-175, 185, 5) if turn)
+
+
+class TestDecisionChart:
+    @settings(max_examples=25)
+    @given(here=ANGLE, chosen=st.sampled_from(TURNS), seen=st.lists(ANGLE, min_size=1, max_size=4))
+    def test_the_chosen_turn_lies_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
+        away = tuple(abs(turn - chosen) for turn in TURNS)
+        weighed = Weighed(TURNS, tuple(-9 + a for a in away), tuple(abs(t) / 100 for t in TURNS), away)
+        svg = decision_chart(here, weighed, chosen, rivals=("a", HOSTILE), seen_deg=seen, number=len(seen))
+        goal, *others = having(svg, "stop", "last")
+        assert not others
+        x, y = centre(goal)
+        assert apart(azimuth_of(x, y), here + chosen) < 1
+        radii = [hypot(px - CENTRE[0], py - CENTRE[1]) for px, py in points(having(svg, "confusion")[0])]
+        assert min(radii) == pytest.approx(hypot(x - CENTRE[0], y - CENTRE[1]), abs=0.02)
+        assert len(radii) == len(having(svg, "cost")) == len(TURNS)
+        stops = [centre(e) for e in having(svg, "stop") if "last" not in e.get("class", "")]
+        assert all(apart(azimuth_of(*at), angle) < 1 for at, angle in zip(stops, seen, strict=True))
+        text = " ".join(words(having(svg, "turn-name")))
+        assert HOSTILE in text
+        assert f"{abs(chosen):.0f}°" in text
+
+    def test_one_object_alone_and_even_values_are_drawn(self) -> None:
+        for turns in ((5.0,), (-5.0, 5.0), TURNS):
+            even = (0.0,) * len(turns)
+            svg = decision_chart(0.0, Weighed(turns, even, even), turns[0])
+            assert "only one object is left" in svg
+            assert not having(svg, "alike")
+            assert "nan" not in svg

@@ -15,6 +15,8 @@ from rig.errors import UsageError
 from rig.plans.enroll import enroll
 from rig.plans.events import Accepted, Decided, Identified, Rejected, Started, event_dict
 from rig.plans.identify import identify
+from rig.plans.model import load_model
+from rig.plans.photograph_table import photograph_table
 from rig.plans.replay import check
 from rig.plans.saved_run import RunWriter, event_of, load_run
 from sim.bench import ShelfOperator, open_sim_bench
@@ -45,6 +47,15 @@ def saved(tmp_path_factory):
                     writer.add(event)
                     events.append(event)
             runs[strategy] = home / strategy, events
+        list(photograph_table(bench))
+        model = load_model(catalog)
+        operator.next_object, operator.yaw_deg = "mug-star", 70.0
+        with RunWriter(home / "dense", bench, model) as writer:
+            events = []
+            for event in identify(bench, model, top=2):
+                writer.add(event)
+                events.append(event)
+        runs["dense"] = home / "dense", events
     return runs
 
 
@@ -92,6 +103,45 @@ def test_the_folder_is_open_formats(saved):
     assert [line["object"] for line in model] == ["mug-white", "mug-star", "lamp"]
     assert len(bytes.fromhex(model[0]["descriptors"][0])) == 54
     assert json.loads((folder / "run.json").read_text())["devices"]["servo"]["model"] == "xl430_w250"
+
+
+def test_a_dense_search_is_computed_again_from_its_frames_rules_and_empty_table(saved, tmp_path):
+    folder, events = saved["dense"]
+    run = load_run(folder)
+    found = check(run)
+    assert found.differences == []
+    assert found.views == found.decisions == len([e for e in events if isinstance(e, Accepted)])
+    assert run.views.descriptor == events[0].descriptor == "edges+colours"
+    assert run.model.rules is not None
+    assert run.empty_table is not None
+    assert all(e.front_end["agreement"] > 0.9 for e in events if isinstance(e, Accepted))
+    again = list(run.events())
+    assert [event_dict(event) for event in again] == [event_dict(event) for event in events]
+    for missing, words in (("empty_table.png", "front_end.agreement"), ("search_rules.json", None)):
+        other = tmp_path / missing
+        shutil.copytree(folder, other)
+        (other / missing).unlink()
+        if words is None:
+            with pytest.raises(UsageError, match="cannot be read"):
+                load_run(other)
+        else:
+            assert words in {difference.what for difference in check(load_run(other)).differences}
+
+
+def test_other_rules_decide_otherwise(saved, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(saved["dense"][0], folder)
+    rules = json.loads((folder / "search_rules.json").read_text())
+    (folder / "search_rules.json").write_text(json.dumps(rules | {"familiar": [2.0] * len(rules["familiar"])}))
+    assert {"what", "verdict"} & {difference.what for difference in check(load_run(folder)).differences}
+
+
+def test_a_run_of_the_first_format_is_read(saved, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(saved["ahbr"][0], folder)
+    about = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(about | {"version": 1}))
+    assert check(load_run(folder)).differences == []
 
 
 def test_every_decision_says_why(saved):
