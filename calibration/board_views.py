@@ -23,6 +23,8 @@ from rig.view import Viewer
 
 MIN_CORNERS = 12
 """Corners that a view needs to say where the board is."""
+MIN_MARKERS = 6
+"""Markers by which the board is known to be there, whether its corners are found or not."""
 GRID = (4, 4)
 """Columns and rows of the frame, for the coverage."""
 LOOSE_DEG = 1.5
@@ -70,11 +72,16 @@ def look(
     """
     views: list[BoardView] = []
     foreign: set[int] = set()
+    elsewhere = 0
     index, planned = 0, len(stands) * len(angles_deg)
     known = set(np.asarray(board.layout().getIds()).ravel().tolist())
     viewer = Viewer(bench.camera, bench.config.view)
     for number, (stand, words) in enumerate(stands.items()):
-        yield Ask(f"Put the calibration board {words}; fix it there, and take your hands off.", PICTURES[stand])
+        yield Ask(
+            f"Put the calibration board {words}; fix it there, and take your hands off. Its squares are "
+            f"{board.square_mm:g} mm wide, as measured on the print (--square-mm).",
+            PICTURES[stand],
+        )
         bench.operator.place(stand)
         with Turntable(bench) as table:
             for angle_deg in angles_deg:
@@ -83,17 +90,19 @@ def look(
                 shot = yield from capture(index, viewer, table, move.settled_ns)
                 seen = sight(board, shot.image_bgr)
                 foreign |= set(seen.marker_ids.tolist()) - known
+                elsewhere += seen.marker_ids.size >= MIN_MARKERS and not seen.ids.size
                 if seen.ids.size >= MIN_CORNERS:
                     views.append(BoardView(number, table.rest_deg, seen.ids, seen.corners_px))
                 index += 1
                 yield Progress(index / planned, _words(seen, board, views, bench))
             table.goto(angles_deg[0])
+    layout = f"a board of {board.columns} columns and {board.rows} rows"
+    remedy = "give the board's own --columns and --rows, or print it anew with --print-board."
     troubles = []
     if foreign:
-        troubles.append(
-            f"Markers that are not on this board were seen ({sorted(foreign)}): give the board's own --columns and "
-            "--rows, or print it anew with --print-board."
-        )
+        troubles.append(f"Markers were seen that are not on {layout} ({sorted(foreign)}): {remedy}")
+    if elsewhere > planned // 4:
+        troubles.append(f"In {elsewhere} views markers were seen, but not where {layout} has them: {remedy}")
     return views, troubles
 
 

@@ -29,6 +29,10 @@ HeightMm = Annotated[float, typer.Option(min=5, max=2000, help="Height of the ta
 MiddleMm = Annotated[
     float, typer.Option(min=0, max=1000, help="Height of the board's middle above the platter, upright, in mm.")
 ]
+LensMm = Annotated[
+    float | None,
+    typer.Option(min=20, max=10_000, help="Distance from lens to axis, if measured: a board of wrong size is noticed."),
+]
 
 app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 
@@ -119,6 +123,7 @@ def table(
     radius_mm: RadiusMm = 80.0,
     height_mm: HeightMm = 150.0,
     middle_mm: MiddleMm = 75.0,
+    lens_mm: LensMm = None,
     print_board: Annotated[
         Path | None,
         typer.Option(
@@ -142,7 +147,7 @@ def table(
 
         print(write_board(board, print_board))
         return
-    room = Room(radius_mm, height_mm, middle_mm)
+    room = Room(radius_mm, height_mm, middle_mm, lens_mm)
     run(settings, lambda bench: table_axis.live(bench, _in_force(bench, "camera.intrinsics"), board, room))
 
 
@@ -176,6 +181,7 @@ def everything(
     radius_mm: RadiusMm = 80.0,
     height_mm: HeightMm = 150.0,
     middle_mm: MiddleMm = 75.0,
+    lens_mm: LensMm = None,
     thing: Annotated[
         str | None,
         typer.Option("--object", metavar="NAME", help="An object by which repeated views are compared last."),
@@ -204,7 +210,7 @@ def everything(
     from rig.markers import Board
 
     board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
-    room = Room(radius_mm, height_mm, middle_mm)
+    room = Room(radius_mm, height_mm, middle_mm, lens_mm)
     last = [] if thing is None else [lambda bench: repeatability.live(bench, thing)]
     run(
         settings,
@@ -279,6 +285,8 @@ def show(settings: Settings) -> None:
             if standing.state is State.IN_FORCE:
                 print(f"✓ {standing.words}")
                 print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.fact.estimates.items()))
+                for key, value in standing.fact.settings.items():
+                    print(f"    sets {key} = {value}")
         if not standings:
             print(f"Nothing is calibrated yet in {store.folder}: run `rig calibrate all`.")
 
@@ -322,6 +330,7 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
         With code 6 when a calibration did not pass.
     """
     from rig.bench import calibrate
+    from rig.cli.catalog import tell_other_regions
     from rig.facts import FactStore
 
     with settings.open_bench() as bench:
@@ -336,7 +345,14 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
                     print(f"{verdict(fact)}\nKept in {path}{then}")
                 if not fact.passed:
                     raise typer.Exit(EXIT_QUALITY)
+            told, region = bench.out_of_force, bench.config.view.roi
             calibrate(bench, store)
+            for finding in bench.out_of_force:
+                if finding not in told:  # what a person wrote into the configuration wins
+                    print(f"Note: {finding}.", file=sys.stderr)
+            if bench.config.view.roi != region and (catalog := settings.catalog_there()):
+                with catalog:
+                    tell_other_regions(settings, catalog, bench)
 
 
 def _in_force(bench: "Bench", name: str) -> "Fact":
@@ -399,4 +415,5 @@ def verdict(fact: "Fact") -> str:
         judged = f" (worst residual {fact.residual:.3g} {unit}, limit {fact.limit:.3g} {unit})"
     lines = [f"{'PASS' if fact.passed else 'FAIL'} {fact.name}{judged}"]
     lines += [f"  {name} = {estimate}" for name, estimate in fact.estimates.items()]
+    lines += [f"  sets {key} = {value}" for key, value in fact.settings.items()]
     return "\n".join([*lines, *(f"  {reason}" for reason in fact.refusals)])

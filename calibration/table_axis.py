@@ -44,6 +44,8 @@ MIN_SPAN_DEG = 60.0
 MAX_RMS_PX = 0.4
 MAX_WOBBLE_DEG = 0.5
 MAX_UNCERTAINTY_PX = 0.3
+MAX_LENS_OFF = 0.06
+"""By how much, relative, a hand may be off that measures the distance from lens to axis."""
 MAX_CUT = 0.1
 """Share of the room's height or width that the frame may cut off on a side: objects seldom fill its corners."""
 ROBUST_PX = 0.3
@@ -69,11 +71,14 @@ class Room:
         Of the cylinder, which stands on the platter.
     board_mm
         How far the board's middle is above the platter on the first stand.
+    lens_mm
+        How far the lens is from the axis at that height, as somebody measured it; None where nobody did.
     """
 
     radius_mm: float = 80.0
     height_mm: float = 150.0
     board_mm: float = 75.0
+    lens_mm: float | None = None
 
 
 def live(
@@ -114,7 +119,10 @@ def live(
     )
     if fact.passed:
         cut = ", ".join(fact.evidence["cut_off"])
-        words = f"Objects are seen within {fact.settings['view.roi']} (x, y, width, height)"
+        words = (
+            f"The lens is {_from_lens(fact.estimates):.0f} mm from the axis: if it is not, the board's squares are not "
+            f"{board.square_mm:g} mm. Objects are seen within {fact.settings['view.roi']} (x, y, width, height)"
+        )
         yield Progress(1.0, f"{words}; the frame cuts off {cut} of the room for them" if cut else words)
     yield fact
     return fact
@@ -151,7 +159,7 @@ def from_data(
         estimates, rms = axis.fit()
         evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
         evidence["view_rms_px"] = axis.view_rms_px
-        refusals += _judge(estimates, rms)
+        refusals += _judge(estimates, rms) + _measured(estimates, board, room)
         corners = region_of_interest(estimates, intrinsics, room)
         region, cut, too_much = _region(corners, intrinsics.evidence["size"], room)
         refusals += [too_much] if too_much else []
@@ -403,6 +411,23 @@ def _first_axis(
     values.append(np.array([float(centres.mean(axis=0) @ direction)]))
     point = np.linalg.lstsq(np.concatenate(equations), np.concatenate(values), rcond=None)[0]
     return direction, np.asarray(point, dtype=np.float64)
+
+
+def _from_lens(estimates: Mapping[str, Estimate]) -> float:
+    """Return how far the lens is from the axis at the height of the board's middle, in mm, along the line of sight."""
+    return float(np.linalg.norm([estimates[name].value for name in ("x", "y", "z")]))
+
+
+def _measured(estimates: Mapping[str, Estimate], board: Board, room: Room) -> list[str]:
+    """Return why the board's size must be wrong, if the measured distance says so: pictures alone tell no lengths."""
+    found = _from_lens(estimates)
+    if room.lens_mm is None or abs(found - room.lens_mm) <= MAX_LENS_OFF * room.lens_mm:
+        return []
+    return [
+        f"By the board the lens is {found:.0f} mm from the axis, by --lens-mm {room.lens_mm:.0f}: its squares would be "
+        f"{board.square_mm * room.lens_mm / found:.1f} mm wide, not {board.square_mm:g}. Measure a square on the print "
+        "and give --square-mm, or print it true to scale."
+    ]
 
 
 def _judge(estimates: Mapping[str, Estimate], rms: float) -> list[str]:

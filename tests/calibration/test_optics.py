@@ -93,6 +93,19 @@ def test_objects_that_the_frame_cuts_off_are_refused():
     assert not fact.settings
 
 
+def test_a_board_of_another_size_is_noticed_by_the_measured_distance():
+    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
+
+    def measured(square_mm: float) -> Fact:
+        room, board = Room(lens_mm=480.0), Board(square_mm=square_mm, marker_mm=square_mm * 11 / 15)
+        return table_axis.from_data(views, board, calibrated(0), room=room, when_utc=WHEN, device={})
+
+    assert measured(15.0).passed
+    larger = measured(18.0)
+    assert any("its squares would be 15." in refusal for refusal in larger.refusals), larger.refusals
+    assert not larger.settings
+
+
 ANGLES = camera_model.ANGLES_DEG[::2]
 
 

@@ -44,8 +44,9 @@ def test_the_region_follows_the_object_of_a_camera_that_was_moved(rig):
     with open_bench("sim", config, seed=2) as bench:  # of the camera, what the axis needs
         *_, intrinsics = camera_model.live(bench)
     FactStore(config.calibration_path("sim")).keep(intrinsics)
-    done = rig("calibrate", "table")
+    done = rig("calibrate", "table", "--lens-mm", "490")
     assert done.exit_code == 0, done.output
+    assert "if it was moved" in " ".join(done.stderr.split()).lower(), "what is enrolled already"
     assert "its middle 75 mm above the platter" in done.stderr
     (fact,) = json.loads(rig("calibrate", "history", "table.axis", "--json").stdout)["calibrations"]
     follows = fact["settings"]["view.roi"]
@@ -62,6 +63,7 @@ def test_the_region_follows_the_object_of_a_camera_that_was_moved(rig):
     assert "described within" not in found.stderr
     assert json.loads(found.stdout.splitlines()[-1])["name"] == "mug-dots"
 
+    assert f"    sets view.roi = {follows}" in rig("calibrate", "show").stdout
     written = rig("identify", "--set", "bench.sim.object=mug-dots", "--set", f"view.roi={BEFORE}").stderr
     assert "of the configuration wins over" in written
     assert f"described within {follows}, view.roi is {BEFORE}" in " ".join(written.split())
