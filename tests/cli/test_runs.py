@@ -150,6 +150,67 @@ def test_every_strategy_answers(rig, strategy):
     assert len([e for e in events if e["event"] == "accepted"]) == (3 if strategy == "hbr" else 2)
 
 
+def test_the_bench_searches_by_its_own_strategy_where_its_catalog_is_described_for_it(rig, enrolled):
+    def searched(*words: str) -> tuple[list[dict], str]:
+        done = rig("identify", "--json", "--set", "bench.sim.object=lamp", *words)
+        return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
+
+    events, _ = searched("--top", "1", "--save-run", "runs/own")
+    started, *_, answer = (event for event in events if event["event"] != "tablepicture")
+    assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
+    assert 0.9 < answer["probability"] <= 1
+    assert answer["familiarity"] >= answer["min_familiarity"]
+    assert "cannot promise" in started["notes"][0]
+    assert rig("replay", "runs/own", "--check").exit_code == 0
+    assert rig("report", "runs/own").exit_code == 0
+    page = (enrolled[0] / "runs" / "own" / "report.html").read_text(encoding="utf-8")
+    assert ("What was weighed before each turn" in page) == any(e["event"] == "decided" for e in events)
+    events, _ = searched("--set", "identify.strategy=ahbr")
+    assert next(e for e in events if e["event"] == "started")["strategy"] == "ahbr"
+
+
+def test_rules_are_rehearsed_kept_and_used(rig, enrolled):
+    told = rig("catalog", "calibrate", "--false-reject", "0.1")
+    assert told.exit_code == 0, told.output
+    assert re.search(r"^\d+ rehearsed searches of 4 views for 2 objects", told.stdout)
+    assert "Not promised: An error rate of 1.0% takes 100 rehearsed searches" in told.stdout
+    kept = enrolled[0] / "catalog" / "search_rules.json"
+    assert told.stdout.rstrip().endswith(str(kept))
+    values = json.loads(rig("catalog", "calibrate", "--json").stdout)
+    assert values["false_reject"] == 0.02
+    assert values["rehearsed"]["views"] == 4
+    assert json.loads(kept.read_text(encoding="utf-8"))["searches"] == values["searches"]
+    kept.write_text("{", encoding="utf-8")
+    done = rig("identify", "--set", "bench.sim.object=lamp")
+    assert done.exit_code == 0
+    assert "cannot be read; rig catalog calibrate makes them anew" in done.stdout
+    kept.unlink()
+
+
+def test_a_catalog_of_before_is_searched_by_the_paper_and_says_what_to_do(enrolled, tmp_path, monkeypatch):
+    import shutil
+    import sqlite3
+    from contextlib import closing
+
+    shutil.copytree(enrolled[0] / "catalog", tmp_path / "catalog")
+    (tmp_path / "rig.toml").write_text(SMALL, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    with closing(sqlite3.connect("catalog/catalog.sqlite")) as database, database:
+        database.execute("DELETE FROM descriptors WHERE name != 'cedd'")
+    run = CliRunner().invoke
+    done = run(app, ["identify", "--set", "bench.sim.object=lamp"])
+    assert done.exit_code == 0, done.output
+    assert "rig catalog redescribe --descriptor edges+colours adds it" in done.stdout
+    assert "S_left" in done.stdout or "fixed" in done.stdout
+    for words in (["identify", "--strategy", "dense"], ["catalog", "calibrate"]):
+        refused = run(app, words)
+        assert refused.exit_code == 7
+        assert "rig catalog redescribe --descriptor edges+colours" in refused.stderr
+    assert run(app, ["catalog", "redescribe", "--descriptor", "edges+colours"]).exit_code == 0
+    again = run(app, ["identify", "--json", "--set", "bench.sim.object=lamp"])
+    assert '"strategy": "dense"' in again.stdout
+
+
 def test_a_strategy_that_is_not_there_is_said_before_anything_moves(rig):
     done = rig("identify", "--strategy", "swep")
     assert done.exit_code == 2

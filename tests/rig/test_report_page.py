@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from report_samples import NAMES, enrolled, enrolling, identified, identifying
+from report_samples import NAMES, enrolled, enrolling, identified, identifying, searching_densely
 
 from rig.errors import UsageError
 from rig.plans.events import Accepted
@@ -256,3 +256,19 @@ def test_a_failed_write_leaves_the_old_page(tmp_path: Path) -> None:
         write_report(path, "new")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     assert (path / "kept").read_text() == "old"
+
+
+@pytest.mark.parametrize("pair", [True, False])
+def test_a_dense_search_is_shown_with_all_that_was_weighed(pair: bool) -> None:
+    record = IdentificationRecord()
+    for event in searching_densely(pair=pair):
+        record.add(event)
+    page = Page(render_report("Search", "", [], [record], meta=META))
+    charts = [attrs["class"] for tag, attrs in page.tags if "confusion" in attrs.get("class", "").split()]
+    assert len(charts) == 2
+    text = " ".join(page.texts)
+    assert "Rehearse them." in text
+    assert "Not sure yet: a probability of 60.0%, and 95.0% ends the search." in text
+    assert "What was weighed before each turn" in text
+    assert ("mug-white or mug-star" in text) == pair
+    assert ["mug-white", "60.0%", "0.900"] in [row for table in page.tables for row in table]
