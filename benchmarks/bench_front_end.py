@@ -35,17 +35,17 @@ class Referenced(Condition):
 
     Attributes
     ----------
-    reference : {"own", "enrollment", "none"}
+    shown : {"own", "enrollment", "none"}
         The query bench's own in the query's light, the enrollment bench's, or none.
     """
 
-    reference: str = "own"
+    shown: str = "own"
 
     def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> Shot:
         image, own = super().query(image_bgr, rng)
-        if self.reference == "none":
+        if self.shown == "none":
             return Shot(image)
-        return Shot(image, own if self.reference == "own" else self.enrolled(image_bgr).empty)
+        return Shot(image, own if self.shown == "own" else self.enrolled(image_bgr).empty)
 
 
 def cases(descriptor: str) -> Iterator[tuple[str, Referenced]]:
@@ -55,7 +55,7 @@ def cases(descriptor: str) -> Iterator[tuple[str, Referenced]]:
         ("another bench", Referenced(background="other-bench", perturbations=Perturbations.parse(EVERYTHING))),
     ):
         for reference in ("own", "enrollment", "none"):
-            yield f"{bench}, {reference}", replace(condition, descriptor=descriptor, reference=reference)
+            yield f"{bench}, {reference}", replace(condition, descriptor=descriptor, shown=reference)
 
 
 def main() -> None:
