@@ -20,6 +20,7 @@ from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
 from hbr.hough import Ranking, retrieve
 from hbr.index import ViewIndex
+from hbr.likeness import symmetry
 from hbr.looking import most_informative_turn, next_look
 from hbr.views import Views
 
@@ -95,6 +96,9 @@ class Runs:
         Distance of the estimated from the true orientation of the true object, 0..180; nan where it was no candidate.
     alike_error_deg : float64
         The same to the nearest orientation from which the object looks as it does from the true one.
+    period_deg : float64
+        After which turn the true object looks the same, of all its views (`hbr.likeness.symmetry`): 360 where it is not
+        symmetric; nan of too few views.
     lead : float64
         `hbr.lead` of the best object, a view; by the dense filter, its score above the second's.
     best : int32
@@ -112,6 +116,7 @@ class Runs:
     rank: NDArray[np.int32]
     pose_error_deg: FloatArray
     alike_error_deg: FloatArray
+    period_deg: FloatArray
     lead: FloatArray
     best: NDArray[np.int32]
     score: FloatArray
@@ -123,11 +128,12 @@ class Runs:
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
         """Nothing looked at yet."""
         shape = (methods, objects, trials, views)
-        errors, alike, lead, score, posterior, travelled = np.full((6, *shape), np.nan)
+        errors, alike, period, lead, score, posterior, travelled = np.full((7, *shape), np.nan)
         return cls(
             np.full(shape, -1, np.int32),
             errors,
             alike,
+            period,
             lead,
             np.full(shape, -1, np.int32),
             score,
@@ -206,10 +212,8 @@ class _Trials:
         self._rows = views.of(object_index)
         self._azimuth_deg = views.azimuth_deg[self._rows]
         name = views.object_names[object_index]
-        self._enrolled = _enrolled(views, protocol.enrolled)
-        absent = np.array([other in protocol.absent for other in views.object_names])
-        self._enrolled &= ~absent[views.object_index]
-        self._is_stranger = bool(absent[object_index])
+        self._enrolled = views_of_trial(views, protocol)
+        self._is_stranger = name in protocol.absent
         self._free = np.flatnonzero(~self._enrolled[self._rows]) if protocol.enrolled else np.arange(len(self._rows))
         self._index: DenseIndex | None = None
         if len(queries) != len(self._rows):
@@ -222,6 +226,8 @@ class _Trials:
         own = views.descriptors[self._rows]
         compared = descriptor(views.descriptor)
         self._alike = _looks_alike(compared.similarity(own, own), self._ring)
+        symmetric = symmetry(views, object_index, similarity=compared.similarity)
+        self._period_deg = np.nan if symmetric is None else symmetric.period_deg
         similar = compared.similarity(queries, views.descriptors)
         similar[:, ~self._enrolled] = -np.inf
         self._own_similar = similar[:, self._rows]
@@ -376,6 +382,7 @@ class _Trials:
         place = np.flatnonzero(objects == self._object)
         runs.rank[at] = place[0] + 1 if len(place) else 0
         runs.best[at] = objects[0]
+        runs.period_deg[at] = self._period_deg
         if len(place):
             away_deg = np.abs(wrap180(pose_deg[place[0]] - self._azimuth_deg))
             runs.pose_error_deg[at] = away_deg[seen[-1]]
@@ -406,13 +413,13 @@ def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:
     return mask
 
 
-def _enrolled(views: Views, count: int | None) -> NDArray[np.bool_]:
-    """Of every object the views that stay enrolled; all without a count."""
-    mask = np.ones(len(views), np.bool_)
-    if count is not None:
+def views_of_trial(views: Views, protocol: Protocol) -> NDArray[np.bool_]:
+    """Which views are enrolled at all: of every object that is not absent, all or so many as the protocol says."""
+    mask = ~np.isin(views.object_index, [j for j, name in enumerate(views.object_names) if name in protocol.absent])
+    if protocol.enrolled is not None:
         for j in range(len(views.object_names)):
             rows = views.of(j)
-            mask[rows] = views_enrolled(views.azimuth_deg[rows], count)
+            mask[rows] &= views_enrolled(views.azimuth_deg[rows], protocol.enrolled)
     return mask
 
 

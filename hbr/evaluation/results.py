@@ -18,7 +18,8 @@ _BEST: int = 10
 class Point:
     """A method after `views` queries; pose errors are of the trials in which the object was found, None if in none.
 
-    Intervals are Wilson's at 95 % and take trials for independent.
+    The asymmetric ones are of objects that look the same after no turn. Intervals are Wilson's at 95 % and take trials
+    for independent.
     """
 
     views: int
@@ -36,6 +37,7 @@ class Point:
     pose_error_rmse_deg: float | None
     alike_error_median_deg: float | None
     alike_error_rmse_deg: float | None
+    asymmetric_error_median_deg: float | None
 
 
 @dataclass(frozen=True)
@@ -205,6 +207,7 @@ def _point(runs: Runs, method: int, n: int) -> Point:
         _rms(errors),
         _median(alike),
         _rms(alike),
+        _median(errors[runs.period_deg[method, ..., n][found] == 360]),
     )
 
 

@@ -1,11 +1,12 @@
 """Objects that were never enrolled: how often they are taken for one that was, and what that costs the others."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hbr.arrays import BoolArray
-from hbr.deciding import Leaders, conformal_threshold, usual_scores
+from hbr.deciding import Leaders, Rehearsal, conformal_threshold, usual_scores
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Protocol, Runs
 
@@ -14,9 +15,11 @@ from hbr.evaluation.protocol import Protocol, Runs
 class Stranger:
     """After so many views, over all draws of objects that were left out.
 
-    False rejects are of the second half of the known objects' trials, against thresholds from the first half.
+    False rejects are of the second half of the known objects' trials, against thresholds from the first half; or, where
+    the catalog was rehearsed, of all of them, against its thresholds.
     """
 
+    rehearsed: bool
     views: int
     nominal: float
     known_trials: int
@@ -43,36 +46,37 @@ def left_out(protocol: Protocol, names: tuple[str, ...], count: int, draws: int)
     return tuple(drawn)
 
 
-def strangers(parts: list[tuple[Runs, BoolArray]], false_reject: float) -> tuple[Stranger, ...]:
+def strangers(
+    parts: Sequence[tuple[Runs, BoolArray]], false_reject: float, rehearsals: Sequence[Rehearsal] = ()
+) -> tuple[Stranger, ...]:
     """Judge the draws at a nominal false-reject rate.
 
     Parameters
     ----------
-    parts : list of (Runs, bool array (objects,))
+    parts : sequence of (Runs, bool array (objects,))
         Of each draw the runs of all objects by one method of the dense filter, and which were absent.
     false_reject : float
         Share of known objects' searches that may be called unknown.
+    rehearsals : sequence of Rehearsal, optional
+        Of each draw's catalog: thresholds come from them instead of from half of the trials.
     """
     views = parts[0][0].score.shape[-1]
-    rows = []
-    for n in range(views):
-        rejects = accepts = known_trials = stranger_trials = 0
-        for runs, absent in parts:
-            half = runs.score.shape[2] // 2
-            first, second, strange = (
-                _leaders(runs, rows, trials)
-                for rows, trials in ((~absent, slice(half)), (~absent, slice(half, None)), (absent, slice(None)))
-            )
-            asked = np.repeat(np.flatnonzero(~absent), half)[:, None]
-            usual = usual_scores(first, first.object_index == asked, len(absent))
-            threshold = conformal_threshold(first.familiarity(usual)[:, n], false_reject)
-            known, stranger = second.familiarity(usual)[:, n], strange.familiarity(usual)[:, n]
-            rejects += int((known < threshold).sum())
-            accepts += int((stranger >= threshold).sum())
-            known_trials += known.size
-            stranger_trials += stranger.size
-        rows.append(Stranger(n + 1, false_reject, known_trials, rejects, stranger_trials, accepts))
-    return tuple(rows)
+    counts = np.zeros((views, 4), int)
+    for d, (runs, absent) in enumerate(parts):
+        half = 0 if rehearsals else runs.score.shape[2] // 2
+        known, strange = _leaders(runs, ~absent, slice(half, None)), _leaders(runs, absent, slice(None))
+        if rehearsals:
+            sample, correct = rehearsals[d].known, rehearsals[d].correct
+        else:
+            sample = _leaders(runs, ~absent, slice(half))
+            correct = sample.object_index == np.repeat(np.flatnonzero(~absent), half)[:, None]
+        usual = usual_scores(sample, correct, len(absent))
+        measured = sample.familiarity(usual)
+        for n in range(views):
+            threshold = conformal_threshold(measured[:, n], false_reject)
+            familiar, odd = known.familiarity(usual)[:, n], strange.familiarity(usual)[:, n]
+            counts[n] += len(familiar), (familiar < threshold).sum(), len(odd), (odd >= threshold).sum()
+    return tuple(Stranger(bool(rehearsals), n + 1, false_reject, *row) for n, row in enumerate(counts.tolist()))
 
 
 def _leaders(runs: Runs, objects: BoolArray, trials: slice) -> Leaders:

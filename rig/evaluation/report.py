@@ -101,18 +101,19 @@ def decision_rows(results: dict[str, Any]) -> Rows:
     for method in results["methods"]:
         last, stopping = method["curve"][-1], method["stopping"]
         poses = [last[f"{kind}_error_{measure}_deg"] for kind in ("pose", "alike") for measure in ("median", "rmse")]
+        poses.append(last["asymmetric_error_median_deg"])
         rows.append(
             [
                 method["label"],
                 f"{stopping['views_mean']:.2f}",
                 f"{stopping['views_p95']:.0f}",
-                f"{100 * stopping['hit_rate']:.1f}",
+                f"{100 * stopping['hit_rate']:.2f}",
                 f"{stopping['travelled_mean_deg']:.0f}",
-                *("–" if error is None else f"{error:.0f}" for error in poses),
+                *("–" if error is None else f"{error:.1f}" for error in poses),
                 f"{results['wall_clock']['step_median_ms'][method['name']][-1]:.1f}",
             ]
         )
-    heads = ["decision", "views", "p95", "hits %", "turned°", "pose°", "RMSE°", "alike°", "RMSE°", "ms"]
+    heads = ["decision", "views", "p95", "hits %", "turned°", "pose°", "RMSE°", "alike°", "RMSE°", "asym.°", "ms"]
     return Rows(heads, rows)
 
 

@@ -7,9 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from hbr.deciding import Rehearsal, rehearse
+from hbr.dense import DenseIndex
 from hbr.evaluation.descriptors import query_levels
 from hbr.evaluation.methods import METHODS
-from hbr.evaluation.protocol import Protocol, Runs, run_object
+from hbr.evaluation.protocol import Protocol, Runs, run_object, views_of_trial
 from hbr.evaluation.statistics import wilson
 from hbr.evaluation.strangers import left_out, strangers
 from hbr.views import Views
@@ -44,9 +46,12 @@ def run_strangers(
         )
         for draw, protocol in enumerate(protocols)
     ]
+    # too few views of each object to leave out those of a search: the catalog says nothing of itself
+    enough = (plan.protocol.enrolled or plan.dataset.views) > plan.protocol.max_views
+    rehearsals = [_rehearsed(views, protocol) for protocol in protocols] if enough else []
     rows = []
     for nominal in NOMINAL:
-        for row in strangers(parts, nominal):
+        for row in (*strangers(parts, nominal), *(strangers(parts, nominal, rehearsals) if enough else ())):
             low, high = wilson(row.false_accepts, row.stranger_trials)
             rows.append({**asdict(row), "false_accepts_low": low, "false_accepts_high": high})
     settings = {**plan.settings(), "left_out": count, "draws": draws}
@@ -55,14 +60,21 @@ def run_strangers(
 
 def stranger_rows(results: dict[str, Any]) -> Rows:
     """Return the table: a row a nominal rate, realised false rejects and false accepts in percent by views."""
-    by_nominal: dict[float, list[str]] = {}
+    by_nominal: dict[tuple[bool, float], list[str]] = {}
     for row in results["strangers"]:
         rejected = 100 * row["false_rejects"] / row["known_trials"]
         accepted = 100 * row["false_accepts"] / row["stranger_trials"]
-        by_nominal.setdefault(row["nominal"], []).append(f"{rejected:.2f} / {accepted:.2f}")
+        by_nominal.setdefault((row["rehearsed"], row["nominal"]), []).append(f"{rejected:.2f} / {accepted:.2f}")
     views = max(row["views"] for row in results["strangers"])
     heads = ["false rejects / accepts, %, at N =", *(str(n) for n in range(1, views + 1))]
-    return Rows(heads, [[f"nominal {100 * nominal:g}", *cells] for nominal, cells in by_nominal.items()])
+    names = {key: f"nominal {100 * key[1]:g}{', rehearsed' if key[0] else ''}" for key in sorted(by_nominal)}
+    return Rows(heads, [[name, *by_nominal[key]] for key, name in names.items()])
+
+
+def _rehearsed(views: Views, protocol: Protocol) -> Rehearsal:
+    """What the catalog says of itself, as on a bench."""
+    there = views_of_trial(views, protocol)
+    return rehearse(DenseIndex(views.select(there)), views=protocol.max_views)
 
 
 def _search(plan: Plan, views: Views, protocols: tuple[Protocol, ...], j: int) -> list[Runs]:

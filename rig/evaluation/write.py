@@ -108,8 +108,8 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Figure]) -> str:
                 f"A search ends when the best object leads by {stopping['margin']:g} a view (by the dense "
                 f"filter: has a probability of {CERTAINTY:g}), or after all views: views "
                 "taken (mean, 95th percentile), hit-rate then, mean of the degrees turned. Pose error after all views, "
-                "of the trials that found the object: median and RMSE, plain, then symmetry-aware. Median time of the "
-                "last step.",
+                "of the trials that found the object: median and RMSE, plain, then symmetry-aware, and the median of "
+                "objects that are not rotation-symmetric. Median time of the last step.",
                 *decisions,
             ),
         ],
