@@ -8,10 +8,9 @@ To have `rig identify --strategy golden` find it, a package names it in the entr
 
 import tempfile
 
-import hbr
-from rig import Catalog, enroll, identify, open_bench
+from rig import Catalog, enroll, identify, load_model, open_bench
 from rig.plans.events import Identified
-from rig.plans.strategies import Look, Stop, Strategy, Turn, enough
+from rig.plans.strategies import AnyStrategy, DenseLook, Look, Stop, Turn, descriptor_for, enough
 from sim.bench import ShelfOperator
 
 OBJECTS = ("toy-house", "toy-car", "book-night")
@@ -26,8 +25,20 @@ class Golden:
         return enough(look) or Turn(137.508, "the golden angle leads far from all views so far")
 
 
+class FarSide:
+    """The same on the rig's own search: its rules say when to stop, and views are described by its descriptor."""
+
+    name = "far-side"
+    descriptor = "edges+colours"
+
+    def next(self, look: DenseLook) -> Turn | Stop:
+        if look.verdict.kind != "look":
+            return Stop(look.verdict.words)
+        return Turn(135.0, "nearly the far side")
+
+
 def main() -> None:
-    strategies: tuple[Strategy | str, ...] = ("ahbr", "sweep", Golden())
+    strategies: tuple[AnyStrategy, ...] = (Golden(), FarSide())
     with (
         tempfile.TemporaryDirectory() as folder,
         open_bench("sim", seed=3) as bench,
@@ -36,16 +47,16 @@ def main() -> None:
         for name in OBJECTS:
             for _ in enroll(bench, catalog, name, views=12):
                 pass
-        index = hbr.ViewIndex(catalog.views().views)
         hands = bench.operator
         assert isinstance(hands, ShelfOperator)  # simulated; on a real bench somebody puts the object there
-        for strategy in strategies:
+        for strategy in (None, *strategies):
+            model = load_model(catalog, descriptor=None if strategy is None else descriptor_for(strategy))
             for name in OBJECTS:
                 hands.next_object = name
-                for event in identify(bench, index, strategy=strategy):
+                for event in identify(bench, model, strategy=strategy):
                     if isinstance(event, Identified):
                         found = f"{event.name or 'unknown':12} {event.views} views, {event.travelled_deg:.0f}°"
-                label = strategy if isinstance(strategy, str) else strategy.name
+                label = "dense" if strategy is None else strategy.name
                 print(f"{label:8} {name:12} found as {found}")
 
 

@@ -5,8 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-import hbr
-from rig import Catalog, open_bench
+from rig import Catalog, load_model, open_bench
 from rig.bench import ObjectStandsThere
 from rig.clock import SystemClock
 from rig.config import load_config
@@ -32,7 +31,7 @@ def main() -> int:
                 bench.operator = TableWatcher(bench)
             answers = 0
             # The model is loaded before each search: what was enrolled meanwhile is found.
-            for event in watch(bench, lambda: hbr.ViewIndex(catalog.views().views)):
+            for event in watch(bench, lambda: load_model(catalog)):
                 print(json.dumps(event_dict(event)), flush=True)
                 answers += isinstance(event, Identified)
                 if answers == arguments.answers:

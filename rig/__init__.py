@@ -7,15 +7,19 @@ if TYPE_CHECKING:
     from rig.catalog import Catalog
     from rig.plans.enroll import enroll
     from rig.plans.identify import identify
+    from rig.plans.model import load_model
+    from rig.plans.photograph_table import photograph_table
 
-__all__ = ["Bench", "Catalog", "enroll", "identify", "open_bench"]
+__all__ = ["Bench", "Catalog", "enroll", "identify", "load_model", "open_bench", "photograph_table"]
 
 _HOMES = {
     "Bench": "rig.bench",
     "Catalog": "rig.catalog",
     "enroll": "rig.plans.enroll",
     "identify": "rig.plans.identify",
+    "load_model": "rig.plans.model",
     "open_bench": "rig.bench",
+    "photograph_table": "rig.plans.photograph_table",
 }
 
 

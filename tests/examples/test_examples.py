@@ -63,6 +63,6 @@ def test_the_loop_tells_an_error_as_its_last_line(tmp_path):
 def test_the_strategy_finds_the_objects_beside_the_others(tmp_path):
     done = run(str(EXAMPLES / "custom_strategy.py"), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    found = re.findall(r"^(\w+) +(\S+) +found as (\S+) +(\d) views", done.stdout, re.M)
-    assert [strategy for strategy, *_ in found] == ["ahbr"] * 3 + ["sweep"] * 3 + ["golden"] * 3
+    found = re.findall(r"^([\w-]+) +(\S+) +found as (\S+) +(\d) views", done.stdout, re.M)
+    assert [strategy for strategy, *_ in found] == ["dense"] * 3 + ["golden"] * 3 + ["far-side"] * 3
     assert all(shown == answer for _, shown, answer, _ in found), done.stdout
