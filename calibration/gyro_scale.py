@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
-from calibration.legs import COVERAGE, Leg
+from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
 from rig.errors import LimitExceeded, UsageError
 from rig.evaluation.drawing import Figure
@@ -123,12 +123,11 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
             "imu.sign and table.direction, that the sensor rides flat on the platter, and that no gear is between."
         )
     else:
-        value, sigma_fit = _ratio(encoder, gyro, sigma)
+        fitted = fit(used, gyro[:, None], resolution_deg)
+        value, uncertainty = float(fitted.values[0]), float(fitted.sigma[0])
         residuals = np.abs(encoder - value * gyro)
         worst = int(np.argmax(residuals / sigma))
         residual, limit = float(residuals[worst]), COVERAGE * float(sigma[worst])
-        # Scatter beyond the stated noise counts (the Birge ratio); less of it is luck.
-        uncertainty = sigma_fit * sqrt(max(float(((residuals / sigma) ** 2).sum()) / (len(used) - 1), 1.0))
         estimates["scale"] = Estimate(value, uncertainty, "true °/s per °/s read")
         (value_up, sigma_up), (value_down, sigma_down) = (
             _ratio(encoder[way], gyro[way], sigma[way]) for way in (up, ~up)

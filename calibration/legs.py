@@ -13,6 +13,9 @@ from rig.turntable import Move
 COVERAGE = 4.0
 """Residuals beyond this many standard uncertainties are no chance (1 in 16 000)."""
 
+STATED_WEIGHT = 4.0
+"""As many degrees of freedom as the scatter of the legs has to outweigh what was stated of it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Leg:
@@ -55,7 +58,7 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
     """Fit the encoder's rotations by a linear model, by generalised least squares.
 
     Every rest lies anywhere within an encoder count, and consecutive legs share one with opposite signs, so that their
-    errors are correlated. Scatter beyond the stated noise counts (the Birge ratio); less of it is luck.
+    errors are correlated. What the legs scatter counts beside what is stated of it: see `scatter`.
 
     Parameters
     ----------
@@ -74,6 +77,15 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
     root = np.linalg.cholesky(covariance)
     white, white_encoder = np.linalg.solve(root, design), np.linalg.solve(root, encoder)
     values = np.linalg.lstsq(white, white_encoder, rcond=None)[0]
-    birge = max(float(((white_encoder - white @ values) ** 2).sum()) / max(n - parameters, 1), 1.0)
-    sigma = np.sqrt(np.diag(np.linalg.inv(white.T @ white)) * birge)
+    square = scatter(float(((white_encoder - white @ values) ** 2).sum()), n - parameters)
+    sigma = np.sqrt(np.diag(np.linalg.inv(white.T @ white)) * square)
     return LinearFit(values, sigma, encoder - design @ values, np.sqrt(np.diag(covariance)))
+
+
+def scatter(chi_square: float, freedom: int) -> float:
+    """Return by how much the variance of legs is larger, or smaller, than stated: the square of the Birge ratio.
+
+    A bench may state its noise with too much caution, or too little. A few legs prove neither: what was stated weighs
+    as much as `STATED_WEIGHT` of them (the mean of an inverse-gamma posterior about 1).
+    """
+    return (chi_square + STATED_WEIGHT) / (freedom + STATED_WEIGHT)
