@@ -286,7 +286,7 @@ def show(settings: Settings) -> None:
                 print(f"✓ {standing.words}")
                 print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.fact.estimates.items()))
                 for key, value in standing.fact.settings.items():
-                    print(f"    sets {key} = {value}")
+                    print(f"    sets {key} = {_plain(value)}")
         if not standings:
             print(f"Nothing is calibrated yet in {store.folder}: run `rig calibrate all`.")
 
@@ -415,5 +415,10 @@ def verdict(fact: "Fact") -> str:
         judged = f" (worst residual {fact.residual:.3g} {unit}, limit {fact.limit:.3g} {unit})"
     lines = [f"{'PASS' if fact.passed else 'FAIL'} {fact.name}{judged}"]
     lines += [f"  {name} = {estimate}" for name, estimate in fact.estimates.items()]
-    lines += [f"  sets {key} = {value}" for key, value in fact.settings.items()]
+    lines += [f"  sets {key} = {_plain(value)}" for key, value in fact.settings.items()]
     return "\n".join([*lines, *(f"  {reason}" for reason in fact.refusals)])
+
+
+def _plain(value: Any) -> str:
+    """Return a value of the configuration in a few digits."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -25,15 +25,16 @@ def rig(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "reason"),
+    ("stands", "arguments", "reason"),
     [
-        (("--columns", "10", "--rows", "7"), "not where a board of 10 columns and 7 rows has them"),
-        (("--columns", "6", "--rows", "4"), "that are not on a board of 6 columns and 4 rows"),
-        (("--set", 'bench.sim.faults=["slip:angle=6@move5"]'), "the table moves while it is looked at"),
+        (1, ("--columns", "10", "--rows", "7"), "not where a board of 10 columns and 7 rows has them"),
+        (1, ("--columns", "6", "--rows", "4"), "that are not on a board of 6 columns and 4 rows"),
+        (4, ("--set", 'bench.sim.faults=["slip:angle=6@move5"]'), "the table moves while it is looked at"),
     ],
     ids=["larger board", "smaller board", "moving table"],
 )
-def test_it_is_refused_with_the_reason_and_nothing_is_in_force(rig, tmp_path, arguments, reason):
+def test_it_is_refused_with_the_reason_and_nothing_is_in_force(rig, tmp_path, monkeypatch, stands, arguments, reason):
+    monkeypatch.setattr(camera_model, "STANDS", dict(list(camera_model.STANDS.items())[:stands]))
     done = rig("calibrate", "camera", *arguments)
     assert done.exit_code == 6, done.output
     assert reason in done.stdout
