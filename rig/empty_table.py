@@ -7,10 +7,9 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Final, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AwareDatetime, BaseModel, ConfigDict, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
 from hbr.frontend import TRUSTED
 from rig.bench import Bench
@@ -69,6 +68,7 @@ class EmptyTable:
         """Return why the picture should be taken anew, though it is better than none."""
         hours = (bench.clock.utc() - self.taken_utc).total_seconds() / 3600
         found = [f"it is {_age_words(hours)} old"] if hours > HOLDS_H else []
+        found += ["it is dated in the future: see to the computer's clock"] if hours < -1 else []
         before, now = asdict(self.locks), asdict(bench.camera.read_locks())
         found += [
             f"{name} was {_setting(value)}, is {_setting(now[name])}"
@@ -186,7 +186,7 @@ class _Kept(BaseModel):
     camera: CameraIdentity
     locks: CameraLocks
     evidence: dict[str, Any]
-    image: str
+    image: str = Field(pattern=r"^empty-table-[0-9TZ.]+\.png$")
     sha256: str
     doubt: str = ""
 
@@ -212,7 +212,7 @@ def _facts(bench: Bench, *, quiet: bool = False) -> _Kept | None:
     except ValidationError as error:
         why = f"{_FACTS} is damaged ({error.errors(include_url=False)[0]['msg']})"
     else:
-        if kept is None or (kept.version == _VERSION and "/" not in kept.image):
+        if kept is None or kept.version == _VERSION:
             return kept
         why = f"{_FACTS} is of version {kept.version}, this program knows {_VERSION}"
     if quiet:
@@ -232,10 +232,11 @@ def _read(bench: Bench) -> EmptyTable | None:
         raise _Damaged(f"{kept.image} is missing")
     if hashlib.sha256(png).hexdigest() != kept.sha256:
         raise _Damaged(f"{kept.image} is damaged")
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise _Damaged(f"{kept.image} cannot be read")
-    return EmptyTable(np.asarray(image, np.uint8), kept.taken_utc, kept.camera, kept.locks, kept.evidence, kept.doubt)
+    try:
+        image = images.decode(png)
+    except images.BadImage as error:
+        raise _Damaged(f"{kept.image} cannot be read: {error}") from error
+    return EmptyTable(image, kept.taken_utc, kept.camera, kept.locks, kept.evidence, kept.doubt)
 
 
 def _age_words(hours: float) -> str:

@@ -44,7 +44,8 @@ def test_it_is_taken_told_and_shown(rig: Callable[..., Any]) -> None:
 
 
 def test_an_enrollment_takes_it_once_a_day_and_says_what_came_of_it(rig: Callable[..., Any]) -> None:
-    first, second = (rig("enroll", name, "--views", "4") for name in ("dice", "lamp"))
+    small = [word for setting in SMALL for word in ("--set", setting)]
+    first, second = (rig("enroll", name, "--views", "4", *small) for name in ("dice", "lamp"))
     assert "Picture of the empty table" in first.stderr
     assert "Picture of the empty table" not in second.stderr
     shown = rig("catalog", "show", "dice")

@@ -4,22 +4,30 @@ import json
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rig.bench import Bench
 from rig.catalog import Catalog
+from rig.config import RigConfig, load_config
 from rig.describer import BENCH_DESCRIPTOR, Sightings
 from rig.empty_table import HOLDS_H, Drift, EmptyTables
 from rig.errors import StateNotKept, TableNotEmpty, UsageError, ViewRejected
 from rig.plans.enroll import enroll
 from rig.plans.events import TablePicture, Warned
 from rig.plans.photograph_table import photograph_table
-from rig.state import FileStore
+from rig.presence import TableWatcher
+from rig.state import FileStore, MemoryStore
 from sim import disk
+from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES
+from sim.objects.shelf import shelf
+from sim.world import World
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 
@@ -132,6 +140,50 @@ def test_on_disk_damage_is_told_and_a_new_picture_mends_it(simulated: Open, tmp_
     assert EmptyTables.current(s.bench) is not None
     photographed(s.bench)
     assert len(list(tmp_path.glob("*.png"))) == 1  # the one before is let go of
+
+
+@pytest.fixture(scope="module")
+def facts() -> bytes:
+    """What a bench keeps beside a picture."""
+    world = World()
+    with open_sim_bench(load_config(None, SMALL), ShelfOperator(world, shelf())) as bench:
+        photographed(bench)
+        return bench.state.read_file("empty-table.json") or b""
+
+
+@given(data=st.data())
+def test_whatever_is_in_the_files_is_a_picture_or_a_reason(facts: bytes, data: st.DataObject) -> None:
+    state = MemoryStore()
+    known = json.loads(facts)
+    garbage = st.recursive(
+        st.none() | st.integers() | st.text() | st.just(1e999), lambda some: st.lists(some), max_leaves=3
+    )
+    spoilt = st.dictionaries(st.sampled_from(sorted(known)), garbage, max_size=3).map(
+        lambda changes: json.dumps({**known, **changes}).encode()
+    )
+    state.files["empty-table.json"] = data.draw(spoilt | st.binary(max_size=40))
+    state.files[known["image"]] = data.draw(st.binary(max_size=40))
+    bench = SimpleNamespace(state=state, config=RigConfig())
+    standing = EmptyTables.standing(bench)  # type: ignore[arg-type]
+    assert standing.table is None
+    assert "of no use" in standing.words
+
+
+def test_a_clock_that_was_set_back_is_told(simulated: Open) -> None:
+    s = simulated(*SMALL)
+    photographed(s.bench)
+    s.world.clock.set_civil(-7200.0)
+    assert "dated in the future" in EmptyTables.standing(s.bench).words
+
+
+def test_a_bench_that_watches_its_table_photographs_it_before_the_first_object(simulated: Open) -> None:
+    s = simulated(*SMALL)
+    s.bench.operator = TableWatcher(s.bench)
+    assert photographed(s.bench).turning_share == 0
+    s.world.clock.call_at(s.world.clock.now_ns() + 2_000_000_000, lambda: s.world.put(shelf()["toy-car"]))
+    s.bench.operator.place(None)
+    with pytest.raises(UsageError, match="cannot be taken away"):
+        photographed(s.bench)
 
 
 def test_a_full_disk_is_told_and_the_picture_before_stays(simulated: Open, tmp_path: Path) -> None:
