@@ -32,9 +32,9 @@ VIEWS: Final = 4
 """Views of a rehearsed search, where the objects have enough."""
 ENOUGH: Final = 400
 """Searches of a rehearsal, from different first views; one for each object where there are more objects."""
-LEAST_CERTAINTY: Final = 0.9
+LEAST_CERTAINTY: Final = 0.95
 """No search ends at less, however well the rehearsed ones went: what stands there now may be less clear."""
-UNPROMISED: Final = 0.95
+UNPROMISED: Final = 0.98
 """Probability that ends a search where no error rate can be promised."""
 
 _QUICK_S: Final = 0.4
@@ -86,7 +86,7 @@ def rehearse(
     """Look for the enrolled objects among each other, and return the rules that follow.
 
     Where there is too little data for a rate that was asked for, the rules do their best and promise nothing: a search
-    ends at a probability of 0.95, and unknown is what is less familiar than every rehearsed search was. What is not
+    ends at a probability of 0.98, and unknown is what is less familiar than every rehearsed search was. What is not
     promised, and how much more data it takes, stands in ``promises``.
 
     Parameters

@@ -36,16 +36,16 @@ def test_it_enrolls_finds_and_recognises_strangers(small):
     assert done.exit_code in (0, 6)  # with so few views an answer may be wrong; that is said, and the exit code tells
     text = done.stdout
     moves = re.findall(
-        r"^ +\d +[\d.]+° +([+-][\d.]+)° +([+-][\d.]+)° +([+-][\d.]+) ± [\d.]+°.* (\S+) (\d\.\d{3})",
+        r"^ +\d +[\d.]+° +([+-][\d.]+)° +([+-][\d.]+)° +([+-][\d.]+) ± [\d.]+°.* (\S+) [<>]?(\d+\.\d)%",
         text.replace("−", "-"),
         re.MULTILINE,
     )
     assert moves
-    for asked, encoder, imu, leader, score in moves:
+    for asked, encoder, imu, leader, odds in moves:
         assert float(encoder) == pytest.approx(float(asked), abs=0.5)
         assert float(imu) == pytest.approx(float(encoder), abs=0.3 + 0.04 * abs(float(encoder)))
         assert leader
-        assert 0 < float(score) <= 1
+        assert 0 < float(odds) < 100
     assert text.count("(never") == 2  # a narrow terminal breaks the line after this word
     assert "3 objects enrolled with 36 views" in text
 
