@@ -1,7 +1,7 @@
 """When a search by the dense filter ends, and when an object is unknown: at error rates that were measured.
 
-The catalog itself is the sample: each of its views is looked for as if it were not enrolled, and once more as if its
-whole object were not.
+The catalog itself is the sample: its views are looked for as if they had been taken a little aside, and once more as if
+their whole object were not enrolled.
 """
 
 from dataclasses import dataclass
@@ -12,11 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hbr.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense import BETA, Belief, DenseIndex, believe
+from hbr.dense import BETA, BINS, Belief, DenseIndex
 
 #: What the lead over the second object counts beside the score, and what its leader's usual score.
 _LEAD: Final = 0.5
 _USUAL: Final = 0.5
+#: No search ends at a smaller probability, however well the rehearsed ones went: what stands there may be less clear.
+LEAST_CERTAINTY: Final = 0.9
+#: Rehearsed views lie aside by shares of a step that are spread over 0..1 as multiples of this.
+_GOLDEN: Final = 0.618034
 #: The views of a rehearsed search are this far apart.
 _STEP_DEG: Final = 90.0
 
@@ -143,12 +147,16 @@ class Verdict:
 def rehearse(
     index: DenseIndex, *, beta: float = BETA, views: int = 4, seen: LevelArray | None = None, searches: int = 4
 ) -> Rehearsal:
-    """Look for every object by its own enrolled views, a quarter of a turn apart, with those views left out.
+    """Look for every object by its own enrolled views, a quarter of a turn apart, as if they had been taken aside.
+
+    A view at the share u of a step from where it was enrolled would look less like itself by u times what its neighbour
+    does. Real queries are half a step away at most; here u is spread over 0..1, for light and noise make views differ,
+    too.
 
     Parameters
     ----------
     index : DenseIndex
-        Of at least two objects. Objects with fewer than ``views + 1`` views are not looked for.
+        Of at least two objects. Objects with fewer than ``views`` views, or with a single one, are not looked for.
     beta : float
         As for `Belief.posterior`.
     views : int
@@ -170,16 +178,24 @@ def rehearse(
     if levels.shape != index.views.descriptors.shape:
         raise ValueError(f"seen has shape {levels.shape}; the catalog's views have {index.views.descriptors.shape}")
     known, stranger, posterior, correct = [], [], [], []
+    aside = 0.0
     for place, object_index in enumerate(index.object_index.tolist()):
         rows = index.views.of(object_index)
-        azimuth_deg = index.views.azimuth_deg[rows]
-        if len(rows) <= views:
+        if len(rows) < max(views, 2):
             continue
+        rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
+        azimuth_deg = index.views.azimuth_deg[rows]
+        similar = index.compared.similarity(levels[rows])
         for start in np.unique(np.arange(searches) * len(rows) // searches).tolist():
             queries = _spread(azimuth_deg, start, views)
-            so_far: DenseIndex | Belief = index.without(rows[queries])
-            for i in queries:
-                so_far = belief = believe(levels[rows[i]], float(azimuth_deg[i]), so_far, kept=len(index))
+            support = np.zeros((len(index), BINS), np.float32)
+            for n, i in enumerate(queries):
+                aside = (aside + _GOLDEN) % 1
+                neighbour = rows[(i + (1 if n % 2 else -1)) % len(rows)]
+                seen_so = similar[i].copy()
+                seen_so[rows[i]] -= aside * (seen_so[rows[i]] - seen_so[neighbour])
+                support += index.support(seen_so, float(azimuth_deg[i] - azimuth_deg[start]))
+                belief = Belief(index, support, azimuth_deg[queries[: n + 1]])
                 scores, odds = belief.scores(), belief.posterior(beta).sum(axis=1)
                 known.append(_leader(index.object_index, scores))
                 others = np.delete(index.object_index, place)
@@ -187,7 +203,7 @@ def rehearse(
                 posterior.append(odds.max())
                 correct.append(odds.argmax() == place)
     if not known:
-        raise ValueError(f"no object has more than {views} views; enroll more of each, or rehearse fewer views")
+        raise ValueError(f"no object has {max(views, 2)} views; enroll more of each, or rehearse fewer views")
     shape = -1, views
     return Rehearsal(
         len(index.views.object_names),
@@ -254,7 +270,7 @@ def rules(rehearsal: Rehearsal, *, error_rate: float = 0.01, false_reject: float
     usual = usual_scores(rehearsal.known, rehearsal.correct, rehearsal.objects)
     known, stranger = rehearsal.known.familiarity(usual), rehearsal.stranger.familiarity(usual)
     familiar = tuple(conformal_threshold(known[:, n], false_reject) for n in range(views))
-    certainty = certainty_for(rehearsal.posterior, rehearsal.correct, error_rate)
+    certainty = max(LEAST_CERTAINTY, certainty_for(rehearsal.posterior, rehearsal.correct, error_rate))
     promises = []
     if familiar[-1] == -inf:
         promises.append(

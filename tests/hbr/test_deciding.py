@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hbr import Belief, DenseIndex, Views, believe
+from hbr import Belief, DenseIndex, Views, believe, tanimoto
 from hbr.deciding import (
     Leaders,
     Rules,
@@ -70,23 +70,31 @@ def test_certainty_is_the_least_that_keeps_the_error_rate() -> None:
     assert certainty_for(posterior[:40], np.ones((40, 1), bool), 0.05) < 1
 
 
-def test_a_rehearsal_looks_for_each_object_without_the_views_it_is_looked_for_by() -> None:
+def test_a_rehearsal_looks_for_each_object_by_its_own_views_as_if_taken_aside() -> None:
     views = catalog()
-    rehearsal = rehearse(DenseIndex(views), beta=BETA, views=3, searches=2)
+    index = DenseIndex(views)
+    rehearsal = rehearse(index, beta=BETA, views=3, searches=2)
     assert rehearsal.known.score.shape == rehearsal.stranger.score.shape == rehearsal.correct.shape == (16, 3)
     np.testing.assert_array_equal(rehearsal.known.object_index, np.repeat(np.arange(8), 2)[:, None] * [1, 1, 1])
     assert (rehearsal.stranger.object_index != rehearsal.known.object_index).all()
     assert (rehearsal.stranger.score < rehearsal.known.score).all()
     assert rehearsal.correct.mean() == 1
-    # the first search once more
+    # the first view of the first search once more: 0.618 of a step aside, to the right
     rows = views.of(0)
-    belief = believe(views.descriptors[rows[0]], 0.0, DenseIndex(views).without(rows[[0, 4, 9]]))
-    scores = np.sort(belief.scores())
-    assert rehearsal.known.score[0, 0] == pytest.approx(scores[-1])
-    assert rehearsal.known.lead[0, 0] == pytest.approx(scores[-1] - scores[-2])
-    others = np.sort(belief.scores()[1:])
+    similar = tanimoto(views.descriptors[rows[0]], views.descriptors)[0]
+    similar[rows[0]] = 1 - 0.618034 * (1 - similar[rows[17]])
+    belief = Belief(index, index.support(similar, 0.0), np.zeros(1))
+    scores = belief.scores()
+    ordered = np.sort(scores)
+    assert rehearsal.known.score[0, 0] == pytest.approx(ordered[-1])
+    assert rehearsal.known.lead[0, 0] == pytest.approx(ordered[-1] - ordered[-2])
+    others = np.sort(scores[1:])
     assert rehearsal.stranger.score[0, 0] == pytest.approx(others[-1])
     assert rehearsal.stranger.lead[0, 0] == pytest.approx(others[-1] - others[-2])
+    # views of a second sitting that are less like the enrolled ones are met less well
+    other = np.maximum(views.descriptors, 1) - (views.descriptors > 0)
+    again = rehearse(index, beta=BETA, views=3, searches=2, seen=other.astype(np.uint8))
+    assert again.known.score.mean() < rehearsal.known.score.mean()
 
 
 def test_familiarity_is_relative_to_what_the_leader_usually_scores() -> None:
@@ -147,7 +155,7 @@ def test_a_score_that_no_enrolled_object_has_ends_as_unknown_and_never_early() -
 def test_what_cannot_be_rehearsed_is_refused() -> None:
     with pytest.raises(ValueError, match="at least two"):
         rehearse(DenseIndex(catalog(1)), beta=BETA)
-    with pytest.raises(ValueError, match="more than 18 views"):
-        rehearse(DenseIndex(catalog(2)), beta=BETA, views=18)
+    with pytest.raises(ValueError, match="no object has 19 views"):
+        rehearse(DenseIndex(catalog(2)), beta=BETA, views=19)
     with pytest.raises(ValueError, match="seen has shape"):
         rehearse(DenseIndex(catalog(2)), beta=BETA, seen=np.zeros((3, 144), np.uint8))
