@@ -268,6 +268,7 @@ class IdentifyView(LiveView):
 
     def __init__(self, console: Console) -> None:
         super().__init__(console)
+        self._notes: tuple[str, ...] = ()
         self._ranked: Ranked | None = None
         self._taken = 0
         self._of = 0
@@ -280,7 +281,9 @@ class IdentifyView(LiveView):
             case Started():
                 self._ranked, self._taken, self._of, self._ended = None, 0, event.views, False
                 self._start()
-                self.note(line(event))
+                if event.notes != self._notes:  # of one search after the other, once
+                    self._notes = event.notes
+                    self.note(line(event))
             case Moved() if plain:
                 self.note(line(event))
             case Moved(agrees=False):

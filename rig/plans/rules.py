@@ -293,9 +293,8 @@ def _unpromised(rules: hbr.Rules) -> tuple[str, ...]:
     if not rules.promises:
         return ()
     return (
-        f"{rules.searches} rehearsed searches cannot promise that {rules.error_rate:.1%} of the answers are "
-        f"wrong and {rules.false_reject:.1%} of the enrolled objects called unknown, at most; rig catalog calibrate "
-        "says why",
+        f"{rules.searches} rehearsed searches cannot promise at most {rules.error_rate:.1%} wrong answers and "
+        f"{rules.false_reject:.1%} of the enrolled objects called unknown; rig catalog calibrate says why",
     )
 
 
