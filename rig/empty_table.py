@@ -167,8 +167,8 @@ class Drift:
         self._told = True
         return (
             f"{IN_A_ROW} frames in a row look like the picture of the empty table over "
-            f"{max(self._low):.0%} of their border at most: the table or its surroundings have changed, "
-            "or the camera was moved"
+            f"{max(self._low):.0%} of their border at most: the table or its surroundings have changed, the camera was "
+            "moved, or the object reaches to the border"
         )
 
 

@@ -12,10 +12,7 @@ from rig.cli.jobs import somebody_there
 if TYPE_CHECKING:
     from rig.bench import Bench
 
-WITHOUT = (
-    "objects are then found before a plain background only, and other light or another place makes them harder to "
-    "find again"
-)
+WITHOUT = "objects are found before a plain background only, and less surely in other light"
 STALE = "the one that is there is used, as far as frames look like it"
 
 
@@ -105,16 +102,20 @@ def _asked(settings: Settings, bench: "Bench", question: str, consequence: str) 
     """Ask until there is a picture or somebody goes on without; return whether the table is empty now."""
     from rig.errors import TableNotEmpty, ViewRejected
 
+    keep = ""
     while True:
-        said = _enter(f"{question}\n  Enter takes its picture, s goes on without ({consequence}): ")
+        said = _enter(f"{question}\n  Enter takes its picture,{keep} s goes on without\n  ({consequence}): ")
         if said in ("s", None):
             return False
-        if said:
+        if said not in ("", "k" if keep else ""):
             continue
         try:
-            _photograph(settings, bench, aside=True)
-        except (TableNotEmpty, ViewRejected) as error:
+            _photograph(settings, bench, anyway=said == "k", aside=True)
+        except ViewRejected as error:
             question = f"{error.what}\n{error.next_step}"
+        except TableNotEmpty as error:
+            question = f"{error.what} Take it off, and stand back."
+            keep = " k takes it with what always stays there (a pattern, a screw),"
         else:
             return True
 

@@ -76,11 +76,13 @@ def asked(
 ) -> Callable[..., tuple[Any, str]]:
     """Return a function that asks a person with an object on the table; their answers, one a line, in the end."""
 
-    def run(answers: Answers | io.StringIO, *, ask: bool = True, as_json: bool = False) -> tuple[Any, str]:
+    def run(
+        answers: Answers | io.StringIO, *, ask: bool = True, as_json: bool = False, stays: bool = False
+    ) -> tuple[Any, str]:
         s = simulated(*SMALL)
         s.operator.place("toy-car")
         s.bench.operator = ObjectStandsThere()
-        if isinstance(answers, Answers):
+        if isinstance(answers, Answers) and not stays:
             times = iter(range(99))
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
         monkeypatch.setattr("sys.stdin", answers)
@@ -99,13 +101,21 @@ def test_a_person_is_asked_again_when_the_object_was_forgotten(asked: Callable[.
     assert "Now put toy-car on the table" in said
 
 
+def test_what_always_turns_with_the_table_is_kept_when_asked(asked: Callable[..., tuple[Any, str]]) -> None:
+    table, said = asked(Answers("k\n\nk\n\n"), stays=True)
+    assert table is not None
+    assert table.evidence["turning_share"] > 0.004
+    assert said.count("Enter takes its picture, s goes on") == 2  # nothing is kept unseen: k counts once it was refused
+    assert said.count("k takes it with what always stays there") == 1
+
+
 @pytest.mark.parametrize("answer", ["s\n", "what?\ns\n", ""])
 def test_a_person_may_go_on_without_and_knows_what_that_means(
     asked: Callable[..., tuple[Any, str]], answer: str
 ) -> None:
     table, said = asked(Answers(answer))
     assert table is None
-    assert "s goes on without (objects are then found before a plain background only" in said
+    assert "s goes on without\n  (objects are found before a plain background only" in said
     assert "Now put" not in said
 
 
