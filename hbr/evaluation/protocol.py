@@ -142,6 +142,10 @@ class Runs:
             np.zeros(shape, np.int64),
         )
 
+    def of(self, objects: slice) -> "Runs":
+        """The runs of some objects alone."""
+        return Runs(*(getattr(self, item.name)[:, objects] for item in fields(self)))
+
     @classmethod
     def concatenate(cls, parts: Sequence["Runs"]) -> "Runs":
         """The objects of all parts, in their order."""

@@ -102,6 +102,12 @@ def evaluate(
     objects: Annotated[
         str | None, typer.Option(metavar="FIRST-LAST", help="These objects alone, counted from 1; e.g. 51-100.")
     ] = None,
+    report: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FIRST-LAST", help="Results of these objects alone, among all; with --resume of old runs."
+        ),
+    ] = None,
     margin: Annotated[
         float | None, typer.Option(min=0, help="Lead a view that ends a search; identify.margin otherwise.")
     ] = None,
@@ -155,6 +161,9 @@ def evaluate(
             ),
         )
         dataset = plan.dataset
+        reported = None if report is None else _range(report)
+        if reported is not None:
+            dataset.subset(*reported)  # refuses what is not there
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
         if leave_out is not None:
@@ -190,7 +199,7 @@ def evaluate(
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
     rule = settings.load().identify
-    results = write_results(plan, runs, rule.margin if margin is None else margin, rule.min_views, out)
+    results = write_results(plan, runs, rule.margin if margin is None else margin, rule.min_views, out, reported)
     if settings.json:
         settings.print_json({"event": "finished", **results})
         return
@@ -254,7 +263,7 @@ def _strangers(settings: Settings, plan: "Plan", count: int, jobs: int, out: Pat
 
 
 def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "Dataset":
-    from hbr.evaluation.datasets import DatasetError, load_coil
+    from hbr.evaluation.datasets import load_coil
     from rig.evaluation.plan import load_catalog
 
     if folder is None:
@@ -264,7 +273,11 @@ def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "D
         dataset = load_coil(folder)
     if objects is None:
         return dataset
-    first, _, last = objects.partition("-")
+    return dataset.subset(*_range(objects))
+
+
+def _range(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("-")
     if not (first.isdecimal() and last.isdecimal()):
-        raise DatasetError(f"objects {objects!r} is no range; give the first and the last, e.g. 51-100")
-    return dataset.subset(int(first), int(last))
+        raise ValueError(f"objects {text!r} is no range; give the first and the last, e.g. 51-100")
+    return int(first), int(last)

@@ -114,7 +114,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> F
         ):
             errors = sorted(error for error in method[key] if error is not None)
             series.append(_Series(f"{method['label']}, {words}", colour, dashed, range(1, len(errors) + 1), errors))
-    count = len(results["settings"]["dataset"]["objects"])
+    count = max(len(method["pose_rmse_deg_by_object"]) for method in methods)
     step = max(1, ceil(count / 10))
     ticks = [1, *range(step, count + 1, step)] if step > 1 else list(range(1, count + 1))
     return _chart(
@@ -154,6 +154,8 @@ def _title(results: dict[str, Any]) -> str:
         f"{dataset['name']}, {len(dataset['objects'])} objects, noise {condition['noise']} at {size} px",
         f"{protocol['trials']} trials an object",
     ]
+    if results["reported"]:
+        words.append("objects {} to {}".format(*results["reported"]))
     if condition["background"] != "same":
         words.append(f"{condition['background']} background")
     if condition["rotation_deg"]:

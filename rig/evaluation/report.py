@@ -15,7 +15,9 @@ from hbr.evaluation.results import Contest, contests, method_results, pose_rmse_
 from rig.evaluation.plan import Plan
 
 
-def evaluate(plan: Plan, runs: Runs, margin: float, min_views: int) -> dict[str, Any]:
+def evaluate(
+    plan: Plan, runs: Runs, margin: float, min_views: int, reported: tuple[int, int] | None = None
+) -> dict[str, Any]:
     """Return all results as JSON values, units in the keys; equal runs give equal values outside of ``wall_clock``.
 
     Parameters
@@ -26,11 +28,16 @@ def evaluate(plan: Plan, runs: Runs, margin: float, min_views: int) -> dict[str,
         Lead a view that ends a search.
     min_views
         Views before which no search ends.
+    reported
+        The first and the last object that count, from 1; all otherwise.
     """
+    if reported is not None:
+        runs = runs.of(slice(reported[0] - 1, reported[1]))
     methods = method_results(runs, plan.methods, margin, min_views)
     rng = generator(plan.protocol.seed, plan.dataset.name, "bootstrap", 0)
     return {
         "settings": plan.settings(),
+        "reported": None if reported is None else list(reported),
         "bytes_per_view": descriptor(plan.condition.descriptor).size_bytes,
         "methods": [
             {

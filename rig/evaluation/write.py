@@ -51,7 +51,9 @@ def write_json(results: Mapping[str, Any], path: Path) -> None:
         ) from error
 
 
-def write_results(plan: Plan, runs: Runs, margin: float, min_views: int, folder: Path) -> dict[str, Any]:
+def write_results(
+    plan: Plan, runs: Runs, margin: float, min_views: int, folder: Path, reported: tuple[int, int] | None = None
+) -> dict[str, Any]:
     """Write results.json, results.csv, the figures as SVG and PNG, and report.html, and return the results.
 
     Raises
@@ -59,7 +61,7 @@ def write_results(plan: Plan, runs: Runs, margin: float, min_views: int, folder:
     UsageError
         The folder cannot be written.
     """
-    results = evaluate(plan, runs, margin, min_views)
+    results = evaluate(plan, runs, margin, min_views, reported)
     drawn = figures(results)
     files: dict[str, bytes] = {
         "results.json": json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1).encode() + b"\n",
@@ -94,6 +96,8 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Figure]) -> str:
         f"{protocol['trials']} trials of {protocol['max_views']} views an object; "
         f"{results['bytes_per_view']} bytes a view."
     )
+    if results["reported"]:
+        summary += " Reported: objects {} to {}.".format(*results["reported"])
     curves, decisions = curve_rows(results, interval=True), decision_rows(results)
     return environment.get_template("page.html.j2").render(
         title=f"Retrieval on {dataset['name']}",

@@ -125,6 +125,19 @@ def test_runs_of_other_settings_are_not_mixed(photographs: Path, tmp_path: Path)
     assert "condition" in done.output
 
 
+def test_some_objects_are_reported_alone_though_all_are_enrolled(photographs: Path, tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "out")
+    assert run(photographs, *QUICK, *out).exit_code == 0
+    whole = results(tmp_path / "out")
+    assert run(photographs, *QUICK, *out, "--resume", "--report", "3-4").exit_code == 0
+    part = results(tmp_path / "out")
+    assert part["settings"] == whole["settings"]
+    assert (whole["reported"], part["reported"]) == (None, [3, 4])
+    assert [method["curve"][0]["trials"] for method in part["methods"]] == [4, 4]
+    assert part["methods"][0]["pose_rmse_deg_by_object"] == whole["methods"][0]["pose_rmse_deg_by_object"][2:]
+    assert "Reported: objects 3 to 4." in (tmp_path / "out/report.html").read_text()
+
+
 def test_a_damaged_file_of_runs_is_run_again(photographs: Path, tmp_path: Path) -> None:
     out = ("--out", tmp_path / "out")
     assert run(photographs, *QUICK, *out).exit_code == 0
@@ -220,6 +233,8 @@ def test_other_descriptors_are_judged_by_the_dense_filter(photographs: Path, tmp
     [
         (("--descriptor", "sift"), "'sift' is unknown"),
         (("--perturb", "fog"), "'fog' is unknown"),
+        (("--report", "3"), "'3' is no range"),
+        (("--report", "3-5"), "has 4; count from 1"),
         (("--descriptor", "edges", "--methods", "hbr"), "compares CEDD alone"),
         (("--background", "bench", "--rotate", "10"), "leave one of them"),
         (("--enrolled", "12", "--methods", "dense"), "queries it needs more"),

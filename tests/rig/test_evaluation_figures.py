@@ -50,6 +50,7 @@ def results(*methods: dict) -> dict:
             },
             "protocol": {"trials": 10, "enrolled": None},
         },
+        "reported": [1, 3],
         "methods": list(methods),
     }
 
@@ -111,7 +112,10 @@ def test_the_curves_go_through_their_rates() -> None:
     assert label is not None
     assert "label &lt;ahbr&gt; 90.0" in label[1]
     assert "Best 10 of HBR 100.0" in label[1]
-    assert "a &amp; b, 3 objects, noise gn:0.012 at 128 px; 10 trials an object; uniform background" in label[1]
+    assert (
+        "a &amp; b, 3 objects, noise gn:0.012 at 128 px; 10 trials an object; objects 1 to 3; uniform background"
+        in label[1]
+    )
     assert "turned by up to 20°; prefilter 1.5 px" in label[1]
 
 
