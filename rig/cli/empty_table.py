@@ -43,6 +43,7 @@ def empty_table(
     with settings.open_bench() as bench:
         if show is None:
             _photograph(settings, bench, anyway=anyway)
+            settings.note("photographed the empty table", anyway=anyway)
             return
         standing = EmptyTables.standing(bench)
         if standing.table is None:

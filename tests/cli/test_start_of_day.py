@@ -48,6 +48,8 @@ def test_an_enrollment_takes_it_once_a_day_and_says_what_came_of_it(rig: Callabl
     first, second = (rig("enroll", name, "--views", "4", *small) for name in ("dice", "lamp"))
     assert "Picture of the empty table" in first.stderr
     assert "Picture of the empty table" not in second.stderr
+    assert rig("empty-table", *small).exit_code == 0
+    assert "photographed the empty table" in rig("log").stdout
     shown = rig("catalog", "show", "dice")
     assert "object found in 4 of 4 views, light normalised in 4" in shown.stdout
     told = json.loads(rig("catalog", "show", "lamp", "--json").stdout)
