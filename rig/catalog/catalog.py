@@ -18,7 +18,9 @@ from rig.catalog.database import Database, insert_row
 from rig.catalog.describing import known_descriptor
 from rig.catalog.enrollment import Enrollment
 from rig.catalog.queries import (
+    EnrolledBefore,
     check_free,
+    enrolled_before,
     enrollment_summaries,
     find,
     in_use,
@@ -284,6 +286,23 @@ class Catalog:
         with self._database.read() as connection:
             named = descriptors.c.name == descriptor
             return connection.scalar(select(descriptors.c.view_id).where(named).limit(1)) is not None
+
+    def empty_tables(self) -> EnrolledBefore:
+        """Return which objects were enrolled before a photographed empty table, and the newest of its pictures."""
+        with self._database.read() as connection:
+            return enrolled_before(connection)
+
+    def read_empty_table(self, picture: tuple[str, str]) -> NDArray[np.uint8]:
+        """Return a picture of the empty table, uint8 (H, W, 3), by its place and its digest.
+
+        Raises
+        ------
+        CatalogError
+            The file is missing, is not the one that was stored, or the system denies access.
+        """
+        image, sha256 = picture
+        with self._database.in_words():
+            return images.read(self.path / image, sha256)
 
     def regions(self, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
         """Return the parts of its images that a bench's views are described within; None is all of an image.

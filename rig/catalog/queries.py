@@ -3,7 +3,7 @@
 import json
 from collections import defaultdict
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,18 @@ from rig.catalog.records import (
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
 from rig.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
 from rig.facts.store import CALIBRATIONS
+
+
+class EnrolledBefore(NamedTuple):
+    """What stood behind the enrolled objects.
+
+    ``pictured`` and ``unpictured`` are the objects that were enrolled with a picture of the empty table and without;
+    ``newest`` is the last of the pictures: its place in the catalog and its digest.
+    """
+
+    pictured: tuple[str, ...]
+    unpictured: tuple[str, ...]
+    newest: tuple[str, str] | None
 
 
 def in_use(name: str) -> ColumnElement[bool]:
@@ -226,6 +238,27 @@ def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> Desc
         f"{kind.version}, the catalog is described {found}",
         next_step=f"describe the stored images anew: rig catalog redescribe{option}",
         evidence={"objects": len(names), "versions": list(versions), "version": kind.version},
+    )
+
+
+def enrolled_before(connection: Connection) -> EnrolledBefore:
+    """Return what stood behind the objects that are retrieved."""
+    newest = None
+    pictured: dict[str, bool] = {}
+    for name, image, sha256 in connection.execute(
+        select(objects.c.name, sittings.c.reference_image, sittings.c.reference_image_sha256)
+        .select_from(objects)
+        .join(enrollments)
+        .join(sittings, sittings.c.enrollment_id == enrollments.c.id)
+        .where(retrieved())
+        .order_by(sittings.c.started_utc)
+    ):
+        pictured[name] = pictured.get(name, False) or image is not None
+        newest = newest if image is None else (image, sha256)
+    return EnrolledBefore(
+        tuple(name for name, so in pictured.items() if so),
+        tuple(name for name, so in pictured.items() if not so),
+        newest,
     )
 
 

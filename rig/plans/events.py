@@ -126,7 +126,7 @@ class Weighed:
 
     ``rotations_deg`` are the camera's, positive to the left; ``confusion`` is the logarithm of the probability of still
     taking one object for another after each, ``cost`` what its motion costs, in the same unit: the lowest sum was
-    chosen. ``alike`` is how alike the two rivals look there; None where only one object is left.
+    chosen. ``alike`` is how alike the two rivals look there; None where no second object is likely.
     """
 
     rotations_deg: tuple[float, ...]

@@ -14,9 +14,9 @@ from rig.empty_table import COMMAND, Drift, EmptyTables
 from rig.errors import RigError
 from rig.plans.capture import announced, capture, moved, unwind
 from rig.plans.events import Accepted, Decided, Event, Identified, Started, Warned
-from rig.plans.model import Model
+from rig.plans.model import Model, empty_table_for
 from rig.plans.search import SHOWN, begin_search
-from rig.plans.strategies import AnyStrategy, Stop, Turn, is_dense
+from rig.plans.strategies import AnyStrategy, Stop, Turn
 from rig.turntable import Turntable
 from rig.view import Viewer
 
@@ -53,8 +53,8 @@ def identify(
     top
         How many candidates the events name.
     empty_table : uint8 array (H, W, 3), optional
-        The bench without an object: the object is found by what differs from it. The bench's own picture, if it has
-        one, where none is given.
+        The bench without an object: the object is found by what differs from it. Where none is given, the one that
+        `rig.plans.model.empty_table_for` has.
 
     Raises
     ------
@@ -69,10 +69,9 @@ def identify(
     search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
     viewer = Viewer(bench.camera, bench.config.view)
     notes = model.notes if isinstance(model, Model) else ()
-    if empty_table is None and is_dense(chosen):
-        standing = EmptyTables.standing(bench)
-        empty_table = None if standing.table is None else standing.table.image_bgr
-        notes += (f"{standing.words}; {COMMAND} takes one",) if standing.doubts else ()
+    if empty_table is None and isinstance(model, Model):
+        empty_table, told = empty_table_for(bench, model)
+        notes += told
     describe, drift = Describer(bench.config.view, (search.descriptor,), empty_table), Drift()
     yield Started(
         "identify",

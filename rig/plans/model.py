@@ -1,11 +1,18 @@
 """What a search compares views with: the enrolled views by one descriptor, and the rules of the dense search."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
 
 import hbr
+from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.describer import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
-from rig.errors import DescriptorOutdated
+from rig.empty_table import COMMAND, EmptyTables
+from rig.errors import CatalogError, DescriptorOutdated
 from rig.plans.rules import rules_of
 
 
@@ -21,11 +28,17 @@ class Model:
         When the dense search ends, and what it calls unknown.
     notes
         What a person should know of an answer by this model.
+    pictured
+        Whether the objects were enrolled with a picture of the empty table, most of them; None where nobody knows.
+    empty_table : uint8 array (H, W, 3), optional
+        The newest picture that they were enrolled with.
     """
 
     index: hbr.ViewIndex | hbr.DenseIndex
     rules: hbr.Rules | None = None
     notes: tuple[str, ...] = ()
+    pictured: bool | None = None
+    empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if isinstance(self.index, hbr.DenseIndex) and self.rules is None:
@@ -73,7 +86,7 @@ def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
             try:
                 return _dense(catalog)
             except DescriptorOutdated as error:
-                notes = (_fallback(f"{error.what}"),)
+                notes = (_fallback(error.what),)
         else:
             notes = (_fallback(f"the catalog has no {BENCH_DESCRIPTOR}"),)
     elif descriptor == BENCH_DESCRIPTOR:
@@ -88,7 +101,48 @@ def _dense(catalog: Catalog) -> Model:
         return Model(hbr.ViewIndex(hbr.Views.empty()))  # the search says so
     index = hbr.DenseIndex(views)
     rules, notes = rules_of(catalog.path, index)
-    return Model(index, rules, notes)
+    before = catalog.empty_tables()
+    pictured = len(before.pictured) >= len(before.unpictured)
+    others = before.unpictured if pictured else before.pictured
+    if others:
+        notes += (
+            f"{_few(others)} {'was' if len(others) == 1 else 'were'} enrolled {'without' if pictured else 'with'} a "
+            "picture of the empty table, unlike the others: such views compare badly; rig enroll --replace takes them "
+            "anew",
+        )
+    table = None
+    if pictured and before.newest is not None:
+        with suppress(CatalogError):  # rig catalog verify tells of it; the bench has a picture of its own
+            table = catalog.read_empty_table(before.newest)
+    return Model(index, rules, notes, pictured, table)
+
+
+def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[str, ...]]:
+    """Return the picture of the empty table that a search goes by, and what a person should know of that.
+
+    The bench's own of today; where it has none, the one that the objects were enrolled with. None where they were
+    enrolled without: views are compared with views that were described alike.
+    """
+    if not isinstance(model.index, hbr.DenseIndex):
+        return None, ()
+    standing = EmptyTables.standing(bench)
+    if model.pictured is False:
+        if standing.table is None:
+            return None, ()
+        return None, (
+            "most objects were enrolled without a picture of the empty table, and are searched without; "
+            "rig enroll --replace takes them anew with it",
+        )
+    if standing.table is not None:
+        return standing.table.image_bgr, (f"{standing.words}; {COMMAND} takes one",) if standing.doubts else ()
+    if model.empty_table is None:
+        return None, (f"{standing.words}; {COMMAND} takes one",)
+    return model.empty_table, (f"{standing.words}: the one of the enrollment is used; {COMMAND} takes one",)
+
+
+def _few(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
 
 
 def _fallback(reason: str) -> str:

@@ -24,11 +24,10 @@ from rig.bench import Bench
 from rig.catalog import images
 from rig.config import RigConfig
 from rig.config_values import validate
-from rig.empty_table import EmptyTables
 from rig.errors import CatalogError, RigError, UsageError
 from rig.files import write
 from rig.plans.events import Accepted, Event, Started, event_dict
-from rig.plans.model import Model, model_of
+from rig.plans.model import Model, empty_table_for, model_of
 from rig.plans.rules import FILE as RULES
 from rig.plans.rules import read_rules, write_rules
 
@@ -52,7 +51,7 @@ class RunWriter:
     model : Model or hbr.ViewIndex
         What is enrolled.
     empty_table : uint8 array (H, W, 3), optional
-        As `rig.plans.identify.identify` is given it; the bench's own picture for a dense search, where none is given.
+        As `rig.plans.identify.identify` is given it.
 
     Raises
     ------
@@ -82,9 +81,8 @@ class RunWriter:
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
             if model.rules is not None and isinstance(model.index, hbr.DenseIndex):
                 write_rules(folder / RULES, model.rules, model.index, made_utc=started_utc)
-            if empty_table is None and isinstance(model.index, hbr.DenseIndex):
-                standing = EmptyTables.current(bench)
-                empty_table = None if standing is None else standing.image_bgr
+            if empty_table is None:
+                empty_table, _ = empty_table_for(bench, model)
             if empty_table is not None:
                 write(folder / EMPTY_TABLE, images.encode(empty_table))
             about = {

@@ -32,7 +32,7 @@ def likeness_words(side: str, s_left: float, s_right: float, rivals: Sequence[st
 def separation_words(rivals: Sequence[str], alike: Sequence[float] | None, chosen: int) -> str:
     """Return what a turn of the dense search is to show: which two objects it separates, and how well."""
     if len(rivals) < 2 or alike is None:
-        return "only one object is left, and that side is new"
+        return "no second object is likely, and that side is new"
     here = alike[chosen]
     least, most = min(alike), max(alike)
     return f"to tell {rivals[0]} from {rivals[1]}, {here:.2f} alike there ({least:.2f} to {most:.2f} all around)"

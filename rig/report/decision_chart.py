@@ -40,7 +40,7 @@ def decision_chart(
     rotation_deg
         The chosen one, of the camera around the object.
     rivals
-        The two objects that it separates; empty where only one is left.
+        The two objects that it separates; empty where no second one is likely.
     seen_deg
         Azimuths of the views so far.
     number
@@ -88,7 +88,8 @@ def decision_chart(
 
 def _reasons(weighed: Weighed, chosen: int, rivals: Sequence[str]) -> list[tuple[str, str]]:
     if len(rivals) < 2 or weighed.alike is None:
-        return [("only one object is left:", "small"), ("what is new helps its pose", "small"), *_cost(weighed, chosen)]
+        reason = [("no second object is likely:", "small"), ("what is new helps its pose", "small")]
+        return [*reason, *_cost(weighed, chosen)]
     least, most = min(weighed.alike), max(weighed.alike)
     left, worst = (odds_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
     return [

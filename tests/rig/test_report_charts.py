@@ -272,6 +272,6 @@ class TestDecisionChart:
         for turns in ((5.0,), (-5.0, 5.0), TURNS):
             even = (0.0,) * len(turns)
             svg = decision_chart(0.0, Weighed(turns, even, even), turns[0])
-            assert "only one object is left" in svg
+            assert "no second object is likely" in svg
             assert not having(svg, "alike")
             assert "nan" not in svg

@@ -36,6 +36,7 @@ def saved(tmp_path_factory):
         open_sim_bench(load_config(None, settings), operator) as bench,
         Catalog.open(home / "catalog", clock=bench.clock) as catalog,
     ):
+        list(photograph_table(bench))
         for name in ("mug-white", "mug-star", "lamp"):
             list(enroll(bench, catalog, name, views=8))
         index = hbr.ViewIndex(catalog.views().views)
@@ -47,7 +48,6 @@ def saved(tmp_path_factory):
                     writer.add(event)
                     events.append(event)
             runs[strategy] = home / strategy, events
-        list(photograph_table(bench))
         model = load_model(catalog)
         operator.next_object, operator.yaw_deg = "mug-star", 70.0
         with RunWriter(home / "dense", bench, model) as writer:
