@@ -78,7 +78,9 @@ def identify(
             seed = settings.seed or 0
             if watch:
                 _bring_by_camera(bench)
-            if isinstance(bench.operator, TableClearer) and model().descriptor != PAPER_DESCRIPTOR:
+            known = model()
+            sees = known.descriptor != PAPER_DESCRIPTOR and known.pictured is not False
+            if sees and isinstance(bench.operator, TableClearer):
                 see_to_empty_table(settings, bench, ask=False)
             if watch:
                 events = watch_table(bench, model, strategy=chosen, seed=seed, top=top)
