@@ -17,11 +17,14 @@ CAPTION_PX: Final = 17
 GAP_PX: Final = 2
 _PAPER: Final = 24
 _INK: Final = 224
+_OUTLINE: Final = (60, 170, 230)
 _CAP_HEIGHT_PX: Final = 9
 _OVERSAMPLING: Final = 4
 
 
-def thumbnail(image_bgr: Image, size: tuple[int, int], region: Region | None = None) -> Image:
+def thumbnail(
+    image_bgr: Image, size: tuple[int, int], region: Region | None = None, box: Sequence[int] | None = None
+) -> Image:
     """Fit an image into ``size`` (width, height) without distortion, centred on the sheet's dark grey.
 
     Parameters
@@ -32,6 +35,8 @@ def thumbnail(image_bgr: Image, size: tuple[int, int], region: Region | None = N
         Width and height in pixels.
     region
         The part to show: x, y, width, height in pixels; None shows all.
+    box
+        What to outline in it: x, y, width, height in pixels of the part.
 
     Returns
     -------
@@ -56,6 +61,9 @@ def thumbnail(image_bgr: Image, size: tuple[int, int], region: Region | None = N
     canvas = np.full((size[1], size[0], 3), _PAPER, dtype=np.uint8)
     left, top = (size[0] - fitted[0]) // 2, (size[1] - fitted[1]) // 2
     canvas[top : top + fitted[1], left : left + fitted[0]] = shrunk
+    if box is not None:
+        x, y, w, h = (round(side * scale) for side in box)
+        cv2.rectangle(canvas, (left + x, top + y), (left + x + w - 1, top + y + h - 1), _OUTLINE, 1)
     return canvas
 
 

@@ -60,13 +60,21 @@ class _Looks:
                 self._refused.append(", ".join(event.reasons))
             case Accepted():
                 refused, self._refused = tuple(self._refused), []
-                look = self.look(event.index, event.azimuth_deg, event.image_bgr, event.evidence)
+                look = self.look(event.index, event.azimuth_deg, event.image_bgr, event.evidence, event.front_end)
                 self.views.append(replace(look, move=self._move, refused=refused))
             case _:
                 pass
 
-    def look(self, index: int, azimuth_deg: float, image_bgr: Image, evidence: ViewEvidence) -> Look:
-        return Look(index, azimuth_deg, thumbnail(image_bgr, self.size, self.region), evidence, None, ())
+    def look(
+        self,
+        index: int,
+        azimuth_deg: float,
+        image_bgr: Image,
+        evidence: ViewEvidence,
+        front_end: Mapping[str, Any] | None,
+    ) -> Look:
+        box = None if front_end is None else front_end.get("box_px")
+        return Look(index, azimuth_deg, thumbnail(image_bgr, self.size, self.region, box), evidence, None, ())
 
 
 class EnrollmentRecord:
@@ -112,7 +120,8 @@ class EnrollmentRecord:
         for record, image_bgr in stored:
             if record.index not in seen:
                 evidence = built(ViewEvidence, record.evidence)
-                self._looks.views.append(self._looks.look(record.index, record.azimuth_deg, image_bgr, evidence))
+                look = self._looks.look(record.index, record.azimuth_deg, image_bgr, evidence, record.front_end)
+                self._looks.views.append(look)
         self._looks.views.sort(key=lambda view: view.index)
         self.planned = max(self.planned, len(self.views))
 

@@ -97,3 +97,11 @@ def test_sheets_need_an_azimuth_an_image() -> None:
         contact_sheet([], [])
     with pytest.raises(ValueError, match="at least 1"):
         contact_sheet([flat(1)], [1.0], columns=0)
+
+
+def test_a_box_is_outlined_where_the_object_is():
+    plain = thumbnail(flat(100, (100, 200)), (50, 50), region=(40, 0, 100, 100))
+    boxed = thumbnail(flat(100, (100, 200)), (50, 50), region=(40, 0, 100, 100), box=(20, 40, 60, 20))
+    rows, columns = np.nonzero((boxed != plain).any(axis=2))
+    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (10, 39, 20, 29)
+    assert len(rows) == 2 * 30 + 2 * 8
