@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from rig import Catalog, open_bench
+from rig import Catalog, open_bench, photograph_table
+from rig.bench import TableClearer
 from rig.config import load_config
 from rig.plans.events import Enrolled, Item, Rejected
 from rig.plans.tray import enroll_tray, read_tray
@@ -22,6 +23,8 @@ def main() -> None:
         open_bench(arguments.bench, load_config()) as bench,
         Catalog.open(arguments.catalog, clock=bench.clock) as catalog,
     ):
+        if isinstance(bench.operator, TableClearer):  # a person has run `rig empty-table` today
+            list(photograph_table(bench))
         for event in enroll_tray(bench, catalog, items, views=arguments.views):
             match event:
                 case Item():

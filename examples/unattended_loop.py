@@ -5,8 +5,8 @@ import json
 import sys
 from pathlib import Path
 
-from rig import Catalog, load_model, open_bench
-from rig.bench import ObjectStandsThere
+from rig import Catalog, load_model, open_bench, photograph_table
+from rig.bench import ObjectStandsThere, TableClearer
 from rig.clock import SystemClock
 from rig.config import load_config
 from rig.errors import RigError
@@ -29,6 +29,9 @@ def main() -> int:
         ):
             if isinstance(bench.operator, ObjectStandsThere):  # nobody presses a key: the camera sees what comes
                 bench.operator = TableWatcher(bench)
+            if isinstance(bench.operator, TableClearer):
+                for taken in photograph_table(bench):  # begin with an empty table
+                    print(json.dumps(event_dict(taken)), flush=True)
             answers = 0
             # The model is loaded before each search: what was enrolled meanwhile is found.
             for event in watch(bench, lambda: load_model(catalog)):

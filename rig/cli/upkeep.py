@@ -73,6 +73,8 @@ def redescribe(
     """Describe the stored images anew, after the descriptor or its settings have changed; goes on where it was stopped.
 
     Example: rig catalog redescribe --region config --bench sim
+
+    Example: rig catalog redescribe --descriptor edges+colours --bench sim
     """
     from rig.catalog.redescribe import redescribe as job
     from rig.plans.events import plain
