@@ -237,7 +237,9 @@ class IdentifyConfig(Section):
     extension: Literal["visual", "orient", "orient_all"] = Field(
         "orient_all", description="how missing views are filled in"
     )
-    margin: float = Field(0.02, ge=0, le=1, description="stop when the best score surely leads by this much a view")
+    margin: float = Field(
+        0.02, ge=0, le=1, description="stop when the best score surely leads by this much a view; not dense"
+    )
     repeatability: float = Field(
         0.97, ge=0, le=1, description="similarity that the same view of two placings surely keeps, by calibration"
     )
@@ -245,7 +247,7 @@ class IdentifyConfig(Section):
         None,
         ge=0,
         le=1,
-        description="below this score a view the object is unknown; none: as the enrolled views suggest",
+        description="below this score a view the object is unknown, not dense; none: as the enrolled views suggest",
     )
 
     @field_validator("min_views")

@@ -5,7 +5,7 @@ from statistics import fmean, median
 from typing import NamedTuple
 
 from rig.plans.events import Insight
-from rig.plans.words import counted, listed, resemblance_words
+from rig.plans.words import counted, listed, odds_words, resemblance_words
 from rig.report.records import EnrollmentRecord, IdentificationRecord
 
 
@@ -102,6 +102,7 @@ def _answer_facts(record: IdentificationRecord) -> list[Fact]:
         return []
     return [
         Fact("answer", answer.name or "unknown"),
+        *([Fact("probability", odds_words(answer.probability))] if answer.probability is not None else []),
         Fact("score", f"{answer.score:.3f}", f"per view; leads by {answer.margin:.3f}"),
         Fact("views", f"{answer.views}"),
         Fact("travelled", f"{answer.travelled_deg:.0f}°"),

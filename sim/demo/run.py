@@ -27,7 +27,7 @@ from rig.plans.events import Accepted, Started
 from rig.plans.identify import identify
 from rig.plans.model import Model, load_model
 from rig.plans.photograph_table import photograph_table
-from rig.plans.strategies import AnyStrategy, descriptor_for
+from rig.plans.strategies import AnyStrategy, descriptor_for, strategy_for
 from rig.plans.strategies import strategy as strategy_named
 from rig.plans.words import signed
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
@@ -81,6 +81,7 @@ class DemoResult:
     enrollments: tuple[EnrollmentRecord, ...]
     trials: tuple[IdentificationRecord, ...]
     seed: int
+    strategy: str
     bench_s: float
     wall_s: float
     report: Path
@@ -97,6 +98,7 @@ class DemoResult:
         answers = [trial.answer for trial in self.trials if trial.answer]
         return {
             "seed": self.seed,
+            "strategy": self.strategy,
             "enrolled": len(self.enrollments),
             "views_enrolled": sum(len(record.views) for record in self.enrollments),
             "found": sum(bool(trial.correct) for trial in known),
@@ -174,13 +176,15 @@ def run_demo(
             )
             for number, (name, thing) in enumerate({**enrolled, **strangers}.items())
         ]
+        searched_by = (chosen or strategy_for(model.descriptor)).name
         bench_s = bench.clock.now_ns() * 1e-9
         devices = bench.devices()
     wall_s = seconds_between(wall_ns, system.now_ns())
-    result = DemoResult(tuple(enrollments), tuple(trials), seed, bench_s, wall_s, out / "report.html")
+    result = DemoResult(tuple(enrollments), tuple(trials), seed, searched_by, bench_s, wall_s, out / "report.html")
     meta = Meta(
         conditions={
             "seed": seed,
+            "strategy": searched_by,
             "software": f"hbr-rig {version('hbr-rig')}",
             "identify": config.identify.model_dump(mode="json"),
             "noise model": asdict(world.noise),
