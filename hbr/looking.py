@@ -14,7 +14,7 @@ from hbr.dense import BETA, BINS, Belief
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3
 #: A view this near to one that was had tells little that is new.
-_NEAR_DEG: Final = 25.0
+_NEAR_DEG: Final = 15.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +56,13 @@ def next_look(
     sharpness: float = 100.0,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
-    second_costs: float = 0.02,
+    second_costs: float = 1.0,
 ) -> Look:
     """Choose the turn with the lowest expected confusion, and what it costs.
 
     For hypotheses p, p' of different objects, a turn a leaves the confusion
-    Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 25°)²) discounts a view
-    at the distance d from the nearest one had, and κ(a) = exp(-½ (e / 25°)²) one at the distance e from the view that
+    Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 15°)²) discounts a view
+    at the distance d from the nearest one had, and κ(a) = exp(-½ (e / 15°)²) one at the distance e from the view that
     is enrolled nearest to it: nothing is known of what lies between. Its logarithm and μ · time(a) are added up; equal
     sums go to the earlier turn.
 

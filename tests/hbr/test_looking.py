@@ -85,13 +85,13 @@ def test_the_expected_confusion_is_that_of_the_formula(start: int, sharpness: fl
     look = next_look(belief, beta=40.0, sharpness=sharpness, rotations_deg=turns)
     probability, place, bins = _strongest(belief.posterior(40.0))
     for turn, confusion in zip(turns, look.confusion, strict=True):
-        novelty = 1 - np.exp(-0.5 * (min(abs(turn), 360 - abs(turn)) / 25) ** 2)
+        novelty = 1 - np.exp(-0.5 * (min(abs(turn), 360 - abs(turn)) / 15) ** 2)
         away = [
             np.abs((VIEWS.azimuth_deg[VIEWS.of(j)] - b * 5 - turn + 180) % 360 - 180)
             for j, b in zip(place.tolist(), bins.tolist(), strict=True)
         ]
         shown = [VIEWS.descriptors[VIEWS.of(j)[own.argmin()]] for j, own in zip(place.tolist(), away, strict=True)]
-        known = np.exp(-0.5 * (np.array([own.min() for own in away]) / 25) ** 2)
+        known = np.exp(-0.5 * (np.array([own.min() for own in away]) / 15) ** 2)
         similar = np.array([[_tanimoto(a, b) for b in shown] for a in shown])
         rivals = np.outer(probability, probability) * (place[:, None] != place)
         assert confusion == pytest.approx(
