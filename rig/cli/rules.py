@@ -23,9 +23,9 @@ def calibrate(
 ) -> None:
     """Rehearse searches for every enrolled object, and keep the rules by which rig identify ends.
 
-    Each object is looked for by its own views, with those views left out, and once more with the whole object left out,
-    as a stranger. What cannot be promised is said, and how much more data it takes. Do it again when the catalog has
-    changed; rig identify notices.
+    Each object is looked for by its own views, as if taken a little aside, and once more with the whole object left
+    out, as a stranger. What cannot be promised is said, and how much more data it takes. Do it again when the catalog
+    has changed; rig identify notices.
 
     Example: rig catalog calibrate --bench sim --error-rate 0.005
     """

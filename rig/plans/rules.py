@@ -32,8 +32,6 @@ VIEWS: Final = 4
 """Views of a rehearsed search, where the objects have enough."""
 ENOUGH: Final = 400
 """Searches of a rehearsal, from different first views; one for each object where there are more objects."""
-LEAST_CERTAINTY: Final = 0.95
-"""No search ends at less, however well the rehearsed ones went: what stands there now may be less clear."""
 UNPROMISED: Final = 0.98
 """Probability that ends a search where no error rate can be promised."""
 
@@ -43,8 +41,6 @@ _LOADED_S: Final = 5e-6
 """What a rehearsal may take that nobody asked for, and at least; less by so much for each view that was loaded."""
 _SEARCH_S, _VIEW_S = 1.4e-3, 1.3e-6
 """What a rehearsed search takes, and how much more for each enrolled view."""
-_KEEP_SHARE: Final = 0.5
-"""Of its views an object keeps in its own rehearsal, at least: what is left must still show it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +118,9 @@ def _affordable(views: int, budget_s: float) -> int:
 
 
 def rehearsed_views(index: hbr.DenseIndex) -> int:
-    """Return how many views a rehearsed search has: four, or fewer where objects would be left with too few."""
+    """Return how many views a rehearsed search has: four, or as many as most objects have; 0 of a single one."""
     usual = int(np.median((~index.left_out).sum(axis=1)))
-    return min(VIEWS, int(usual * _KEEP_SHARE))
+    return min(VIEWS, usual) if usual > 1 else 0
 
 
 def _with_what_is_known(
@@ -149,7 +145,7 @@ def _with_what_is_known(
             f"there are {searches}: what is less familiar than all of them is called unknown, a rate of {least:.1%}"
         )
     promised = found.certainty <= 1
-    certainty = max(found.certainty, LEAST_CERTAINTY) if promised else UNPROMISED
+    certainty = found.certainty if promised else UNPROMISED
     ends = rehearsed.posterior >= certainty
     at = np.flatnonzero(ends.any(axis=1))
     first = ends[at].argmax(axis=1)
