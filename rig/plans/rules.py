@@ -35,6 +35,7 @@ ENOUGH: Final = 400
 UNPROMISED: Final = 0.98
 """Probability that ends a search where no error rate can be promised."""
 
+_KNOWN_SHARE: Final = 0.5
 _QUICK_S: Final = 0.4
 _LEAST_QUICK_S: Final = 0.08
 _LOADED_S: Final = 5e-6
@@ -260,7 +261,8 @@ def rules_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.Rules, tuple[str,
 
     The stored ones, where they are of this model. Where the catalog has changed since, they are rehearsed anew if all
     objects can be without anybody waiting; else the stored ones go on, and objects that they do not know are taken for
-    usual ones. Where none are stored, a quick rehearsal makes them.
+    usual ones. Where none are stored, or those of another catalog, which know less than half of the objects, a quick
+    rehearsal makes them.
     """
     notes: list[str] = []
     try:
@@ -273,11 +275,12 @@ def rules_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.Rules, tuple[str,
     if stored is None:
         found = rehearse(index, quick=True).rules
         return found, (*notes, *_unpromised(found))
-    asked = stored.rules
-    if _affordable(len(index.views), _QUICK_S) >= len(index):
+    asked, names = stored.rules, index.views.object_names
+    foreign = len(set(names) & set(stored.objects)) < _KNOWN_SHARE * len(names)
+    if foreign or _affordable(len(index.views), _QUICK_S) >= len(index):
         found = rehearse(index, error_rate=asked.error_rate, false_reject=asked.false_reject, quick=True).rules
         return found, (*notes, *_unpromised(found))
-    changed = _changes(stored.objects, index.views.object_names)
+    changed = _changes(stored.objects, names)
     notes.append(
         f"the search rules are of {stored.made_utc[:10]}, and the catalog has changed since ({changed}): they are used "
         "as they are and promise nothing; rig catalog calibrate renews them"

@@ -186,8 +186,9 @@ class DenseSearch(Search):
         self._so_far = self._belief = belief = hbr.believe(
             levels, self._orientations[-1], self._so_far, kept=self._kept
         )
-        self._verdict = verdict = judged(belief, self._rules, max_views=self._config.identify.max_views)
-        self._words = verdict_words(verdict, certainty=self._rules.certainty, least=self._least, views=belief.queries)
+        verdict, least = judged(belief, self._rules, max_views=self._config.identify.max_views)
+        self._words = verdict_words(verdict, certainty=self._rules.certainty, least=least, views=belief.queries)
+        self._verdict = replace(verdict, words=self._words)
         odds = belief.posterior(self._rules.beta).sum(axis=1)
         scores = belief.scores()
         ranking = belief.ranking()
@@ -207,7 +208,7 @@ class DenseSearch(Search):
         rotations_deg, seconds = reachable_turns(self._config, table_deg)
         look = DenseLook(
             belief=self._belief,
-            verdict=replace(self._verdict, words=self._words),
+            verdict=self._verdict,
             rules=self._rules,
             rotations_deg=rotations_deg,
             seconds=seconds,
@@ -229,15 +230,23 @@ class DenseSearch(Search):
         )
 
 
-def judged(belief: hbr.Belief, by: hbr.Rules, *, max_views: int) -> hbr.Verdict:
-    """Judge what is believed (`hbr.judge`), and call unknown what is still unfamiliar after the rehearsed views.
+def judged(belief: hbr.Belief, by: hbr.Rules, *, max_views: int) -> tuple[hbr.Verdict, float]:
+    """Judge what is believed (`hbr.judge`); return that, and the familiarity that an object must have here to be found.
 
-    Beyond those nothing was rehearsed, and no rate of wrong rejections is known.
+    Before the last of the rehearsed views that is the most that is asked of any number of views: a stranger that passes
+    at a first glance is looked at once more, which costs a known object little. After them what is still unfamiliar is
+    unknown, however many views may follow: of those no rate of wrong rejections was rehearsed.
     """
     verdict = hbr.judge(belief, by, max_views=max_views)
-    if verdict.kind == "look" and belief.queries >= len(by.familiar) and verdict.familiarity < by.familiar[-1]:
-        return hbr.judge(belief, by, max_views=belief.queries)
-    return verdict
+    rehearsed = len(by.familiar)
+    least = by.familiar[min(belief.queries, rehearsed) - 1]
+    if belief.queries < min(rehearsed, max_views):
+        least = max(by.familiar)
+        if verdict.kind == "found" and verdict.familiarity < least:
+            return replace(verdict, kind="look"), least
+    elif verdict.kind == "look" and verdict.familiarity < least:
+        return hbr.judge(belief, by, max_views=belief.queries), least
+    return verdict, least
 
 
 def begin_search(

@@ -1,6 +1,7 @@
 """Rules of the dense search: rehearsed, kept beside the catalog, noticed when they are of another one."""
 
 import json
+from dataclasses import replace
 from math import isfinite, nan
 
 import numpy as np
@@ -13,7 +14,7 @@ from rig.errors import CatalogError, DescriptorOutdated, UsageError
 from rig.plans.events import Ranked
 from rig.plans.model import Model, load_model, model_of
 from rig.plans.rules import FILE, UNPROMISED, digest, read_rules, rehearse, rules_of, write_rules
-from rig.plans.search import begin_search
+from rig.plans.search import begin_search, judged
 from rig.plans.strategies import DenseLook, Stop, Turn, reachable_turns, strategy
 from rig.plans.words import verdict_words
 
@@ -183,6 +184,10 @@ def test_rules_of_a_catalog_that_has_changed(tmp_path, monkeypatch):
     np.testing.assert_array_equal(old.usual[8], np.median(kept.usual, axis=0))
     assert "1 object more" in notes[0]
     assert "rig catalog calibrate renews them" in notes[0]
+    others = hbr.DenseIndex(hbr.Views.concatenate([views_of(f"thing {j}", 18, seed=j) for j in range(9)]))
+    own, _ = rules_of(tmp_path, others)  # the rules are of another catalog
+    assert own.familiar != kept.familiar
+    assert (own.error_rate, own.false_reject) == (0.05, 0.1)
 
 
 def test_a_digest_is_of_all_that_decides():
@@ -267,6 +272,29 @@ def test_unknown_is_said_after_the_rehearsed_views_and_looking_goes_on_where_it_
     assert len(rules.familiar) == 4
     assert look_for(index, rules, views_of("stranger", 18, seed=77), max_views=8) == (None, 4)
     assert look_for(index, rules, views_of("stranger", 18, seed=77), max_views=2) == (None, 2)
+
+
+@pytest.mark.parametrize(
+    ("familiar", "views", "max_views", "kind"),
+    [
+        ((0.0, 0.0, 0.0), 1, 8, "found"),
+        ((0.0, 9.0, 9.0), 1, 8, "look"),  # familiar enough for one view, and not for three
+        ((0.0, 9.0, 9.0), 1, 1, "found"),  # but no more views are allowed
+        ((0.0, 9.0, 9.0), 2, 8, "look"),
+        ((0.0, 9.0, 9.0), 3, 8, "unknown"),
+        ((0.0, 0.0, 0.0), 3, 8, "found"),
+        ((9.0,), 1, 8, "unknown"),
+    ],
+)
+def test_a_first_glance_must_be_as_familiar_as_all_rehearsed_views(familiar, views, max_views, kind):
+    index = shelf(12, 12, 12)
+    rules = replace(rehearse(index).rules, familiar=familiar, usual=np.zeros((3, len(familiar))))
+    belief: hbr.Belief | hbr.DenseIndex = index
+    for number in range(views):
+        belief = hbr.believe(index.views.descriptors[4 * number], 120.0 * number, belief)
+    assert isinstance(belief, hbr.Belief)
+    verdict, _ = judged(belief, rules, max_views=max_views)
+    assert verdict.kind == kind
 
 
 def test_a_catalog_is_searched_by_the_paper_where_objects_lack_the_descriptor(sim_catalog_of_both):
