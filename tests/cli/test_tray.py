@@ -140,4 +140,4 @@ def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identifi
     for path in runs[: len(NAMES) : 12]:
         found = check(load_run(path))
         assert found.differences == []
-        assert found.views >= 2
+        assert found.decisions == found.views >= 1  # one after each view; the first may be enough
