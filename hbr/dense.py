@@ -108,16 +108,20 @@ class DenseIndex:
         return fewer
 
     def _arrange(self) -> None:
-        """Lay three turns of every object's views out in rows, each with the arc on which it is the nearest."""
-        turns_deg = np.where(self.left_out, np.inf, self.azimuth_deg)
-        unrolled_deg = np.concatenate([turns_deg - 360, turns_deg, turns_deg + 360], axis=1)
+        """Lay two turns of every object's views out in rows, each with the arc on which it is the nearest.
+
+        From half a turn before 0 on: a copy of each view is within half a turn of any azimuth.
+        """
+        first_deg = np.where(self.azimuth_deg < 180, self.azimuth_deg, self.azimuth_deg - 360)
+        first_deg = np.where(self.left_out, np.inf, first_deg)
+        unrolled_deg = np.concatenate([first_deg, first_deg + 360], axis=1)
         places = np.argsort(unrolled_deg, axis=1, kind="stable")
         ring_deg = np.take_along_axis(unrolled_deg, places, axis=1)
         with np.errstate(invalid="ignore"):  # what was left out stands at infinity, behind all others
             middle_deg = (ring_deg[:, 1:] + ring_deg[:, :-1]) / 2
-        count = 3 * (~self.left_out).sum(axis=1)
+        count = 2 * (~self.left_out).sum(axis=1)
         own = np.arange(places.shape[1]) < count[:, None]
-        #: The view at each place of the three turns; behind them one beyond all.
+        #: The view at each place of the two turns; behind them one beyond all.
         self._ring = np.where(own, np.take_along_axis(self.rows, places % self.rows.shape[1], axis=1), len(self.views))
         #: Where the arc of each view ends and the next one's begins; far away behind the last.
         ends_deg = np.where(own[:, 1:], middle_deg, _FAR_DEG)
@@ -143,18 +147,16 @@ class DenseIndex:
         seen_deg = part_deg + np.arange(BINS) * _BIN_DEG  # in this order the search below is quicker
         slope_at = (seen_deg * (self.omega / 360)).astype(np.float32)
         levels = np.append(np.maximum(similar, 0) ** self.power, -np.inf).astype(np.float32)
-        own, penalty, width = levels[self._ring], self._penalty, self._penalty.shape[1]
+        own, penalty = levels[self._ring], self._penalty
         place = np.arange(len(self))[:, None]
-        # the view on whose arc the azimuth lies; an object's three turns reach beyond all azimuths
-        nearest = np.searchsorted(self._keys, seen_deg + 2 * _FAR_DEG * place) - width * place
-        best: Floats = np.take_along_axis(own, nearest, axis=1)
+        # the view on whose arc the azimuth lies, among all objects' rows
+        nearest = np.searchsorted(self._keys, seen_deg + 2 * _FAR_DEG * place) + place
         # of the views before and behind a running maximum knows the best: the penalty is a straight line from its arc
-        before = np.maximum.accumulate(own[:, :-1] + penalty, axis=1)
-        behind = np.maximum.accumulate((own[:, 1:] - penalty)[:, ::-1], axis=1)[:, ::-1]
-        risen = np.take_along_axis(before, np.maximum(nearest - 1, 0), axis=1) - slope_at
-        fallen = np.take_along_axis(behind, np.minimum(nearest, width - 1), axis=1) + slope_at
-        np.maximum(best, risen, out=best, where=nearest > 0)
-        np.maximum(best, fallen, out=best, where=nearest < width)
+        before, behind = np.full((2, *own.shape), -np.inf, np.float32)
+        np.maximum.accumulate(own[:, :-1] + penalty, axis=1, out=before[:, 1:])
+        np.maximum.accumulate((own[:, 1:] - penalty)[:, ::-1], axis=1, out=behind[:, -2::-1])
+        best: Floats = np.maximum(before.ravel()[nearest] - slope_at, behind.ravel()[nearest] + slope_at)
+        np.maximum(best, own.ravel()[nearest], out=best)
         return np.roll(best, -int(whole), axis=1)
 
 
