@@ -75,16 +75,14 @@ def _lines(found: "Rehearsed", objects: int, seconds: float) -> list[str]:
         )
     if isfinite(rules.familiar[-1]):
         least = ", ".join(f"{one:.3f}" for one in rules.familiar)
-        rejected = (
-            f": {found.rejected} of {rules.searches} enrolled objects were ({found.rejected / rules.searches:.1%})"
-        )
-        lines.append(
-            f"  unknown  below a familiarity of {least} after 1, 2, ... views{rejected if found.ended else ''}"
-        )
+        so = f": {found.rejected} of {rules.searches} searches for enrolled objects ended so"
+        share = f"{so} ({found.rejected / rules.searches:.1%})" if found.ended else ""
+        lines.append(f"  unknown  below a familiarity of {least} after 1, 2, ... views{share}")
     if found.accepted is not None:
+        pairs = ", ".join(f"{one} for {other}" for one, other in found.taken_for)
         lines.append(
             f"  strangers  {found.accepted} of {rules.searches} left out were taken for another object "
-            f"({found.accepted / rules.searches:.1%})"
+            f"({found.accepted / rules.searches:.1%}){f': {pairs}' if pairs else ''}"
         )
     if not rules.promises:
         lines.append(

@@ -5,6 +5,7 @@ data to promise the rates that were asked for, and whose rules the stored ones a
 """
 
 import json
+from collections import Counter
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from importlib.metadata import version
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 import hbr
 from hbr.deciding import Rehearsal, conformal_threshold
@@ -62,6 +64,8 @@ class Rehearsed:
         Searches for enrolled objects that ended "unknown" after the last view.
     accepted
         Searches for objects that were left out, and did not; None where that cannot be rehearsed.
+    taken_for
+        Which objects those were, and what they were taken for: the three most frequent pairs of names.
     """
 
     rules: hbr.Rules
@@ -71,6 +75,7 @@ class Rehearsed:
     mean_views: float = nan
     rejected: int = 0
     accepted: int | None = None
+    taken_for: tuple[tuple[str, str], ...] = ()
 
 
 def rehearse(
@@ -181,7 +186,22 @@ def _with_what_is_known(
         mean_views=float(first.mean() + 1) if len(at) else nan,
         rejected=int((known[:, -1] < familiar[-1]).sum()),
         accepted=accepted,
+        taken_for=_taken_for(rehearsed, stranger[:, -1] >= familiar[-1], index.views.object_names),
     )
+
+
+def _taken_for(
+    rehearsed: Rehearsal, accepted: NDArray[np.bool_], names: tuple[str, ...]
+) -> tuple[tuple[str, str], ...]:
+    which = accepted & rehearsed.correct[:, -1]  # where it was found, it is known what was looked for
+    pairs = Counter(
+        zip(
+            rehearsed.known.object_index[which, -1].tolist(),
+            rehearsed.stranger.object_index[which, -1].tolist(),
+            strict=True,
+        )
+    )
+    return tuple((names[one], names[other]) for (one, other), _ in pairs.most_common(3))
 
 
 def _alone(index: hbr.DenseIndex, error_rate: float, false_reject: float) -> Rehearsed:

@@ -136,6 +136,13 @@ def test_an_error_rate_that_look_alikes_forbid_is_not_promised():
     assert any("look too much alike" in promise for promise in found.rules.promises)
 
 
+def test_what_strangers_are_taken_for_is_named():
+    alike = [views_of("one", 18, seed=1), views_of("two", 18, seed=1, changing=0.45), views_of("three", 18, seed=2)]
+    found = rehearse(hbr.DenseIndex(hbr.Views.concatenate([*alike, views_of("four", 18, seed=3)])))
+    assert set(found.taken_for) <= {("one", "two"), ("two", "one")}
+    assert bool(found.taken_for) == bool(found.accepted)
+
+
 def test_rules_come_back_as_they_were_kept(tmp_path):
     for number, counts in enumerate(([8], [8, 8], [18] * 6)):
         index = shelf(*counts)
