@@ -58,18 +58,18 @@ def test_objects_enrolled_with_a_picture_are_searched_by_todays_or_else_by_their
     s = simulated(*SMALL)
     list(photograph_table(s.bench))
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        for name in ("lamp", "dice", "teapot"):
-            list(enroll(s.bench, catalog, name, views=8))
+        for name in ("lamp", "teapot"):
+            list(enroll(s.bench, catalog, name, views=6))
         model = load_model(catalog)
-        events, answer = search(s, model, "dice")
+        events, answer = search(s, model, "lamp")
         assert "empty table" not in " ".join(events[0].notes)
-        assert answer.name == "dice"
+        assert answer.name == "lamp"
         another = simulated(*SMALL, seed=5)
         events, answer = search(another, model, "teapot")
         assert "no picture of the empty table was taken yet: the one of the enrollment is used" in events[0].notes[-1]
         assert answer.name == "teapot"
         assert all(e.front_end["agreement"] > 0.9 for e in events if isinstance(e, Accepted))
-        list(enroll(another.bench, catalog, "mug-dots", views=8))
+        list(enroll(another.bench, catalog, "mug-dots", views=3))
         mixed = load_model(catalog)
         assert "mug-dots was enrolled without a picture of the empty table, unlike the others" in mixed.notes[-1]
         for picture in tmp_path.rglob("empty-*.png"):
@@ -123,7 +123,7 @@ def test_every_decision_names_its_pair_and_stays_within_the_cable(simulated, she
 def test_a_loop_takes_what_was_enrolled_meanwhile(simulated, tmp_path):
     s = simulated(*SMALL)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        list(enroll(s.bench, catalog, "lamp", views=6))
+        list(enroll(s.bench, catalog, "lamp", views=4))
         s.operator.next_object = "lamp"
         names = []
         for event in watch(s.bench, lambda: load_model(catalog)):
@@ -131,7 +131,7 @@ def test_a_loop_takes_what_was_enrolled_meanwhile(simulated, tmp_path):
                 names.append(event.name)
                 if len(names) == 2:
                     break
-                list(enroll(s.bench, catalog, "dice", views=6))
+                list(enroll(s.bench, catalog, "dice", views=4))
                 s.operator.next_object = "dice"
     assert names == ["lamp", "dice"]
 
@@ -139,7 +139,7 @@ def test_a_loop_takes_what_was_enrolled_meanwhile(simulated, tmp_path):
 def test_one_object_alone_is_known_by_its_likeness_to_itself(simulated, tmp_path):
     s = simulated(*SMALL)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        list(enroll(s.bench, catalog, "lamp", views=8))
+        list(enroll(s.bench, catalog, "lamp", views=6))
         model = load_model(catalog)
     assert isinstance(model.index, hbr.DenseIndex)
     assert search(s, model, "lamp")[1].name == "lamp"
