@@ -16,7 +16,7 @@ from hbr.dense import BETA, BINS, Belief, DenseIndex
 
 #: What the lead over the second object counts beside the score, and what its leader's usual score.
 _LEAD: Final = 0.5
-_USUAL: Final = 0.5
+_USUAL: Final = 1.0
 #: No search ends at a smaller probability, however well the rehearsed ones went: what stands there may be less clear.
 LEAST_CERTAINTY: Final = 0.9
 #: Rehearsed views lie aside by shares of a step that are spread over 0..1 as multiples of this.
@@ -45,7 +45,7 @@ class Leaders:
         """Return how much each search looks like one for an enrolled object, (searches, views).
 
         The score and half of the lead: a stranger is a little like several objects, a known object much like one. Less
-        half of what its leader usually scores above others: what looks the same from all sides must be met better.
+        what its leader usually scores above others: what looks the same from all sides must be met better.
 
         Parameters
         ----------

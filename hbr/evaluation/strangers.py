@@ -15,8 +15,8 @@ from hbr.evaluation.protocol import Protocol, Runs
 class Stranger:
     """After so many views, over all draws of objects that were left out.
 
-    False rejects are of the second half of the known objects' trials, against thresholds from the first half; or, where
-    the catalog was rehearsed, of all of them, against its thresholds.
+    False rejects are of the last third of the known objects' trials: what each object usually scores comes from the
+    first third, thresholds from the second. Or, where the catalog was rehearsed, of all against its thresholds.
     """
 
     rehearsed: bool
@@ -58,19 +58,23 @@ def strangers(
     false_reject : float
         Share of known objects' searches that may be called unknown.
     rehearsals : sequence of Rehearsal, optional
-        Of each draw's catalog: thresholds come from them instead of from half of the trials.
+        Of each draw's catalog: thresholds come from them instead of from trials.
     """
     views = parts[0][0].score.shape[-1]
     counts = np.zeros((views, 4), int)
     for d, (runs, absent) in enumerate(parts):
-        half = 0 if rehearsals else runs.score.shape[2] // 2
-        known, strange = _leaders(runs, ~absent, slice(half, None)), _leaders(runs, absent, slice(None))
+        third = runs.score.shape[2] // 3
+        strange = _leaders(runs, absent, slice(None))
         if rehearsals:
-            sample, correct = rehearsals[d].known, rehearsals[d].correct
+            known, sample = _leaders(runs, ~absent, slice(None)), rehearsals[d].known
+            usual = usual_scores(sample, rehearsals[d].correct, len(absent))
         else:
-            sample = _leaders(runs, ~absent, slice(half))
-            correct = sample.object_index == np.repeat(np.flatnonzero(~absent), half)[:, None]
-        usual = usual_scores(sample, correct, len(absent))
+            first = _leaders(runs, ~absent, slice(third))
+            sample, known = (
+                _leaders(runs, ~absent, part) for part in (slice(third, 2 * third), slice(2 * third, None))
+            )
+            correct = first.object_index == np.repeat(np.flatnonzero(~absent), third)[:, None]
+            usual = usual_scores(first, correct, len(absent))
         measured = sample.familiarity(usual)
         for n in range(views):
             threshold = conformal_threshold(measured[:, n], false_reject)

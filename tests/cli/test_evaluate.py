@@ -250,14 +250,14 @@ def test_what_does_not_go_together_is_refused_in_words(
 
 def test_objects_that_are_left_out_are_looked_for_too(photographs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    options = ("--descriptor", "edges+colours", "--enrolled", "6", "--leave-out", "2", "--trials", "2")
+    options = ("--descriptor", "edges+colours", "--enrolled", "6", "--leave-out", "2", "--trials", "3")
     done = run(photographs, *options, "--views", "2", "--jobs", "1", "--out", out)
     assert done.exit_code == 0, done.output
     assert "false rejects / accepts" in done.output
     found = json.loads((out / "strangers.json").read_text())
-    assert {row["stranger_trials"] for row in found["strangers"]} == {20}
-    # rehearsed rules are judged by all trials, others by the half that they do not come from
-    assert {(row["rehearsed"], row["known_trials"]) for row in found["strangers"]} == {(False, 10), (True, 20)}
+    assert {row["stranger_trials"] for row in found["strangers"]} == {30}
+    # rehearsed rules are judged by all trials, others by the third that they do not come from
+    assert {(row["rehearsed"], row["known_trials"]) for row in found["strangers"]} == {(False, 10), (True, 30)}
     # two calibration trials can promise nothing: nobody is called unknown
-    assert all(row["false_rejects"] == 0 and row["false_accepts"] == 20 for row in found["strangers"])
+    assert all(row["false_rejects"] == 0 and row["false_accepts"] == 30 for row in found["strangers"])
     assert run(photographs, *options[:4], "--leave-out", "3", "--out", out).exit_code == 2

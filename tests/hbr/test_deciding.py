@@ -103,7 +103,7 @@ def test_familiarity_is_relative_to_what_the_leader_usually_scores() -> None:
     np.testing.assert_allclose(usual[:, 0], [0.85, 0.7, 0.775])  # of the third nothing is known
     np.testing.assert_allclose(
         known.familiarity(usual)[:, 0],
-        [0.9 + 0.05 - 0.0375, 0.8 + 0.05 - 0.0375, 0.7 + 0.05 + 0.0375, 0.2 + 0.05 + 0.0375],
+        [0.9 + 0.05 - 0.075, 0.8 + 0.05 - 0.075, 0.7 + 0.05 + 0.075, 0.2 + 0.05 + 0.075],
     )
 
 
