@@ -266,10 +266,10 @@ class Stored:
 
 
 def digest(index: hbr.DenseIndex) -> str:
-    """Return a digest of a model: its objects, their views, the descriptor's version, and how they are searched."""
+    """Return a digest of a model: its objects, their views, the descriptor's version, and the program that searches."""
     views = index.views
     kind = descriptor(views.descriptor)
-    searched = [kind.name, kind.version, index.omega, index.power, BETA]
+    searched = [version("hbr-rig"), kind.name, kind.version, index.omega, index.power, BETA]
     found = sha256(json.dumps([searched, views.object_names], ensure_ascii=False).encode())
     for column in (views.object_index.astype("<i8"), views.azimuth_deg.astype("<f8"), views.descriptors):
         found.update(np.ascontiguousarray(column).data)
@@ -320,7 +320,7 @@ def _unpromised(rules: hbr.Rules) -> tuple[str, ...]:
 def _changes(before: tuple[str, ...], now: tuple[str, ...]) -> str:
     added, gone = len(set(now) - set(before)), len(set(before) - set(now))
     parts = [f"{counted(n, 'object')} {what}" for n, what in ((added, "more"), (gone, "gone")) if n]
-    return ", ".join(parts) or "other views"
+    return ", ".join(parts) or "other views, or another version of this program"
 
 
 def rules_values(rules: hbr.Rules, index: hbr.DenseIndex, *, made_utc: str) -> dict[str, Any]:
