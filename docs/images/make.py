@@ -1,4 +1,4 @@
-"""Make the terminal pictures of the README: real commands in a real terminal, drawn by rich and Chromium.
+"""Make the pictures of the README: real commands in a real terminal, drawn by rich and Chromium.
 
 From the checkout: .venv/bin/python docs/images/make.py
 """
@@ -18,15 +18,16 @@ from rich.text import Text
 
 HERE = Path(__file__).parent
 WIDTH, HEIGHT = 104, 32
+DEMO_WIDTH = 124
 STEP = re.compile(r"\x1b\[(?P<count>\d*)(?P<what>[A-Za-z])|\x1b\[\?25[hl]|(?P<break>\r?\n)|(?P<back>\r)")
 
 
-def output(folder: Path, arguments: list[str], until: str | None = None) -> str:
+def output(folder: Path, arguments: list[str], until: str | None = None, columns: int = WIDTH) -> str:
     """Run `rig` in a terminal and return what it printed: all, or as far as a live picture that holds ``until``."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.chdir(folder)
-        os.environ |= {"COLUMNS": str(WIDTH), "LINES": str(HEIGHT), "TERM": "xterm-256color"}
+        os.environ |= {"COLUMNS": str(columns), "LINES": str(HEIGHT), "TERM": "xterm-256color"}
         code = "from rig.cli.main import main; main()"
         os.execv(sys.executable, [sys.executable, "-c", code, *arguments])
     seen = b""
@@ -67,9 +68,9 @@ def screen(text: str) -> list[str]:
     return lines
 
 
-def picture(name: str, command: str, lines: list[str]) -> None:
+def picture(name: str, command: str, lines: list[str], columns: int = WIDTH) -> None:
     """Write ``name``.png: the command, and what stood on the screen below it."""
-    console = Console(record=True, width=WIDTH, file=open(os.devnull, "w"), force_terminal=True)  # noqa: SIM115, PTH123
+    console = Console(record=True, width=columns, file=open(os.devnull, "w"), force_terminal=True)  # noqa: SIM115, PTH123
     console.print(Text(f"$ {command}", style="bold"))
     for line in lines:
         console.print(Text.from_ansi(line))
@@ -79,11 +80,17 @@ def picture(name: str, command: str, lines: list[str]) -> None:
         width, height = (round(float(n)) for n in re.findall(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg.read_text())[0])
         page = Path(folder) / "page.html"
         page.write_text(f'<body style="margin:0"><img src="{svg}" width="{width}"></body>', encoding="utf-8")
-        browser = next(b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b))
+        photograph(name, page, width, height)
+
+
+def photograph(name: str, page: Path, width: int, height: int) -> None:
+    """Write ``name``.png: the upper part of a page in a browser."""
+    browser = next(b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b))
+    with tempfile.TemporaryDirectory() as profile:
         subprocess.run(
             [
                 browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
-                "--disable-background-networking", f"--user-data-dir={folder}/profile",
+                "--disable-background-networking", f"--user-data-dir={profile}",
                 f"--window-size={width},{height}", f"--screenshot={HERE / name}.png", f"file://{page}",
             ],
             check=True, capture_output=True,
@@ -101,6 +108,10 @@ def main() -> None:
         picture("enroll", "rig " + " ".join(words), screen(text))
         words = ["identify", "--set", "bench.sim.object=book-night", "--seed", "3"]
         picture("identify", "rig identify", [line for line in screen(output(folder, words)) if line.strip()])
+        lines = screen(output(folder, ["demo"], columns=DEMO_WIDTH))
+        enrolled = max(n for n, line in enumerate(lines) if "views enrolled in" in line)
+        picture("demo", "make demo", [*lines[:3], "...", *lines[enrolled:]], DEMO_WIDTH)
+        photograph("report", folder / "rig-demo" / "report.html", 990, 2270)
 
 
 if __name__ == "__main__":
