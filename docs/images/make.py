@@ -18,7 +18,7 @@ from rich.text import Text
 
 HERE = Path(__file__).parent
 WIDTH, HEIGHT = 104, 32
-DEMO_WIDTH = 124
+DEMO_WIDTH = 136
 STEP = re.compile(r"\x1b\[(?P<count>\d*)(?P<what>[A-Za-z])|\x1b\[\?25[hl]|(?P<break>\r?\n)|(?P<back>\r)")
 
 
@@ -100,13 +100,15 @@ def photograph(name: str, page: Path, width: int, height: int) -> None:
 def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
-        for thing in ("mug-dots", "toy-house", "book-night", "camera", "teapot"):
+        (folder / "rig.toml").write_text(
+            'default_bench = "sim"\nstate_dir = "state"\n[catalog]\npath = "catalog"\n', encoding="utf-8"
+        )
+        for thing in ("mug-star", "toy-house", "book-night", "camera", "teapot"):
             output(folder, ["enroll", thing, "--views", "36"])
         words = ["enroll", "mug-white", "--views", "36"]
         text = output(folder, words, until="/36")
         picture("enroll", "rig " + " ".join(words), screen(text))
-        words = ["identify", "--set", "bench.sim.object=book-night", "--seed", "3"]
+        words = ["identify", "--set", "bench.sim.object=mug-white", "--seed", "3"]
         picture("identify", "rig identify", [line for line in screen(output(folder, words)) if line.strip()])
         lines = screen(output(folder, ["demo"], columns=DEMO_WIDTH))
         enrolled = max(n for n, line in enumerate(lines) if "views enrolled in" in line)
