@@ -18,7 +18,7 @@ from rig.plans.saved_run import load_run
 from sim.objects.shelf import CONFUSABLE, shelf
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
-VIEWS = 6
+VIEWS = 9
 NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:25]
 SMALL = f"""\
 default_bench = "sim"
