@@ -159,7 +159,7 @@ def test_signals_end_an_enrollment_with_their_code_and_it_resumes(tmp_path, numb
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
     process = subprocess.Popen(
-        [*RIG, "enroll", "dice", "--views", "72", "--json"],
+        [*RIG, "enroll", "dice", "--views", "36", "--json"],
         cwd=tmp_path,
         env=environment,
         stdout=subprocess.PIPE,
@@ -181,5 +181,5 @@ def test_signals_end_an_enrollment_with_their_code_and_it_resumes(tmp_path, numb
     )
     assert resumed.returncode == 0, resumed.stderr
     events = lines(resumed.stdout)
-    assert events[0]["views"] == 72 - stored
-    assert events[-1] == {**events[-1], "event": "enrolled", "views": 72}
+    assert events[0]["views"] == 36 - stored
+    assert events[-1] == {**events[-1], "event": "enrolled", "views": 36}
