@@ -5,13 +5,14 @@ from math import cos, pi, radians, sin, sqrt, tan
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtbtrs
 
 from sim.motion import Floats
 from sim.world import World
 
 WARM_UP_S = 300.0
 """Time constant of the warming up, of a sensor on a small board in still air."""
+_NOTHING = 1e-12
+"""Share of an input that a 16-bit register cannot show."""
 
 
 class InertialModel:
@@ -101,28 +102,33 @@ class InertialModel:
 
 
 @cache
-def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[float, float, float]:
-    """Return b₀, a₁ and a₂ of a Butterworth low-pass of second order (bilinear transform); b₁ = 2b₀, b₂ = b₀."""
+def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[float, float, float, Floats]:
+    """Return b₀, a₁ and a₂ of a Butterworth low-pass of second order (bilinear transform), and its recursion's echo.
+
+    b₁ = 2b₀, b₂ = b₀. The echo is what one input leaves behind in the outputs, until nothing of it is left.
+    """
     k = tan(pi * bandwidth_hz / rate_hz)
     norm = 1 / (1 + sqrt(2) * k + k * k)
-    return k * k * norm, 2 * (k * k - 1) * norm, (1 - sqrt(2) * k + k * k) * norm
+    a1, a2 = 2 * (k * k - 1) * norm, (1 - sqrt(2) * k + k * k) * norm
+    echo = [1.0, -a1]
+    while max(abs(echo[-1]), abs(echo[-2])) > _NOTHING:
+        echo.append(-a1 * echo[-1] - a2 * echo[-2])
+    return k * k * norm, a1, a2, np.array(echo)
 
 
 def _filtered(felt: Floats, filtered_before: Floats, rate_hz: float, bandwidth_hz: float) -> Floats:
     """Return the low-pass of ``felt`` (n + 2, 6) from its third row on, (n, 6); two rows came out before.
 
-    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]) is a triangular band matrix, which LAPACK solves; the
-    import of scipy.signal would take longer than all else of the simulator together.
+    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]), solved by its echo: the import of scipy's filters would
+    take longer than all else of the simulator together.
     """
-    b0, a1, a2 = _low_pass(rate_hz, bandwidth_hz)
+    b0, a1, a2, echo = _low_pass(rate_hz, bandwidth_hz)
     right = b0 * (felt[2:] + 2 * felt[1:-1] + felt[:-2])
     right[0] -= a1 * filtered_before[1] + a2 * filtered_before[0]
     if len(right) > 1:
         right[1] -= a2 * filtered_before[1]
-    band = np.empty((3, len(right)))
-    band[0], band[1], band[2] = 1.0, a1, a2
-    solved, _ = dtbtrs(band, right, uplo="L", diag="U")
-    return np.asarray(solved, dtype=np.float64)
+    columns = [np.convolve(column, echo[: len(right)])[: len(right)] for column in right.T]
+    return np.stack(columns, axis=1)
 
 
 def _steps(before: float, values: NDArray[np.int64] | Floats) -> Floats:

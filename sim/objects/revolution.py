@@ -14,7 +14,6 @@ from functools import cached_property, partial
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from sim.objects.curves import Curve, evenly
 from sim.objects.layers import place
@@ -173,7 +172,8 @@ def _sections(profile: Floats, up_mm: Floats) -> tuple[Floats, Floats]:
 
 def _normals(profile: Floats) -> tuple[Floats, Floats]:
     """Return the outward normal's radial and vertical part at every sample, edges rounded over 2 mm."""
-    dr, dh = uniform_filter1d(np.gradient(profile, axis=0), round(2 / _STEP_MM), axis=0).T
+    slopes = cv2.blur(np.gradient(profile, axis=0), (1, round(2 / _STEP_MM)), borderType=cv2.BORDER_REFLECT)
+    dr, dh = slopes.T
     length = np.hypot(dr, dh)
     return -dh / length, dr / length
 
