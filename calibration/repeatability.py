@@ -27,6 +27,7 @@ from calibration import pictures
 from calibration.charts import LIMIT, OTHER, Axis, Series, chart
 from calibration.events import Ask
 from rig.bench import Bench
+from rig.describer import PAPER_DESCRIPTOR, Describer
 from rig.errors import UsageError
 from rig.evaluation.drawing import Figure
 from rig.facts import Estimate, Fact
@@ -76,6 +77,7 @@ def live(
         )
     when_utc = bench.clock.utc()
     viewer = Viewer(bench.camera, bench.config.view)
+    describe = Describer(bench.config.view, (PAPER_DESCRIPTOR,))
     sittings: list[Sitting] = []
     index = 0
     for placing in range(1, placements + 1):
@@ -94,7 +96,7 @@ def live(
                     yield moved(index, move)
                     shot = yield from capture(index, viewer, table, move.settled_ns)
                     yield Accepted(index, (-move.encoder_deg) % 360.0, shot.evidence, shot.image_bgr)
-                    views.append(viewer.describe(shot.image_bgr))
+                    views.append(describe(shot.image_bgr).levels[PAPER_DESCRIPTOR])
                     index += 1
                 rounds.append(views)
             table.goto(0.0)

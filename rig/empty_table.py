@@ -98,11 +98,6 @@ class EmptyTables:
     """The picture of the empty table that is kept beside a bench's state."""
 
     @staticmethod
-    def current(bench: Bench) -> EmptyTable | None:
-        """Return the picture that objects are to be found by now; None where there is none that is of use."""
-        return EmptyTables.standing(bench).table
-
-    @staticmethod
     def standing(bench: Bench) -> TableStanding:
         """Return the bench's picture, and whether it should be taken anew: then ``doubts`` say why."""
         if bench.config.table.carries == "camera":

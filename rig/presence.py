@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rig.bench import Bench
 from rig.clock import seconds_between
 from rig.config import ViewConfig
-from rig.view import region
+from rig.describer import within
 
 GRID: Final = 48
 """Cells along each side of the picture that is compared."""
@@ -85,7 +85,7 @@ class TableWatcher:
 
 def picture(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Picture:
     """Return the region of a frame as it is compared, float32 (`GRID`, `GRID`, 3)."""
-    return cv2.resize(region(image_bgr, config), (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.resize(within(image_bgr, config.roi), (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def changed_cells(a: Picture, b: Picture) -> int:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import hbr
 from rig.config import ViewConfig
+from rig.describer import within
 from rig.devices.camera import Camera, CameraLocks, Frame
 from rig.heading import Stillness
 
@@ -57,14 +57,6 @@ class Attempt:
         return not self.reasons
 
 
-def region(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8]:
-    """Return the region of interest of a frame, uint8 (H, W, 3); a view into it."""
-    if config.roi is None:
-        return image_bgr
-    x, y, width, height = config.roi
-    return image_bgr[y : y + height, x : x + width]
-
-
 @dataclass(frozen=True, slots=True)
 class Looks:
     """What the region of a frame looks like; see `ViewEvidence`.
@@ -95,7 +87,7 @@ class Looks:
 
 def looks(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Looks:
     """Measure the region of interest of a frame, uint8 (H, W, 3)."""
-    grey = cv2.cvtColor(region(image_bgr, config), cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(within(image_bgr, config.roi), cv2.COLOR_BGR2GRAY)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).var())
     return Looks(
         sharpness=sharpness,
@@ -114,7 +106,7 @@ def likeness(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8], config:
     """
     small = [
         cv2.resize(
-            cv2.cvtColor(region(image, config), cv2.COLOR_BGR2GRAY),
+            cv2.cvtColor(within(image, config.roi), cv2.COLOR_BGR2GRAY),
             None,
             fx=1 / LIKENESS_PX,
             fy=1 / LIKENESS_PX,
@@ -123,11 +115,6 @@ def likeness(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8], config:
         for image in (image_bgr, other_bgr)
     ]
     return float(cv2.matchTemplate(small[0], small[1], cv2.TM_CCOEFF_NORMED)[0, 0])
-
-
-def describe(image_bgr: NDArray[np.uint8], config: ViewConfig) -> NDArray[np.uint8]:
-    """Return the CEDD levels, uint8 (144,), of a frame's region of interest."""
-    return hbr.describe(region(image_bgr, config))
 
 
 class Viewer:
@@ -165,10 +152,6 @@ class Viewer:
             if attempt.accepted:
                 return
             after_ns = frame.exposed_ns + 1
-
-    def describe(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the CEDD levels, uint8 (144,), of the frame's region of interest."""
-        return describe(image_bgr, self._config)
 
     def _judge(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:
         config = self._config

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.descriptors.cosine import Cosine
 from hbr.descriptors.packing import check_levels, pack_quarters, unpack_quarters
 from hbr.frontend import CROP_PX, Sighting, sight
 
@@ -52,9 +53,9 @@ class Edges:
         image = (view if isinstance(view, Sighting) else sight(view)).alone
         return np.searchsorted(_BORDERS, _histogram(image)).astype(np.uint8)
 
-    def prepared(self, rows: LevelArray, /) -> "_Cosine":
+    def prepared(self, rows: LevelArray, /) -> Cosine:
         check_levels(self, rows)
-        return _Cosine(_unit(rows))
+        return Cosine(_unit(rows), _unit)
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         check_levels(self, a)
@@ -93,23 +94,6 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
     clipped /= np.sqrt((clipped * clipped).sum())
     roots: NDArray[np.float32] = np.sqrt(clipped).ravel()
     return roots
-
-
-class _Cosine:
-    def __init__(self, unit: NDArray[np.float32]) -> None:
-        self._unit = unit
-
-    def similarity(self, queries: LevelArray, /) -> FloatArray:
-        similar: FloatArray = np.minimum(_unit(queries) @ self._unit.T, 1, dtype=np.float64)
-        return similar
-
-    def only(self, rows: IndexArray, /) -> "_Cosine":
-        return _Cosine(self._unit[rows])
-
-    def among(self, rows: IndexArray, /) -> FloatArray:
-        part = self._unit[rows]
-        similar: FloatArray = np.minimum(part @ part.transpose(0, 2, 1), 1, dtype=np.float64)
-        return similar
 
 
 def _unit(levels: LevelArray) -> NDArray[np.float32]:

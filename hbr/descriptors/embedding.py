@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.descriptors.cosine import Cosine
 from hbr.descriptors.packing import check_levels
 from hbr.frontend import Sighting, sight
 
@@ -63,9 +64,9 @@ class Embedding:
         levels: NDArray[np.float32] = np.clip(np.rint(entries) + 128, 0, 255)
         return levels.astype(np.uint8)
 
-    def prepared(self, rows: LevelArray, /) -> "_Cosine":
+    def prepared(self, rows: LevelArray, /) -> Cosine:
         check_levels(self, rows)
-        return _Cosine(_unit(rows))
+        return Cosine(_unit(rows), _unit)
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         check_levels(self, a)
@@ -84,26 +85,6 @@ class Embedding:
         blob = cv2.dnn.blobFromImage(image, 1 / 255, (_SIDE_PX, _SIDE_PX), _MEAN, swapRB=True)
         self._net.setInput(np.asarray(blob, np.float32) / _DEVIATION)
         return np.asarray(self._net.forward(), np.float32).ravel()
-
-
-class _Cosine:
-    def __init__(self, unit: NDArray[np.float32]) -> None:
-        self._unit = unit
-
-    def similarity(self, queries: LevelArray, /) -> FloatArray:
-        return _positive(_unit(queries) @ self._unit.T)
-
-    def only(self, rows: IndexArray, /) -> "_Cosine":
-        return _Cosine(self._unit[rows])
-
-    def among(self, rows: IndexArray, /) -> FloatArray:
-        part = self._unit[rows]
-        return _positive(part @ part.transpose(0, 2, 1))
-
-
-def _positive(cosine: NDArray[np.float32]) -> FloatArray:
-    similar: FloatArray = np.clip(cosine, 0, 1).astype(np.float64)
-    return similar
 
 
 def _unit(levels: LevelArray) -> NDArray[np.float32]:

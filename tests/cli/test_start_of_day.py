@@ -89,7 +89,7 @@ def asked(
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
         monkeypatch.setattr("sys.stdin", answers)
         see_to_empty_table(Settings(json=as_json), s.bench, ask=ask, then="toy-car")
-        return EmptyTables.current(s.bench), capsys.readouterr().err
+        return EmptyTables.standing(s.bench).table, capsys.readouterr().err
 
     return run
 

@@ -45,7 +45,7 @@ def test_the_table_is_cleared_photographed_and_turned_back(simulated: Open) -> N
     s.operator.place("dice")
     assert EmptyTables.standing(s.bench).words == "no picture of the empty table was taken yet"
     taken = photographed(s.bench)
-    kept = EmptyTables.current(s.bench)
+    kept = EmptyTables.standing(s.bench).table
     assert kept is not None
     assert np.array_equal(kept.image_bgr, taken.image_bgr)
     assert s.world.scene.thing is None
@@ -72,7 +72,7 @@ def test_a_forgotten_object_is_refused_and_the_picture_before_stays(simulated: O
         s.operator.place(name)
         with pytest.raises(TableNotEmpty):
             photographed(s.bench)
-    kept = EmptyTables.current(s.bench)
+    kept = EmptyTables.standing(s.bench).table
     assert kept is not None
     assert np.array_equal(kept.image_bgr, before.image_bgr)
     assert abs(s.world.table_deg()) < 1
@@ -94,7 +94,7 @@ def test_a_dark_table_is_refused_as_a_view_is(simulated: Open) -> None:
     s.world.change(light=(0.0, 0.0, 0.0))
     with pytest.raises(ViewRejected, match="too dark"):
         photographed(s.bench)
-    assert EmptyTables.current(s.bench) is None
+    assert EmptyTables.standing(s.bench).table is None
 
 
 def test_a_camera_that_goes_around_has_no_empty_table(simulated: Open) -> None:
@@ -137,7 +137,7 @@ def test_on_disk_damage_is_told_and_a_new_picture_mends_it(simulated: Open, tmp_
         assert standing.table is None
         assert said in standing.words
     photographed(s.bench)
-    assert EmptyTables.current(s.bench) is not None
+    assert EmptyTables.standing(s.bench).table is not None
     photographed(s.bench)
     assert len(list(tmp_path.glob("*.png"))) == 1  # the one before is let go of
 
@@ -208,7 +208,7 @@ def test_a_full_disk_is_told_and_the_picture_before_stays(simulated: Open, tmp_p
         photographed(s.bench)
     assert "Make room" in caught.value.next_step
     s.bench.state = store
-    table = EmptyTables.current(s.bench)
+    table = EmptyTables.standing(s.bench).table
     assert table is not None
     assert np.array_equal(table.image_bgr, before.image_bgr)
     assert sorted(path.name for path in tmp_path.iterdir()) == kept
