@@ -10,13 +10,12 @@ half-way to its neighbours: an azimuth between two enrolled views is as good as 
 The power p lets a query that meets an enrolled view well say more than one that lies between two.
 """
 
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hbr.angles import wrap180, wrap360
 from hbr.arrays import FloatArray, IndexArray, LevelArray
@@ -292,17 +291,6 @@ def believe(query: LevelArray, orientation_deg: float, so_far: DenseIndex | Beli
         index = index.only(np.sort(np.argsort(-best, kind="stable")[:kept]))
         similar = index.compared.similarity(query[None])[0]
     return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64))
-
-
-def believe_all(queries: Sequence[LevelArray] | LevelArray, orientation_deg: ArrayLike, index: DenseIndex) -> Belief:
-    """Return what is believed after all these queries, in their order: (n, length) and (n,), n at least 1."""
-    orientations = np.asarray(orientation_deg, np.float64)
-    if len(queries) < 1 or orientations.shape != (len(queries),):
-        raise ValueError(f"{len(queries)} queries and orientations of shape {orientations.shape}; one each is needed")
-    belief = believe(queries[0], float(orientations[0]), index)
-    for query, angle_deg in zip(queries[1:], orientations[1:].tolist(), strict=True):
-        belief = believe(query, angle_deg, belief)
-    return belief
 
 
 def _between(support: FloatArray, bins: FloatArray) -> FloatArray:

@@ -35,8 +35,6 @@ class Look:
         motion costs, in the same unit.
     alike : float64 array (a,), or None
         How alike the pair looks after each turn; None where there is no pair.
-    words : str
-        The decision for people.
     """
 
     rotation_deg: float
@@ -46,7 +44,6 @@ class Look:
     confusion: FloatArray
     cost: FloatArray
     alike: FloatArray | None
-    words: str
 
 
 def next_look(
@@ -118,16 +115,7 @@ def next_look(
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
         alike = similar[:, first, second]
     turn = float(turns_deg[chosen])
-    names = belief.index.views.object_names
-    side = "left" if turn > 0 else "right"
-    if pair is None or alike is None:
-        words = f"turn {abs(turn):.0f}° to the {side}: only {names[_leader(belief)]} is left, and that side is new"
-    else:
-        words = (
-            f"turn {abs(turn):.0f}° to the {side}, where {names[pair[0]]} and {names[pair[1]]} are {alike[chosen]:.2f} "
-            f"alike (from {alike.min():.2f} to {alike.max():.2f} all around)"
-        )
-    return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike, words)
+    return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike)
 
 
 def most_informative_turn(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
@@ -157,10 +145,6 @@ def most_informative_turn(belief: Belief, *, beta: float = BETA, rotations_deg: 
 def _all_turns() -> FloatArray:
     steps: FloatArray = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1)
     return steps * (360 / BINS)
-
-
-def _leader(belief: Belief) -> int:
-    return int(belief.index.object_index[belief.support.max(axis=1).argmax()])
 
 
 def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from searches import believe_all
 
 from hbr import DenseIndex, Views, believe, tanimoto
-from hbr.dense import BINS, Belief, believe_all
+from hbr.dense import BINS, Belief
 
 
 def catalog(seed: int, objects: int = 4, *, ragged: bool = True) -> Views:
@@ -119,7 +120,5 @@ def test_what_is_no_query_is_refused() -> None:
         believe(query, 0.0, index, kept=0)
     with pytest.raises(ValueError, match="enroll at least one object"):
         DenseIndex(Views.empty())
-    with pytest.raises(ValueError, match="2 queries and orientations"):
-        believe_all([query, query], [0.0], index)
     with pytest.raises(ValueError, match=r"power is 0\.5"):
         DenseIndex(catalog(1), power=0.5)

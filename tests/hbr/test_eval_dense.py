@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from searches import believe_all
 from test_eval_protocol import QUERIES, STEP, VIEWS
 
 from hbr import DenseIndex, believe, next_look
 from hbr.angles import wrap180
-from hbr.dense import believe_all
 from hbr.evaluation.methods import METHODS, choose_methods
 from hbr.evaluation.protocol import Protocol, Runs, _Trials, run_object
 from hbr.evaluation.results import contests, method_results

@@ -41,9 +41,6 @@ def test_twins_are_told_apart_where_they_differ(azimuth: float, low: float, high
     look = next_look(believe(looked(azimuth), 0.0, INDEX), beta=60.0)
     assert low <= look.rotation_deg <= high
     assert look.pair in ((0, 1), (1, 0))
-    assert "plain" in look.words
-    assert "marked" in look.words
-    assert f"turn {abs(look.rotation_deg):.0f}° to the {'left' if look.rotation_deg > 0 else 'right'}" in look.words
     assert look.orientation_deg == look.rotation_deg % 360
     # the baseline sees it, too
     assert low <= most_informative_turn(believe(looked(azimuth), 0.0, INDEX), beta=60.0) <= high
@@ -105,7 +102,6 @@ def test_one_object_alone_is_looked_at_from_a_new_side() -> None:
     look = next_look(believe(looked(30.0), 0.0, alone), beta=60.0)
     assert look.pair is None
     assert abs(look.rotation_deg) >= 50
-    assert "plain" in look.words
 
 
 def test_what_is_no_choice_is_refused() -> None:
