@@ -17,7 +17,7 @@ from benchmarks.large_catalog import build
 from hbr import describe, pack
 from rig.catalog import Catalog
 from rig.catalog.exchange import bring_in, plan_import, read_folder
-from rig.clock import SystemClock, seconds_between
+from rig.core.clock import SystemClock, seconds_between
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 COIL = Path(os.environ.get("RIG_TEST_DATA", "../shared/data")) / "coil-100"

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hbr import cedd, describe
-from hbr.arrays import ImageArray
+from hbr.core.arrays import ImageArray
 
 REPEATS = 300
 

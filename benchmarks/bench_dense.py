@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from benchmarks.bench_search import model, queries_of
-from hbr import Background, DenseIndex, ViewIndex, Views, believe, descriptor, next_look, next_view, retrieve, sight
-from hbr.arrays import ImageArray, IndexArray
-from hbr.dense import Belief
+from hbr import Background, DenseIndex, ViewIndex, Views, believe, descriptor, next_look, next_view, retrieve, segment
+from hbr.core.arrays import ImageArray, IndexArray
+from hbr.dense.filter import Belief
 from hbr.descriptors import names
 from hbr.evaluation.scenes import plain_bench
 
@@ -88,9 +88,9 @@ def bench_describe(name: str, frame: ImageArray, empty: ImageArray | None) -> No
     background = None if empty is None else Background(empty)
     plain = milliseconds(lambda _: descriptor("cedd").describe(frame), REPEATS)
     row(name, "cedd of the whole frame (= 1)", plain, plain)
-    found = milliseconds(lambda _: sight(frame, reference=background), REPEATS)
+    found = milliseconds(lambda _: segment(frame, reference=background), REPEATS)
     row(name, "find the object and its light", found, plain)
-    seen = sight(frame, reference=background)
+    seen = segment(frame, reference=background)
 
     def describe(kind: str) -> object:
         seen.__dict__.pop("alone", None)  # each has to make it anew

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from hbr import DenseIndex, Views
-from hbr.arrays import ImageArray
+from hbr.core.arrays import ImageArray
 from hbr.evaluation.condition import Condition, Shot
 from hbr.evaluation.datasets import load_coil, read_photograph
 from hbr.evaluation.matrix import enrolled_few, hits

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hbr import ViewIndex, Views, next_view, retrieve
-from hbr.arrays import FloatArray, IndexArray, LevelArray
-from hbr.index import Method
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.paper.index import Method
 
 VIEWS_OF_AN_OBJECT = 72
 QUERIES = 12

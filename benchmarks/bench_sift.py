@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hbr import descriptor
-from hbr.arrays import FloatArray, ImageArray
+from hbr.core.arrays import FloatArray, ImageArray
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, load_coil, read_photograph
 from hbr.evaluation.draws import generator

@@ -26,12 +26,12 @@ import hbr
 from calibration import backlash, camera_model, encoder, gyro_scale, motion_model, repeatability, table_axis
 from hbr.evaluation.statistics import wilson
 from rig.bench import Bench, calibrate
+from rig.calibrations import CalibrationResult, CalibrationStore
 from rig.catalog import Catalog
 from rig.config import load_config
-from rig.errors import RigError
-from rig.facts import Fact, FactStore
+from rig.core.errors import RigError
+from rig.events.events import Identified, Moved
 from rig.plans.enroll import enroll
-from rig.plans.events import Identified, Moved
 from rig.plans.identify import identify
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
@@ -64,13 +64,13 @@ PROCEDURES: tuple[Callable[[Bench], Iterator[Any]], ...] = (
 Told = dict[str, list[float]]
 
 
-def calibrated_on(bench: Bench, store: FactStore, told: Told, thing: str) -> None:
+def calibrated_on(bench: Bench, store: CalibrationStore, told: Told, thing: str) -> None:
     """Calibrate the bench and put in force what passes."""
-    camera: list[Fact] = []
+    camera: list[CalibrationResult] = []
 
     def lens(bench: Bench) -> Iterator[Any]:
         for event in camera_model.live(bench):
-            camera.extend([event] if isinstance(event, Fact) else [])
+            camera.extend([event] if isinstance(event, CalibrationResult) else [])
             yield event
 
     for procedure in (
@@ -80,7 +80,7 @@ def calibrated_on(bench: Bench, store: FactStore, told: Told, thing: str) -> Non
         lambda bench: repeatability.live(bench, thing),
     ):
         *_, fact = procedure(bench)
-        assert isinstance(fact, Fact)
+        assert isinstance(fact, CalibrationResult)
         store.keep(fact)
         told[f"refused {fact.name}"].append(not fact.passed)
         calibrate(bench, store)
@@ -108,7 +108,7 @@ def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder
         operator = ShelfOperator(World(noise=noise, seed=bench_seed), things)
         with open_sim_bench(config, operator) as bench:
             if calibrated:
-                calibrated_on(bench, FactStore(folder / f"facts {bench_seed}"), told, names[0])
+                calibrated_on(bench, CalibrationStore(folder / f"facts {bench_seed}"), told, names[0])
             with Catalog.open(folder / "catalog", clock=bench.clock, create=bench_seed == seed) as catalog:
                 if bench_seed == seed:
                     for name in names[:OBJECTS]:

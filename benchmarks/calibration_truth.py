@@ -27,13 +27,13 @@ from calibration import (
     motion_model,
     table_axis,
 )
+from rig.calibrations import CalibrationResult
 from rig.config import load_config
-from rig.facts import Fact
-from rig.markers import Board
-from rig.turntable import Turntable
+from rig.motion.turntable import Turntable
+from rig.views.charuco_board import Board
 from sim.bench import ShelfOperator, open_sim_bench
+from sim.calibration_board import boards
 from sim.noise import NoiseModel
-from sim.objects.board import boards
 from sim.objects.shelf import shelf
 from sim.world import World
 
@@ -48,19 +48,19 @@ def opened(seed: int, noise: NoiseModel | None = None, *settings: str) -> Iterat
         yield bench, operator.parts
 
 
-def last(events: Iterator[Any]) -> Fact:
+def last(events: Iterator[Any]) -> CalibrationResult:
     *_, fact = events
-    assert isinstance(fact, Fact)
+    assert isinstance(fact, CalibrationResult)
     return fact
 
 
-def imu_scale(seed: int) -> tuple[Fact, Truth]:
+def imu_scale(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed) as (bench, parts):
         part = parts.imu.inertial
         return last(gyro_scale.live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
 
 
-def imu_noise(seed: int) -> tuple[Fact, Truth]:
+def imu_noise(seed: int) -> tuple[CalibrationResult, Truth]:
     rng = np.random.default_rng(seed)
     noise = NoiseModel(
         gyro_noise_dps_rthz=float(rng.uniform(0.003, 0.015)), gyro_bias_walk_dps_rts=float(rng.uniform(1e-4, 1e-3))
@@ -75,7 +75,7 @@ def imu_noise(seed: int) -> tuple[Fact, Truth]:
         return last(gyro_noise.live(bench)), truth
 
 
-def mounting(seed: int) -> tuple[Fact, Truth]:
+def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed) as (bench, parts):
         part = parts.imu.inertial
         truth = {f"tilt_{name}": (degrees(float(part.up[i])), "°") for i, name in enumerate("xy")}
@@ -84,13 +84,13 @@ def mounting(seed: int) -> tuple[Fact, Truth]:
         return last(imu_mounting.live(bench)), truth
 
 
-def play(seed: int) -> tuple[Fact, Truth]:
+def play(seed: int) -> tuple[CalibrationResult, Truth]:
     play_deg = float(np.random.default_rng(seed).uniform(0.05, 1.0))
     with opened(seed, NoiseModel(backlash_deg=play_deg)) as (bench, _):
         return last(backlash.live(bench)), {"backlash": (play_deg, "°")}
 
 
-def over_the_turn(seed: int) -> tuple[Fact, Truth]:
+def over_the_turn(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed, NoiseModel(encoder_harmonic_deg=0.2)) as (bench, parts):
         fact = last(encoder.live(bench))
         (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
@@ -98,7 +98,7 @@ def over_the_turn(seed: int) -> tuple[Fact, Truth]:
         return fact, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
 
 
-def motion(seed: int) -> tuple[Fact, Truth]:
+def motion(seed: int) -> tuple[CalibrationResult, Truth]:
     rng = np.random.default_rng(seed)
     speed, ramp = rng.uniform(40, 120), rng.uniform(100, 500)
     with opened(seed, None, f"table.velocity_dps={speed}", f"table.acceleration_dps2={ramp}") as (bench, _):
@@ -122,28 +122,28 @@ def light(seed: int) -> NoiseModel:
     )
 
 
-def photons(seed: int) -> tuple[Fact, Truth]:
+def photons(seed: int) -> tuple[CalibrationResult, Truth]:
     noise = light(seed)
     with opened(seed, noise) as (bench, _):
         fact = last(camera_light.live_scene(bench))
     return fact, {"full_well_e": (noise.full_well_e, "electrons"), "read_noise_e": (noise.read_noise_e, "electrons")}
 
 
-def card(seed: int, name: str, truth: Truth) -> tuple[Fact, Truth]:
+def card(seed: int, name: str, truth: Truth) -> tuple[CalibrationResult, Truth]:
     with opened(seed, light(seed)) as (bench, _):
         events = [*camera_light.live_card(bench)]
-    return next(event for event in events if isinstance(event, Fact) and event.name == name), truth
+    return next(event for event in events if isinstance(event, CalibrationResult) and event.name == name), truth
 
 
-def corners(seed: int) -> tuple[Fact, Truth]:
+def corners(seed: int) -> tuple[CalibrationResult, Truth]:
     return card(seed, camera_light.FLAT_FIELD, {"vignetting": (light(seed).vignetting, "")})
 
 
-def steadiness(seed: int) -> tuple[Fact, Truth]:
+def steadiness(seed: int) -> tuple[CalibrationResult, Truth]:
     return card(seed, camera_light.DRIFT, {"flicker": (light(seed).light_flicker, ""), "drift": (0.0, "%/min")})
 
 
-def lens(seed: int) -> tuple[Fact, Truth]:
+def lens(seed: int) -> tuple[CalibrationResult, Truth]:
     operator = ShelfOperator(World(noise=NoiseModel(camera_mount=1.0), seed=seed), shelf())
     with open_sim_bench(load_config(None, ()), operator) as bench:
         fact = last(camera_model.live(bench))
@@ -152,7 +152,7 @@ def lens(seed: int) -> tuple[Fact, Truth]:
     return fact, {name: (value, unit) for (name, unit), value in zip(camera_model.PARAMETERS, values, strict=True)}
 
 
-def axis(seed: int) -> tuple[Fact, Truth]:
+def axis(seed: int) -> tuple[CalibrationResult, Truth]:
     operator = ShelfOperator(World(noise=NoiseModel(camera_mount=1.0), seed=seed), shelf())
     with open_sim_bench(load_config(None, ()), operator) as bench:
         fact = last(table_axis.live(bench, last(camera_model.live(bench))))
@@ -170,7 +170,7 @@ def axis(seed: int) -> tuple[Fact, Truth]:
     }
 
 
-PROCEDURES: dict[str, Callable[[int], tuple[Fact, Truth]]] = {
+PROCEDURES: dict[str, Callable[[int], tuple[CalibrationResult, Truth]]] = {
     "servo.backlash": play,
     "servo.encoder": over_the_turn,
     "servo.motion": motion,

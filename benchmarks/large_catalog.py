@@ -14,11 +14,12 @@ import numpy as np
 
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
 from hbr import Views, descriptor, pack
-from rig.catalog import Catalog, EnrollmentStatus, images
+from rig.catalog import Catalog, EnrollmentStatus
 from rig.catalog.exchange import Package, bring_in, plan_import
 from rig.catalog.exchange.package import Enrollment, ImageSource, Levels, Object, Sitting, View
-from rig.clock import SystemClock
-from rig.describer import BENCH_DESCRIPTOR
+from rig.core.clock import SystemClock
+from rig.views import image_files as images
+from rig.views.description import BENCH_DESCRIPTOR
 
 OBJECTS = 1_000
 _NOW = datetime(2026, 1, 1, tzinfo=UTC)

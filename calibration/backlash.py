@@ -20,12 +20,12 @@ import numpy as np
 from calibration.charts import MODEL, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
-from rig.errors import LimitExceeded, UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import LimitExceeded, UsageError
+from rig.events.events import Moved, plain
+from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
-from rig.plans.events import Moved, plain
-from rig.turntable import Turntable
 
 NAME = "servo.backlash"
 VALID_DAYS = 90
@@ -39,7 +39,7 @@ MAX_BACKLASH_DEG = 2.0
 MAX_UNCERTAINTY_DEG = 0.03
 
 
-def live(bench: Bench, *, reversals: int = 24) -> Generator[Moved | Fact, None, Fact]:
+def live(bench: Bench, *, reversals: int = 24) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
     """Measure the play by ``reversals`` of the table around where it stands; yields each move, then the fact.
 
     Raises
@@ -49,7 +49,7 @@ def live(bench: Bench, *, reversals: int = 24) -> Generator[Moved | Fact, None, 
     LimitExceeded
         The cable leaves no room; before anything moves.
     MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.turntable`.
+        See `rig.motion.turntable`.
     """
     if reversals < MIN_REVERSALS:
         raise UsageError(f"{reversals} reversals are too few.", next_step=f"Give at least {MIN_REVERSALS}.")
@@ -90,7 +90,9 @@ def live(bench: Bench, *, reversals: int = 24) -> Generator[Moved | Fact, None, 
     return fact
 
 
-def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def from_data(
+    legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime, device: Mapping[str, Any]
+) -> CalibrationResult:
     """Fit play and ratio to ``legs``, each of which reverses the one before, and judge them.
 
     Parameters
@@ -124,7 +126,7 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
         refusals = _judge(estimates, residual, limit, worst)
         # What may differ between encoder and platter without being a fault: the play, and what is not known of it.
         settings = {"table.backlash_deg": round(max(float(play), 0.0) + COVERAGE * float(play_sigma), 3)}
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=residual,
@@ -151,7 +153,7 @@ def plain_approach(bench: Bench) -> Generator[None, None, None]:
         bench.config = before
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return what each reversal lost beyond the fitted ratio: the play, whatever the length of the leg."""
     if "backlash" not in fact.estimates:
         return None

@@ -13,13 +13,13 @@ from calibration import pictures
 from calibration.charts import LIMIT, MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
-from rig.evaluation.drawing import Figure
-from rig.facts import Fact
-from rig.markers import Board, Sighting, sight
+from rig.calibrations import CalibrationResult
+from rig.charts.drawing import Figure
+from rig.events.events import Event
+from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
-from rig.plans.events import Event
-from rig.turntable import Turntable
-from rig.view import Viewer
+from rig.views.capture import Viewer
+from rig.views.charuco_board import Board, BoardDetection, detect_board
 
 MIN_CORNERS = 12
 """Corners that a view needs to say where the board is."""
@@ -68,7 +68,7 @@ def look(
     Raises
     ------
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.view` and `rig.turntable`.
+        See `rig.views.capture` and `rig.motion.turntable`.
     """
     views: list[BoardView] = []
     foreign: set[int] = set()
@@ -88,7 +88,7 @@ def look(
                 move = table.goto(angle_deg)
                 yield moved(index, move)
                 shot = yield from capture(index, viewer, table, move.settled_ns)
-                seen = sight(board, shot.image_bgr)
+                seen = detect_board(board, shot.image_bgr)
                 foreign |= set(seen.marker_ids.tolist()) - known
                 elsewhere += seen.marker_ids.size >= MIN_MARKERS and not seen.ids.size
                 if seen.ids.size >= MIN_CORNERS:
@@ -173,7 +173,7 @@ def by_stand(views: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[Ma
     ]
 
 
-def plot_views(fact: Fact, limit_px: float) -> Figure | None:
+def plot_views(fact: CalibrationResult, limit_px: float) -> Figure | None:
     """Return how far the corners of each view are off the fit (RMS); the title names the worst."""
     views, rms = fact.evidence["views"], fact.evidence.get("view_rms_px")
     if not rms:
@@ -198,7 +198,7 @@ def plot_views(fact: Fact, limit_px: float) -> Figure | None:
     )
 
 
-def _words(seen: Sighting, board: Board, views: Sequence[BoardView], bench: Bench) -> str:
+def _words(seen: BoardDetection, board: Board, views: Sequence[BoardView], bench: Bench) -> str:
     identity = bench.camera.identity
     cells = coverage(views, (identity.width, identity.height)) if views else np.zeros(GRID)
     covered = float((cells > 0).mean())

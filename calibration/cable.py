@@ -10,7 +10,7 @@ from typing import Any
 from calibration import pictures
 from calibration.events import Ask
 from rig.bench import Bench
-from rig.facts import Estimate, Fact
+from rig.calibrations import CalibrationResult, Estimate
 
 NAME = "servo.cable"
 VALID_DAYS = 365
@@ -22,7 +22,7 @@ HAND_DEG = 5.0
 TURN_DEG = 360.0
 
 
-def live(bench: Bench) -> Generator[Ask | Fact, None, Fact]:
+def live(bench: Bench) -> Generator[Ask | CalibrationResult, None, CalibrationResult]:
     """Have both ends of the cable shown; yields what to do, then the fact. The servo moves nothing.
 
     Raises
@@ -48,7 +48,9 @@ def live(bench: Bench) -> Generator[Ask | Fact, None, Fact]:
     return fact
 
 
-def from_data(high_deg: float, low_deg: float, *, pan: bool, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def from_data(
+    high_deg: float, low_deg: float, *, pan: bool, when_utc: datetime, device: Mapping[str, Any]
+) -> CalibrationResult:
     """Judge the two ends of the cable, table angles in degrees; ``pan`` tables need no whole turn."""
     limits = [round(low_deg + MARGIN_DEG, 1), round(high_deg - MARGIN_DEG, 1)]
     span_deg = limits[1] - limits[0]
@@ -68,7 +70,7 @@ def from_data(high_deg: float, low_deg: float, *, pan: bool, when_utc: datetime,
             f"The table's zero does not lie between {limits[0]:.0f}° and {limits[1]:.0f}°: turn the table to where "
             "the cable hangs free, tell the rig with `rig home --set`, and teach the ends again."
         )
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates={"lowest": Estimate(low_deg, HAND_DEG, "°"), "highest": Estimate(high_deg, HAND_DEG, "°")},
         residual=None,

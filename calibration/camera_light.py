@@ -21,11 +21,11 @@ from calibration import pictures
 from calibration.charts import MODEL, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
 from rig.devices.camera import CameraLocks
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
-from rig.plans.events import plain
-from rig.view import looks
+from rig.events.events import plain
+from rig.views.capture import looks
 
 NOISE, FLAT_FIELD, DRIFT, SHARPNESS = "camera.noise", "camera.flat_field", "camera.drift", "camera.sharpness"
 VALID_DAYS = 180
@@ -64,7 +64,7 @@ class CardFrames:
     mean: NDArray[np.float64]
 
 
-def live_scene(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
+def live_scene(bench: Bench) -> Generator[Ask | Progress | CalibrationResult, None, CalibrationResult]:
     """Look at the board at rest, and find the camera's noise; yields what to do, and the facts of noise and sharpness.
 
     Raises
@@ -88,7 +88,7 @@ def live_scene(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
     return fact
 
 
-def live_card(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
+def live_card(bench: Bench) -> Generator[Ask | Progress | CalibrationResult, None, CalibrationResult]:
     """Look at a card for some minutes; yields what to do, then the facts of the flat field and of the drift.
 
     Raises
@@ -125,7 +125,7 @@ def live_card(bench: Bench) -> Generator[Ask | Progress | Fact, None, Fact]:
     return fact
 
 
-def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Mapping[str, Any]) -> CalibrationResult:
     """Fit gain and read noise to ``frames`` of a scene at rest, uint8 (n, H, W, 3), and judge them."""
     green = frames[..., 1].astype(np.float64)
     # The lamp's flicker moves all pixels together: each frame is brought to the brightness of all.
@@ -182,7 +182,7 @@ def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Ma
                 "full_well_e": Estimate(full_well, full_well_sigma, "electrons"),
                 "read_noise_e": Estimate(read, sqrt(float(slope @ covariance @ slope)), "electrons"),
             }
-    return Fact(
+    return CalibrationResult(
         name=NOISE,
         estimates=estimates,
         residual=residual,
@@ -196,7 +196,7 @@ def photon_transfer(frames: NDArray[np.uint8], *, when_utc: datetime, device: Ma
     )
 
 
-def sharpness(values: Sequence[float], *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def sharpness(values: Sequence[float], *, when_utc: datetime, device: Mapping[str, Any]) -> CalibrationResult:
     """Judge the sharpness of frames of the board: the reference by which a lens that shifted is noticed."""
     mean = float(np.mean(values))
     refusals: tuple[str, ...] = ()
@@ -204,7 +204,7 @@ def sharpness(values: Sequence[float], *, when_utc: datetime, device: Mapping[st
         refusals = (
             f"The board's sharpness is {mean:.1f}, below {MIN_SHARPNESS:g}: focus the lens, and calibrate again.",
         )
-    return Fact(
+    return CalibrationResult(
         name=SHARPNESS,
         estimates={"sharpness": Estimate(mean, float(np.std(values, ddof=1)), "squared levels")},
         residual=None,
@@ -218,7 +218,7 @@ def sharpness(values: Sequence[float], *, when_utc: datetime, device: Mapping[st
     )
 
 
-def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any]) -> CalibrationResult:
     """Fit the loss of light towards the corners to a card that fills the frame, and judge it."""
     square, x, y = _shading(card.mean.shape)
     design = np.column_stack([np.ones(square.size), x.ravel(), y.ravel(), -square.ravel()])
@@ -247,7 +247,7 @@ def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any
         refusals.append(
             f"The corners lose {loss:.0%} of the light: something covers the lens, or the zoom is at its end."
         )
-    return Fact(
+    return CalibrationResult(
         name=FLAT_FIELD,
         estimates={
             "vignetting": Estimate(loss, float(sigma[2]), "of the light in the corners"),
@@ -267,7 +267,7 @@ def flat_field(card: CardFrames, *, when_utc: datetime, device: Mapping[str, Any
 
 def drift(
     card: CardFrames, before: CameraLocks, after: CameraLocks, *, when_utc: datetime, device: Mapping[str, Any]
-) -> Fact:
+) -> CalibrationResult:
     """Judge how steady light and settings are, and the white balance by the card's colour."""
     kept: dict[str, Any] = {"when_utc": when_utc, "device": device, "valid_days": VALID_DAYS}
     evidence = {
@@ -277,7 +277,7 @@ def drift(
     }
     grey = card.levels.mean(axis=1)
     if card.levels.min() < 1.0:
-        return Fact(
+        return CalibrationResult(
             name=DRIFT,
             estimates={},
             residual=None,
@@ -325,7 +325,7 @@ def drift(
             f"The card looks coloured: red {red / green:.2f} and blue {blue / green:.2f} of green. Change "
             "camera.white_balance_k until they are near 1, or use a grey card."
         )
-    return Fact(
+    return CalibrationResult(
         name=DRIFT,
         estimates=estimates,
         residual=drifted,
@@ -337,7 +337,7 @@ def drift(
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return what the fact of noise, sharpness, flat field or drift was fitted to."""
     evidence = fact.evidence
     if not fact.estimates:

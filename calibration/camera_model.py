@@ -16,10 +16,10 @@ from calibration.board_views import plot_views as plot_views_of
 from calibration.charts import Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
-from rig.markers import Board
-from rig.plans.events import Event
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.events.events import Event
+from rig.views.charuco_board import Board
 
 NAME = "camera.intrinsics"
 VALID_DAYS = 365
@@ -44,13 +44,15 @@ PARAMETERS = (
 )
 
 
-def live(bench: Bench, board: Board | None = None) -> Generator[Event | Ask | Progress | Fact, None, Fact]:
+def live(
+    bench: Bench, board: Board | None = None
+) -> Generator[Event | Ask | Progress | CalibrationResult, None, CalibrationResult]:
     """Have the board put on four stands, look at it from nine sides each, and calibrate; yields events, then the fact.
 
     Raises
     ------
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.view` and `rig.turntable`.
+        See `rig.views.capture` and `rig.motion.turntable`.
     """
     board = board or Board()
     when_utc = bench.clock.utc()
@@ -76,7 +78,7 @@ def from_data(
     troubles: Sequence[str] = (),
     when_utc: datetime,
     device: Mapping[str, Any],
-) -> Fact:
+) -> CalibrationResult:
     """Fit the camera to ``views`` of the board and judge it.
 
     Parameters
@@ -121,7 +123,7 @@ def from_data(
         _, loose = turned_otherwise(views, poses)
         refusals += [loose] if loose else []
         refusals += _judge(estimates, float(rms), np.ravel(each), float((cells > 0).mean()))
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=None if rms is None else float(rms),
@@ -141,14 +143,14 @@ def from_data(
     )
 
 
-def matrix_of(fact: Fact) -> tuple["np.ndarray[tuple[int, int], np.dtype[np.float64]]", list[float]]:
+def matrix_of(fact: CalibrationResult) -> tuple["np.ndarray[tuple[int, int], np.dtype[np.float64]]", list[float]]:
     """Return the camera matrix (3, 3) and the distortion k1, k2, p1, p2 of a calibrated camera."""
     value = {name: estimate.value for name, estimate in fact.estimates.items()}
     matrix = np.array([[value["fx"], 0.0, value["cx"]], [0.0, value["fy"], value["cy"]], [0.0, 0.0, 1.0]])
     return matrix, [value[name] for name in ("k1", "k2", "p1", "p2")]
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return where in the frame corners were seen; every stand has its colour."""
     views = fact.evidence["views"]
     if not views:
@@ -168,7 +170,7 @@ def plot(fact: Fact) -> Figure | None:
     )
 
 
-def plot_residuals(fact: Fact) -> Figure | None:
+def plot_residuals(fact: CalibrationResult) -> Figure | None:
     """Return by how much and where to each corner is off the fit, enlarged; every stand has its colour."""
     views = fact.evidence["views"]
     if not views or not fact.estimates:
@@ -194,12 +196,12 @@ def plot_residuals(fact: Fact) -> Figure | None:
     )
 
 
-def plot_views(fact: Fact) -> Figure | None:
+def plot_views(fact: CalibrationResult) -> Figure | None:
     """Return how far the corners of each view are off the fit; see `calibration.board_views.plot_views`."""
     return plot_views_of(fact, MAX_RMS_PX)
 
 
-def _frame(fact: Fact) -> Series:
+def _frame(fact: CalibrationResult) -> Series:
     width, height = fact.evidence["size"]
     return Series("frame", [0, width, width, 0, 0], [0, 0, height, height, 0], "#8a8f96", dots=False, curve=True)
 

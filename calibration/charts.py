@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
 
-from rig.evaluation.drawing import Area, Dot, Figure, Line, Text
-from rig.report.svg import Point
+from rig.charts.drawing import Area, Dot, Figure, Line, Text
+from rig.charts.svg import Point
 
 WIDTH, HEIGHT = 640, 360
 _LEFT, _TOP, _RIGHT, _BOTTOM = 66.0, 44.0, 620.0, 300.0

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.command import Settings, command
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from calibration.events import Ask
     from rig.bench import Bench
-    from rig.facts import Fact
+    from rig.calibrations import CalibrationResult
 
 EXIT_QUALITY = 6
 
@@ -107,7 +108,7 @@ def camera(
     Example: rig calibrate camera --bench sim
     """
     from calibration import camera_light, camera_model
-    from rig.markers import Board
+    from rig.views.charuco_board import Board
 
     board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
     run(settings, camera_light.live_scene, camera_light.live_card, lambda bench: camera_model.live(bench, board))
@@ -139,7 +140,7 @@ def table(
     """
     from calibration import table_axis
     from calibration.table_axis import Room
-    from rig.markers import Board
+    from rig.views.charuco_board import Board
 
     board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
     if print_board is not None:
@@ -207,7 +208,7 @@ def everything(
         table_axis,
     )
     from calibration.table_axis import Room
-    from rig.markers import Board
+    from rig.views.charuco_board import Board
 
     board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
     room = Room(radius_mm, height_mm, middle_mm, lens_mm)
@@ -244,10 +245,10 @@ def report(
     Example: rig calibrate report --bench sim --out calibration.html
     """
     from calibration.report import write_page
-    from rig.facts import FactStore
+    from rig.calibrations import CalibrationStore
 
     with settings.open_bench(tell=False) as bench:
-        store = FactStore(bench.config.calibration_path(bench.name))
+        store = CalibrationStore(bench.config.calibration_path(bench.name))
         now_utc = bench.clock.utc()
         standings = store.standings(bench.apparatus(), now_utc)
         unreadable = [error.what for error in store.unreadable]
@@ -265,11 +266,11 @@ def show(settings: Settings) -> None:
 
     Example: rig calibrate show --bench sim
     """
-    from rig.facts import FactStore, State
-    from rig.plans.events import plain
+    from rig.calibrations import CalibrationStore, State
+    from rig.events.events import plain
 
     with settings.open_bench(tell=False) as bench:
-        store = FactStore(bench.config.calibration_path(bench.name))
+        store = CalibrationStore(bench.config.calibration_path(bench.name))
         standings = store.standings(bench.apparatus(), bench.clock.utc())
         if settings.json:
             settings.print_json(
@@ -301,10 +302,10 @@ def history(
 
     Example: rig calibrate history servo.backlash --bench sim
     """
-    from rig.facts import FactStore
-    from rig.plans.events import plain
+    from rig.calibrations import CalibrationStore
+    from rig.events.events import plain
 
-    store = FactStore(settings.load().calibration_path(settings.bench_name))
+    store = CalibrationStore(settings.load().calibration_path(settings.bench_name))
     facts = store.history(name)
     for error in store.unreadable:
         print(f"! {error.what}", file=sys.stderr)
@@ -319,7 +320,7 @@ def history(
         print(f"No calibration{f' of {name}' if name else ''} was kept in {store.folder}.")
 
 
-def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None, Fact]]") -> None:
+def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None, CalibrationResult]]") -> None:
     """Run calibrations on the bench one after the other, keep each fact, passed or not, and say how it went.
 
     What passed is in force for the next one. The first that does not pass ends the row.
@@ -330,11 +331,11 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
         With code 6 when a calibration did not pass.
     """
     from rig.bench import calibrate
-    from rig.cli.catalog import tell_other_regions
-    from rig.facts import FactStore
+    from rig.calibrations import CalibrationStore
+    from rig.cli.catalog.catalog import tell_other_regions
 
     with settings.open_bench() as bench:
-        store = FactStore(bench.config.calibration_path(bench.name))
+        store = CalibrationStore(bench.config.calibration_path(bench.name))
         for procedure in procedures:
             for fact in _told(settings, procedure(bench)):
                 path = store.keep(fact)
@@ -355,7 +356,7 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
                     tell_other_regions(settings, catalog, bench)
 
 
-def _in_force(bench: "Bench", name: str) -> "Fact":
+def _in_force(bench: "Bench", name: str) -> "CalibrationResult":
     """Return the calibration of that name in force on the bench, which another one needs.
 
     Raises
@@ -363,10 +364,10 @@ def _in_force(bench: "Bench", name: str) -> "Fact":
     UsageError
         There is none.
     """
-    from rig.errors import UsageError
-    from rig.facts import FactStore, State
+    from rig.calibrations import CalibrationStore, State
+    from rig.core.errors import UsageError
 
-    store = FactStore(bench.config.calibration_path(bench.name))
+    store = CalibrationStore(bench.config.calibration_path(bench.name))
     for standing in store.standings(bench.apparatus(), bench.clock.utc()):
         if standing.fact.name == name and standing.state is State.IN_FORCE:
             return standing.fact
@@ -375,16 +376,16 @@ def _in_force(bench: "Bench", name: str) -> "Fact":
     )
 
 
-def _told(settings: Settings, events: "Generator[Any, None, Fact]") -> "Iterator[Fact]":
+def _told(settings: Settings, events: "Generator[Any, None, CalibrationResult]") -> "Iterator[CalibrationResult]":
     """Tell the events of a procedure as they come, and yield its facts."""
     from calibration.events import Ask, Progress
-    from rig.cli.present import line
-    from rig.facts import Fact
-    from rig.plans.events import event_dict
+    from rig.calibrations import CalibrationResult
+    from rig.cli.ui.present import line
+    from rig.events.events import event_dict
 
     with closing(events):
         for event in events:
-            if isinstance(event, Fact):
+            if isinstance(event, CalibrationResult):
                 yield event
             elif isinstance(event, Ask):
                 _ask(event, with_picture=not settings.json)
@@ -401,13 +402,13 @@ def _ask(what: "Ask", *, with_picture: bool) -> None:
         typer.prompt("Then press Enter", default="", show_default=False, err=True)
 
 
-def _print_json(settings: Settings, fact: "Fact", path: "Path") -> None:
-    from rig.plans.events import plain
+def _print_json(settings: Settings, fact: "CalibrationResult", path: "Path") -> None:
+    from rig.events.events import plain
 
     settings.print_json({"event": "calibrated", "passed": fact.passed, "id": fact.id, "file": str(path), **plain(fact)})
 
 
-def verdict(fact: "Fact") -> str:
+def verdict(fact: "CalibrationResult") -> str:
     """Return in words what a calibration found, or why it was refused and what to do."""
     judged = ""
     if fact.residual is not None and fact.limit is not None:

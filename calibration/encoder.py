@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from calibration.charts import MODEL, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
-from rig.errors import LimitExceeded, UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import LimitExceeded, UsageError
+from rig.events.events import Moved, plain
+from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
-from rig.plans.events import Moved, plain
-from rig.turntable import Turntable
 
 NAME = "servo.encoder"
 VALID_DAYS = 365
@@ -48,7 +48,7 @@ class Step:
     leg: Leg
 
 
-def live(bench: Bench, *, turns: int = 2) -> Generator[Moved | Fact, None, Fact]:
+def live(bench: Bench, *, turns: int = 2) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
     """Measure the encoder's error over ``turns`` of the table, in even steps upwards; yields each move, then the fact.
 
     Raises
@@ -58,7 +58,7 @@ def live(bench: Bench, *, turns: int = 2) -> Generator[Moved | Fact, None, Fact]
     LimitExceeded
         The cable does not reach; before anything moves.
     MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.turntable`.
+        See `rig.motion.turntable`.
     """
     if turns < MIN_TURNS:
         raise UsageError(f"{turns} turns are too few.", next_step="Give at least one.")
@@ -121,7 +121,7 @@ def from_data(
     resolution_deg: float,
     when_utc: datetime,
     device: Mapping[str, Any],
-) -> Fact:
+) -> CalibrationResult:
     """Fit the harmonics to ``steps`` and judge them.
 
     Parameters
@@ -174,7 +174,7 @@ def from_data(
                 f"The harmonics are uncertain by {uncertainty:.3f}°, more than {MAX_UNCERTAINTY_DEG:g}°: give more "
                 "--turns, and keep vibration off the bench."
             )
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=residual,
@@ -189,7 +189,7 @@ def from_data(
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return the encoder's error over its turn, as fitted and as the steps show it."""
     if not fact.estimates:
         return None

@@ -23,9 +23,9 @@ from scipy.optimize import nnls
 from calibration.charts import MODEL, Axis, Series, chart
 from calibration.events import Progress
 from rig.bench import Bench
-from rig.errors import UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import UsageError
 
 NAME = "imu.noise"
 VALID_DAYS = 365
@@ -59,7 +59,7 @@ class Rest:
     lost: int = 0
 
 
-def live(bench: Bench, *, minutes: float = 20.0) -> Generator[Progress | Fact, None, Fact]:
+def live(bench: Bench, *, minutes: float = 20.0) -> Generator[Progress | CalibrationResult, None, CalibrationResult]:
     """Listen to the sensor for some ``minutes`` while the table stands without torque; yields progress, then the fact.
 
     Soon after power-on the sensor warms up: only then the slope over temperature can be told.
@@ -110,7 +110,9 @@ def live(bench: Bench, *, minutes: float = 20.0) -> Generator[Progress | Fact, N
     return fact
 
 
-def from_data(rest: Rest, *, column: int, when_utc: datetime, device: Mapping[str, Any], seed: int = 0) -> Fact:
+def from_data(
+    rest: Rest, *, column: int, when_utc: datetime, device: Mapping[str, Any], seed: int = 0
+) -> CalibrationResult:
     """Fit the noise of the vertical gyro (``column`` of the sensor's axes) and judge it.
 
     Parameters
@@ -157,7 +159,7 @@ def from_data(rest: Rest, *, column: int, when_utc: datetime, device: Mapping[st
     steady = rate - _slope(rate, trend)[0] * trend
     taus, deviation, freedom = allan(steady, rest.block_s)
     model = np.sqrt(arw**2 / taus + walk**2 * taus / 3)
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=float(np.max(np.abs(np.log(deviation / model)) * np.sqrt(freedom / 2))),
@@ -200,7 +202,7 @@ def allan(
     return taus, np.sqrt(variance), np.maximum(freedom, 1.0)
 
 
-def rotation_sigma_deg(fact: Fact, seconds: float) -> float:
+def rotation_sigma_deg(fact: CalibrationResult, seconds: float) -> float:
     """Return the standard uncertainty that noise and wandering give a rotation measured over ``seconds``.
 
     The zero is taken to be known exactly when the rotation begins: σ² = N²·t + K²·t³/3.
@@ -209,7 +211,7 @@ def rotation_sigma_deg(fact: Fact, seconds: float) -> float:
     return sqrt(arw**2 * seconds + walk**2 * seconds**3 / 3)
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return the Allan deviation over the time that is averaged, measured and fitted."""
     taus = fact.evidence["tau_s"]
     return chart(

@@ -24,12 +24,12 @@ from scipy.stats import chi2
 from calibration.charts import LIMIT, MODEL, Axis, Series, chart
 from calibration.legs import Leg
 from rig.bench import Bench
-from rig.errors import LimitExceeded, UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import LimitExceeded, UsageError
+from rig.events.events import Moved, plain
+from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
-from rig.plans.events import Moved, plain
-from rig.turntable import Turntable
 
 NAME = "imu.rotation"
 VALID_DAYS = 180
@@ -53,7 +53,7 @@ class Timed:
     leg: Leg
 
 
-def live(bench: Bench, *, repeats: int = 10) -> Generator[Moved | Fact, None, Fact]:
+def live(bench: Bench, *, repeats: int = 10) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
     """Go to and fro ``repeats`` times at each speed around where the table stands; yields each move, then the fact.
 
     Raises
@@ -63,7 +63,7 @@ def live(bench: Bench, *, repeats: int = 10) -> Generator[Moved | Fact, None, Fa
     LimitExceeded
         The cable leaves no room; before anything moves.
     MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.turntable`.
+        See `rig.motion.turntable`.
     """
     if repeats < MIN_REPEATS:
         raise UsageError(f"{repeats} repeats are too few to see a scatter.", next_step=f"Give at least {MIN_REPEATS}.")
@@ -101,7 +101,9 @@ def live(bench: Bench, *, repeats: int = 10) -> Generator[Moved | Fact, None, Fa
     return fact
 
 
-def from_data(moves: Sequence[Timed], *, resolution_deg: float, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def from_data(
+    moves: Sequence[Timed], *, resolution_deg: float, when_utc: datetime, device: Mapping[str, Any]
+) -> CalibrationResult:
     """Compare the scatter of ``moves``, each speed for itself, with what was stated for them.
 
     Parameters
@@ -158,7 +160,7 @@ def from_data(moves: Sequence[Timed], *, resolution_deg: float, when_utc: dateti
                 f"times what is stated ({rows[-1]['stated_deg']:.3f}°): {what}. Then calibrate again."
             )
     worst = max(rows, key=lambda row: row["measured_deg"] / row["stated_deg"] / row["ratio_may_be"][1], default=None)
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=estimates[f"ratio_{worst['speed']}"].value if worst else None,
@@ -172,7 +174,7 @@ def from_data(moves: Sequence[Timed], *, resolution_deg: float, when_utc: dateti
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return the scatter of repeated rotations over their duration, and what is stated for them."""
     rows = fact.evidence["by_duration"]
     if not rows:

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
-from rig.errors import LimitExceeded, UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
-from rig.heading import DRAIN_S, MEMORY_S
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import LimitExceeded, UsageError
+from rig.events.events import Moved, plain
+from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
-from rig.plans.events import Moved, plain
-from rig.turntable import Turntable
+from rig.safety.gyro_rotation import DRAIN_S, MEMORY_S
 
 NAME = "imu.scale"
 
@@ -43,7 +43,7 @@ MAX_UNCERTAINTY = 0.001
 """What a rotation by 90° needs to be known to a tenth of a degree."""
 
 
-def live(bench: Bench, *, turns: int = 8) -> Generator[Moved | Fact, None, Fact]:
+def live(bench: Bench, *, turns: int = 8) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
     """Calibrate the gyro's scale by at least ``turns`` whole turns; yields each move, then the fact, and returns it.
 
     The table goes back to where it was when all turns are done, and when the generator is closed between two of them.
@@ -56,7 +56,7 @@ def live(bench: Bench, *, turns: int = 8) -> Generator[Moved | Fact, None, Fact]
     LimitExceeded
         The cable does not reach around once; before anything moves.
     MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.turntable`.
+        See `rig.motion.turntable`.
     """
     table_config, imu_config = bench.config.table, bench.config.imu
     low_deg, high_deg = table_config.limits_deg
@@ -87,7 +87,9 @@ def live(bench: Bench, *, turns: int = 8) -> Generator[Moved | Fact, None, Fact]
     return fact
 
 
-def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def from_data(
+    legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime, device: Mapping[str, Any]
+) -> CalibrationResult:
     """Fit the scale to ``legs`` and judge it.
 
     Parameters
@@ -149,7 +151,7 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
                 "Keep vibration off the bench, or give more --turns."
             )
     settings = {NAME: value, f"{NAME}_uncertainty": uncertainty}
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=residual,
@@ -164,7 +166,7 @@ def from_data(legs: Sequence[Leg], *, resolution_deg: float, when_utc: datetime,
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return encoder over gyro for each leg, and the scale."""
     legs = [(i + 1, leg) for i, leg in enumerate(fact.evidence["legs"]) if not leg["trouble"] and leg["gyro_deg"]]
     if not legs or not fact.estimates:

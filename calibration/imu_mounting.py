@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.recording import Recording, recording
 from rig.bench import Bench
-from rig.errors import LimitExceeded
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import LimitExceeded
+from rig.events.events import Moved
+from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
-from rig.plans.events import Moved
-from rig.turntable import Turntable
 
 NAME = "imu.mounting"
 VALID_DAYS = 180
@@ -68,7 +68,7 @@ class Level:
     sigma_g: float
 
 
-def live(bench: Bench) -> Generator[Moved | Fact, None, Fact]:
+def live(bench: Bench) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
     """Turn the table once, in eight steps, and listen at each stop; yields each move, then the fact.
 
     Raises
@@ -76,7 +76,7 @@ def live(bench: Bench) -> Generator[Moved | Fact, None, Fact]:
     LimitExceeded
         The cable leaves less than a turn; before anything moves.
     MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.turntable`.
+        See `rig.motion.turntable`.
     """
     when_utc, config = bench.clock.utc(), bench.config
     low, high = config.table.limits_deg
@@ -135,7 +135,7 @@ def from_data(
     sign: int,
     when_utc: datetime,
     device: Mapping[str, Any],
-) -> Fact:
+) -> CalibrationResult:
     """Find tilt, levels and delay, and judge them.
 
     Parameters
@@ -175,7 +175,7 @@ def from_data(
                 f"The table's axis is {level_deg:.1f}° off the vertical, more than {MAX_LEVEL_DEG:g}°: put something "
                 "under the base, or does the accelerometer's range not fit?"
             )
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=residual,
@@ -193,7 +193,7 @@ def from_data(
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return what the accelerometer reads across the axis over the turn: a tilt and an offset make a circle of it."""
     levels = fact.evidence["levels"]
     if not levels or not fact.estimates:

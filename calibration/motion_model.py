@@ -21,13 +21,13 @@ from scipy.optimize import least_squares
 from calibration.backlash import plain_approach
 from calibration.charts import MODEL, Axis, Series, chart
 from rig.bench import Bench
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import LimitExceeded, UsageError
 from rig.devices.servo import MotionProfile
-from rig.errors import LimitExceeded, UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
+from rig.events.events import Moved, plain
+from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
-from rig.plans.events import Moved, plain
-from rig.turntable import Turntable
 
 NAME = "servo.motion"
 VALID_DAYS = 180
@@ -49,7 +49,7 @@ class Timed:
     seconds: float
 
 
-def live(bench: Bench, *, rounds: int = 3) -> Generator[Moved | Fact, None, Fact]:
+def live(bench: Bench, *, rounds: int = 3) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
     """Time moves over seven distances, both ways, ``rounds`` times; yields each move, then the fact.
 
     Raises
@@ -59,7 +59,7 @@ def live(bench: Bench, *, rounds: int = 3) -> Generator[Moved | Fact, None, Fact
     LimitExceeded
         The cable leaves no room; before anything moves.
     MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.turntable`.
+        See `rig.motion.turntable`.
     """
     if rounds < MIN_ROUNDS:
         raise UsageError(f"{rounds} rounds are too few.", next_step=f"Give at least {MIN_ROUNDS}.")
@@ -96,13 +96,15 @@ def live(bench: Bench, *, rounds: int = 3) -> Generator[Moved | Fact, None, Fact
     return fact
 
 
-def predicted_s(fact: Fact, distance_deg: float) -> float:
+def predicted_s(fact: CalibrationResult, distance_deg: float) -> float:
     """Return the time that a move by ``distance_deg`` takes until the table is at rest."""
     model = np.array([fact.estimates[name].value for name in ("pace", "wind_up", "delay")])
     return float(_seconds(model, np.array([abs(distance_deg)]))[0])
 
 
-def from_data(moves: Sequence[Timed], nominal: MotionProfile, *, when_utc: datetime, device: Mapping[str, Any]) -> Fact:
+def from_data(
+    moves: Sequence[Timed], nominal: MotionProfile, *, when_utc: datetime, device: Mapping[str, Any]
+) -> CalibrationResult:
     """Fit the model to ``moves`` robustly and judge it.
 
     Steep ramps are over before they can be timed, and wind-up and delay told apart: the ``nominal`` profile says what
@@ -138,7 +140,7 @@ def from_data(moves: Sequence[Timed], nominal: MotionProfile, *, when_utc: datet
             f"The move by {moves[worst].distance_deg:.0f}° took {seconds[worst]:.2f} s, {residual:.2f} s off the "
             "others: something hindered it, or shook the bench. Look at cable and platter, and calibrate again."
         )
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=residual,
@@ -153,7 +155,7 @@ def from_data(moves: Sequence[Timed], nominal: MotionProfile, *, when_utc: datet
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return the time of each move over its length, and the model."""
     if not fact.estimates:
         return None

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.errors import UsageError
-from rig.files import write
-from rig.markers import Board
+from rig.core.errors import UsageError
+from rig.core.files import write
+from rig.views.charuco_board import Board
 
 PNG_PX_MM: Final = 12
 """About 305 dots an inch."""

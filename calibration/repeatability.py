@@ -27,14 +27,14 @@ from calibration import pictures
 from calibration.charts import LIMIT, OTHER, Axis, Series, chart
 from calibration.events import Ask
 from rig.bench import Bench
-from rig.describer import PAPER_DESCRIPTOR, Describer
-from rig.errors import UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.core.errors import UsageError
+from rig.events.events import Accepted, Event
+from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
-from rig.plans.events import Accepted, Event
-from rig.turntable import Turntable
-from rig.view import Viewer
+from rig.views.capture import Viewer
+from rig.views.description import PAPER_DESCRIPTOR, Describer
 
 NAME = "noise.repeatability"
 VALID_DAYS = 180
@@ -59,7 +59,7 @@ class Sitting:
 
 def live(
     bench: Bench, name: str, *, placements: int = 5, error_rate: float = ERROR_RATE
-) -> Generator[Event | Ask | Fact, None, Fact]:
+) -> Generator[Event | Ask | CalibrationResult, None, CalibrationResult]:
     """Have ``name`` placed several times at its mark, and look at it from all sides; yields events, then the fact.
 
     Raises
@@ -67,7 +67,7 @@ def live(
     UsageError
         Too few placements to be sure of the error rate.
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.view` and `rig.turntable`.
+        See `rig.views.capture` and `rig.motion.turntable`.
     """
     needed = needed_placements(error_rate)
     if placements < needed:
@@ -130,7 +130,7 @@ def from_data(
     device: Mapping[str, Any],
     name: str = "",
     seed: int = 0,
-) -> Fact:
+) -> CalibrationResult:
     """Find the similarity that repeats keep, and judge it.
 
     Parameters
@@ -191,7 +191,7 @@ def from_data(
         key: Estimate(value, float(s), "of similarity") for key, value, s in zip(names, found, sigma, strict=True)
     }
     margin = NormalDist().inv_cdf(1 - error_rate) * sqrt(2 / views) * found[3]
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=1.0 - low,
@@ -215,7 +215,7 @@ def from_data(
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return how alike views are that lie some degrees of the table apart."""
     steps = [step["step_deg"] for step in fact.evidence["by_step"]]
     threshold = fact.estimates["repeatability"].value

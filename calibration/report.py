@@ -21,12 +21,12 @@ from calibration import (
     repeatability,
     table_axis,
 )
-from rig.errors import UsageError
-from rig.evaluation.drawing import Figure
-from rig.facts import Fact, Standing, State
-from rig.files import write
+from rig.calibrations import CalibrationResult, Standing, State
+from rig.charts.drawing import Figure
+from rig.core.errors import UsageError
+from rig.core.files import write
 
-PLOTS: Mapping[str, Callable[[Fact], Figure | None]] = {
+PLOTS: Mapping[str, Callable[[CalibrationResult], Figure | None]] = {
     **{
         module.NAME: module.plot
         for module in (
@@ -47,14 +47,14 @@ PLOTS: Mapping[str, Callable[[Fact], Figure | None]] = {
     ),
 }
 
-FURTHER: Mapping[str, Sequence[Callable[[Fact], Figure | None]]] = {
+FURTHER: Mapping[str, Sequence[Callable[[CalibrationResult], Figure | None]]] = {
     camera_model.NAME: (camera_model.plot_views, camera_model.plot_residuals),
     table_axis.NAME: (table_axis.plot_views,),
 }
 
 
 class _Shown(NamedTuple):
-    fact: Fact
+    fact: CalibrationResult
     good: bool
     state: str
     words: str
@@ -64,7 +64,7 @@ class _Shown(NamedTuple):
     devices: Sequence[tuple[str, str]]
 
 
-def plots(fact: Fact) -> list[Figure]:
+def plots(fact: CalibrationResult) -> list[Figure]:
     """Return the plots of a fact, the main one first; none where its kind has none, or nothing could be estimated."""
     draw = [*([PLOTS[fact.name]] if fact.name in PLOTS else []), *FURTHER.get(fact.name, ())]
     return [figure for figure in (one(fact) for one in draw) if figure]
@@ -73,7 +73,7 @@ def plots(fact: Fact) -> list[Figure]:
 def write_page(
     path: Path,
     standings: Sequence[Standing],
-    history: Sequence[Fact],
+    history: Sequence[CalibrationResult],
     *,
     bench: str,
     now_utc: datetime,
@@ -86,7 +86,7 @@ def write_page(
     path
         Where to.
     standings
-        See `rig.facts.FactStore.standings`.
+        See `rig.calibrations.CalibrationStore.standings`.
     history
         All facts that were kept, oldest first.
     bench, now_utc
@@ -126,7 +126,7 @@ def write_page(
         ) from error
 
 
-def _shown(standing: Standing, history: Sequence[Fact]) -> _Shown:
+def _shown(standing: Standing, history: Sequence[CalibrationResult]) -> _Shown:
     fact = standing.fact
     latest = [kept for kept in history if kept.name == fact.name][-1]
     refused = (

@@ -29,10 +29,10 @@ from calibration.camera_model import PARAMETERS, matrix_of
 from calibration.charts import LIMIT, MODEL, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
-from rig.evaluation.drawing import Figure
-from rig.facts import Estimate, Fact
-from rig.markers import Board
-from rig.plans.events import Event
+from rig.calibrations import CalibrationResult, Estimate
+from rig.charts.drawing import Figure
+from rig.events.events import Event
+from rig.views.charuco_board import Board
 
 NAME = "table.axis"
 VALID_DAYS = 365
@@ -82,8 +82,8 @@ class Room:
 
 
 def live(
-    bench: Bench, intrinsics: Fact, board: Board | None = None, room: Room | None = None
-) -> Generator[Event | Ask | Progress | Fact, None, Fact]:
+    bench: Bench, intrinsics: CalibrationResult, board: Board | None = None, room: Room | None = None
+) -> Generator[Event | Ask | Progress | CalibrationResult, None, CalibrationResult]:
     """Have the board put on two stands, look at it from thirteen sides each, and find the axis.
 
     Parameters
@@ -100,7 +100,7 @@ def live(
     Raises
     ------
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.view` and `rig.turntable`.
+        See `rig.views.capture` and `rig.motion.turntable`.
     """
     board = board or Board()
     room = room or Room()
@@ -131,13 +131,13 @@ def live(
 def from_data(
     views: Sequence[BoardView],
     board: Board,
-    intrinsics: Fact,
+    intrinsics: CalibrationResult,
     *,
     room: Room = Room(),
     troubles: Sequence[str] = (),
     when_utc: datetime,
     device: Mapping[str, Any],
-) -> Fact:
+) -> CalibrationResult:
     """Fit the axis to ``views`` of the board and judge it; see `calibration.camera_model.from_data`."""
     refusals = list(troubles)
     estimates: dict[str, Estimate] = {}
@@ -164,7 +164,7 @@ def from_data(
         region, cut, too_much = _region(corners, intrinsics.evidence["size"], room)
         refusals += [too_much] if too_much else []
         evidence["cut_off"] = cut
-    return Fact(
+    return CalibrationResult(
         name=NAME,
         estimates=estimates,
         residual=rms,
@@ -179,7 +179,7 @@ def from_data(
     )
 
 
-def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: Fact, room: Room) -> Floats:
+def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: CalibrationResult, room: Room) -> Floats:
     """Return the corners in the image of what the ``room`` takes up, float64 (2, 2): x and y, lowest and highest.
 
     They may lie outside the frame.
@@ -224,7 +224,7 @@ def _region(corners: Floats, size: Sequence[int], room: Room) -> tuple[list[int]
     )
 
 
-def plot(fact: Fact) -> Figure | None:
+def plot(fact: CalibrationResult) -> Figure | None:
     """Return the way of the board's middle about the axis, seen along it, and the circles that were fitted."""
     if not fact.estimates:
         return None
@@ -251,7 +251,7 @@ def plot(fact: Fact) -> Figure | None:
     )
 
 
-def plot_views(fact: Fact) -> Figure | None:
+def plot_views(fact: CalibrationResult) -> Figure | None:
     """Return how far the corners of each view are off the fit; see `calibration.board_views.plot_views`."""
     return plot_views_of(fact, MAX_RMS_PX)
 
@@ -266,7 +266,7 @@ class _Axis:
         self,
         views: Sequence[BoardView],
         board: Board,
-        intrinsics: Fact,
+        intrinsics: CalibrationResult,
         poses: Sequence[tuple[Floats, Floats]],
     ) -> None:
         self._views = views

@@ -9,8 +9,8 @@ To have `rig identify --strategy golden` find it, a package names it in the entr
 import tempfile
 
 from rig import Catalog, enroll, identify, load_model, open_bench
-from rig.plans.events import Identified
-from rig.plans.strategies import AnyStrategy, DenseLook, Look, Stop, Turn, descriptor_for, enough
+from rig.events.events import Identified
+from rig.search.strategies import AnyStrategy, DenseLook, Look, Stop, Turn, descriptor_for, enough
 from sim.bench import ShelfOperator
 
 OBJECTS = ("toy-house", "toy-car", "book-night")

@@ -6,7 +6,7 @@ from pathlib import Path
 from rig import Catalog, open_bench, photograph_table
 from rig.bench import TableClearer
 from rig.config import load_config
-from rig.plans.events import Enrolled, Item, Rejected
+from rig.events.events import Enrolled, Item, Rejected
 from rig.plans.tray import enroll_tray, read_tray
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from rig import Catalog, load_model, open_bench, photograph_table
 from rig.bench import ObjectStandsThere, TableClearer
-from rig.clock import SystemClock
 from rig.config import load_config
-from rig.errors import RigError
-from rig.plans.events import Identified, event_dict
+from rig.core.clock import SystemClock
+from rig.core.errors import RigError
+from rig.events.events import Identified, event_dict
 from rig.plans.watch import watch
-from rig.presence import TableWatcher
+from rig.views.object_presence import TableWatcher
 
 
 def main() -> int:

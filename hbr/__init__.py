@@ -1,20 +1,20 @@
 """Retrieval: arrays in, decisions out."""
 
-from hbr.active import Decision, Side, next_view
-from hbr.cedd import cedd
-from hbr.deciding import Rules, Verdict, judge, rehearse, rules
-from hbr.dense import Belief, DenseIndex, believe
-from hbr.describing import describe
+from hbr.dense.filter import Belief, DenseIndex, believe
+from hbr.dense.next_view import Look, next_look
+from hbr.dense.stopping import Rules, Verdict, judge, rehearse, rules
 from hbr.descriptors import Descriptor, descriptor
-from hbr.familiar import familiar_score
-from hbr.frontend import Background, Sighting, sight
-from hbr.hough import Extension, Ranking, retrieve
-from hbr.index import ViewIndex
-from hbr.lead import lead
-from hbr.looking import Look, next_look
-from hbr.packing import pack, unpack, unpack_rows
-from hbr.tanimoto import tanimoto
-from hbr.views import Views
+from hbr.descriptors.cedd import cedd
+from hbr.descriptors.cedd_packing import pack, unpack, unpack_rows
+from hbr.descriptors.describe import describe
+from hbr.descriptors.tanimoto import tanimoto
+from hbr.model.views import Views
+from hbr.paper.hough import Extension, Ranking, retrieve
+from hbr.paper.index import ViewIndex
+from hbr.paper.margin import lead
+from hbr.paper.next_view import Decision, Side, next_view
+from hbr.paper.open_set import familiar_score
+from hbr.segmentation import Background, Segmentation, segment
 
 __all__ = [
     "Background",
@@ -26,8 +26,8 @@ __all__ = [
     "Look",
     "Ranking",
     "Rules",
+    "Segmentation",
     "Side",
-    "Sighting",
     "Verdict",
     "ViewIndex",
     "Views",
@@ -44,7 +44,7 @@ __all__ = [
     "rehearse",
     "retrieve",
     "rules",
-    "sight",
+    "segment",
     "tanimoto",
     "unpack",
     "unpack_rows",

@@ -7,8 +7,8 @@ if TYPE_CHECKING:
     from rig.catalog import Catalog
     from rig.plans.enroll import enroll
     from rig.plans.identify import identify
-    from rig.plans.model import load_model
     from rig.plans.photograph_table import photograph_table
+    from rig.search.model import load_model
 
 __all__ = ["Bench", "Catalog", "enroll", "identify", "load_model", "open_bench", "photograph_table"]
 
@@ -17,7 +17,7 @@ _HOMES = {
     "Catalog": "rig.catalog",
     "enroll": "rig.plans.enroll",
     "identify": "rig.plans.identify",
-    "load_model": "rig.plans.model",
+    "load_model": "rig.search.model",
     "open_bench": "rig.bench",
     "photograph_table": "rig.plans.photograph_table",
 }

@@ -10,12 +10,13 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, field_validator
 
 from rig.bench import Bench, BenchKind
-from rig.clock import SystemClock
+from rig.bench.computer import Host
+from rig.bench.hardware import assemble
 from rig.config import RigConfig, Section
-from rig.errors import ObjectNotFound, UsageError
-from rig.hardware import assemble
-from rig.host import Host
-from rig.state import BenchLock, FileStore, MemoryStore, StateStore
+from rig.core.clock import SystemClock
+from rig.core.errors import ObjectNotFound, UsageError
+from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
+from sim.calibration_board import utensils
 from sim.change import Change
 from sim.clock import VirtualClock
 from sim.faults import Fault, Faults
@@ -23,7 +24,6 @@ from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.host import simulated_host
 from sim.noise import NoiseModel
-from sim.objects.board import utensils
 from sim.objects.photographs import Photographed, photographs
 from sim.objects.shelf import shelf
 from sim.optics import Optics

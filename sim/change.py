@@ -8,7 +8,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from rig.errors import UsageError
+from rig.core.errors import UsageError
 from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, SIN, WIDTH, Image
 from sim.parts import SimParts
 from sim.sensor import Gains

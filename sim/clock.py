@@ -30,7 +30,7 @@ class Timer:
 
 
 class VirtualClock:
-    """A `rig.clock.Clock` whose time is moved by its sleepers.
+    """A `rig.core.clock.Clock` whose time is moved by its sleepers.
 
     Emulators schedule what they do by themselves (a byte arrives, a watchdog expires) with `call_at`; whoever sleeps
     runs these callbacks on the way, each at its own time, equal times in the order of their scheduling.

@@ -6,14 +6,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rig.bench.computer import SERIAL_NAMES, LinuxHost, User
 from rig.config import RigConfig
+from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, Wire
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.devices.opencv_camera import Capture
-from rig.errors import DeviceNotFound, RigError
-from rig.host import SERIAL_NAMES, LinuxHost, User
 from sim.i2c import SimI2cBus
 from sim.parts import SimParts
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 from math import sqrt
 from typing import Self
 
-from rig.facts import Fact
+from rig.calibrations import CalibrationResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class NoiseModel:
         return replace(self, **values)
 
 
-def from_calibration(facts: Iterable[Fact], base: NoiseModel | None = None) -> NoiseModel:
+def from_calibration(facts: Iterable[CalibrationResult], base: NoiseModel | None = None) -> NoiseModel:
     """Return the noise model of the bench on which ``facts`` were calibrated, for the simulated bench beside it.
 
     A value that differs from part to part becomes a spread as wide as the part's own error: worlds of other seeds are

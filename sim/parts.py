@@ -8,8 +8,8 @@ from typing import Self
 import serial
 
 from rig.config import RigConfig
+from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import READ_SLICE_S
-from rig.errors import DeviceNotFound
 from sim.camera import SimCapture
 from sim.head.board import PinChange, SimHead
 from sim.head.wire import HeadSerial

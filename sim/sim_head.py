@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from rig.cli.command import Settings, command
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
 
 
 @command
@@ -29,7 +30,7 @@ def sim_head(
 
     Example: rig sim-head --spin 30
     """
-    from rig.errors import UsageError
+    from rig.core.errors import UsageError
     from sim.head.realtime import HeadPty, PacedClock
     from sim.motion import to_velocity
     from sim.parts import SimParts

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import Settings, command
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
 
 
 @command
@@ -25,8 +26,8 @@ def sim_servo(
 
     Example: rig sim-servo --set servo.model=xm430_w350 --id 1 --id 2
     """
-    from rig.clock import SystemClock
-    from rig.errors import UsageError
+    from rig.core.clock import SystemClock
+    from rig.core.errors import UsageError
     from sim.servo import ServoBus
     from sim.servo.configured import simulated_servo
     from sim.servo.terminal import ServoTerminal

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.descriptors.packing import check_levels
-from hbr.frontend import CROP_PX, Sighting, sight
+from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.descriptors.levels import check_levels
+from hbr.segmentation import CROP_PX, Segmentation, segment
 
 _CELLS: Final = 8
 _PIXELS: Final = CROP_PX // 2
@@ -54,8 +54,8 @@ class Colours:
     size_bytes: int = sum(_KEPT)
     length: int = sum(_KEPT)
 
-    def describe(self, view: ImageArray | Sighting, /) -> LevelArray:
-        seen = view if isinstance(view, Sighting) else sight(view)
+    def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
+        seen = view if isinstance(view, Segmentation) else segment(view)
         steps = np.rint(_coefficients(seen.crop, seen.cover) / _STEP)
         levels: FloatArray = np.clip(steps + 128, 0, 255)
         return levels.astype(np.uint8)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, IndexArray, LevelArray
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 
 
 class Cosine:

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.core.arrays import FloatArray, ImageArray, LevelArray
 from hbr.descriptors.cosine import Cosine
-from hbr.descriptors.packing import check_levels, pack_quarters, unpack_quarters
-from hbr.frontend import CROP_PX, Sighting, sight
+from hbr.descriptors.levels import check_levels, pack_quarters, unpack_quarters
+from hbr.segmentation import CROP_PX, Segmentation, segment
 
 _CELLS: Final = 8
 _DIRECTIONS: Final = 8
@@ -49,8 +49,8 @@ class Edges:
     size_bytes: int = _CELLS * _CELLS * _DIRECTIONS // 4
     length: int = _CELLS * _CELLS * _DIRECTIONS
 
-    def describe(self, view: ImageArray | Sighting, /) -> LevelArray:
-        image = (view if isinstance(view, Sighting) else sight(view)).alone
+    def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
+        image = (view if isinstance(view, Segmentation) else segment(view)).alone
         return np.searchsorted(_BORDERS, _histogram(image)).astype(np.uint8)
 
     def prepared(self, rows: LevelArray, /) -> Cosine:

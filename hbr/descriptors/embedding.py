@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray, ImageArray, LevelArray
+from hbr.core.arrays import FloatArray, ImageArray, LevelArray
 from hbr.descriptors.cosine import Cosine
-from hbr.descriptors.packing import check_levels
-from hbr.frontend import Sighting, sight
+from hbr.descriptors.levels import check_levels
+from hbr.segmentation import Segmentation, segment
 
 #: Name of such a descriptor: this, and the model's file.
 PREFIX: Final = "onnx:"
@@ -57,8 +57,8 @@ class Embedding:
             raise ValueError(f"{path} returns {self.length} number; an embedding has more, take the layer before")
         self.size_bytes = self.length
 
-    def describe(self, view: ImageArray | Sighting, /) -> LevelArray:
-        vector = self._run((view if isinstance(view, Sighting) else sight(view)).alone)
+    def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
+        vector = self._run((view if isinstance(view, Segmentation) else segment(view)).alone)
         length = float(np.sqrt((vector * vector).sum()))
         entries = vector * (_STEPS * np.sqrt(self.length) / length) if length > 0 else vector
         levels: NDArray[np.float32] = np.clip(np.rint(entries) + 128, 0, 255)

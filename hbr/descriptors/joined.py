@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hbr.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.descriptors.packing import check_levels
-from hbr.descriptors.protocol import Comparison, Descriptor
-from hbr.frontend import Sighting, sight
+from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.descriptors.base import Comparison, Descriptor
+from hbr.descriptors.levels import check_levels
+from hbr.segmentation import Segmentation, segment
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Joined:
     def length(self) -> int:
         return sum(part.length for part in self.parts)
 
-    def describe(self, view: ImageArray | Sighting, /) -> LevelArray:
-        seen = view if isinstance(view, Sighting) else sight(view)
+    def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
+        seen = view if isinstance(view, Segmentation) else segment(view)
         return np.concatenate([part.describe(seen) for part in self.parts])
 
     def prepared(self, rows: LevelArray, /) -> "_Average":

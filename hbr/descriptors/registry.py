@@ -4,12 +4,12 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
+from hbr.descriptors.base import Descriptor
 from hbr.descriptors.colours import Colours
 from hbr.descriptors.edges import Edges
 from hbr.descriptors.embedding import PREFIX, Embedding
 from hbr.descriptors.joined import Joined
-from hbr.descriptors.plain import Cedd
-from hbr.descriptors.protocol import Descriptor
+from hbr.descriptors.plain_cedd import Cedd
 
 _CEDD: Final = Cedd()
 _EDGES: Final = Edges()

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from hbr.arrays import LevelArray
+from hbr.core.arrays import LevelArray
+from hbr.descriptors.base import Descriptor
+from hbr.descriptors.cedd_packing import unpack_rows as unpack_cedd_rows
 from hbr.descriptors.edges import Edges
 from hbr.descriptors.joined import Joined
-from hbr.descriptors.packing import unpack_quarters
-from hbr.descriptors.plain import Cedd
-from hbr.descriptors.protocol import Descriptor
-from hbr.packing import unpack_rows as unpack_cedd_rows
+from hbr.descriptors.levels import unpack_quarters
+from hbr.descriptors.plain_cedd import Cedd
 
 
 def unpack_rows(kind: Descriptor, packed: bytes) -> LevelArray:

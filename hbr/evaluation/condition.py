@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import ImageArray
+from hbr.core.arrays import ImageArray
 from hbr.descriptors import descriptor
 from hbr.evaluation.noise import Noise
 from hbr.evaluation.perturb import Perturbations

@@ -8,8 +8,8 @@ from typing import Final
 import cv2
 import numpy as np
 
-from hbr.angles import wrap360
-from hbr.arrays import FloatArray, ImageArray
+from hbr.core.angles import wrap360
+from hbr.core.arrays import FloatArray, ImageArray
 
 _SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
 _COIL_NAME: Final = re.compile(r"obj(?P<number>\d+)__(?P<angle>\d+(?:\.\d+)?)")

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hbr.arrays import ImageArray, LevelArray
-from hbr.describing import describe
+from hbr.core.arrays import ImageArray, LevelArray
+from hbr.descriptors.describe import describe
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, read_photograph
 from hbr.evaluation.draws import generator

@@ -7,17 +7,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.angles import wrap180
-from hbr.arrays import LevelArray
-from hbr.dense import Belief, DenseIndex, believe
-from hbr.describing import describe
+from hbr.core.angles import wrap180
+from hbr.core.arrays import LevelArray
+from hbr.dense.filter import Belief, DenseIndex, believe
+from hbr.descriptors.describe import describe
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, read_photograph
 from hbr.evaluation.draws import generator
 from hbr.evaluation.noise import Noise
 from hbr.evaluation.perturb import STRENGTHS, Perturbations
 from hbr.evaluation.protocol import Protocol, views_enrolled
-from hbr.views import Views
+from hbr.model.views import Views
 
 #: Queries of a trial are taken at this step, as a search without any decision would.
 _STEP_DEG: Final = 90.0

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from hbr.hough import Extension
+from hbr.paper.hough import Extension
 
 Walk = Literal["random", "sweep-45", "sweep-90", "ahbr", "ahbr-90", "coin", "look", "look-coin", "mutual", "oracle"]
 

@@ -6,7 +6,7 @@ from typing import Final, Self
 import cv2
 import numpy as np
 
-from hbr.arrays import FloatArray, ImageArray
+from hbr.core.arrays import FloatArray, ImageArray
 
 GN_VARIANCE: Final = 0.012
 MB_LENGTH_PX: Final = 15.0

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import ImageArray
+from hbr.core.arrays import ImageArray
 from hbr.evaluation.scenes import FOOT_PX, HEIGHT, SIDE_PX, WIDTH, Picture
 
 #: What each strength means: 1, 2, 3.

@@ -11,18 +11,18 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.active import Side, next_view
-from hbr.angles import wrap180
-from hbr.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense import Belief, DenseIndex, believe
+from hbr.core.angles import wrap180
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.dense.filter import Belief, DenseIndex, believe
+from hbr.dense.next_view import most_informative_turn, next_look
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
-from hbr.hough import Ranking, retrieve
-from hbr.index import ViewIndex
-from hbr.likeness import symmetry
-from hbr.looking import most_informative_turn, next_look
-from hbr.views import Views
+from hbr.model.symmetry import symmetry
+from hbr.model.views import Views
+from hbr.paper.hough import Ranking, retrieve
+from hbr.paper.index import ViewIndex
+from hbr.paper.next_view import Side, next_view
 
 Removal = Literal["near", "paper79", "queries"]
 #: Probability of the best object that ends a search by the dense filter.
@@ -97,8 +97,8 @@ class Runs:
     alike_error_deg : float64
         The same to the nearest orientation from which the object looks as it does from the true one.
     period_deg : float64
-        After which turn the true object looks the same, of all its views (`hbr.likeness.symmetry`): 360 where it is not
-        symmetric; nan of too few views.
+        Symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not symmetric;
+        nan if it has too few views.
     lead : float64
         `hbr.lead` of the best object, a view; by the dense filter, its score above the second's.
     best : int32

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray
+from hbr.core.arrays import FloatArray
 from hbr.evaluation.methods import Method
 from hbr.evaluation.protocol import CERTAINTY, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson

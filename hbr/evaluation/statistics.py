@@ -6,7 +6,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.arrays import FloatArray
+from hbr.core.arrays import FloatArray
 
 Hits = NDArray[np.bool_]
 

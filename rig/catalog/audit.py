@@ -12,7 +12,7 @@ from sqlalchemy import Connection, insert, select
 
 from rig.catalog.records import JsonObject, as_json, this_software
 from rig.catalog.schema import audit
-from rig.clock import Clock
+from rig.core.clock import Clock
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, and_, select, update
 
 import hbr
-from rig.catalog import audit, images
+from rig.catalog import audit
 from rig.catalog.audit import AuditEntry
 from rig.catalog.database import Database, insert_row
 from rig.catalog.describing import known_descriptor
@@ -43,9 +43,10 @@ from rig.catalog.records import (
     clean_name,
 )
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
-from rig.clock import Clock
-from rig.errors import CatalogError, ObjectExists, UsageError
-from rig.files import make_folder
+from rig.core.clock import Clock
+from rig.core.errors import CatalogError, ObjectExists, UsageError
+from rig.core.files import make_folder
+from rig.views import image_files as images
 
 
 class ModelSet(NamedTuple):

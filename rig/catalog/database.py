@@ -12,8 +12,8 @@ from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, ev
 
 from rig.catalog.failures import DATABASE_NAME, absent, in_words
 from rig.catalog.schema import APPLICATION_ID, METADATA, SCHEMA_VERSION
-from rig.errors import CatalogError, CatalogOutdated
-from rig.files import make_folder, sync_folder
+from rig.core.errors import CatalogError, CatalogOutdated
+from rig.core.files import make_folder, sync_folder
 
 
 class Database:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.descriptors import PAPERS, Descriptor, descriptor, names
-from rig.catalog import images
 from rig.catalog.records import JsonObject, Region
 from rig.config import ViewConfig
-from rig.describer import Describer
-from rig.errors import CatalogError, UsageError
+from rig.core.errors import CatalogError, UsageError
+from rig.views import image_files as images
+from rig.views.description import Describer
 
 
 class Reference(NamedTuple):

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, and_, delete, insert, select, update
 
-from rig.catalog import audit, images
+from rig.catalog import audit
 from rig.catalog.database import Database, insert_row
 from rig.catalog.describing import packed_rows
 from rig.catalog.records import EnrollmentStatus, Sitting, StoredView, ViewRecord
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
-from rig.clock import Clock
-from rig.errors import CatalogError, UsageError
-from rig.files import write
+from rig.core.clock import Clock
+from rig.core.errors import CatalogError, UsageError
+from rig.core.files import write
+from rig.views import image_files as images
 
 
 class Enrollment:
@@ -121,7 +122,7 @@ class Enrollment:
                 image_sha256=sha256,
                 image_bytes=len(png),
                 evidence=record.evidence,
-                front_end=record.front_end,
+                segmentation=record.segmentation,
             )
             connection.execute(insert(descriptors), [{"view_id": view_id, **row} for row in packed])
         return StoredView(

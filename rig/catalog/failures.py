@@ -9,7 +9,7 @@ from typing import Final
 
 from sqlalchemy.exc import DBAPIError
 
-from rig.errors import CatalogBusy, CatalogError, RigError
+from rig.core.errors import CatalogBusy, CatalogError, RigError
 
 DATABASE_NAME: Final = "catalog.sqlite"
 

@@ -13,9 +13,9 @@ from rig.catalog import audit, migrations
 from rig.catalog.database import is_there, version_of
 from rig.catalog.failures import DATABASE_NAME, absent, in_words
 from rig.catalog.schema import SCHEMA_VERSION
-from rig.clock import Clock
-from rig.errors import CatalogDamaged
-from rig.files import sync_file, sync_folder
+from rig.core.clock import Clock
+from rig.core.errors import CatalogDamaged
+from rig.core.files import sync_file, sync_folder
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from sqlalchemy import ColumnElement, Connection, Row, Text, and_, cast, func, s
 
 import hbr
 from hbr.descriptors import Descriptor, descriptor, unpack_rows
+from rig.calibrations.store import CALIBRATIONS
 from rig.catalog.describing import region_of
 from rig.catalog.records import (
     EnrollmentStatus,
@@ -24,8 +25,7 @@ from rig.catalog.records import (
     clean_name,
 )
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
-from rig.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
-from rig.facts.store import CALIBRATIONS
+from rig.core.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
 
 
 class EnrolledBefore(NamedTuple):
@@ -170,7 +170,7 @@ def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[Sto
                 imu_sigma_deg=row.imu_sigma_deg,
                 evidence=row.evidence,
                 region=None if row.packed is None else region_of(row.settings),
-                front_end=row.front_end,
+                segmentation=row.segmentation,
             ),
             captured_utc=row.captured_utc,
             image=row.image,

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.errors import UsageError
+from rig.core.errors import UsageError
 
 MAX_NAME_LENGTH: Final = 100
 
@@ -106,7 +106,7 @@ class ViewRecord:
         The numbers it was judged by (sharpness, exposure, settling, locks), units in the keys, as JSON values.
     region
         The part of the image that is described: x, y, width, height in pixels; None for all of it.
-    front_end
+    segmentation
         What found the object in the image and balanced its colours, or why it did not, as JSON values; None where
         nothing tried.
     further : mapping of name to uint8 array
@@ -128,7 +128,7 @@ class ViewRecord:
     imu_sigma_deg: float | None = None
     evidence: JsonObject = field(default_factory=dict)
     region: Region | None = None
-    front_end: JsonObject | None = None
+    segmentation: JsonObject | None = None
     further: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -158,9 +158,9 @@ class ViewRecord:
                 next_step="give the standard uncertainty, which is not negative",
             )
         object.__setattr__(self, "evidence", as_json(self.evidence, f"the evidence of view {self.index}"))
-        if self.front_end is not None:
+        if self.segmentation is not None:
             object.__setattr__(
-                self, "front_end", as_json(self.front_end, f"what the front end says of view {self.index}")
+                self, "segmentation", as_json(self.segmentation, f"what the front end says of view {self.index}")
             )
         if self.region is not None:
             object.__setattr__(self, "region", tuple(operator.index(number) for number in self.region))

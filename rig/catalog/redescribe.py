@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import and_, bindparam, delete, insert, select, update
 
-from rig.catalog import images
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import Reference, known_descriptor, region_of, settings_of, stored_describer
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
-from rig.errors import CatalogError, UsageError
-from rig.processes import over_processes
+from rig.core.errors import CatalogError, UsageError
+from rig.core.processes import over_processes
+from rig.views import image_files as images
 
 
 class Stored(Enum):
@@ -48,7 +48,7 @@ class _Found(NamedTuple):
     """What a descriptor says of a view, or the reason why it says nothing."""
 
     packed: bytes | None
-    front_end: dict[str, Any] | None = None
+    segmentation: dict[str, Any] | None = None
     reason: str = ""
 
 
@@ -102,8 +102,8 @@ def redescribe(
                 {"view_id": item.view_id, "name": kind.name, "version": kind.version, "settings": settings}
                 | {"packed": one.packed}
             )
-            if one.front_end is not None:
-                sightings.append({"seen_id": item.view_id, "seen": one.front_end})
+            if one.segmentation is not None:
+                sightings.append({"seen_id": item.view_id, "seen": one.segmentation})
         with catalog.database.write() as connection:
             ids = [row["view_id"] for row in rows]
             alive = set(connection.scalars(select(views.c.id).where(views.c.id.in_(ids))))
@@ -120,7 +120,7 @@ def redescribe(
                 connection.execute(insert(descriptors), [row for row in rows if row["view_id"] in alive])
             if sightings:
                 connection.execute(
-                    update(views).where(views.c.id == bindparam("seen_id")).values(front_end=bindparam("seen")),
+                    update(views).where(views.c.id == bindparam("seen_id")).values(segmentation=bindparam("seen")),
                     sightings,
                 )
         done += len(portion)
@@ -193,7 +193,7 @@ def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[_Found]
         try:
             image = images.read(root / item.image, item.sha256)
             described = stored_describer(root, (kind.name,), item.region, item.reference)(image)
-            found.append(_Found(kind.pack(described.levels[kind.name]), described.front_end))
+            found.append(_Found(kind.pack(described.levels[kind.name]), described.segmentation))
         except (CatalogError, UsageError) as error:
             found.append(_Found(None, reason=error.what))
         except (OSError, ValueError) as error:  # ValueError: the descriptor cannot describe such an image

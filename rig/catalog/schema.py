@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 
 from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
-from rig.describer import PAPER_DESCRIPTOR
+from rig.views.description import PAPER_DESCRIPTOR
 
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
@@ -138,7 +138,7 @@ views = Table(
     Column("image_sha256", String(64), nullable=False),
     Column("image_bytes", Integer, nullable=False),
     Column("evidence", JSON, nullable=False),
-    Column("front_end", JSON(none_as_null=True)),
+    Column("front_end", JSON(none_as_null=True), key="segmentation"),
     UniqueConstraint("enrollment_id", "view_index"),
     sqlite_autoincrement=True,
 )

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, delete, null, select, update
 
 from hbr.descriptors import PAPERS, Descriptor, descriptor, names
-from rig.catalog import audit, images
+from rig.catalog import audit
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import Reference, region_of, stored_describer
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.schema import descriptors, enrollments, objects, sittings, views
 from rig.catalog.upkeep import LOST
-from rig.errors import CatalogError, UsageError
-from rig.files import make_folder, write
-from rig.processes import over_processes
+from rig.core.errors import CatalogError, UsageError
+from rig.core.files import make_folder, write
+from rig.core.processes import over_processes
+from rig.views import image_files as images
 
 ROUNDED: Final = 0.02
 """Share of a view's levels that may be rounded the other way."""

@@ -7,34 +7,20 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import (
-    catalog,
-    config,
-    doctor,
-    empty_table,
-    enroll,
-    evaluate,
-    exchange,
-    find,
-    identify,
-    rules,
-    runs,
-    safety,
-    servo,
-    setup,
-    table,
-    upkeep,
-)
-from rig.cli.command import (
+from rig.cli.bench import config, doctor, find, safety, servo, setup, table
+from rig.cli.catalog import calibrate as rules
+from rig.cli.catalog import catalog, exchange, upkeep
+from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
+from rig.cli.ui.command import (
     BenchOption,
     ConfigOption,
     JsonOption,
     NoColorOption,
     SeedOption,
     SetOption,
-    Settings,
     without_color,
 )
+from rig.cli.ui.settings import Settings
 
 GROUP = "rig.commands"
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.clock import Clock, seconds_between
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import DeviceFault, DeviceMismatch, DeviceSilent
 from rig.devices.i2c import I2cRegisters, I2cStatistics
 from rig.devices.imu import ImuIdentity, ImuSamples
-from rig.errors import DeviceFault, DeviceMismatch, DeviceSilent
 
 Floats = NDArray[np.float64]
 

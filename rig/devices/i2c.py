@@ -7,8 +7,8 @@ from typing import TypeVar
 
 from smbus2 import SMBus, i2c_msg
 
-from rig.clock import Clock
-from rig.errors import DeviceNotFound, DeviceSilent
+from rig.core.clock import Clock
+from rig.core.errors import DeviceNotFound, DeviceSilent
 
 ATTEMPTS, RETRY_PAUSE_S = 3, 0.002
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.clock import Clock
+from rig.core.clock import Clock
+from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent
 from rig.devices.i2c import I2cRegisters, I2cStatistics
 from rig.devices.imu import ImuIdentity, ImuSamples
-from rig.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
 _USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W, _WHO_AM_I = 0x6A, 0x6B, 0x72, 0x74, 0x75

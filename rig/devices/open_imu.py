@@ -1,7 +1,7 @@
 """The inertial sensor that the configuration names, on an I2C bus."""
 
-from rig.clock import Clock
 from rig.config import ImuConfig
+from rig.core.clock import Clock
 from rig.devices.bno055 import Bno055
 from rig.devices.imu import Imu
 from rig.devices.mpu6050 import Mpu6050

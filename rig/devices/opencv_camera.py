@@ -24,9 +24,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from rig.clock import Clock, seconds_between
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
-from rig.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 
 V4L2_EXPOSURE_MANUAL = 1
 _V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera chooses the time

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from rig.clock import seconds_between
+from rig.core.clock import seconds_between
+from rig.core.errors import DeviceNotFound
 from rig.devices.camera import Camera
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.errors import DeviceNotFound
-from rig.view import looks
+from rig.views.capture import looks
 
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Frames taken one after the other, which tell the rate, and frames spread over a second, which tell of the light."""

@@ -8,10 +8,10 @@ from shlex import quote
 from typing import Any
 
 from rig.bench import bench_kind
+from rig.bench.computer import Host, Hosted, LinuxHost
 from rig.config import RigConfig
-from rig.config_values import validate
-from rig.host import Host, Hosted, LinuxHost
-from rig.state import Holder, busy, holder
+from rig.config.values import validate
+from rig.safety.saved_state import Holder, busy, holder
 
 
 @dataclass

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 
-from rig.clock import seconds_between
+from rig.bench.computer import Node, SerialPort
+from rig.core.clock import seconds_between
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, warning
-from rig.host import Node, SerialPort
-from rig.state import FileStore
+from rig.safety.saved_state import FileStore
 
 LATENCY_MS = 1
 """What an FTDI adapter's latency timer should be; 16 by default, and each reading waits for it."""

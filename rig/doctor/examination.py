@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from threading import Thread
 
+from rig.core.errors import RigError
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, of_error
-from rig.errors import RigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from rig.errors import RigError
+from rig.core.errors import RigError
 
 
 class Level(StrEnum):

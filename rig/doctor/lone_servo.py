@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import serial
 
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceRefused, DeviceSilent, SeveralServos, UsageError
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, Wire
 from rig.devices.dynamixel.registers import ControlTable, control_table
 from rig.doctor.case import Case
 from rig.doctor.register_words import baud_codes
 from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos, without_echoes
-from rig.errors import DeviceMismatch, DeviceNotFound, DeviceRefused, DeviceSilent, SeveralServos, UsageError
 
 MAX_ID = 252
 _SETTLE_S = 0.05

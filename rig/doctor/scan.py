@@ -9,12 +9,12 @@ import serial
 from dynamixel_sdk import Protocol2PacketHandler
 from smbus2 import SMBus
 
-from rig.clock import Clock
+from rig.bench.computer import Host
+from rig.core.clock import Clock
+from rig.core.errors import DeviceRefused, DeviceSilent
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, LineBabble, Wire
 from rig.devices.dynamixel.registers import model_numbers
-from rig.errors import DeviceRefused, DeviceSilent
-from rig.host import Host
 
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
 """What servos of Protocol 2.0 are set to: the factory's first, then by how common they are."""

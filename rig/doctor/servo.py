@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 from contextlib import ExitStack
 
-from rig.clock import seconds_between
 from rig.config import ServoConfig
+from rig.core.clock import seconds_between
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import Wire
 from rig.devices.dynamixel.register_servo import RegisterServo
@@ -12,7 +13,6 @@ from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos, without_echoes
-from rig.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 
 READS = 100
 REPEATED = 2

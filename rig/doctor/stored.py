@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 
+from rig.calibrations import CalibrationStore, State, apparatus
 from rig.catalog import Catalog
+from rig.core.errors import CatalogError
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.errors import CatalogError
-from rig.facts import FactStore, State, apparatus
 
 IMAGES = 24
 """Images that are compared with what was stored; `rig catalog verify` looks at all of them."""
@@ -51,7 +51,7 @@ def catalog(case: Case) -> Iterator[Finding]:
 
 def calibrations(case: Case) -> Iterator[Finding]:
     """Calibrations are there, of this bench's devices, and not too old."""
-    store = FactStore(case.config.calibration_path(case.bench))
+    store = CalibrationStore(case.config.calibration_path(case.bench))
     device = apparatus(case.bench, case.identities, case.config, {})
     standings = store.standings(device, case.host.clock.utc())
     for error in store.unreadable:

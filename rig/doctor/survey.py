@@ -10,7 +10,9 @@ from typing import Any
 import cv2
 import serial
 
-from rig.config_file import Key
+from rig.bench.computer import Node, SerialPort
+from rig.config.toml_file import Key
+from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.doctor.case import Case
@@ -27,8 +29,6 @@ from rig.doctor.scan import (
     scan_servos,
     without_echoes,
 )
-from rig.errors import DeviceNotFound, RigError
-from rig.host import Node, SerialPort
 
 _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
 """I2C buses with memory, monitors and clock chips on them, which are not to be asked."""

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.dense import DenseIndex
+from hbr.dense.filter import DenseIndex
 from hbr.evaluation.matrix import Cell, cells, enrolled_few, hits
 from hbr.evaluation.statistics import wilson
-from hbr.views import Views
+from hbr.model.views import Views
+from rig.core.processes import over_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import Rows
-from rig.processes import over_processes
 
 _Enrolled = dict[bool, Views]
 

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from functools import partial
 
-from hbr.arrays import LevelArray
+from hbr.core.arrays import LevelArray
 from hbr.evaluation.descriptors import enrolled_levels, query_levels
 from hbr.evaluation.protocol import Runs, run_object
-from hbr.views import Views
-from rig.clock import SystemClock
+from hbr.model.views import Views
+from rig.core.clock import SystemClock
+from rig.core.processes import over_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.store import Store
-from rig.processes import over_processes
 
 
 def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Views:

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from hbr.evaluation.protocol import Runs
-from rig.errors import UsageError
+from rig.core.errors import UsageError
 
 
 class Store:

@@ -9,9 +9,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from hbr.evaluation.protocol import CERTAINTY, Runs
-from rig.errors import UsageError
-from rig.evaluation.drawing import Figure
-from rig.evaluation.figures import figures
+from rig.charts.drawing import Figure
+from rig.charts.evaluation_figures import figures
+from rig.core.errors import UsageError
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
 

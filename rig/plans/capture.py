@@ -2,11 +2,11 @@
 
 from collections.abc import Generator
 
-from rig.errors import ViewRejected
-from rig.heading import finite
-from rig.plans.events import Event, Moved, Rejected, Unwinding
-from rig.turntable import Move, Turntable
-from rig.view import Attempt, Viewer
+from rig.core.errors import ViewRejected
+from rig.events.events import Event, Moved, Rejected, Unwinding
+from rig.motion.turntable import Move, Turntable
+from rig.safety.gyro_rotation import finite
+from rig.views.capture import Attempt, Viewer
 
 
 def moved(index: int, move: Move) -> Moved:

@@ -5,18 +5,18 @@ from collections.abc import Generator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.angles import wrap360
+from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
-from rig.clock import seconds_between
-from rig.describer import DESCRIPTORS, PAPER_DESCRIPTOR, Describer
-from rig.empty_table import COMMAND, Drift, EmptyTables
-from rig.errors import ObjectMoved, RigError, RotationDisagreement
+from rig.core.clock import seconds_between
+from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
+from rig.events.events import Accepted, Enrolled, Event, Started, Warned, plain
+from rig.motion.turntable import Move, Turntable
 from rig.plans.capture import announced, capture, moved
 from rig.plans.estimate import even_azimuths, table_angles
-from rig.plans.events import Accepted, Enrolled, Event, Started, Warned, plain
-from rig.turntable import Move, Turntable
-from rig.view import Viewer, likeness
+from rig.views.capture import Viewer, likeness
+from rig.views.description import DESCRIPTORS, PAPER_DESCRIPTOR, Describer
+from rig.views.empty_table import COMMAND, Drift, EmptyTables
 
 SAME_LIKENESS = 0.97
 """Two frames of an object at one angle are more alike; one that was shifted by a centimetre, or taken away, is less."""
@@ -40,8 +40,8 @@ def enroll(
     pans over less than a turn takes the views that it reaches. An interrupted enrollment keeps its views: ``resume``
     takes the missing ones, of an object that nobody has moved since. Closing the generator takes the torque off.
 
-    Every view is described by `rig.describer.DESCRIPTORS`. The object is found by what differs from the bench's picture
-    of the empty table, if it has one (`rig.plans.photograph_table`), which is kept with the enrollment.
+    Every view is described by `rig.views.description.DESCRIPTORS`. Segmentation uses the bench's empty-table image, if
+    there is one (`rig.plans.photograph_table`); the enrollment stores it.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def enroll(
     ObjectMoved
         The object does not stand as it stood for the first view of this sitting: the enrollment is abandoned.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.view` and `rig.turntable`; views stored so far stay.
+        See `rig.views.capture` and `rig.motion.turntable`; views stored so far stay.
     """
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     standing = EmptyTables.standing(bench)
@@ -141,12 +141,12 @@ def _take_views(
                 imu_sigma_deg=imu.sigma_deg,
                 evidence=plain(shot.evidence),
                 region=bench.config.view.roi,
-                front_end=described.front_end,
+                segmentation=described.segmentation,
                 further=levels,
             )
             enrollment.add(record, shot.image_bgr)
-            yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr, described.front_end)
-            if drifted := drift.look(described.front_end):
+            yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr, described.segmentation)
+            if drifted := drift.look(described.segmentation):
                 EmptyTables.doubt(bench, drifted)
                 yield Warned(index, drifted, f"Go on, these views do without it; then take a new one: {COMMAND}")
             first = first or (index, angle_deg, shot.image_bgr)

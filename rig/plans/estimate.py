@@ -6,18 +6,14 @@ from itertools import pairwise
 from math import ceil, floor
 from typing import Final
 
-from hbr.angles import wrap360
+from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
-from rig.clock import seconds_between
-from rig.config import RigConfig
-from rig.devices.servo import MotionProfile
-from rig.errors import LimitExceeded
-from rig.plans.events import Accepted, Event
-from rig.turntable import FIRST_REST_S, Turntable, motion_seconds
-
-FRAMES: Final = 1.5
-"""Frames that pass until one was exposed whole after the table came to rest."""
+from rig.core.clock import seconds_between
+from rig.core.errors import LimitExceeded
+from rig.events.events import Accepted, Event
+from rig.motion.motion_model import MotionModel
+from rig.motion.turntable import Turntable
 
 _FLOAT_DEG: Final = 1e-6
 
@@ -87,36 +83,7 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
 
 
 @dataclass(frozen=True, slots=True)
-class MotionModel:
-    """The time that moves and views take, from the table's profile and the camera's frame rate."""
-
-    config: RigConfig
-
-    def move_s(self, distance_deg: float) -> float:
-        """Return the time of a move by ``distance_deg`` until the table is at rest; downwards it goes a bit below."""
-        table = self.config.table
-        profile = MotionProfile(table.velocity_dps, table.acceleration_dps2)
-        seconds = table.settle_s + motion_seconds(distance_deg, profile)
-        if distance_deg < 0:
-            seconds += motion_seconds(table.approach_deg, profile) + 2 * table.poll_s
-        return seconds
-
-    @property
-    def view_s(self) -> float:
-        """The time until a frame is there."""
-        return FRAMES / self.config.camera.fps
-
-    def enrollment_s(self, start_deg: float, angles_deg: Sequence[float]) -> float:
-        """Return the time of views at these table angles, begun at ``start_deg``, and of the way back to 0."""
-        if not angles_deg:
-            return 0.0
-        stops = [start_deg, *angles_deg]
-        moves = sum(self.move_s(b - a) for a, b in pairwise(stops))
-        return FIRST_REST_S + moves + len(angles_deg) * self.view_s + self.move_s(-angles_deg[-1])
-
-
-@dataclass(frozen=True, slots=True)
-class Rehearsal:
+class DryRun:
     """What an enrollment would do.
 
     ``action`` is "enroll", "resume", "replace", "skip" (it is enrolled already) or "refuse", with the reason in
@@ -136,7 +103,7 @@ class Rehearsal:
     seconds: float
 
 
-def rehearse(
+def dry_run(
     bench: Bench,
     catalog: Catalog | None,
     names: Sequence[str],
@@ -144,7 +111,7 @@ def rehearse(
     views: int | None = None,
     resume: bool = False,
     replace: bool = False,
-) -> tuple[Rehearsal, ...]:
+) -> tuple[DryRun, ...]:
     """Say what enrolling these objects would do; nothing moves and nothing is stored.
 
     Parameters
@@ -184,7 +151,7 @@ def rehearse(
             angles = ()
         stops = [table_deg, *angles, 0.0] if angles else [table_deg]
         found.append(
-            Rehearsal(
+            DryRun(
                 name=name,
                 action=action,
                 why=why,

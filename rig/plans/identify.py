@@ -6,19 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.angles import wrap360
+from hbr.core.angles import wrap360
 from rig.bench import Bench
-from rig.clock import seconds_between
-from rig.describer import Describer
-from rig.empty_table import COMMAND, Drift, EmptyTables
-from rig.errors import RigError
+from rig.core.clock import seconds_between
+from rig.core.errors import RigError
+from rig.events.events import Accepted, Decided, Event, Identified, Started, Warned
+from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, moved, unwind
-from rig.plans.events import Accepted, Decided, Event, Identified, Started, Warned
-from rig.plans.model import Model, empty_table_for
-from rig.plans.search import SHOWN, begin_search
-from rig.plans.strategies import AnyStrategy, Stop, Turn
-from rig.turntable import Turntable
-from rig.view import Viewer
+from rig.search.model import Model, empty_table_for
+from rig.search.session import SHOWN, begin_search
+from rig.search.strategies import AnyStrategy, Stop, Turn
+from rig.views.capture import Viewer
+from rig.views.description import Describer
+from rig.views.empty_table import COMMAND, Drift, EmptyTables
 
 
 def identify(
@@ -32,8 +32,8 @@ def identify(
 ) -> Generator[Event, None, Identified]:
     """Identify the object on the table against the enrolled views; yields events and returns the answer.
 
-    The strategy decides after each view where to look next, or that it is enough; `rig.plans.strategies` has those that
-    come with the rig. ``dense`` is the bench's own: it turns to where the likeliest objects differ most, until one is
+    After each view the strategy chooses the next view or ends the search (`rig.search.strategies`).
+    ``dense`` is the bench's own: it turns to where the likeliest objects differ most, until one is
     probable enough, or unknown, by rules that were rehearsed on the catalog. ``ahbr`` is the paper's: the first two
     views are a fixed step apart, every later one lies where the rivals look less alike (Eq. 5-7), until a known object
     leads all others by ``identify.margin`` a view, or ``identify.max_views`` were taken. Its object is unknown when its
@@ -45,7 +45,7 @@ def identify(
     bench
         An open bench.
     model : Model or hbr.ViewIndex
-        What is enrolled, as `rig.plans.model.load_model` has it; a ViewIndex is for the paper's strategies.
+        What is enrolled, as `rig.search.model.load_model` has it; a ViewIndex is for the paper's strategies.
     strategy
         Its name, or a strategy of your own; None takes the one that the model is for.
     seed
@@ -54,7 +54,7 @@ def identify(
         How many candidates the events name.
     empty_table : uint8 array (H, W, 3), optional
         The bench without an object: the object is found by what differs from it. Where none is given, the one that
-        `rig.plans.model.empty_table_for` has.
+        `rig.search.model.empty_table_for` has.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def identify(
     UsageError
         There is no such strategy, or the model is not for it.
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.view` and `rig.turntable`.
+        See `rig.views.capture` and `rig.motion.turntable`.
     """
     config = bench.config.identify
     search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
@@ -97,8 +97,8 @@ def identify(
             shot = yield from capture(number, viewer, table, move.settled_ns)
             azimuth_deg = float(wrap360(orientation_deg))
             seen = describe(shot.image_bgr)
-            yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr, seen.front_end)
-            if drifted := drift.look(seen.front_end):
+            yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr, seen.segmentation)
+            if drifted := drift.look(seen.segmentation):
                 EmptyTables.doubt(bench, drifted)
                 yield Warned(number, drifted, f"The search goes on without it; then take a new one: {COMMAND}")
             ranked, step = search.look(seen.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)

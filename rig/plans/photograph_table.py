@@ -4,18 +4,18 @@ from collections.abc import Generator
 from typing import Final
 
 import hbr
-from hbr.frontend import TRUSTED
+from hbr.segmentation import TRUSTED
 from rig.bench import Bench, TableClearer
-from rig.clock import seconds_between
-from rig.describer import within
-from rig.empty_table import COMMAND, EmptyTable, EmptyTables
-from rig.errors import TableNotEmpty, UsageError
+from rig.core.clock import seconds_between
+from rig.core.errors import TableNotEmpty, UsageError
+from rig.events.events import Event, TablePicture, Warned, plain
+from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture
 from rig.plans.enroll import SAME_LIKENESS
-from rig.plans.events import Event, TablePicture, Warned, plain
-from rig.presence import GRID, changed_cells, picture
-from rig.turntable import Turntable
-from rig.view import Viewer, likeness
+from rig.views.capture import Viewer, likeness
+from rig.views.description import within
+from rig.views.empty_table import COMMAND, EmptyTable, EmptyTables
+from rig.views.object_presence import GRID, changed_cells, picture
 
 TURN_DEG: Final = 25.0
 """So far the table turns between two pictures: what stands on it shows another side, or stands elsewhere."""
@@ -47,7 +47,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
     StateNotKept
         The picture cannot be kept.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.view` and `rig.turntable`.
+        See `rig.views.capture` and `rig.motion.turntable`.
     """
     if bench.config.table.carries == "camera":
         raise UsageError(
@@ -76,7 +76,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         pictures = [picture(shot.image_bgr, config) for shot in (first, turned)]
         share = changed_cells(*pictures) / GRID**2
         parts = [within(shot.image_bgr, config.roi) for shot in (first, turned)]
-        agreement = hbr.sight(parts[1], reference=hbr.Background(parts[0])).agreement
+        agreement = hbr.segment(parts[1], reference=hbr.Background(parts[0])).agreement
         if not anyway:
             _check(share, agreement)
     before = EmptyTables.standing(bench)

@@ -11,9 +11,9 @@ from typing import Final, Protocol
 
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
-from rig.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected
+from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected
+from rig.events.events import Event, Item
 from rig.plans.enroll import enroll
-from rig.plans.events import Event, Item
 
 COLUMNS: Final = ("name", "label", "note", "views")
 FEWEST, MOST = 4, 720

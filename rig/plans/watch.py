@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 import hbr
 from rig.bench import Bench
-from rig.errors import ViewRejected
+from rig.core.errors import ViewRejected
+from rig.events.events import Event, Failed, Waiting
+from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
-from rig.plans.events import Event, Failed, Waiting
 from rig.plans.identify import identify
-from rig.plans.model import Model
-from rig.plans.search import SHOWN
-from rig.plans.strategies import AnyStrategy
-from rig.turntable import Turntable
+from rig.search.model import Model
+from rig.search.session import SHOWN
+from rig.search.strategies import AnyStrategy
 
 
 def watch(
@@ -28,9 +28,9 @@ def watch(
 ) -> Generator[Event, None, None]:
     """Identify one object after the other, endlessly; yields a `Waiting` before the events of each.
 
-    The bench's operator brings the objects, or waits for them (`rig.presence.TableWatcher`). After each answer the
-    table goes back to where it stood, with its cable unwound. An object of which no acceptable view can be had is told
-    as `Failed`, and the next one is waited for; any other error ends the plan.
+    The bench's operator brings the objects, or waits for them (`rig.views.object_presence.TableWatcher`). After each
+    answer the table returns to its start angle and unwinds its cable. If no view of an object is acceptable, the plan
+    yields `Failed` and waits for the next object; any other error ends the plan.
 
     Parameters
     ----------

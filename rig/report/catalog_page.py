@@ -12,13 +12,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from rig.catalog.exchange.bundle import checked
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.exchange.package import Enrollment, Object, Sitting, region_of_view
-from rig.catalog.images import decode
 from rig.catalog.records import EnrollmentStatus
-from rig.errors import ExportFailed
-from rig.plans.words import counted
+from rig.core.errors import ExportFailed
+from rig.events.wording import counted
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.page import JPEG_QUALITY
 from rig.report.records import TILE
+from rig.views.image_files import decode
 
 Collected = Iterable[tuple[Object, dict[str, Path]]]
 SHEETS: Final = "sheets"

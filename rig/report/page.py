@@ -12,10 +12,14 @@ import cv2
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from hbr.angles import wrap360
-from rig.errors import UsageError
-from rig.plans.events import Candidate
-from rig.plans.words import (
+from hbr.core.angles import wrap360
+from rig.charts.azimuth_ring import RingView, azimuth_ring
+from rig.charts.decision_chart import decision_chart
+from rig.charts.polar_path import polar_path
+from rig.charts.score_chart import score_chart
+from rig.core.errors import UsageError
+from rig.events.events import Candidate
+from rig.events.wording import (
     answer_words,
     azimuth_words,
     counted,
@@ -26,13 +30,9 @@ from rig.plans.words import (
     sentence,
     signed,
 )
-from rig.report.azimuth_ring import RingView, azimuth_ring
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
-from rig.report.decision_chart import decision_chart
-from rig.report.polar_path import polar_path
 from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
-from rig.report.score_chart import score_chart
-from rig.report.summary import Fact, enrollment_facts, totals
+from rig.report.summary import SummaryItem, enrollment_facts, totals
 
 JPEG_QUALITY: Final = 84
 COLUMNS: Final = 12
@@ -168,7 +168,7 @@ class _Object(NamedTuple):
     retakes: int
     sheet: str
     ring: Markup
-    facts: list[Fact]
+    facts: list[SummaryItem]
     unfold: bool
 
 

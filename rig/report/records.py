@@ -4,9 +4,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from hbr.angles import wrap180
+from hbr.core.angles import wrap180
 from rig.catalog import ViewRecord
-from rig.plans.events import (
+from rig.charts.polar_path import Turn
+from rig.events.events import (
     Accepted,
     Decided,
     Enrolled,
@@ -18,10 +19,9 @@ from rig.plans.events import (
     Rejected,
     Started,
 )
-from rig.plans.saved_run import built
 from rig.report.contact_sheet import Image, Region, thumbnail
-from rig.report.polar_path import Turn
-from rig.view import ViewEvidence
+from rig.search.saved_run import built
+from rig.views.capture import ViewEvidence
 
 TILE: Final = (96, 96)
 """Width and height of a view on a contact sheet, pixels."""
@@ -60,7 +60,7 @@ class _Looks:
                 self._refused.append(", ".join(event.reasons))
             case Accepted():
                 refused, self._refused = tuple(self._refused), []
-                look = self.look(event.index, event.azimuth_deg, event.image_bgr, event.evidence, event.front_end)
+                look = self.look(event.index, event.azimuth_deg, event.image_bgr, event.evidence, event.segmentation)
                 self.views.append(replace(look, move=self._move, refused=refused))
             case _:
                 pass
@@ -71,9 +71,9 @@ class _Looks:
         azimuth_deg: float,
         image_bgr: Image,
         evidence: ViewEvidence,
-        front_end: Mapping[str, Any] | None,
+        segmentation: Mapping[str, Any] | None,
     ) -> Look:
-        box = None if front_end is None else front_end.get("box_px")
+        box = None if segmentation is None else segmentation.get("box_px")
         return Look(index, azimuth_deg, thumbnail(image_bgr, self.size, self.region, box), evidence, None, ())
 
 
@@ -120,7 +120,7 @@ class EnrollmentRecord:
         for record, image_bgr in stored:
             if record.index not in seen:
                 evidence = built(ViewEvidence, record.evidence)
-                look = self._looks.look(record.index, record.azimuth_deg, image_bgr, evidence, record.front_end)
+                look = self._looks.look(record.index, record.azimuth_deg, image_bgr, evidence, record.segmentation)
                 self._looks.views.append(look)
         self._looks.views.sort(key=lambda view: view.index)
         self.planned = max(self.planned, len(self.views))

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from statistics import fmean, median
 from typing import NamedTuple
 
-from rig.plans.events import Insight
-from rig.plans.words import counted, listed, odds_words, resemblance_words
+from rig.events.events import Insight
+from rig.events.wording import counted, listed, odds_words, resemblance_words
 from rig.report.records import EnrollmentRecord, IdentificationRecord
 
 
-class Fact(NamedTuple):
+class SummaryItem(NamedTuple):
     """A number with its name and a remark."""
 
     label: str
@@ -17,14 +17,18 @@ class Fact(NamedTuple):
     note: str = ""
 
 
-def totals(enrollments: Sequence[EnrollmentRecord], identifications: Sequence[IdentificationRecord]) -> list[Fact]:
+def totals(
+    enrollments: Sequence[EnrollmentRecord], identifications: Sequence[IdentificationRecord]
+) -> list[SummaryItem]:
     """Return the headline numbers of a run; a single object's own numbers stand with it, not here."""
     facts = []
     if len(enrollments) + len(identifications) > 1 and enrollments:
         views = sum(len(record.views) for record in enrollments)
         retakes = sum(record.retakes for record in enrollments)
         finished = sum(record.result is not None for record in enrollments)
-        facts.append(Fact("objects enrolled", f"{finished}", f"{counted(views, 'view')}, {counted(retakes, 'retake')}"))
+        facts.append(
+            SummaryItem("objects enrolled", f"{finished}", f"{counted(views, 'view')}, {counted(retakes, 'retake')}")
+        )
     answered = [record for record in identifications if record.answer is not None]
     if len(identifications) == 1 and not identifications[0].truth:
         return facts + (_answer_facts(answered[0]) if answered else [])
@@ -32,79 +36,89 @@ def totals(enrollments: Sequence[EnrollmentRecord], identifications: Sequence[Id
     unknown = [record for record in answered if record.truth and record.truth.name is None]
     if known:
         right = sum(record.correct is True for record in known)
-        facts.append(Fact("found", f"{right}/{len(known)}", "enrolled objects named rightly"))
+        facts.append(SummaryItem("found", f"{right}/{len(known)}", "enrolled objects named rightly"))
     if unknown:
         right = sum(record.correct is True for record in unknown)
-        facts.append(Fact("unknown recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
+        facts.append(SummaryItem("unknown recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
     if answered:
         views_taken = [record.answer.views for record in answered if record.answer]
         travelled = [record.answer.travelled_deg for record in answered if record.answer]
         facts.append(
-            Fact("views to an answer", f"{fmean(views_taken):.1f}", f"mean; {min(views_taken)} to {max(views_taken)}")
+            SummaryItem(
+                "views to an answer", f"{fmean(views_taken):.1f}", f"mean; {min(views_taken)} to {max(views_taken)}"
+            )
         )
-        facts.append(Fact("travelled", f"{fmean(travelled):.0f}°", f"mean a retrieval; {sum(travelled):.0f}° in all"))
+        facts.append(
+            SummaryItem("travelled", f"{fmean(travelled):.0f}°", f"mean a retrieval; {sum(travelled):.0f}° in all")
+        )
     errors = [record.pose_error_deg for record in answered if record.pose_error_deg is not None]
     if errors:
         facts.append(
-            Fact("pose error", f"{median(errors):.1f}°", f"median of {len(errors)}; largest {max(errors):.1f}°")
+            SummaryItem("pose error", f"{median(errors):.1f}°", f"median of {len(errors)}; largest {max(errors):.1f}°")
         )
     return facts
 
 
-def enrollment_facts(record: EnrollmentRecord) -> list[Fact]:
+def enrollment_facts(record: EnrollmentRecord) -> list[SummaryItem]:
     """Return the evidence of one enrollment."""
     views = record.views
-    facts = [Fact("views", f"{len(views)}", f"of {record.planned} planned")]
+    facts = [SummaryItem("views", f"{len(views)}", f"of {record.planned} planned")]
     reasons = listed(reason for view in views for reason in view.refused)
-    facts.append(Fact("retakes", f"{record.retakes}", reasons))
+    facts.append(SummaryItem("retakes", f"{record.retakes}", reasons))
     if views:
         sharpness = [view.evidence.sharpness for view in views]
         levels = [view.evidence.mean_level for view in views]
         facts.append(
-            Fact("sharpness", f"{median(sharpness):.0f}", f"median; {min(sharpness):.0f} to {max(sharpness):.0f}")
+            SummaryItem(
+                "sharpness", f"{median(sharpness):.0f}", f"median; {min(sharpness):.0f} to {max(sharpness):.0f}"
+            )
         )
-        facts.append(Fact("mean level", f"{fmean(levels):.0f}", f"of 255; {min(levels):.0f} to {max(levels):.0f}"))
+        facts.append(
+            SummaryItem("mean level", f"{fmean(levels):.0f}", f"of 255; {min(levels):.0f} to {max(levels):.0f}")
+        )
     moves = [view.move for view in views if view.move is not None]
     if moves:
         off = max(abs(move.encoder_deg - move.commanded_deg) for move in moves)
-        facts.append(Fact("off the angle asked", f"{off:.2f}°", "largest, by the encoder"))
+        facts.append(SummaryItem("off the angle asked", f"{off:.2f}°", "largest, by the encoder"))
     gaps = [
         abs(move.rotation_encoder_deg - move.rotation_imu_deg) for move in moves if move.rotation_imu_deg is not None
     ]
     if gaps:
         agree = sum(move.agrees for move in moves)
         facts.append(
-            Fact(
+            SummaryItem(
                 "encoder against gyro", f"{max(gaps):.2f}°", f"largest difference; {agree} of {len(moves)} moves agree"
             )
         )
     if record.insight:
         facts.append(_symmetry(record.insight))
         similar = [resemblance_words(one).removeprefix("looks like ") for one in record.insight.lookalikes]
-        facts.append(Fact("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
+        facts.append(SummaryItem("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
     if record.result:
-        facts.append(Fact("bench time", f"{record.result.seconds:.0f} s"))
+        facts.append(SummaryItem("bench time", f"{record.result.seconds:.0f} s"))
     return facts
 
 
-def _symmetry(insight: Insight) -> Fact:
+def _symmetry(insight: Insight) -> SummaryItem:
     if insight.period_deg is None or insight.neighbours is None or insight.alike is None:
-        return Fact("symmetry", "–", "too few views to tell")
+        return SummaryItem("symmetry", "–", "too few views to tell")
     note = f"similarity {insight.alike:.3f}, of neighbouring views {insight.neighbours:.3f}"
     if insight.period_deg == 360:
-        return Fact("symmetry", "none", note)
-    return Fact("symmetry", f"every {insight.period_deg:g}°" if insight.period_deg else "alike from everywhere", note)
+        return SummaryItem("symmetry", "none", note)
+    return SummaryItem(
+        "symmetry", f"every {insight.period_deg:g}°" if insight.period_deg else "alike from everywhere", note
+    )
 
 
-def _answer_facts(record: IdentificationRecord) -> list[Fact]:
+def _answer_facts(record: IdentificationRecord) -> list[SummaryItem]:
     answer = record.answer
     if answer is None:
         return []
     return [
-        Fact("answer", answer.name or "unknown"),
-        *([Fact("probability", odds_words(answer.probability))] if answer.probability is not None else []),
-        Fact("score", f"{answer.score:.3f}", f"per view; leads by {answer.margin:.3f}"),
-        Fact("views", f"{answer.views}"),
-        Fact("travelled", f"{answer.travelled_deg:.0f}°"),
-        Fact("bench time", f"{answer.seconds:.1f} s"),
+        SummaryItem("answer", answer.name or "unknown"),
+        *([SummaryItem("probability", odds_words(answer.probability))] if answer.probability is not None else []),
+        SummaryItem("score", f"{answer.score:.3f}", f"per view; leads by {answer.margin:.3f}"),
+        SummaryItem("views", f"{answer.views}"),
+        SummaryItem("travelled", f"{answer.travelled_deg:.0f}°"),
+        SummaryItem("bench time", f"{answer.seconds:.1f} s"),
     ]

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import Settings, command
-from rig.cli.complete import strategy_names
+from rig.cli.ui.command import command
+from rig.cli.ui.complete import strategy_names
+from rig.cli.ui.settings import Settings
 
 EXIT_QUALITY = 6
 

@@ -2,7 +2,8 @@
 
 import typer
 
-from rig.cli.command import Settings, command
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
 
 
 @command

@@ -2,9 +2,9 @@
 
 from typing import ClassVar
 
-from rig.cli.present import line
-from rig.plans.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
-from rig.plans.words import azimuth_words, distinct, odds_words, signed
+from rig.cli.ui.present import line
+from rig.events.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
+from rig.events.wording import azimuth_words, distinct, odds_words, signed
 
 
 class MoveLines:

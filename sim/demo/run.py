@@ -17,20 +17,20 @@ from rich.table import Table
 
 from rig.bench import Bench
 from rig.catalog import Catalog
-from rig.cli.command import Settings
-from rig.cli.present import Progress, line
-from rig.clock import SystemClock, seconds_between
-from rig.config_values import validate
-from rig.errors import UsageError
+from rig.cli.ui.present import Progress, line
+from rig.cli.ui.settings import Settings
+from rig.config.values import validate
+from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import UsageError
+from rig.events.events import Accepted, Started
+from rig.events.wording import signed
 from rig.plans.enroll import enroll
-from rig.plans.events import Accepted, Started
 from rig.plans.identify import identify
-from rig.plans.model import Model, load_model
 from rig.plans.photograph_table import photograph_table
-from rig.plans.strategies import AnyStrategy, descriptor_for, strategy_for
-from rig.plans.strategies import strategy as strategy_named
-from rig.plans.words import signed
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
+from rig.search.model import Model, load_model
+from rig.search.strategies import AnyStrategy, descriptor_for, strategy_for
+from rig.search.strategies import strategy as strategy_named
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
 from sim.change import Change
 from sim.demo.lines import MoveLines

@@ -5,7 +5,8 @@ Nothing here touches a driver. `kinds` is the vocabulary, `Fault` one entry of i
 """
 
 from sim.faults.injector import Faults
-from sim.faults.kind import Kind, kinds
+from sim.faults.kind import Kind
 from sim.faults.schedule import Fault, load_faults
+from sim.faults.vocabulary import kinds
 
 __all__ = ["Fault", "Faults", "Kind", "kinds", "load_faults"]

@@ -2,14 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
-from functools import cache
 from types import MappingProxyType
 
 import numpy as np
 
-from rig.clock import seconds_between
-from rig.errors import UsageError
+from rig.core.clock import seconds_between
+from rig.core.errors import UsageError
 from sim.clock import Timer, VirtualClock
 from sim.parts import SimParts
 
@@ -73,49 +71,18 @@ class Kind:
         return {name: given.get(name, parameter.default) for name, parameter in self.parameters.items()}
 
 
-_kinds: dict[str, Kind] = {}
+registry: dict[str, Kind] = {}
+"""Every fault that was entered by `kind`."""
 
 
 def kind(name: str, what: str, **parameters: Parameter) -> Callable[[Begin], Begin]:
     """Enter a function into the vocabulary as the beginning of the fault ``name``."""
 
     def enter(begin: Begin) -> Begin:
-        _kinds[name] = Kind(name, what, MappingProxyType(parameters), begin)
+        registry[name] = Kind(name, what, MappingProxyType(parameters), begin)
         return begin
 
     return enter
-
-
-@cache
-def kinds() -> Mapping[str, Kind]:
-    """Return the vocabulary by name: the faults that every device has, then the particular ones."""
-    from sim.faults import camera, imu, servo, surroundings  # noqa: F401 - they enter their words
-
-    order = {f"{device}.{word}": i for i, (device, word) in enumerate(_device_words())}
-    return MappingProxyType(dict(sorted(_kinds.items(), key=lambda item: order.get(item[0], len(order)))))
-
-
-def find_kind(name: str) -> Kind:
-    """Return the kind called ``name``.
-
-    Raises
-    ------
-    UsageError
-        There is none; the next step names the nearest.
-    """
-    if name in kinds():
-        return kinds()[name]
-    of_devices = [f"{device}.{name}" for device in DEVICES if f"{device}.{name}" in kinds()]
-    near = of_devices or get_close_matches(name, kinds(), n=2, cutoff=0.5)
-    raise UsageError(
-        f"There is no fault {name!r}.",
-        next_step=f"Did you mean {' or '.join(near)}?" if near else "List them: rig faults",
-    )
-
-
-def _device_words() -> list[tuple[str, str]]:
-    words = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
-    return [(device, word) for device in DEVICES for word in words]
 
 
 def repeatedly(clock: VirtualClock, period_s: float, action: Callable[[], None]) -> End:

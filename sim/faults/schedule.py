@@ -8,8 +8,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Self
 
-from rig.errors import UsageError
-from sim.faults.kind import Kind, find_kind
+from rig.core.errors import UsageError
+from sim.faults.kind import Kind
+from sim.faults.vocabulary import find_kind
 
 NOTATION = "NAME[:PARAMETER=VALUE...][@TIME], TIME being 12s, move3 or view10, with +2s behind it for how long"
 

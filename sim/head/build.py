@@ -10,8 +10,8 @@ from pathlib import Path
 
 import platformdirs
 
-from rig.config_values import APP
-from rig.errors import ConfigError
+from rig.config.values import APP
+from rig.core.errors import ConfigError
 
 HERE = Path(__file__).resolve().parent
 FIRMWARE = HERE.parent.parent / "firmware"

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 
-from rig.clock import SystemClock
+from rig.core.clock import SystemClock
 from sim.clock import VirtualClock
 from sim.head.board import SimHead
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
-from rig.errors import UsageError
+from rig.core.errors import UsageError
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 
 _LAYOUT = re.compile(r"obj(\d+)__(\d+(?:\.\d+)?)\.(?:png|jpe?g)", re.IGNORECASE)

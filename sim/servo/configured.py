@@ -1,8 +1,8 @@
 """The simulated servo that a configuration describes."""
 
 from rig.config import ServoConfig
+from rig.core.errors import ConfigError
 from rig.devices.dynamixel.registers import protocol_of
-from rig.errors import ConfigError
 from sim.servo.ax12 import Ax12Servo
 from sim.servo.device import XSeriesServo
 from sim.servo.shaft import Geared, Shaft

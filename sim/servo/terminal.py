@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, suppress
 from types import TracebackType
 from typing import Self
 
-from rig.clock import Clock
+from rig.core.clock import Clock
 from sim.servo.bus import Frame, ServoBus
 
 LONGEST_WAIT_S = 0.1

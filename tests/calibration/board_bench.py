@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from calibration.board_views import MIN_CORNERS, BoardView
-from rig.markers import Board, sight
-from sim.objects.board import BoardOnPlatter, boards
+from rig.views.charuco_board import Board, detect_board
+from sim.calibration_board import BoardOnPlatter, boards
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
 
@@ -34,7 +34,7 @@ def seen(
             picture = empty_platter()
             thing.draw(picture, angle_deg)
             noisy = np.clip(spoil(picture) + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
-            found = sight(board or thing.board, noisy)
+            found = detect_board(board or thing.board, noisy)
             if found.ids.size >= MIN_CORNERS:
                 encoder_deg = ratio * angle_deg + float(rng.normal(0, 0.03))
                 views.append(BoardView(number, encoder_deg, found.ids, found.corners_px))

@@ -7,15 +7,15 @@ import pytest
 
 from calibration.backlash import from_data, live
 from calibration.legs import Leg
-from rig.errors import LimitExceeded, UsageError
-from rig.facts import Fact
-from rig.plans.events import Moved
+from rig.calibrations import CalibrationResult
+from rig.core.errors import LimitExceeded, UsageError
+from rig.events.events import Moved
 from sim.noise import NoiseModel
 
 COUNT_DEG = 360 / 4096
 
 
-def fit(legs: list[Leg]) -> Fact:
+def fit(legs: list[Leg]) -> CalibrationResult:
     return from_data(legs, resolution_deg=COUNT_DEG, when_utc=datetime(2026, 3, 1, tzinfo=UTC), device={})
 
 
@@ -30,11 +30,11 @@ def drawn(rng: np.random.Generator, play_deg: float = 0.3, *, ratio: float = 1.0
     return [Leg(float(e), float(g), 0.01) for e, g in zip(np.diff(read), gyro, strict=True)]
 
 
-def run(s, *, during=None) -> Fact:
+def run(s, *, during=None) -> CalibrationResult:
     for event in live(s.bench):
         if isinstance(event, Moved) and during and (happens := during.get(event.index)):
             happens()
-    assert isinstance(event, Fact)
+    assert isinstance(event, CalibrationResult)
     return event
 
 

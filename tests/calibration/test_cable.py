@@ -6,7 +6,7 @@ import pytest
 
 from calibration.cable import MARGIN_DEG, from_data, live
 from calibration.events import Ask
-from rig.facts import put_in_force
+from rig.calibrations import put_in_force
 
 
 def hand(s, angle_deg: float) -> None:

@@ -10,8 +10,8 @@ import pytest
 from calibration import camera_light
 from calibration.camera_light import CardFrames, drift, flat_field, photon_transfer, sharpness
 from calibration.events import Ask
+from rig.calibrations import CalibrationResult
 from rig.devices.camera import CameraLocks
-from rig.facts import Fact
 from sim.noise import NoiseModel, from_calibration
 from sim.sensor import Sensor
 
@@ -146,7 +146,7 @@ def test_the_bench_finds_its_own_camera_again(simulated, monkeypatch):
     s = simulated(noise=true, seed=1)
     told = [*camera_light.live_scene(s.bench), *camera_light.live_card(s.bench)]
     assert [type(event) for event in told[:1]] == [Ask]
-    facts = [event for event in told if isinstance(event, Fact)]
+    facts = [event for event in told if isinstance(event, CalibrationResult)]
     assert [fact.name for fact in facts] == ["camera.sharpness", "camera.noise", "camera.flat_field", "camera.drift"]
     assert all(fact.passed for fact in facts), [fact.refusals for fact in facts]
     found = from_calibration(facts)

@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 from calibration import camera_light, camera_model, encoder, table_axis
 from calibration.report import plots
+from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.cli.main import app
-from rig.clock import SystemClock
-from rig.facts import Estimate, Fact, FactStore
-from rig.markers import Board
+from rig.core.clock import SystemClock
+from rig.views.charuco_board import Board
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_what_passed_is_kept_and_in_force_from_then_on(rig, tmp_path):
     done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4", "--seed", "6")
     assert done.exit_code == 0, done.output
     paths = sorted((tmp_path / "facts" / "sim").iterdir())
-    facts = [Fact.from_file(path) for path in paths]
+    facts = [CalibrationResult.from_file(path) for path in paths]
     assert [fact.name for fact in facts] == ["imu.scale", "imu.mounting", "imu.noise", "imu.rotation"]
     for path, fact in zip(paths, facts, strict=True):
         assert f"PASS {fact.name}" in done.stdout
@@ -65,7 +65,7 @@ def test_a_failure_says_why_ends_with_6_and_leaves_what_is_in_force(rig, tmp_pat
     assert done.exit_code == 6
     assert "FAIL imu.scale" in done.stdout
     assert "imu.axis" in done.stdout
-    passed = [Fact.from_file(path).passed for path in sorted((tmp_path / "facts" / "sim").iterdir())]
+    passed = [CalibrationResult.from_file(path).passed for path in sorted((tmp_path / "facts" / "sim").iterdir())]
     assert passed == [True, True, True, True, False]
     assert json.loads(rig("goto", "90", "--json").stdout)["bound_deg"] < 1.5
 
@@ -77,7 +77,7 @@ def test_too_few_turns_are_a_mistake_of_usage(rig):
 def test_the_servo_is_calibrated_in_a_row_and_each_result_counts_for_the_next(rig, tmp_path):
     done = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
     assert done.exit_code == 0, done.output
-    facts = [Fact.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
+    facts = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
     assert [fact.name for fact in facts] == ["servo.backlash", "servo.encoder", "servo.motion"]
     again = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
     assert again.exit_code == 0, "a newer result takes the place of an older one"
@@ -119,7 +119,7 @@ def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_p
     assert done.exit_code == 0, done.output
     assert "[O] camera" in done.stderr, "a picture of what to do"
     assert "rig calibrate noise NAME" in done.stderr
-    facts = [Fact.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
+    facts = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
     assert [fact.name for fact in facts] == [
         "servo.backlash",
         "servo.encoder",
@@ -169,8 +169,8 @@ def test_the_board_is_printed_without_a_bench(rig, tmp_path):
 
 
 def kept(tmp_path, days: float, **device: str) -> None:
-    FactStore(tmp_path / "facts" / "sim").keep(
-        Fact(
+    CalibrationStore(tmp_path / "facts" / "sim").keep(
+        CalibrationResult(
             name=encoder.NAME,
             estimates={"cos1": Estimate(0.0, 0.01, "°")},
             residual=None,

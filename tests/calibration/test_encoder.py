@@ -8,9 +8,9 @@ import pytest
 from calibration.encoder import Step, from_data, live
 from calibration.legs import Leg
 from rig.bench import calibrate
-from rig.errors import LimitExceeded, UsageError
-from rig.facts import Fact, FactStore
-from rig.turntable import Turntable
+from rig.calibrations import CalibrationResult, CalibrationStore
+from rig.core.errors import LimitExceeded, UsageError
+from rig.motion.turntable import Turntable
 from sim.noise import NoiseModel
 
 COUNT_DEG = 360 / 4096
@@ -34,7 +34,7 @@ def drawn(rng: np.random.Generator, harmonics, *, direction: int = 1, turns: int
     ]
 
 
-def fit(steps: list[Step], direction: int = 1) -> Fact:
+def fit(steps: list[Step], direction: int = 1) -> CalibrationResult:
     return from_data(
         steps,
         direction=direction,
@@ -66,8 +66,8 @@ def test_put_in_force_the_table_stands_where_it_is_told(simulated, tmp_path):
     before = np.ptp(errors())
     *_, fact = live(s.bench)
     assert fact.passed, fact.refusals
-    FactStore(tmp_path).keep(fact)
-    calibrate(s.bench, FactStore(tmp_path))
+    CalibrationStore(tmp_path).keep(fact)
+    calibrate(s.bench, CalibrationStore(tmp_path))
     after = np.ptp(errors())
     assert before > 0.3
     assert after < 0.15

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calibration.gyro_noise import Rest, allan, from_data, live, rotation_sigma_deg
-from rig.errors import UsageError
-from rig.facts import Fact
+from rig.calibrations import CalibrationResult
+from rig.core.errors import UsageError
 
 ARW, WALK, SLOPE = 0.0035, 0.0003, 0.02
 WHEN = datetime(2026, 3, 1, tzinfo=UTC)
@@ -22,7 +22,7 @@ def drawn(rng: np.random.Generator, minutes: float = 20.0, *, warm_up_c: float =
     return Rest(rate, temperature_c, 1.0)
 
 
-def fit(rest: Rest) -> Fact:
+def fit(rest: Rest) -> CalibrationResult:
     return from_data(rest, column=2, when_utc=WHEN, device={})
 
 

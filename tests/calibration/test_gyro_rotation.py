@@ -7,8 +7,8 @@ import pytest
 
 from calibration.gyro_rotation import SPEEDS, Timed, from_data, live
 from calibration.legs import Leg
-from rig.errors import LimitExceeded, UsageError
-from rig.facts import Fact
+from rig.calibrations import CalibrationResult
+from rig.core.errors import LimitExceeded, UsageError
 from sim.noise import NoiseModel
 
 WHEN = datetime(2026, 3, 1, tzinfo=UTC)
@@ -27,7 +27,7 @@ def moves(seed: int, *, true: float = 1.0, repeats: int = 10, play_deg: float = 
     return made
 
 
-def judged(some: list[Timed]) -> Fact:
+def judged(some: list[Timed]) -> CalibrationResult:
     return from_data(some, resolution_deg=1e-6, when_utc=WHEN, device={})
 
 

@@ -8,10 +8,10 @@ import pytest
 
 from calibration.gyro_scale import from_data, live
 from calibration.legs import Leg
-from rig.errors import DeviceSilent, LimitExceeded, UsageError
-from rig.facts import Fact
-from rig.plans.events import Moved
-from rig.turntable import Turntable
+from rig.calibrations import CalibrationResult
+from rig.core.errors import DeviceSilent, LimitExceeded, UsageError
+from rig.events.events import Moved
+from rig.motion.turntable import Turntable
 from sim.imu.inertial import InertialModel
 from sim.world import World
 
@@ -26,7 +26,7 @@ def true_scale(seed: int) -> float:
     return 1 / float(part.gyro_gain[2] * part.up[2])
 
 
-def fit(legs: list[Leg]) -> Fact:
+def fit(legs: list[Leg]) -> CalibrationResult:
     return from_data(legs, resolution_deg=COUNT_DEG, when_utc=datetime(2026, 3, 1, tzinfo=UTC), device={})
 
 
@@ -39,13 +39,13 @@ def drawn(rng: np.random.Generator, scale: float, legs: int = 4, turn_deg: float
     return [Leg(float(e), float(g), sigma) for e, g in zip(np.diff(read), turned, strict=True)]
 
 
-def run(s, *, turns: int = 4, during=None) -> Fact:
+def run(s, *, turns: int = 4, during=None) -> CalibrationResult:
     """Calibrate; ``during`` maps the index of a leg, from 1, to what happens to the world in the middle of it."""
     events = live(s.bench, turns=turns)
     for event in events:
         if isinstance(event, Moved) and during and (happens := during.get(event.index + 1)):
             s.world.clock.call_at(s.world.clock.now_ns() + SLIP_DELAY_NS, happens)
-    assert isinstance(event, Fact)
+    assert isinstance(event, CalibrationResult)
     return event
 
 
@@ -93,7 +93,7 @@ def test_scatter_beyond_the_stated_noise_widens_the_uncertainty():
 def test_a_drifting_bias_cancels_between_the_ways_and_a_strong_one_is_refused():
     rng = np.random.default_rng(2)
 
-    def drifting(by_deg: float) -> Fact:
+    def drifting(by_deg: float) -> CalibrationResult:
         return fit([Leg(leg.encoder_deg, leg.gyro_deg + by_deg, leg.sigma_deg) for leg in drawn(rng, 1.02)])
 
     mild = drifting(0.08)

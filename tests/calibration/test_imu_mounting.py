@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calibration.imu_mounting import Level, Turn, from_data, live
-from rig.errors import LimitExceeded
-from rig.facts import Fact
+from rig.calibrations import CalibrationResult
+from rig.core.errors import LimitExceeded
 
 AXIS = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
 
@@ -25,7 +25,7 @@ def measured(axis=AXIS, *, zero_g=(0.01, -0.02, 0.03), table_axis_deg=(0.0, 0.0)
     return turns, levels
 
 
-def fit(turns, levels, *, column=2, sign=1) -> Fact:
+def fit(turns, levels, *, column=2, sign=1) -> CalibrationResult:
     when = datetime(2026, 3, 1, tzinfo=UTC)
     return from_data(turns, levels, column=column, sign=sign, when_utc=when, device={})
 

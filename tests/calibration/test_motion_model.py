@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from calibration.motion_model import DISTANCES_DEG, Timed, from_data, live, predicted_s
+from rig.calibrations import CalibrationResult
+from rig.core.errors import UsageError
 from rig.devices.servo import MotionProfile
-from rig.errors import UsageError
-from rig.facts import Fact
-from rig.turntable import Turntable
+from rig.motion.turntable import Turntable
 
 WHEN = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -23,7 +23,7 @@ def drawn(rng: np.random.Generator, pace: float, wind_up: float, delay: float) -
     return [Timed(float(d), float(t)) for d, t in zip(distances, seconds, strict=True)]
 
 
-def fit(moves: list[Timed]) -> Fact:
+def fit(moves: list[Timed]) -> CalibrationResult:
     return from_data(moves, MotionProfile(70.0, 220.0), when_utc=WHEN, device={})
 
 

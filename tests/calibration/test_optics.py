@@ -11,25 +11,25 @@ import pytest
 from calibration import camera_model, table_axis
 from calibration.board_views import STANDS, BoardView
 from calibration.table_axis import Room
-from rig.facts import Fact
-from rig.markers import Board
-from sim.objects.board import boards
+from rig.calibrations import CalibrationResult
+from rig.views.charuco_board import Board
+from sim.calibration_board import boards
 from tests.calibration.board_bench import blurred, optics, seen
 
 WHEN = datetime(2026, 3, 1, tzinfo=UTC)
 ALL = list(STANDS)
 
 
-def camera(views: list[BoardView], board: Board | None = None) -> Fact:
+def camera(views: list[BoardView], board: Board | None = None) -> CalibrationResult:
     return camera_model.from_data(views, board or Board(), (640, 480), when_utc=WHEN, device={})
 
 
-def axis(views: list[BoardView], intrinsics: Fact) -> Fact:
+def axis(views: list[BoardView], intrinsics: CalibrationResult) -> CalibrationResult:
     return table_axis.from_data(views, Board(), intrinsics, when_utc=WHEN, device={})
 
 
 @cache
-def calibrated(seed: int, wobble_deg: float = 0.0) -> Fact:
+def calibrated(seed: int, wobble_deg: float = 0.0) -> CalibrationResult:
     return camera(seen(optics(seed, wobble_deg), ALL, camera_model.ANGLES_DEG))
 
 
@@ -96,7 +96,7 @@ def test_objects_that_the_frame_cuts_off_are_refused():
 def test_a_board_of_another_size_is_noticed_by_the_measured_distance():
     views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
 
-    def measured(square_mm: float) -> Fact:
+    def measured(square_mm: float) -> CalibrationResult:
         room, board = Room(lens_mm=480.0), Board(square_mm=square_mm, marker_mm=square_mm * 11 / 15)
         return table_axis.from_data(views, board, calibrated(0), room=room, when_utc=WHEN, device={})
 

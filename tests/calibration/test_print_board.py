@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from calibration.print_board import write_board
-from rig.errors import UsageError
-from rig.markers import Board, sight
+from rig.core.errors import UsageError
+from rig.views.charuco_board import Board, detect_board
 
 
 def px_per_mm(board: Board, picture) -> float:
-    found = sight(board, picture)
+    found = detect_board(board, picture)
     assert found.ids.size == board.corners
     flat = np.column_stack([board.points_mm()[found.ids][:, :2], np.ones(found.ids.size)])
     map_, residual, *_ = np.linalg.lstsq(flat, found.corners_px, rcond=None)

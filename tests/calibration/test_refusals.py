@@ -6,8 +6,8 @@ import pytest
 from typer.testing import CliRunner
 
 from calibration import camera_light, camera_model
+from rig.calibrations import CalibrationStore
 from rig.cli.main import app
-from rig.facts import FactStore
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_it_is_refused_with_the_reason_and_nothing_is_in_force(rig, tmp_path, mo
     done = rig("calibrate", "camera", *arguments)
     assert done.exit_code == 6, done.output
     assert reason in done.stdout
-    (fact,) = FactStore(tmp_path / "facts" / "sim").history()
+    (fact,) = CalibrationStore(tmp_path / "facts" / "sim").history()
     assert not fact.passed
     assert not fact.settings
     (told,) = json.loads(rig("calibrate", "show", "--json").stdout)["calibrations"]

@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from calibration import camera_model, table_axis
 from rig.bench import open_bench
+from rig.calibrations import CalibrationStore
 from rig.cli.main import app
 from rig.config import load_config
-from rig.facts import FactStore
 
 MOVED = "bench.sim.noise={camera_mount=1.0}"
 BEFORE = [80, 0, 480, 480]
@@ -43,7 +43,7 @@ def test_the_region_follows_the_object_of_a_camera_that_was_moved(rig):
     config = load_config(Path("rig.toml"), [MOVED])
     with open_bench("sim", config, seed=2) as bench:  # of the camera, what the axis needs
         *_, intrinsics = camera_model.live(bench)
-    FactStore(config.calibration_path("sim")).keep(intrinsics)
+    CalibrationStore(config.calibration_path("sim")).keep(intrinsics)
     done = rig("calibrate", "table", "--lens-mm", "490")
     assert done.exit_code == 0, done.output
     assert "if it was moved" in " ".join(done.stderr.split()).lower(), "what is enrolled already"

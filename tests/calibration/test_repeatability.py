@@ -8,9 +8,9 @@ import pytest
 
 import hbr
 from calibration.repeatability import AZIMUTHS, Sitting, from_data, live, needed_placements
-from rig.errors import UsageError
-from rig.facts import Fact, put_in_force
-from rig.plans.events import Accepted
+from rig.calibrations import CalibrationResult, put_in_force
+from rig.core.errors import UsageError
+from rig.events.events import Accepted
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 
@@ -30,7 +30,7 @@ def drawn(rng: np.random.Generator, placements: int, *, flips: int = 4, drift: i
     return [Sitting(np.array([seen(drift * k) for _ in range(2)], np.uint8)) for k in range(placements)]
 
 
-def fit(sittings: list[Sitting], error_rate: float = 0.02) -> Fact:
+def fit(sittings: list[Sitting], error_rate: float = 0.02) -> CalibrationResult:
     when = datetime(2026, 3, 1, tzinfo=UTC)
     return from_data(sittings, error_rate=error_rate, views=2, when_utc=when, device={})
 
@@ -88,5 +88,5 @@ def test_light_that_drifts_while_it_measures_is_refused(simulated):
         if isinstance(event, Accepted):
             light *= 0.99
             s.world.change(light=(light, light, light**1.5))
-    assert isinstance(event, Fact)
+    assert isinstance(event, CalibrationResult)
     assert not event.passed

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pytest
 import serial
 
-from rig.clock import Clock, SystemClock
+from rig.core.clock import Clock, SystemClock
 from rig.devices.dynamixel.port import Wire
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD

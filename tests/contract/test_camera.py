@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.clock import Clock
+from rig.core.clock import Clock
 from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
 from rig.devices.opencv_camera import OpenCvCamera, open_capture
 from sim.camera import SimCapture

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from rig.clock import Clock
+from rig.core.clock import Clock
+from rig.core.errors import DeviceSilent
 from rig.devices.bno055 import Bno055
 from rig.devices.head.sensors import HeadSensor
 from rig.devices.imu import Imu
 from rig.devices.mpu6050 import Mpu6050
-from rig.errors import DeviceSilent
 from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050

@@ -11,10 +11,9 @@ from math import ceil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fault_runs import VIEWS, Outcome, answer, enrollment, identification, new_rig
-from scenarios import SCENARIOS, Scenario
-
 from sim.faults import kinds
+from tests.faults.fault_runs import VIEWS, Outcome, answer, enrollment, identification, new_rig
+from tests.faults.scenarios import SCENARIOS, Scenario
 
 PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
 SLACK_S = 0.1

@@ -8,20 +8,19 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from angle_code import Coded, coded_deg
 from sqlalchemy import func, select
 
 import hbr
-from hbr.angles import wrap180
+from hbr.core.angles import wrap180
 from rig.bench import Bench
 from rig.catalog import Catalog, StoredView
 from rig.catalog.queries import stored_views
 from rig.catalog.schema import enrollments, views
-from rig.clock import seconds_between
 from rig.config import load_config
-from rig.errors import RigError
+from rig.core.clock import seconds_between
+from rig.core.errors import RigError
+from rig.events.events import Accepted, Enrolled, Event, Identified
 from rig.plans.enroll import enroll
-from rig.plans.events import Accepted, Enrolled, Event, Identified
 from rig.plans.identify import identify
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault, Faults
@@ -29,6 +28,7 @@ from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.parts import SimParts
 from sim.world import World
+from tests.faults.angle_code import Coded, coded_deg
 
 VIEWS = 72
 NAME = "toy-car"

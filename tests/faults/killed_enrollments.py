@@ -15,12 +15,11 @@ import signal
 import sys
 from pathlib import Path
 
-from fault_runs import NAME, Rig, new_rig
-
 from rig.catalog import Catalog
-from rig.clock import SystemClock, seconds_between
+from rig.core.clock import SystemClock, seconds_between
+from rig.events.events import Accepted
 from rig.plans.enroll import enroll
-from rig.plans.events import Accepted
+from tests.faults.fault_runs import NAME, Rig, new_rig
 
 VIEWS = 8
 

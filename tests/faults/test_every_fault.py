@@ -3,8 +3,12 @@
 from pathlib import Path
 
 import pytest
-from document import SLACK_S, documented, goes_on, identification_cell, masked, message, sentence
-from fault_runs import (
+
+from rig.core.errors import FaultLatched, Unreferenced
+from rig.motion.turntable import Turntable
+from sim.faults import kinds
+from tests.faults.document import SLACK_S, documented, goes_on, identification_cell, masked, message, sentence
+from tests.faults.fault_runs import (
     NAME,
     VIEWS,
     Outcome,
@@ -17,11 +21,7 @@ from fault_runs import (
     identification,
     new_rig,
 )
-from scenarios import BOOT_S, FOUND, SCENARIOS, After, Scenario, Step
-
-from rig.errors import FaultLatched, Unreferenced
-from rig.turntable import Turntable
-from sim.faults import kinds
+from tests.faults.scenarios import BOOT_S, FOUND, SCENARIOS, After, Scenario, Step
 
 TOLERANCE_DEG = 0.5
 """Half the play, the encoder's noise, and a slip too small to be told from the gyro's error over 5°."""

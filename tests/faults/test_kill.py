@@ -6,12 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import killed_enrollments
 import pytest
-from fault_runs import NAME, check_stored, enrolled, enrollment, new_rig
-from killed_enrollments import VIEWS
 
 from rig.catalog import Catalog
+from tests.faults import killed_enrollments
+from tests.faults.fault_runs import NAME, check_stored, enrolled, enrollment, new_rig
+from tests.faults.killed_enrollments import VIEWS
 
 BATCHES = 5
 KILLS, KILLS_NIGHTLY = 40, 200

@@ -4,16 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_runs import NOISE
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig import files
 from rig.catalog import Catalog
 from rig.config import load_config
-from rig.errors import DeviceMismatch, DeviceSilent, UsageError
+from rig.core import files
+from rig.core.errors import DeviceMismatch, DeviceSilent, UsageError
+from rig.events.events import Accepted, Moved
 from rig.plans.enroll import enroll
-from rig.plans.events import Accepted, Moved
 from sim.bench import SIM, ShelfOperator, SimOptions, open_sim_bench
 from sim.faults import Fault, Faults, kinds, load_faults
 from sim.faults.injector import DURING_S
@@ -21,6 +20,7 @@ from sim.faults.schedule import Trigger
 from sim.objects.shelf import shelf
 from sim.parts import SimParts
 from sim.world import World
+from tests.faults.fault_runs import NOISE
 
 VOCABULARY = {
     *(f"{d}.{w}" for d in ("servo", "imu", "camera") for w in ("off", "stuck", "garbage", "wrong", "slow", "delayed")),

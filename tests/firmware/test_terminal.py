@@ -14,7 +14,7 @@ from sim.head import build
 
 HOST = """
 import sys, serial
-from rig.clock import SystemClock
+from rig.core.clock import SystemClock
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
 from rig.devices.head.sensors import head_sensor

@@ -12,7 +12,7 @@ from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
 from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
-from rig.state import MemoryStore, StateStore
+from rig.safety.saved_state import MemoryStore, StateStore
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.config import RigConfig
-from rig.errors import UsageError
+from rig.core.errors import UsageError
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES, Change
 from sim.noise import NoiseModel

@@ -4,7 +4,7 @@ import pytest
 
 from rig.bench import open_bench
 from rig.config import load_config
-from rig.errors import ConfigError
+from rig.core.errors import ConfigError
 from sim.noise import NoiseModel
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.errors import UsageError
+from rig.core.errors import UsageError
 from sim.objects.photographs import Photographed, photographs
 from sim.objects.projection import Image, Visible
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, select, update
 
-from rig.catalog import audit, images
+from rig.catalog import audit
 from rig.catalog.catalog import Catalog
 from rig.catalog.database import insert_row
 from rig.catalog.describing import known_descriptor, settings_of
@@ -17,7 +17,8 @@ from rig.catalog.exchange.stage import Staged
 from rig.catalog.records import EnrollmentStatus, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sittings, views
 from rig.catalog.upkeep import LOST
-from rig.files import make_folder, sync_folder
+from rig.core.files import make_folder, sync_folder
+from rig.views import image_files as images
 
 
 def admit(
@@ -164,7 +165,7 @@ def _insert_views(
         rows.append(
             {
                 **row,
-                "front_end": row["front_end"] if one.front_end is None else one.front_end,
+                "segmentation": row["segmentation"] if one.segmentation is None else one.segmentation,
                 "enrollment_id": enrollment_id,
                 "view_index": view.index,
                 "sitting_id": sitting_ids[view.sitting],

@@ -16,10 +16,10 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from pydantic import ValidationError
 
-from rig.catalog import images
 from rig.catalog.exchange.package import ImageSource, Object, Package
-from rig.errors import ExportFailed, ImportRefused, RigError
-from rig.files import sync_file, sync_folder
+from rig.core.errors import ExportFailed, ImportRefused, RigError
+from rig.core.files import sync_file, sync_folder
+from rig.views import image_files as images
 
 SUFFIX: Final = ".rigcat.zip"
 FORMAT: Final = "rigcat"

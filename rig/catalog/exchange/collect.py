@@ -7,11 +7,11 @@ from typing import Any
 
 from sqlalchemy import Connection, select
 
-from rig.catalog import images
 from rig.catalog.catalog import Catalog
 from rig.catalog.exchange.package import Enrollment, ImageSource, Levels, Object, Package, Sitting, View
 from rig.catalog.queries import find
 from rig.catalog.schema import descriptors, enrollments, objects, sittings, views
+from rig.views import image_files as images
 
 
 def collect(catalog: Catalog, names: Collection[str] = ()) -> Iterator[tuple[Object, dict[str, Path]]]:
@@ -136,7 +136,7 @@ def _views(
                 "image_sha256",
                 "image_bytes",
                 "evidence",
-                "front_end",
+                "segmentation",
             )
         }
         yield View(

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hbr.angles import wrap360
+from hbr.core.angles import wrap360
 from rig.catalog.exchange.bundle import checked
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.exchange.package import (
@@ -23,7 +23,7 @@ from rig.catalog.exchange.package import (
     region_words,
 )
 from rig.catalog.records import EnrollmentStatus, this_software
-from rig.errors import ExportFailed, ImportRefused, UsageError
+from rig.core.errors import ExportFailed, ImportRefused, UsageError
 
 DEFAULT_PATTERN: Final = "{object}__{angle}"
 NAMES: Final = "objects.csv"

@@ -12,9 +12,9 @@ from rig.catalog.exchange.plan import Plan
 from rig.catalog.exchange.stage import Staged, items_of, stage
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.staging import staging
-from rig.errors import ImportRefused
-from rig.files import sync_tree
-from rig.processes import over_processes
+from rig.core.errors import ImportRefused
+from rig.core.files import sync_tree
+from rig.core.processes import over_processes
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
 
-from rig.errors import ExportFailed
-from rig.files import sync_folder, sync_tree
+from rig.core.errors import ExportFailed
+from rig.core.files import sync_folder, sync_tree
 
 
 @contextmanager

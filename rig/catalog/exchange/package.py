@@ -8,12 +8,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AliasChoices, AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from hbr.descriptors import descriptor, names
 from rig.catalog.describing import region_of
 from rig.catalog.records import EnrollmentStatus, Region, as_json, check_azimuth, check_text, clean_name
-from rig.errors import UsageError
+from rig.core.errors import UsageError
 
 Degrees = Annotated[float, Field(allow_inf_nan=False)]
 Azimuth = Annotated[float, Field(ge=0, lt=360)]
@@ -67,7 +67,10 @@ class View(_Part):
     image_sha256: Sha256 | None = None
     image_bytes: Annotated[int, Field(ge=1)] | None = None
     evidence: Json = {}
-    front_end: Json | None = None
+    segmentation: Json | None = Field(
+        default=None,
+        validation_alias=AliasChoices("segmentation", "front_end"),  # bundles before version 2
+    )
     descriptors: tuple[Levels, ...] = ()
 
     @model_validator(mode="after")
@@ -77,7 +80,7 @@ class View(_Part):
         if len({(levels.name, levels.version) for levels in self.descriptors}) < len(self.descriptors):
             raise ValueError("the same version of a descriptor is there twice")
         as_json(self.evidence, "the evidence")
-        as_json(self.front_end or {}, "what the front end says")
+        as_json(self.segmentation or {}, "the segmentation")
         return self
 
 

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, select
 from rig.catalog.catalog import Catalog
 from rig.catalog.exchange.package import Object, Package
 from rig.catalog.schema import objects
-from rig.errors import ObjectExists
+from rig.core.errors import ObjectExists
 
 
 class Conflict(StrEnum):

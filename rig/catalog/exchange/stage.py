@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
-from rig.catalog import images
 from rig.catalog.describing import known_descriptor
 from rig.catalog.exchange.package import ImageSource
 from rig.catalog.exchange.plan import Plan
 from rig.catalog.records import Region
 from rig.catalog.schema import DESCRIPTOR
 from rig.config import ViewConfig
-from rig.describer import Describer
-from rig.errors import UsageError
+from rig.core.errors import UsageError
+from rig.views import image_files as images
+from rig.views.description import Describer
 
 
 class Item(NamedTuple):
@@ -38,7 +38,7 @@ class Staged(NamedTuple):
     sha256: str = ""
     size: int = 0
     packed: tuple[tuple[str, bytes], ...] = ()
-    front_end: dict[str, Any] | None = None
+    segmentation: dict[str, Any] | None = None
     reason: str = ""
 
 
@@ -86,7 +86,7 @@ def _stage_one(root: Path | None, item: Item) -> Staged:
         return Staged("", reason="is not the image that was stored")
     if root is None:
         return Staged("", sha256, len(content))
-    packed, front_end = [], None
+    packed, segmentation = [], None
     if item.descriptors:
         try:
             described = Describer(ViewConfig(roi=item.region), item.descriptors)(image)
@@ -95,14 +95,14 @@ def _stage_one(root: Path | None, item: Item) -> Staged:
         except ValueError as error:
             return Staged("", reason=str(error))
         packed = [(name, known_descriptor(name).pack(levels)) for name, levels in described.levels.items()]
-        front_end = described.front_end
+        segmentation = described.segmentation
     file = f"{item.folder}/{item.stem}{images.suffix(content)}"
     try:
         (root / file).write_bytes(content)
     except FileNotFoundError:
         (root / item.folder).mkdir(exist_ok=True)
         (root / file).write_bytes(content)
-    return Staged(file, sha256, len(content), tuple(packed), front_end)
+    return Staged(file, sha256, len(content), tuple(packed), segmentation)
 
 
 def _read(source: ImageSource) -> bytes:

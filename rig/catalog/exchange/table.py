@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from hbr.angles import wrap360
+from hbr.core.angles import wrap360
 from hbr.descriptors import descriptor
 from rig.catalog.exchange.bundle import checked, new_file
 from rig.catalog.exchange.new_folder import new_folder
@@ -25,7 +25,7 @@ from rig.catalog.exchange.package import (
 )
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.catalog.schema import DESCRIPTOR
-from rig.errors import ExportFailed, ImportRefused
+from rig.core.errors import ExportFailed, ImportRefused
 
 TABLE: Final = "views.csv"
 _NUMBERS: Final = ("commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")

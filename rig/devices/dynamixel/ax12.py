@@ -1,9 +1,9 @@
 """An AX-12A over Protocol 1.0: a pan servo of 300°, with no count of turns and no watchdog."""
 
+from rig.core.errors import ConfigError, DeviceFault
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
 from rig.devices.dynamixel.settings import ServoMode
 from rig.devices.servo import MotionProfile, ServoCondition, ServoState
-from rig.errors import ConfigError, DeviceFault
 
 RANGE_DEG, MAX_COUNTS = 300.0, 1023
 DPS_PER_UNIT = 0.111 * 6.0

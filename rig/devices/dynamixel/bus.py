@@ -8,7 +8,8 @@ from threading import RLock
 import serial
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
-from rig.clock import seconds_between
+from rig.core.clock import seconds_between
+from rig.core.errors import DeviceRefused, DeviceSilent, UsageError
 from rig.devices.dynamixel.packets import (
     BROADCAST_ID,
     PING,
@@ -23,7 +24,6 @@ from rig.devices.dynamixel.packets import (
 )
 from rig.devices.dynamixel.port import ClockedPort, LineBabble
 from rig.devices.dynamixel.registers import Register
-from rig.errors import DeviceRefused, DeviceSilent, UsageError
 
 OWED_S = 2.0
 """How long an answer that never came may still come: longer than any buffer on the way keeps it."""

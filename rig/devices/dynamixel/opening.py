@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from rig.clock import Clock
 from rig.config import ServoConfig
+from rig.core.clock import Clock
 from rig.devices.dynamixel.ax12 import Ax12Servo
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, Wire

@@ -9,8 +9,8 @@ from typing import Protocol
 import serial
 from dynamixel_sdk import PortHandler
 
-from rig.clock import Clock
-from rig.errors import DeviceNotFound
+from rig.core.clock import Clock
+from rig.core.errors import DeviceNotFound
 
 READ_SLICE_S = 0.002
 """How long one read of the wire blocks: bounds how late a timeout is noticed, and keeps the CPU idle meanwhile."""

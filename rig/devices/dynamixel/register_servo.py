@@ -2,13 +2,13 @@
 
 from abc import ABC, abstractmethod
 
-from rig.clock import Clock
+from rig.core.clock import Clock
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_numbers
 from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
-from rig.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 
 BOOT_ALLOWANCE_S = 3.0
 """How long a servo may be silent after a reboot; the e-manual gives no number, they take some tenths of a second."""

@@ -10,7 +10,7 @@ from importlib.resources import files
 from struct import Struct
 from typing import Self
 
-from rig.errors import ConfigError
+from rig.core.errors import ConfigError
 
 _FOLDER = "control_table"
 _PACKAGE = "dynamixel_easy_sdk"

@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 from typing import Any
 
-from rig.clock import seconds_between
+from rig.core.clock import seconds_between
+from rig.core.errors import DeviceFault, UsageError
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import watchdog_units
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
 from rig.devices.dynamixel.settings import ServoMode
 from rig.devices.servo import MotionProfile, ServoCondition, ServoState
-from rig.errors import DeviceFault, UsageError
 
 COUNTS_PER_TURN = 4096
 DEG_PER_COUNT = 360.0 / COUNTS_PER_TURN

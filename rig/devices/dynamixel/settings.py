@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from rig.core.errors import DeviceRefused
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.registers import ControlTable
-from rig.errors import DeviceRefused
 
 
 class ServoMode(StrEnum):

@@ -15,7 +15,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.clock import Clock, seconds_between
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import (
+    ConfigError,
+    DeviceFault,
+    DeviceMismatch,
+    DeviceNotFound,
+    DeviceRefused,
+    DeviceSilent,
+    DeviceUnplugged,
+    EmergencyStop,
+    FirmwareMismatch,
+    HeadRestarted,
+    HostWasSilent,
+    RigError,
+)
 from rig.devices.dynamixel.port import Wire
 from rig.devices.head.link import HeadLink
 from rig.devices.head.protocol import (
@@ -53,20 +67,6 @@ from rig.devices.head.protocol import (
 from rig.devices.head.sensors import HeadSensor
 from rig.devices.head.timing import HeadClock
 from rig.devices.imu import ImuIdentity, ImuSamples
-from rig.errors import (
-    ConfigError,
-    DeviceFault,
-    DeviceMismatch,
-    DeviceNotFound,
-    DeviceRefused,
-    DeviceSilent,
-    DeviceUnplugged,
-    EmergencyStop,
-    FirmwareMismatch,
-    HeadRestarted,
-    HostWasSilent,
-    RigError,
-)
 
 GREETING_S = 3.0
 """How long the first answer may take: opening its port restarts an Arduino, whose boot loader then waits."""

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from typing import TypeVar
 
-from rig.clock import Clock
+from rig.core.clock import Clock
+from rig.core.errors import DeviceRefused, DeviceSilent, DeviceUnplugged
 from rig.devices.dynamixel.port import Wire
 from rig.devices.head import protocol
 from rig.devices.head.framing import CRC, HEADER, Deframer, Frame, encode
 from rig.devices.head.protocol import Answer, Changed, Done, Refusal, Request, Sample
-from rig.errors import DeviceRefused, DeviceSilent, DeviceUnplugged
 
 REPLY_S = 0.06
 """How long an answer may take: 6 ms behind a full transmitter, and twice a USB adapter's latency timer."""

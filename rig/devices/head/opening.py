@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rig.clock import Clock
 from rig.config import HeadConfig, RigConfig
+from rig.core.clock import Clock
+from rig.core.errors import EmergencyStop, RigError
 from rig.devices.dynamixel.port import Wire
 from rig.devices.head.head import RigHead
 from rig.devices.head.sensors import head_sensor
-from rig.errors import EmergencyStop, RigError
 
 
 def open_head(config: RigConfig, open_port: Callable[[], Wire], clock: Clock) -> RigHead:

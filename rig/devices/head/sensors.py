@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from rig.core.errors import ConfigError
 from rig.devices import mpu6050
 from rig.devices.head.protocol import Imu, ImuModel
-from rig.errors import ConfigError
 
 BNO055_RANGE_DPS = 2000.0
 BNO055_RATE_HZ = 100.0

@@ -3,17 +3,17 @@
 import pytest
 
 from hbr import ViewIndex
-from hbr.angles import wrap180
+from hbr.core.angles import wrap180
 from rig.catalog import Catalog
 from rig.config import load_config
+from rig.core.errors import DeviceSilent, EmergencyStop, FaultLatched, HeadRestarted, ViewRejected
 from rig.devices.head.opening import powered
 from rig.devices.head.protocol import Reset
-from rig.errors import DeviceSilent, EmergencyStop, FaultLatched, HeadRestarted, ViewRejected
+from rig.events.events import Accepted
+from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
-from rig.plans.events import Accepted
 from rig.plans.identify import identify
-from rig.safety import State
-from rig.turntable import Turntable
+from rig.safety.supervisor import State
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.parts import SimParts

@@ -5,6 +5,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from rig.core.errors import DeviceRefused
 from rig.devices.head.link import HeadLink
 from rig.devices.head.protocol import (
     DEADMAN_MAX_MS,
@@ -22,7 +23,6 @@ from rig.devices.head.protocol import (
     Trigger,
     Triggered,
 )
-from rig.errors import DeviceRefused
 from sim.head.board import SimHead
 from sim.head.build import missing
 from sim.head.wire import HeadSerial

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from rig.core.errors import RigError
 from rig.devices.head.protocol import Reset
-from rig.errors import RigError
 from sim.head import board
 from sim.motion import to_position
 from sim.noise import NoiseModel

@@ -6,11 +6,11 @@ import sys
 
 import pytest
 
-from rig.clock import SystemClock, seconds_between
+from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import DeviceSilent
 from rig.devices.dynamixel.port import open_serial
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
-from rig.errors import DeviceSilent
 from tests.contract.heads import mpu6050, needs
 
 PATIENCE_S = 20.0

@@ -1,5 +1,6 @@
 import pytest
-from servo_line import Line
+
+from tests.sim.servo.servo_line import Line
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from servo_line import ALERT, Line, extended
 
 from sim.servo.device import (
     BOOT_S,
@@ -18,6 +17,7 @@ from sim.servo.device import (
 from sim.servo.models import DEG_PER_COUNT, MODELS
 from sim.servo.motor import OVERLOAD_S, PWM_PER_COUNT
 from sim.servo.protocol2 import StatusError
+from tests.sim.servo.servo_line import ALERT, Line, extended
 
 FOLLOWING_ERROR = 0x08
 

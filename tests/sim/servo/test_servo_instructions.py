@@ -11,12 +11,12 @@ from dynamixel_sdk import (
     GroupSyncRead,
     GroupSyncWrite,
 )
-from servo_line import ALERT, Line, extended
 
 from sim.servo import Source
 from sim.servo.device import BOOT_S, OVERLOAD_ERROR
 from sim.servo.models import MODELS
 from sim.servo.protocol2 import StatusError, with_crc
+from tests.sim.servo.servo_line import ALERT, Line, extended
 
 
 def word(value: int) -> list[int]:

@@ -9,11 +9,11 @@ import serial
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from servo_line import Line
 
 from sim.servo import Frame, SimSerial, Source
 from sim.servo.bus import ABANDON_S, superpose
 from sim.servo.models import BAUD_RATES
+from tests.sim.servo.servo_line import Line
 
 PING = bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))
 

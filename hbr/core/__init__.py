@@ -1,0 +1,1 @@
+"""Angles, array types and checks that every room uses."""

@@ -1,0 +1,178 @@
+"""Where to look next, by what is believed: the turn after which the strongest hypotheses are least alike."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hbr.core.angles import wrap180, wrap360
+from hbr.core.arrays import FloatArray, IndexArray
+from hbr.dense.filter import BETA, BINS, Belief
+
+#: Hypotheses that are compared at most, and the share of the belief that need not be compared.
+_STRONGEST: Final = 16
+_NEGLIGIBLE: Final = 1e-3
+#: A view this near to one that was had tells little that is new.
+_NEAR_DEG: Final = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A turn, and what it was decided on.
+
+    Attributes
+    ----------
+    rotation_deg : float
+        Turn of the camera around the object, counter-clockwise.
+    orientation_deg : float
+        Where it leads, in the zero of the queries' orientations, in [0, 360).
+    pair : (int, int) or None
+        The two objects that it separates most: index of each in the views' names, the likelier first. None where only
+        one object is left.
+    rotations_deg, confusion, cost : float64 arrays (a,)
+        All turns that were weighed; logarithm of the probability of still confusing two objects after each; what the
+        motion costs, in the same unit.
+    alike : float64 array (a,), or None
+        How alike the pair looks after each turn; None where there is no pair.
+    """
+
+    rotation_deg: float
+    orientation_deg: float
+    pair: tuple[int, int] | None
+    rotations_deg: FloatArray
+    confusion: FloatArray
+    cost: FloatArray
+    alike: FloatArray | None
+
+
+def next_look(
+    belief: Belief,
+    *,
+    beta: float = BETA,
+    sharpness: float = 100.0,
+    rotations_deg: ArrayLike | None = None,
+    seconds: ArrayLike | None = None,
+    second_costs: float = 1.0,
+) -> Look:
+    """Choose the turn with the lowest expected confusion, and what it costs.
+
+    For hypotheses p, p' of different objects, a turn a leaves the confusion
+    Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 15°)²) discounts a view
+    at the distance d from the nearest one had, and κ(a) = exp(-½ (e / 15°)²) one at the distance e from the view that
+    is enrolled nearest to it: nothing is known of what lies between. Its logarithm and μ · time(a) are added up; equal
+    sums go to the earlier turn.
+
+    Parameters
+    ----------
+    belief : Belief
+        After at least one query.
+    beta : float
+        As for `Belief.posterior`.
+    sharpness : float
+        λ: how surely a view separates two objects that look different.
+    rotations_deg : array (a,), optional
+        Turns that may be made, e.g. those that the cable allows; every 5 degrees, the shorter way round, otherwise.
+    seconds : array (a,), optional
+        How long each takes by the bench's motion model; proportional to the angle, 90 degrees a second, otherwise.
+    second_costs : float
+        μ: what a second is worth, in logarithms of the confusion.
+
+    Raises
+    ------
+    ValueError
+        No turn to choose from, or not one time for each.
+    """
+    turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    if turns_deg.ndim != 1 or not len(turns_deg) or not np.isfinite(turns_deg).all():
+        raise ValueError(f"rotations_deg is {turns_deg}; at least one finite turn is needed, check the cable's limits")
+    times_s = np.abs(turns_deg) / 90 if seconds is None else np.asarray(seconds, np.float64)
+    if times_s.shape != turns_deg.shape or not np.isfinite(times_s).all():
+        raise ValueError(f"{len(turns_deg)} turns and times of shape {times_s.shape}; one finite time each is needed")
+
+    here_deg = float(belief.orientation_deg[-1])
+    landing_deg = here_deg + turns_deg
+    apart_deg = np.abs(wrap180(landing_deg[:, None] - belief.orientation_deg)).min(axis=1)
+    novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
+    probability, place, bin_of = _strongest(belief.posterior(beta))
+    cost = second_costs * times_s
+    rivals = probability[:, None] * probability * (place[:, None] != place)
+    if rivals.any():
+        similar, known = _expected(belief, place, bin_of, turns_deg)
+        tells = novelty[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :])
+        remaining = rivals * np.exp(-sharpness * tells * (1 - similar))
+        confusion = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
+    else:  # one object alone: what is new helps its azimuth
+        confusion = -sharpness * novelty
+    chosen = int((confusion + cost).argmin())
+    pair: tuple[int, int] | None = None
+    alike: FloatArray | None = None
+    if rivals.any():
+        gained = rivals - remaining[chosen]
+        first, second = np.unravel_index(int(gained.argmax()), gained.shape)
+        objects = belief.index.object_index
+        ordered = sorted((first, second), key=lambda i: -probability[i])
+        pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
+        alike = similar[:, first, second]
+    turn = float(turns_deg[chosen])
+    return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike)
+
+
+def most_informative_turn(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
+    """Choose the turn whose view is expected to leave the least entropy of the object: a baseline for `next_look`.
+
+    If hypothesis h is true, the view after a turn is the one that was enrolled there, and hypothesis h' is then as
+    likely as exp(β T(view_h, view_h')^p) says.
+
+    Parameters
+    ----------
+    belief, beta, rotations_deg
+        As for `next_look`.
+    """
+    turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    probability, place, bin_of = _strongest(belief.posterior(beta))
+    similar, _ = _expected(belief, place, bin_of, turns_deg)
+    weights = probability * np.exp(
+        beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
+    )
+    weights /= weights.sum(axis=2, keepdims=True)
+    objects = (place[:, None] == np.unique(place)).astype(np.float64)
+    shares = weights @ objects
+    entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=2)
+    return float(turns_deg[int((entropy @ probability).argmin())])
+
+
+def _all_turns() -> FloatArray:
+    steps: FloatArray = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1)
+    return steps * (360 / BINS)
+
+
+def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
+    """Probability, object (its place) and bin of the strongest hypotheses, one peak of an object after the other."""
+    peaks = posterior * (posterior >= np.roll(posterior, 1, axis=1)) * (posterior >= np.roll(posterior, -1, axis=1))
+    # a peak stands for the slopes beside it
+    mass = posterior.sum(axis=1, keepdims=True)
+    total = peaks.sum(axis=1, keepdims=True)
+    weight = (peaks * np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)).ravel()
+    count = min(_STRONGEST, len(weight))
+    best = np.argpartition(-weight, count - 1)[:count]
+    best = best[np.argsort(-weight[best], kind="stable")]
+    place, bin_of = np.divmod(best, posterior.shape[1])
+    rival = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
+    enough = max(1 + int(np.searchsorted(np.cumsum(weight[best]), 1 - _NEGLIGIBLE)), rival + 1)
+    best, place, bin_of = best[:enough], place[:enough], bin_of[:enough]
+    return weight[best], place, bin_of
+
+
+def _expected(
+    belief: Belief, place: IndexArray, bin_of: IndexArray, turns_deg: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Similarity of what the hypotheses would show after each turn, (a, m, m), and how well that is known, (a, m)."""
+    index = belief.index
+    seen_deg = bin_of * (360.0 / BINS) + belief.turned_deg + turns_deg[:, None]
+    own_deg = index.azimuth_deg[place]
+    away_deg = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None]))
+    away_deg[:, index.left_out[place]] = np.inf
+    nearest = away_deg.argmin(axis=2)
+    known = np.exp(-0.5 * (np.take_along_axis(away_deg, nearest[:, :, None], axis=2)[:, :, 0] / _NEAR_DEG) ** 2)
+    return index.compared.among(index.rows[place[None], nearest]), known

@@ -1,0 +1,160 @@
+"""The model set: the views of the enrolled objects, as arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hbr.core.angles import wrap360
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.core.segments import ranges
+from hbr.descriptors import descriptor as descriptor_of
+from hbr.descriptors.cedd import BINS
+
+_T = TypeVar("_T", bound=np.generic)
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Descriptors of enrolled views, each with its object and the orientation it was taken from.
+
+    Arrays of the right type are kept, not copied, and are read-only through this class.
+
+    Parameters
+    ----------
+    descriptors : uint8 array (n, length)
+        Levels of the descriptor; of CEDD 144, each 0..7.
+    azimuth_deg : float64 array (n,)
+        Orientation of the camera around the object, counter-clockwise seen from above; kept in [0, 360).
+    object_index : integer array (n,)
+        Index of each view's object in `object_names`.
+    object_names : sequence of str
+        Distinct names. An object may be without views.
+    descriptor : str
+        Name of the descriptor that all views were described by.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A wrong type or shape, a level above 7, an azimuth that is not finite, an index without a name, equal names.
+    """
+
+    descriptors: LevelArray
+    azimuth_deg: FloatArray
+    object_index: IndexArray
+    object_names: tuple[str, ...]
+    descriptor: str = "cedd"
+
+    def __post_init__(self) -> None:
+        names = tuple(self.object_names)
+        if len(set(names)) != len(names):
+            repeated = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"object name {repeated!r} occurs twice; give each object a name of its own")
+        azimuth_deg = np.asarray(self.azimuth_deg, np.float64)
+        _check_views(self.descriptors, azimuth_deg, np.asarray(self.object_index), len(names), self.descriptor)
+        object.__setattr__(self, "descriptors", _read_only(self.descriptors))
+        object.__setattr__(self, "azimuth_deg", _read_only(wrap360(azimuth_deg)))
+        object.__setattr__(self, "object_index", _read_only(np.asarray(self.object_index, np.intp)))
+        object.__setattr__(self, "object_names", names)
+
+    def __len__(self) -> int:
+        return len(self.descriptors)
+
+    @classmethod
+    def empty(cls, descriptor: str = "cedd") -> "Views":
+        """No objects, no views."""
+        none = np.empty((0, descriptor_of(descriptor).length), np.uint8)
+        return cls(none, np.empty(0), np.empty(0, np.intp), (), descriptor)
+
+    @classmethod
+    def of_object(cls, name: str, descriptors: LevelArray, azimuth_deg: ArrayLike, descriptor: str = "cedd") -> "Views":
+        """Views of one object."""
+        azimuths = np.asarray(azimuth_deg, np.float64)
+        return cls(descriptors, azimuths, np.zeros(len(descriptors), np.intp), (name,), descriptor)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Views"]) -> "Views":
+        """All views of the parts in their order; objects of the same name become one.
+
+        Raises
+        ------
+        ValueError
+            The parts are of different descriptors.
+        """
+        kinds = dict.fromkeys(part.descriptor for part in parts) or {"cedd": None}
+        if len(kinds) > 1:
+            raise ValueError(f"views of {' and '.join(kinds)} cannot be compared; describe all by one descriptor")
+        (kind,) = kinds
+        parts = [cls.empty(kind), *parts]
+        names = tuple(dict.fromkeys(name for part in parts for name in part.object_names))
+        index = {name: i for i, name in enumerate(names)}
+        renumbered = [
+            np.array([index[name] for name in part.object_names], np.intp)[part.object_index] for part in parts
+        ]
+        return cls(
+            np.concatenate([part.descriptors for part in parts]),
+            np.concatenate([part.azimuth_deg for part in parts]),
+            np.concatenate(renumbered),
+            names,
+            kind,
+        )
+
+    def select(self, rows: IndexArray | NDArray[np.bool_]) -> "Views":
+        """The views of these indices, or where a mask holds; every object keeps its index and name."""
+        return replace(
+            self,
+            descriptors=self.descriptors[rows],
+            azimuth_deg=self.azimuth_deg[rows],
+            object_index=self.object_index[rows],
+        )
+
+    def of(self, object_index: int) -> IndexArray:
+        """Indices of the views of an object, ascending."""
+        return self.of_each(np.array([object_index]))[0]
+
+    def of_each(self, object_index: IndexArray) -> tuple[IndexArray, IndexArray]:
+        """Indices of the views of these objects, one object after the other, and where each object begins."""
+        order, start = self._by_object
+        positions, begin = ranges(start[object_index], start[object_index + 1] - start[object_index])
+        return order[positions], begin
+
+    @cached_property
+    def _by_object(self) -> tuple[IndexArray, IndexArray]:
+        order = np.argsort(self.object_index, kind="stable")
+        start = np.searchsorted(self.object_index[order], np.arange(len(self.object_names) + 1))
+        return order, start
+
+
+def _check_views(
+    descriptors: object, azimuth_deg: FloatArray, object_index: NDArray[np.generic], name_count: int, descriptor: str
+) -> None:
+    if not isinstance(descriptors, np.ndarray) or descriptors.dtype != np.uint8:
+        kind = getattr(descriptors, "dtype", type(descriptors).__name__)
+        raise TypeError(f"descriptors are of {kind}; stack the uint8 rows that cedd or describe returns")
+    length = descriptor_of(descriptor).length
+    if descriptors.ndim != 2 or descriptors.shape[1] != length:
+        raise ValueError(f"descriptors have shape {descriptors.shape}; {descriptor} needs the shape (n, {length})")
+    count = len(descriptors)
+    for name, column in (("azimuth_deg", azimuth_deg), ("object_index", object_index)):
+        if column.shape != (count,):
+            raise ValueError(f"{name} has shape {column.shape}; one value for each of the {count} views is needed")
+    if not np.issubdtype(object_index.dtype, np.integer) and count:
+        raise TypeError(f"object_index is of {object_index.dtype}; integers are needed")
+    if not count:
+        return
+    if descriptor.startswith("cedd") and descriptors[:, :BINS].max() > 7:
+        raise ValueError(f"a level of {descriptors.max()}; CEDD levels are 0..7, unpack packed descriptors first")
+    if not np.isfinite(azimuth_deg).all():
+        raise ValueError(f"azimuth of view {np.isfinite(azimuth_deg).argmin()} is not finite; leave such views out")
+    if object_index.min() < 0 or object_index.max() >= name_count:
+        span = f"{object_index.min()}..{object_index.max()}"
+        raise ValueError(f"object_index spans {span} but there are {name_count} names; name every object")
+
+
+def _read_only(array: NDArray[_T]) -> NDArray[_T]:
+    view = array.view()
+    view.flags.writeable = False
+    return view

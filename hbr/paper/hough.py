@@ -1,0 +1,240 @@
+"""Hough-based retrieval (HBR): objects vote with paths of views that fit the queries and the turns between them.
+
+Source: Czúni and Rashad, "Lightweight Active Object Retrieval with Weak Classifiers", Sensors 2018, 18, 801, Eq. 2-4.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hbr.core.angles import turns_between
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.core.segments import first_maximum, lengths, ranges
+from hbr.descriptors.tanimoto import tanimoto
+from hbr.model.views import Views
+from hbr.paper.index import ViewIndex, check_queries
+
+Extension = Literal["visual", "orient", "orient_all"]
+#: View indices for each query.
+_Columns = list[IndexArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """The candidates of a retrieval, best first.
+
+    Attributes
+    ----------
+    object_index : integer array (C,)
+        The objects with a view on any retrieval list, by falling score, equal scores by lower index.
+    scores : float64 array (C,)
+        Hough score H of each; at most the number of queries.
+    pose_deg : float64 array (C,)
+        Orientation of the camera around each object at the last query, in [0, 360).
+    paths : integer array (C, N)
+        The view of each object that stands for each query on its best path.
+    lists : tuple of N integer arrays
+        Retrieval list of each query: view indices, best first.
+    orientation_deg : float64 array (N,)
+        Orientations of the queries as given.
+    views : Views
+        The model set that the indices refer to.
+    """
+
+    object_index: IndexArray
+    scores: FloatArray
+    pose_deg: FloatArray
+    paths: IndexArray
+    lists: tuple[IndexArray, ...]
+    orientation_deg: FloatArray
+    views: Views
+
+    def __len__(self) -> int:
+        return len(self.object_index)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the candidates, best first."""
+        return tuple(self.views.object_names[j] for j in self.object_index)
+
+    @property
+    def margin(self) -> float:
+        """Score of the best candidate above the second's; its whole score where there is no second."""
+        return float(self.scores[0] - self.scores[1]) if len(self) > 1 else float(self.scores[0])
+
+
+def retrieve(
+    queries: LevelArray | Sequence[LevelArray],
+    orientation_deg: ArrayLike,
+    index: ViewIndex,
+    *,
+    omega: float = 0.5,
+    list_length: int = 10,
+    extension: Extension = "orient_all",
+) -> Ranking:
+    """Rank the enrolled objects by their Hough score over all queries so far.
+
+    For each object, H = max over its paths of Σ T(q_i, c_i) - ω Σ Δ(o_i - o_{i+1}, o_{c_i} - o_{c_{i+1}}), Δ in turns,
+    where a path takes one view of the object from every query's list. Exact, by dynamic programming; of equal paths the
+    one whose last view has the lower index is taken, then the one whose view before it has, and so on.
+
+    Parameters
+    ----------
+    queries : uint8 array (N, 144)
+        Descriptors of the views so far, in their order; N >= 1.
+    orientation_deg : array (N,)
+        Orientation of the camera around the object at each query, in degrees from any zero, e.g. the first query.
+    index : ViewIndex
+        The enrolled views.
+    omega : float
+        Weight ω of the orientation; 0 leaves it out.
+    list_length : int
+        Views on the retrieval list of each query.
+    extension : {"orient_all", "orient", "visual"}
+        What stands in where an object is missing from a list. ``visual``: its view most similar to the query.
+        ``orient``: outward from the first list it is on, each view of the neighbouring list adds the view that the turn
+        between the two queries leads to. ``orient_all``: each of its views on any list does so on all other lists, also
+        where it is not missing. Of equally close views the lower index is taken.
+
+    Returns
+    -------
+    Ranking
+        Never empty.
+
+    Raises
+    ------
+    TypeError, ValueError
+        No query, not one finite orientation for each, an empty index, or a setting out of range.
+    """
+    queries, orientations = np.asarray(queries), np.array(orientation_deg, np.float64)
+    _check(queries, orientations, index, omega, list_length, extension)
+    views = index.views
+    lists = [index.search(query, list_length)[0] for query in queries]
+    match extension:
+        case "visual":
+            extended = _extend_visual(lists, queries, views)
+        case "orient":
+            extended = _extend_orient(lists, orientations, views)
+        case "orient_all":
+            extended = _extend_orient_all(lists, orientations, views)
+    columns = [_by_object(rows, views) for rows in extended]
+    scores, paths = _best_paths(columns, queries, orientations, views, omega)
+
+    order = np.argsort(-scores, kind="stable")
+    paths = paths[order]
+    last = paths[:, -1]
+    return Ranking(
+        object_index=views.object_index[last],
+        scores=scores[order],
+        pose_deg=views.azimuth_deg[last],
+        paths=paths,
+        lists=tuple(lists),
+        orientation_deg=orientations,
+        views=views,
+    )
+
+
+def _check(
+    queries: LevelArray, orientations: FloatArray, index: ViewIndex, omega: float, list_length: int, extension: str
+) -> None:
+    if queries.ndim != 2 or not len(queries):
+        raise ValueError(
+            f"queries have shape {queries.shape}; stack one descriptor for each view, at least one: (N, 144)"
+        )
+    check_queries(queries)
+    if orientations.shape != (len(queries),) or not np.isfinite(orientations).all():
+        raise ValueError(
+            f"orientation_deg is {orientations}; one finite angle for each of {len(queries)} queries is needed"
+        )
+    if not len(index):
+        raise ValueError("the index is empty; enroll at least one object first")
+    if not (np.isfinite(omega) and omega >= 0):
+        raise ValueError(f"omega is {omega}; a finite weight of at least 0 is needed, 0.5 by default")
+    if list_length < 1:
+        raise ValueError(f"list_length is {list_length}; at least 1 is needed, 10 by default")
+    if extension not in get_args(Extension):
+        raise ValueError(f"extension {extension!r} is unknown; use one of {', '.join(get_args(Extension))}")
+
+
+def _extend_visual(lists: _Columns, queries: LevelArray, views: Views) -> _Columns:
+    """An object missing from a list gets there by its view most similar to the query."""
+    candidates = np.unique(views.object_index[np.concatenate(lists)])
+    extended = []
+    for rows, query in zip(lists, queries, strict=True):
+        missing, begin = views.of_each(np.setdiff1d(candidates, views.object_index[rows]))
+        if len(missing):
+            best = first_maximum(tanimoto(query, views.descriptors[missing])[0], begin)
+            rows = np.concatenate([rows, missing[best]])
+        extended.append(rows)
+    return extended
+
+
+def _extend_orient(lists: _Columns, orientations: FloatArray, views: Views) -> _Columns:
+    """An object missing from a list gets there by its views on the neighbouring list, turned like the camera."""
+    columns = list(lists)
+    forward = [(i, i - 1) for i in range(1, len(lists))]
+    backward = [(i, i + 1) for i in reversed(range(len(lists) - 1))]
+    for here, neighbour in forward + backward:
+        objects = views.object_index[columns[neighbour]]
+        anchors = columns[neighbour][~np.isin(objects, views.object_index[columns[here]])]
+        turn_deg = np.full(len(anchors), orientations[here] - orientations[neighbour])
+        columns[here] = np.concatenate([columns[here], _turned(anchors, turn_deg, views)])
+    return columns
+
+
+def _extend_orient_all(lists: _Columns, orientations: FloatArray, views: Views) -> _Columns:
+    """Every view on a list gets on all others too, turned like the camera."""
+    anchors, listed = np.concatenate(lists), np.repeat(np.arange(len(lists)), [len(rows) for rows in lists])
+    here, anchor = np.nonzero(np.arange(len(lists))[:, None] != listed)
+    turned = _turned(anchors[anchor], orientations[here] - orientations[listed[anchor]], views)
+    added = np.split(turned, np.searchsorted(here, np.arange(1, len(lists))))
+    return [np.concatenate(column) for column in zip(lists, added, strict=True)]
+
+
+def _turned(anchors: IndexArray, turn_deg: FloatArray, views: Views) -> IndexArray:
+    """ρ: for each view the one of its object whose azimuth is closest to turn_deg further on."""
+    if not len(anchors):
+        return anchors
+    rows, begin = views.of_each(views.object_index[anchors])
+    count = lengths(begin, len(rows))
+    turned_deg = views.azimuth_deg[rows] - np.repeat(views.azimuth_deg[anchors], count)
+    return rows[first_maximum(-turns_between(turned_deg, np.repeat(turn_deg, count)), begin)]
+
+
+def _by_object(rows: IndexArray, views: Views) -> IndexArray:
+    """The distinct views, ascending by object, then by index."""
+    rows = np.unique(rows)
+    return rows[np.argsort(views.object_index[rows], kind="stable")]
+
+
+def _best_paths(
+    columns: _Columns, queries: LevelArray, orientations: FloatArray, views: Views, omega: float
+) -> tuple[FloatArray, IndexArray]:
+    """Score (C,) and path (C, N) of every object, ascending by object; every object is in every column."""
+    azimuth_deg = views.azimuth_deg
+    value = tanimoto(queries[0], views.descriptors[columns[0]])[0]
+    predecessors = []
+    for i in range(1, len(columns)):
+        before, here = columns[i - 1], columns[i]
+        objects_before, objects_here = views.object_index[before], views.object_index[here]
+        start = np.searchsorted(objects_before, objects_here, side="left")
+        count = np.searchsorted(objects_before, objects_here, side="right") - start
+        tails, begin = ranges(start, count)
+        turned_deg = azimuth_deg[before[tails]] - np.repeat(azimuth_deg[here], count)
+        penalty = omega * turns_between(turned_deg, orientations[i - 1] - orientations[i])
+        through = value[tails] - penalty
+        best = first_maximum(through, begin)
+        value = through[best] + tanimoto(queries[i], views.descriptors[here])[0]
+        predecessors.append(tails[best])
+
+    _, begin = np.unique(views.object_index[columns[-1]], return_index=True)
+    node = first_maximum(value, begin)
+    scores = value[node]
+    path = [columns[-1][node]]
+    for rows, predecessor in zip(reversed(columns[:-1]), reversed(predecessors), strict=True):
+        node = predecessor[node]
+        path.append(rows[node])
+    return scores, np.stack(path[::-1], axis=1)

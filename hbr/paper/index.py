@@ -1,0 +1,279 @@
+"""Exact search for the views most similar to a query."""
+
+from copy import copy
+from typing import Final, Literal, Protocol, Self, TypeVar, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.descriptors.cedd import BINS
+from hbr.descriptors.tanimoto import squares, tanimoto, tanimoto_of_dots
+from hbr.model.views import Views
+
+Method = Literal["auto", "flat", "bound", "kdtree"]
+_T = TypeVar("_T", np.float32, np.float64)
+
+#: Below this many views one product over all 144 levels is as quick as the bound.
+_SMALL: Final = 10_000
+#: Principal components in the bound: more cost more memory traffic, fewer leave more views to refine.
+_COMPONENTS: Final = 15
+#: Rows that share one maximum when the first candidates are looked for.
+_GROUP: Final = 64
+#: Searches whose answers are kept; then all are given up.
+_REMEMBERED: Final = 64
+#: Rows that are converted to float at a time.
+_CHUNK: Final = 4_096
+
+
+class ViewIndex:
+    """Exact nearest views by Tanimoto.
+
+    Parameters
+    ----------
+    views : Views
+        The model set; not copied.
+    method : {"auto", "flat", "bound", "kdtree"}
+        ``flat`` compares with every view. ``bound`` compares a few principal components with every view: with an
+        orthonormal projection P, q·c <= Pq·Pc + |q - PᵀPq| |c - PᵀPc|, which bounds the similarity from above, and only
+        views whose bound reaches the k-th best similarity found so far are compared in full. ``kdtree`` looks up the
+        k nearest by Euclid in a KD-tree, then all in the ball that holds every view as similar as those; it takes eight
+        times the memory of the descriptors, and scipy. ``auto`` takes ``flat`` for small sets, ``bound`` for others.
+        The answers are the same.
+    """
+
+    def __init__(self, views: Views, method: Method = "auto") -> None:
+        if method not in get_args(Method):
+            raise ValueError(f"method {method!r} is unknown; use one of {', '.join(get_args(Method))}")
+        if views.descriptors.shape[1] != BINS:
+            raise ValueError(
+                f"the views are of {views.descriptor}; this search compares CEDD alone, use hbr.DenseIndex"
+            )
+        self.views = views
+        self._method = method
+        self._searcher: _Searcher = _searcher(views.descriptors, method)
+        self._remembered: dict[tuple[bytes, int], tuple[IndexArray, FloatArray]] = {}
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def extended(self, more: Views) -> "ViewIndex":
+        """Return an index of these views and more, behind them; this one stays as it is.
+
+        What was computed of the views at hand is kept, except where their number has doubled since, and by ``kdtree``.
+
+        Parameters
+        ----------
+        more : Views
+            Objects of the same name become one (`Views.concatenate`).
+        """
+        views = Views.concatenate([self.views, more])
+        grown = copy(self)
+        grown.views = views
+        grown._searcher = _searcher(views.descriptors, self._method, self._searcher)
+        grown._remembered = {}
+        return grown
+
+    def search(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        """Find the `k` views with the largest Tanimoto similarity to the query.
+
+        Parameters
+        ----------
+        query : uint8 array (144,)
+            Levels 0..7.
+        k : int
+            At least 1; all views are returned if there are fewer.
+
+        Returns
+        -------
+        view_indices : integer array (min(k, n),)
+            Best first, equal similarities by lower index.
+        similarities : float64 array (min(k, n),)
+            As `hbr.tanimoto` computes them.
+
+        Raises
+        ------
+        TypeError, ValueError
+            The query is no uint8 array of shape (144,) with levels 0..7, or `k` is below 1.
+        """
+        check_queries(np.asarray(query)[None])
+        if k < 1:
+            raise ValueError(f"k is {k}; ask for at least 1 view")
+        k = min(k, len(self.views))
+        if k == 0:
+            return np.empty(0, np.intp), np.empty(0)
+        # an active search asks for the lists of its earlier queries again with every new one
+        key = np.asarray(query).tobytes(), k
+        found = self._remembered.get(key)
+        if found is None:
+            found = self._searcher.top(query, k)
+            if len(self._remembered) >= _REMEMBERED:
+                self._remembered.clear()
+            self._remembered[key] = found
+        return found[0].copy(), found[1].copy()
+
+
+def check_queries(queries: LevelArray) -> None:
+    """Refuse what is not a uint8 array (n, 144) of levels 0..7."""
+    if queries.dtype != np.uint8:
+        raise TypeError(f"the query is of {queries.dtype}; pass the uint8 levels that cedd or describe returns")
+    if queries.ndim != 2 or queries.shape[1] != BINS:
+        raise ValueError(f"the query has {queries.shape[1:]} levels, not ({BINS},); describe the image first")
+    if queries.size and queries.max() > 7:
+        raise ValueError(f"the query has a level of {queries.max()}; CEDD levels are 0..7, unpack packed bytes first")
+
+
+class _Searcher(Protocol):
+    def extended(self, descriptors: LevelArray, /) -> Self | None:
+        """A searcher of these rows, which begin with its own; None where it had better be built anew."""
+        ...
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]: ...
+
+
+def _searcher(descriptors: LevelArray, method: Method, known: _Searcher | None = None) -> _Searcher:
+    if method == "auto":
+        method = "flat" if len(descriptors) < _SMALL else "bound"
+    kinds: dict[str, type[_Flat] | type[_Bound] | type[_Tree]] = {"flat": _Flat, "bound": _Bound, "kdtree": _Tree}
+    kind = kinds[method]
+    return (known.extended(descriptors) if isinstance(known, kind) else None) or kind(descriptors)
+
+
+class _Flat:
+    """Products with every view; float32 holds them exactly (below 144 * 49)."""
+
+    def __init__(self, descriptors: LevelArray) -> None:
+        self._rows = descriptors.astype(np.float32)
+        self._squares = squares(self._rows)
+
+    def extended(self, descriptors: LevelArray, /) -> "_Flat":
+        more = _Flat(descriptors[len(self._rows) :])
+        more._rows = np.concatenate([self._rows, more._rows])
+        more._squares = np.concatenate([self._squares, more._squares])
+        return more
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        q = query.astype(np.float32)
+        dots = (self._rows @ q).astype(np.float64)
+        return _best(tanimoto_of_dots(dots, squares(q[None]), self._squares), k)
+
+
+class _Bound:
+    """Bounds for every view, products for the few that can still be among the best."""
+
+    def __init__(self, descriptors: LevelArray) -> None:
+        moments = np.zeros((BINS, BINS))
+        for start in range(0, len(descriptors), _CHUNK):
+            rows = descriptors[start : start + _CHUNK].astype(np.float32)
+            moments += rows.T @ rows
+        # eigh sorts ascending: the last components carry most of the length
+        self._axes = np.ascontiguousarray(np.linalg.eigh(moments)[1][:, -_COMPONENTS:])
+        self._fitted = len(descriptors)
+        self._columns, self._squares = np.empty((_COMPONENTS + 1, 0), np.float32), np.empty(0, np.float32)
+        self._take_in(descriptors)
+
+    def extended(self, descriptors: LevelArray, /) -> "_Bound | None":
+        if len(descriptors) > 2 * self._fitted:
+            return None  # the axes may no longer be those of most views
+        grown = copy(self)
+        grown._take_in(descriptors)
+        return grown
+
+    def _take_in(self, descriptors: LevelArray) -> None:
+        """Project the rows that are new, into arrays of their own."""
+        self._descriptors = descriptors
+        known = len(self._squares)
+        columns, lengths = self._columns, self._squares
+        self._columns = np.empty((len(columns), len(descriptors)), np.float32)
+        self._squares = np.empty(len(descriptors), np.float32)
+        self._columns[:, :known], self._squares[:known] = columns, lengths
+        for start in range(known, len(descriptors), _CHUNK):
+            chunk = slice(start, start + _CHUNK)
+            projected, self._squares[chunk] = self._project(descriptors[chunk])
+            self._columns[:, chunk] = projected.T
+
+    def _project(self, rows: LevelArray) -> tuple[FloatArray, FloatArray]:
+        """Components and length of the residual, (n, components + 1), and squared length of each row."""
+        x = rows.astype(np.float64)
+        inside = x @ self._axes
+        residual = np.linalg.norm(x - inside @ self._axes.T, axis=1)
+        return np.column_stack([inside, residual]), squares(x)
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        columns, own_squares = self._project(query[None])
+        own = float(own_squares[0])
+        if own == 0:
+            return np.arange(k), np.zeros(k)
+        # float32 errs by less than (components + 3) * 2**-24 of |q| |c|, and |c| <= 84
+        dots = columns[0].astype(np.float32) @ self._columns + np.float32(1e-5 * 84 * own**0.5)
+        bounds = dots / (self._squares + np.float32(own) - dots)
+        promising = _promising(bounds, k)
+        reached = np.sort(self._similarities(query, promising))[-k]
+        rows = np.flatnonzero(bounds >= np.float32(reached * (1 - 1e-5)))
+        best, similarities = _best(self._similarities(query, rows), k)
+        return rows[best], similarities
+
+    def _similarities(self, query: LevelArray, rows: IndexArray) -> FloatArray:
+        parts = (rows[start : start + _CHUNK] for start in range(0, len(rows), _CHUNK))
+        return np.concatenate([tanimoto(query, self._descriptors[part])[0] for part in parts])
+
+
+class _Tree:
+    """A KD-tree by Euclid, and a ball that makes it exact by Tanimoto.
+
+    With α = (1 + t) / 2t, T(q, c) >= t is |c - αq| <= |q| √(α² - 1): multiply T's definition out, complete the square.
+    """
+
+    def __init__(self, descriptors: LevelArray) -> None:
+        from scipy.spatial import cKDTree
+
+        self._descriptors = descriptors
+        self._tree = cKDTree(descriptors.astype(np.float64)) if len(descriptors) else None
+
+    def extended(self, _descriptors: LevelArray, /) -> None:
+        return None
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        assert self._tree is not None
+        q = query.astype(np.float64)
+        nearest = np.atleast_1d(self._tree.query(q, k)[1])
+        reached = float(tanimoto(query, self._descriptors[nearest])[0].min())
+        if reached == 0:
+            rows = np.arange(len(self._descriptors))
+        else:
+            alpha = (1 + reached) / (2 * reached)
+            # a hair wider: a view on the rim may tie with the k-th
+            radius = np.sqrt(q @ q * (alpha * alpha - 1)) * (1 + 1e-9) + 1e-6
+            rows = np.sort(np.array(self._tree.query_ball_point(alpha * q, radius), np.intp))
+        best, similarities = _best(tanimoto(query, self._descriptors[rows])[0], k)
+        return rows[best], similarities
+
+
+def _best(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:
+    """Indices and values of the `k` largest, best first, equal values by lower index."""
+    rows = np.arange(len(values))
+    if len(values) >= k * _GROUP:
+        # k groups have a maximum of at least `limit`, so at least k values have
+        limit = np.partition(_group_maxima(values), -k)[-k]
+        rows = np.flatnonzero(values >= limit)
+    best = rows[np.argsort(-values[rows], kind="stable")[:k]]
+    return best, values[best]
+
+
+def _promising(values: NDArray[np.float32], k: int) -> IndexArray:
+    """Some `k` indices or more, of large values."""
+    wanted = 4 * k
+    if len(values) < wanted * _GROUP:
+        return np.arange(len(values))
+    maxima = _group_maxima(values)
+    groups = np.argpartition(maxima, -wanted)[-wanted:]
+    in_group = groups + len(maxima) * np.arange(_GROUP)[:, None]
+    rows: IndexArray = in_group[values[in_group].argmax(axis=0), np.arange(wanted)]
+    return rows
+
+
+def _group_maxima(values: NDArray[_T]) -> NDArray[_T]:
+    """Maxima over groups of every n-th value, so that neighbours (views of one object) fall into different groups."""
+    whole = len(values) // _GROUP * _GROUP
+    maxima: NDArray[_T] = values[:whole].reshape(_GROUP, -1).max(axis=0)
+    return maxima

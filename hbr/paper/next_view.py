@@ -1,0 +1,146 @@
+"""Active Hough-based retrieval (AHBR): where to look next.
+
+Source: Czúni and Rashad, "Lightweight Active Object Retrieval with Weak Classifiers", Sensors 2018, 18, 801, Eq. 5-7.
+"""
+
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hbr.core.angles import wrap180, wrap360
+from hbr.core.arrays import FloatArray, IndexArray
+from hbr.descriptors.tanimoto import tanimoto
+from hbr.model.views import Views
+from hbr.paper.hough import Ranking
+
+Side = Literal["left", "right"]
+
+_SECTOR_DEG: Final = 90.0
+_CENTRES_DEG: Final = np.arange(4) * _SECTOR_DEG + _SECTOR_DEG / 2
+_BEST: Final = 10
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A side to turn to, and what it was decided on.
+
+    Attributes
+    ----------
+    side : {"left", "right"}
+        ``left`` turns the camera counter-clockwise around the object, seen from above.
+    rotation_deg : float
+        Turn of the camera around the object, positive to the left; the detour is included.
+    s_left, s_right : float
+        How alike the candidates look from either side (Eq. 6), summed over their pairs; the smaller sum tells more.
+    candidates : tuple of int
+        The objects that were compared.
+    orientation_deg : float
+        Where the turn leads, in the zero of the queries' orientations, in [0, 360).
+    detour_deg : float
+        How much of the turn, in degrees without sign, avoids orientations that were visited before.
+    """
+
+    side: Side
+    rotation_deg: float
+    s_left: float
+    s_right: float
+    candidates: tuple[int, ...]
+    orientation_deg: float
+    detour_deg: float
+
+
+def next_view(
+    ranking: Ranking,
+    *,
+    visited_deg: ArrayLike | None = None,
+    revisit_deg: float = 10.0,
+    side: Side | None = None,
+) -> Decision:
+    """Decide to which side the candidates differ most, and turn to the next sector centre of the best candidate there.
+
+    The views of an object fall into four sectors of 90 degrees; an average view stands for each (Eq. 5). The candidates
+    are the objects on the last retrieval list; if they are fewer than two, the ten best of the ranking.
+
+    Parameters
+    ----------
+    ranking : Ranking
+        Of at least two queries.
+    visited_deg : array, optional
+        Orientations not to visit again; those of the ranking's queries by default. The last query's is always avoided.
+    revisit_deg : float
+        A turn that would end this close to a visited orientation, or closer, goes on for 90 degrees, and again until it
+        is clear of all. If all four endings are visited, the first is taken.
+    side : {"left", "right"}, optional
+        Turn to this side whatever the likenesses say, by the same step: the control that a decision is measured by.
+
+    Returns
+    -------
+    Decision
+        Left if both sides are equally alike.
+
+    Raises
+    ------
+    ValueError
+        The ranking is of a single query, `revisit_deg` is out of range, a visited orientation is not finite, or `side`
+        is unknown.
+    """
+    if len(ranking.orientation_deg) < 2:
+        raise ValueError("a decision needs two queries; turn to the second view by a fixed step such as +90 degrees")
+    visited = np.asarray(ranking.orientation_deg if visited_deg is None else visited_deg, np.float64).ravel()
+    if not np.isfinite(visited).all():
+        raise ValueError(f"visited_deg is {visited}; leave out orientations that are not known")
+    if not 0 <= revisit_deg < _SECTOR_DEG / 2:
+        raise ValueError(f"revisit_deg is {revisit_deg}; at least 0 and less than {_SECTOR_DEG / 2} is needed")
+    if side not in (None, *get_args(Side)):
+        raise ValueError(f"side {side!r} is unknown; use left or right, or None to decide by the candidates")
+
+    candidates = np.unique(ranking.views.object_index[ranking.lists[-1]])
+    if len(candidates) < 2:
+        candidates = np.sort(ranking.object_index[:_BEST])
+    pose_of = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
+    poses = np.array([pose_of[j] for j in candidates.tolist()])
+    s_left = _likeness(ranking.views, candidates, _next_sector(poses, +1)[0])
+    s_right = _likeness(ranking.views, candidates, _next_sector(poses, -1)[0])
+
+    if side is None:
+        side = "left" if s_left <= s_right else "right"
+    sign = 1 if side == "left" else -1
+    step = float(_next_sector(ranking.pose_deg[:1], sign)[1][0])
+    here = float(ranking.orientation_deg[-1])
+    detour = _detour(here + sign * step, sign, np.append(visited, here), revisit_deg)
+    rotation = sign * (step + detour)
+    return Decision(side, rotation, s_left, s_right, tuple(candidates.tolist()), wrap360(here + rotation), detour)
+
+
+def _next_sector(pose_deg: FloatArray, sign: int) -> tuple[IndexArray, FloatArray]:
+    """The sector whose centre comes next to the left (+1) or right (-1), and the turn to it, in (0, 90]."""
+    gap_deg = wrap360(sign * (_CENTRES_DEG - pose_deg[:, None]))
+    gap_deg[gap_deg == 0] = 360.0
+    return gap_deg.argmin(axis=1), gap_deg.min(axis=1)
+
+
+def _likeness(views: Views, candidates: IndexArray, sectors: IndexArray) -> float:
+    """Sum of the similarities of all pairs of candidates, each seen in its sector (Eq. 6)."""
+    averages = np.stack([_average_view(views, int(j), int(s)) for j, s in zip(candidates, sectors, strict=True)])
+    return float(np.triu(tanimoto(averages, averages), k=1).sum())
+
+
+def _average_view(views: Views, object_index: int, sector: int) -> FloatArray:
+    """Mean descriptor of an object's views in a sector (Eq. 5); of an empty sector, the view nearest to it."""
+    rows = views.of(object_index)
+    offset_deg = wrap180(views.azimuth_deg[rows] - _CENTRES_DEG[sector])
+    half = _SECTOR_DEG / 2
+    inside = rows[(offset_deg >= -half) & (offset_deg < half)]
+    if not len(inside):
+        inside = rows[[np.abs(offset_deg).argmin()]]
+    mean: FloatArray = views.descriptors[inside].mean(axis=0)
+    return mean
+
+
+def _detour(landing_deg: float, sign: int, visited_deg: FloatArray, revisit_deg: float) -> float:
+    for detour_deg in np.arange(4) * _SECTOR_DEG:
+        if np.all(np.abs(wrap180(landing_deg + sign * detour_deg - visited_deg)) > revisit_deg):
+            return float(detour_deg)
+    return 0.0

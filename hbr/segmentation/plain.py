@@ -1,0 +1,63 @@
+"""The object before a plain background that no reference shows."""
+
+from typing import Final
+
+import cv2
+import numpy as np
+
+from hbr.core.arrays import ImageArray
+from hbr.segmentation.background import Mask
+
+#: A pixel differs when it does by this many grey levels, or by this share of what the object differs.
+_LEAST_LEVELS: Final = 12.0
+_SHARE: Final = 0.25
+#: A backdrop is plain where three corners of the frame have one colour, within so many grey levels each, or two if they
+#: are as dark as this,
+_ONE_COLOUR: Final = 12.0
+_DARK: Final = 40.0
+#: and the smoothest of them is off by no more than this and its noise.
+_SMOOTH: Final = 3.0
+_NOISE: Final = 1.5
+
+
+def plain_difference(small: ImageArray) -> Mask | None:
+    """Where a small image differs from its background, bool (h, w); None where its border is not plain.
+
+    The background of a row is what lies between its two ends, which a horizon does not disturb.
+    """
+    height, width = small.shape[:2]
+    image = cv2.GaussianBlur(small, (7, 7), 1.3)
+    edge = max(2, width // 32)
+    left, right = (
+        cv2.blur(np.sort(part, axis=1)[:, part.shape[1] // 2, None].astype(np.float32), (1, 9)).reshape(height, 1, 3)
+        for part in (image[:, :edge], image[:, -edge:])
+    )
+    across = ((np.arange(width, dtype=np.float32) + 0.5) / width)[None, :, None]
+    apart = cv2.split(cv2.absdiff(image.astype(np.float32), left + (right - left) * across))
+    away = cv2.max(cv2.max(apart[0], apart[1]), apart[2])
+    border = np.concatenate([away[:edge].ravel(), away[:, :edge].ravel(), away[:, -edge:].ravel()])
+    threshold = max(_LEAST_LEVELS, 4 * float(np.median(border)))
+    if not _backdrop(image, away, cv2.absdiff(small, image), edge + 2):
+        return None
+    # the object's own contrast: what a twentieth of the frame exceeds, of every third pixel each way
+    sample = np.sort(away[::3, ::3], axis=None)
+    contrast = float(sample[-(len(sample) // 20 + 1)])
+    differs: Mask = away > max(threshold, _SHARE * contrast)
+    return differs
+
+
+def _backdrop(image: cv2.typing.MatLike, away: cv2.typing.MatLike, noise: cv2.typing.MatLike, edge: int) -> bool:
+    """Whether the corners show one smooth backdrop; not so a wall and a table, nor a pattern."""
+    height, width = (max(1, side // 8) for side in away.shape)
+    corners = [(rows, part) for rows in (np.s_[:height], np.s_[-height:]) for part in (np.s_[:width], np.s_[-width:])]
+    colours = np.array([np.median(image[corner].reshape(-1, 3), axis=0) for corner in corners])
+    alike = (np.abs(colours[:, None] - colours).max(axis=2) <= _ONE_COLOUR).sum(axis=1)
+    dark = colours.max(axis=1) < _DARK
+    if not (alike >= np.where(dark, 2, 3)).any():
+        return False
+    edge = min(edge, (away.shape[1] - 1) // 2)
+    inner = away[:, edge : -edge or None], noise[:, edge : -edge or None]  # the edges are what is compared with
+    unrest, grain = min(
+        (float(np.median(inner[0][corner])), float(inner[1][corner].max(axis=2).mean())) for corner in corners
+    )
+    return unrest <= _SMOOTH + _NOISE * grain

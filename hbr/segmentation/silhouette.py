@@ -1,0 +1,94 @@
+"""Which of the pixels that differ from the background are the object."""
+
+from functools import lru_cache
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.segmentation.background import Mask
+
+Binary = NDArray[np.uint8]
+
+#: The object takes at least this share of the frame.
+_LEAST: Final = 0.004
+#: A part beside the largest one belongs to the object if it has this share of its area.
+_PART: Final = 0.08
+#: Radii of the bars that are cut off where something reaches into the frame, in pixels of the small image.
+_BARS: Final = (0, 2, 3, 4, 5)
+#: Rows at the foot that are narrower than this share of the usual row are the stump of a bar.
+_STUMP: Final = 0.35
+
+
+def silhouette(surely: Mask, perhaps: Mask | None = None, *, framed: bool) -> Mask | None:
+    """Return the object's silhouette, without holes; None where there is none.
+
+    Parameters
+    ----------
+    surely, perhaps : bool arrays (h, w)
+        What is no background, and what may be shadow: it counts where the object is around it.
+    framed : bool
+        Whether whatever touches the frame's border is no object: a holder, a hand, a shelf.
+    """
+    grown = cv2.morphologyEx(
+        cv2.morphologyEx(surely.astype(np.uint8), cv2.MORPH_OPEN, _disc(1)), cv2.MORPH_CLOSE, _disc(3)
+    )
+    everything = grown.astype(np.uint8)
+    for radius in _BARS if framed else _BARS[:1]:
+        kept = _main_parts(_opened(everything, radius), framed=framed)
+        if kept is None:
+            continue
+        if radius:  # what was rounded off comes back
+            kept = _without_stump(cv2.dilate(kept, _disc(1)).astype(np.uint8) & everything)
+        if perhaps is not None:
+            hull = np.zeros_like(kept)
+            cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(kept)), (1,))
+            kept |= hull & perhaps
+        return _filled(kept)
+    return None
+
+
+def _without_stump(mask: Binary) -> Binary:
+    """What is left of a holder from below, where a bar was cut off: things stand on more than that."""
+    widths = np.count_nonzero(mask, axis=1)
+    foot = np.flatnonzero(widths >= _STUMP * np.median(widths[widths > 0]))[-1]
+    mask[foot + 1 :] = 0
+    return mask
+
+
+def _opened(mask: Binary, radius: int) -> Binary:
+    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(radius)).astype(np.uint8) if radius else mask
+
+
+def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
+    """The largest part and those close by, if it outweighs whatever reaches in from the border."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    if count < 2:
+        return None
+    height, width = mask.shape
+    x, y, w, h, area = stats[1:].T
+    outside = framed & ((x == 0) | (y == 0) | (x + w == width) | (y + h == height))
+    inner, outer = np.where(outside, 0, area), np.where(outside, area, 0)
+    largest = int(inner.argmax())
+    if inner[largest] < max(_LEAST * mask.size, 0.6 * outer.max()):
+        return None
+    near = (x < x[largest] + w[largest] + 5) & (x[largest] < x + w + 5)
+    near &= (y < y[largest] + h[largest] + 5) & (y[largest] < y + h + 5)
+    keep = (inner > _PART * inner[largest]) & (near if framed else True)
+    return np.isin(labels, 1 + np.flatnonzero(keep)).astype(np.uint8)
+
+
+def _filled(mask: Binary) -> Mask:
+    margin = 12  # closing must not see the frame's border as background
+    wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
+    wide = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8))
+    contours, _ = cv2.findContours(wide, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(wide, contours, -1, (1,), -1)
+    filled: Mask = wide[margin:-margin, margin:-margin] > 0
+    return filled
+
+
+@lru_cache
+def _disc(radius: int) -> Binary:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.uint8)

@@ -1,0 +1,33 @@
+"""A bench: servo, IMU, camera and table together, opened by name."""
+
+from rig.bench.bench import (
+    GROUP,
+    Bench,
+    BenchKind,
+    ObjectStandsThere,
+    Operator,
+    ServoAlone,
+    TableClearer,
+    bench_kind,
+    bench_names,
+    calibrate,
+    check_config,
+    open_bench,
+    open_servo,
+)
+
+__all__ = [
+    "GROUP",
+    "Bench",
+    "BenchKind",
+    "ObjectStandsThere",
+    "Operator",
+    "ServoAlone",
+    "TableClearer",
+    "bench_kind",
+    "bench_names",
+    "calibrate",
+    "check_config",
+    "open_bench",
+    "open_servo",
+]

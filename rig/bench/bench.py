@@ -1,0 +1,302 @@
+"""What a bench is, and how one is opened by name.
+
+Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, or anybody else's.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from importlib.metadata import entry_points
+from types import TracebackType
+from typing import Any, Protocol, Self, runtime_checkable
+
+from pydantic import BaseModel
+
+from rig.calibrations import CalibrationStore, State, apparatus, put_in_force
+from rig.calibrations.store import CALIBRATIONS
+from rig.config import RigConfig
+from rig.config.values import Values, mistaken, validate
+from rig.core.clock import Clock
+from rig.core.errors import ConfigError, RigError
+from rig.devices.camera import Camera
+from rig.devices.head.head import RigHead
+from rig.devices.imu import Imu
+from rig.devices.servo import Servo
+from rig.safety.saved_state import MemoryStore, StateStore
+from rig.safety.supervisor import Safety
+
+GROUP = "rig.benches"
+
+
+class Operator(Protocol):
+    """Whoever puts objects on the table."""
+
+    def place(self, name: str | None) -> None:
+        """Have the object ``name`` on the table (None: the one to be identified), and the hands away, on return."""
+        ...
+
+
+@runtime_checkable
+class TableClearer(Protocol):
+    """An operator who empties the table without being asked by anybody."""
+
+    def clear(self) -> bool:
+        """Have nothing on the table, and the hands away, on return; False where that cannot be."""
+        ...
+
+
+class ObjectStandsThere:
+    """The operator of a bench where the object is on the table before the command is given."""
+
+    def place(self, name: str | None) -> None:
+        """Do nothing: ``name`` stands there already."""
+
+
+@dataclass(slots=True)
+class Bench(AbstractContextManager["Bench"]):
+    """The open devices of one bench, on one clock.
+
+    ``conditions`` says under which noise model or calibration the bench works, ``findings`` what opening it revealed
+    that a person should know; both are kept with every enrollment. ``out_of_force`` are the findings about calibrations
+    that do not hold, or not as they were kept. ``state`` is where the table's turns and faults
+    outlive the program, ``head`` the rig head that ``imu`` is on, if it is on one, ``wires`` what must be closed after
+    the devices.
+    """
+
+    name: str
+    config: RigConfig
+    clock: Clock
+    servo: Servo
+    imu: Imu
+    camera: Camera
+    operator: Operator = field(default_factory=ObjectStandsThere)
+    conditions: Mapping[str, Any] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
+    out_of_force: tuple[str, ...] = field(default=(), init=False)
+    state: StateStore = field(default_factory=MemoryStore, repr=False)
+    head: RigHead | None = None
+    wires: ExitStack = field(default_factory=ExitStack, repr=False)
+    safety: Safety = field(init=False, repr=False)
+    _open: bool = field(default=True, init=False, repr=False)
+    _as_opened: tuple[RigConfig, tuple[str, ...]] | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.safety = Safety(self.servo, self.config, self.clock, self.state)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except (RigError, OSError) as failure:
+            if error is None:  # otherwise the first error is the one that people must see
+                raise
+            error.add_note(f"The bench could not be closed properly: {failure}")
+
+    def close(self) -> None:
+        """Torque off, then let go of the devices; a device that fails here does not keep the others open.
+
+        A second call does nothing.
+        """
+        if not self._open:
+            return
+        self._open = False
+        failures: list[Exception] = []
+        for step in (self.servo.torque_off, self.servo.close, self.imu.close, self.camera.close, self.wires.close):
+            try:
+                step()
+            except (RigError, OSError) as failure:
+                if not (step == self.servo.torque_off and self._unpowered()):
+                    failures.append(failure)
+        if failures:
+            raise failures[0]
+
+    def _unpowered(self) -> bool:
+        """Return whether the servo is without its supply, by the rig head's relay: then it has no torque either."""
+        return self.head is not None and self.config.head.power and not self.head.status.relay_closed
+
+    def devices(self) -> dict[str, Any]:
+        """Return the identities of the devices, for the record."""
+        return {
+            "servo": _plain(self.servo.identity),
+            "imu": _plain(self.imu.identity),
+            "camera": _plain(self.camera.identity),
+        }
+
+    def apparatus(self, *parts: str) -> dict[str, Any]:
+        """Return what a calibration of some of the devices (all of them by default) is bound to."""
+        whole = apparatus(self.name, self.devices(), self.config, self.conditions)
+        return {key: value for key, value in whole.items() if not parts or key in ("bench", "conditions", *parts)}
+
+
+class BenchKind(Protocol):
+    """A plug-in: its options, checked with the rest of the configuration, and how it is opened."""
+
+    @property
+    def options(self) -> type[BaseModel]:
+        """Model of the section ``[bench.<name>]``."""
+        ...
+
+    def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
+        """Open the devices; what was opened is closed again when a later one fails."""
+        ...
+
+
+@runtime_checkable
+class ServoAlone(Protocol):
+    """A kind of bench whose servo can be opened without the other devices: to stop it, whatever else is broken."""
+
+    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Servo]: ...
+
+
+def bench_names() -> list[str]:
+    """Return the names of the installed kinds of benches."""
+    return sorted(point.name for point in entry_points(group=GROUP))
+
+
+def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Bench:
+    """Open a bench by name; use it in a ``with`` block.
+
+    Parameters
+    ----------
+    name
+        A kind of bench (`bench_names`); None takes ``config.default_bench``.
+    config
+        The configuration; None takes the defaults.
+    seed
+        Seed of a simulated bench; real ones ignore it.
+
+    Raises
+    ------
+    ConfigError
+        There is no such bench, or its options have mistakes.
+    DeviceNotFound, DeviceMismatch, DeviceSilent
+        A device is not there, is another one, or does not answer.
+    BenchBusy
+        Another program holds the bench.
+    """
+    config = config or RigConfig()
+    kind, options = _kind(name or config.default_bench, config)
+    bench = kind.open(config, options, seed)
+    try:
+        calibrate(bench, CalibrationStore(config.calibration_path(bench.name)))
+    except BaseException:
+        bench.close()
+        raise
+    return bench
+
+
+@contextmanager
+def open_servo(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Iterator[Servo]:
+    """Open the servo of a bench alone, where its kind knows how, else with all devices; writes nothing to it.
+
+    Raises
+    ------
+    ConfigError, DeviceNotFound, DeviceMismatch, DeviceSilent, BenchBusy
+        As of `open_bench`.
+    """
+    config = config or RigConfig()
+    kind, options = _kind(name or config.default_bench, config)
+    if isinstance(kind, ServoAlone):
+        with kind.open_servo(config, options, seed) as servo:
+            yield servo
+    else:
+        with kind.open(config, options, seed) as bench:
+            yield bench.servo
+
+
+def calibrate(bench: Bench, store: CalibrationStore) -> None:
+    """Put the bench's calibrations in force; what has expired or belongs to other devices becomes a finding.
+
+    A second call takes what was calibrated meanwhile.
+
+    Raises
+    ------
+    ConfigError
+        A calibration sets what the configuration does not take.
+    """
+    bench._as_opened = bench._as_opened or (bench.config, bench.findings)
+    config, findings = bench._as_opened
+    standings = store.standings(bench.apparatus(), bench.clock.utc())
+    facts = [standing.fact for standing in standings if standing.state is State.IN_FORCE]
+    bench.config, told = put_in_force(config, facts)
+    bench.safety.reference.calibrate(bench.config.table)
+    bench.conditions = {**bench.conditions, CALIBRATIONS: [fact.id for fact in facts]}
+    bench.out_of_force = (
+        *told,
+        *(error.what for error in store.unreadable),
+        *(
+            f"{standing.words}; calibrate again with `{standing.command}`"
+            for standing in standings
+            if standing.state is not State.IN_FORCE
+        ),
+    )
+    bench.findings = (*findings, *bench.out_of_force)
+
+
+def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:
+    """Return the kind of bench called ``name``, and its options."""
+    for wrong in sorted(set(config.bench) - set(bench_names())):
+        bench_kind(wrong)  # a misspelt section is told before anything is opened
+    kind = bench_kind(name)
+    where = "the configuration"
+    return kind, validate(kind.options, config.bench.get(name, {}), where=where, prefix=f"bench.{name}")
+
+
+def bench_kind(name: str) -> BenchKind:
+    """Return the plug-in of that name.
+
+    Raises
+    ------
+    ConfigError
+        There is no such bench.
+    """
+    points = {point.name: point for point in entry_points(group=GROUP)}
+    if name in points:
+        kind: BenchKind = points[name].load()
+        return kind
+    near = get_close_matches(name, points, n=1)
+    raise ConfigError(
+        f"There is no bench {name!r}.",
+        next_step=f"Did you mean {near[0]}?" if near else "Choose one of the benches listed.",
+        evidence={"benches": sorted(points)},
+    )
+
+
+def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
+    """Return the configuration and the options of every bench that is installed.
+
+    Raises
+    ------
+    ConfigError
+        All mistakes at once, those in the benches' own sections included.
+    """
+    found: list[str] = []
+    config, options = RigConfig(), {}
+    where = str(read.path) if read.path else "the command line"
+    try:
+        config = validate(RigConfig, read.values, where=where, places=read.places)
+    except ConfigError as error:
+        found += error.evidence["mistakes"]
+    sections = read.values.get("bench", {})
+    if not isinstance(sections, dict) or not all(isinstance(section, dict) for section in sections.values()):
+        sections = {}  # told above
+    for name in sorted({*bench_names(), *sections}):
+        try:
+            kind = bench_kind(name)
+            options[name] = validate(
+                kind.options, sections.get(name, {}), where=where, prefix=f"bench.{name}", places=read.places
+            )
+        except ConfigError as error:
+            found += error.evidence.get("mistakes") or [f"bench.{name}: {error.what} {error.next_step}"]
+    if found:
+        raise mistaken(found, where)
+    return config, options
+
+
+def _plain(identity: Any) -> dict[str, Any]:
+    return {name: getattr(identity, name) for name in identity.__dataclass_fields__}

@@ -1,0 +1,329 @@
+"""The computer that a bench hangs on: its ports, buses and cameras, who holds them, and who may use them.
+
+Facts are read from files of Linux (sysfs, /proc, /etc) below a root folder, so that a simulated bench and a test lay
+out a computer of their own; devices are opened by the same functions as for a bench.
+"""
+
+import grp
+import os
+import pwd
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from rig.config import RigConfig
+from rig.core.clock import Clock, SystemClock
+
+if TYPE_CHECKING:
+    from rig.devices.dynamixel.port import Wire
+    from rig.devices.opencv_camera import Capture
+
+SERIAL_NAMES = re.compile(r"tty(USB|ACM|AMA|S)\d+")
+_NETWORK_FILE_SYSTEMS = frozenset({"nfs", "nfs4", "cifs", "smb3", "smbfs", "sshfs", "fuse.sshfs", "9p", "afs"})
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A program that has a device open."""
+
+    pid: int
+    command: str
+
+    def __str__(self) -> str:
+        return f"process {self.pid} ({self.command})"
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A device file and what is known of it without opening it.
+
+    ``stable`` is a name of it that outlives replugging, ``group`` whom it belongs to; ``usable`` says whether this user
+    may open it, ``holders`` who has it open, as far as this user may know.
+    """
+
+    path: str
+    name: str
+    stable: str | None
+    group: str
+    usable: bool
+    holders: tuple[Process, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPort(Node):
+    """A serial port; ``latency_ms`` is the adapter's latency timer, None where it has none (`latency_file`)."""
+
+    latency_ms: int | None
+    latency_file: str
+    usb: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """Who runs the program: ``gids`` are the groups of this login."""
+
+    name: str
+    uid: int
+    gids: frozenset[int]
+
+    @classmethod
+    def current(cls) -> "User":
+        uid = os.geteuid()
+        try:
+            name = pwd.getpwuid(uid).pw_name
+        except KeyError:
+            name = str(uid)
+        return cls(name, uid, frozenset({os.getegid(), *os.getgroups()}))
+
+
+@dataclass(frozen=True, slots=True)
+class Disk:
+    """The disk below a folder; ``network`` where it is another computer's, ``writable`` where this user may write."""
+
+    free_bytes: int
+    network: bool
+    writable: bool = True
+
+
+class Host(Protocol):
+    """Where devices are looked for, and how they are opened."""
+
+    @property
+    def clock(self) -> Clock: ...
+
+    @property
+    def user(self) -> User: ...
+
+    @property
+    def model(self) -> str:
+        """What kind of computer it is; empty where it does not say."""
+        ...
+
+    def serial_ports(self) -> list[SerialPort]: ...
+
+    def serial_port(self, path: str) -> SerialPort | None:
+        """Return the port of that name, whatever is behind it (a pseudo-terminal, too); None where there is none."""
+        ...
+
+    def i2c_buses(self) -> list[Node]: ...
+    def cameras(self) -> list[Node]: ...
+
+    def same_file(self, one: str, other: str) -> bool:
+        """Return whether two paths, one of which may be a link, are one device."""
+        ...
+
+    def joined(self, group: str) -> bool:
+        """Return whether the user is listed as a member of the group, in this login or only from the next one on."""
+        ...
+
+    def time_synchronised(self) -> bool | None:
+        """Return whether the civil time is kept by a time server; None where no service tells."""
+        ...
+
+    def disk(self, path: Path) -> Disk:
+        """Return the disk on which ``path`` is, or would be."""
+        ...
+
+    def open_wire(self, path: str, baud: int) -> "Wire": ...
+    def i2c_name(self, bus: int | str) -> str:
+        """Return what people call a bus: its device file."""
+        ...
+
+    def i2c_path(self, bus: int | str) -> str:
+        """Return the path under which smbus2 opens a bus."""
+        ...
+
+    def open_capture(self, source: int | str) -> "Capture": ...
+
+
+@runtime_checkable
+class Hosted(Protocol):
+    """A kind of bench whose computer can be looked at while the bench is not open."""
+
+    def host(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Host]: ...
+
+
+@dataclass
+class LinuxHost:
+    """A computer with Linux, as far as its files below ``root`` tell; the one that the program runs on by default."""
+
+    root: Path = Path("/")
+    clock: Clock = field(default_factory=SystemClock)
+    user: User = field(default_factory=User.current)
+
+    @property
+    def model(self) -> str:
+        return self._text("/proc/device-tree/model") or self._text("/sys/class/dmi/id/product_name")
+
+    def serial_ports(self) -> list[SerialPort]:
+        """Return the ports that hang on hardware; the computer's own come last."""
+        ports = []
+        for entry in self._entries("sys/class/tty"):
+            device = entry / "device"
+            if not SERIAL_NAMES.fullmatch(entry.name) or not device.exists():
+                continue
+            if entry.name.startswith("ttyS") and device.resolve().parent.name.startswith("serial8250"):
+                continue  # reserved by the kernel, with nothing behind them
+            latency_file = f"/sys/bus/usb-serial/devices/{entry.name}/latency_timer"
+            latency = self._text(latency_file)
+            usb = self._usb(device)
+            name = " ".join(usb[key] for key in ("manufacturer", "product") if usb.get(key)) or "serial port"
+            ports.append(
+                SerialPort(
+                    **self._node(f"/dev/{entry.name}", name, "dev/serial/by-id"),
+                    latency_ms=int(latency) if latency.isdigit() else None,
+                    latency_file=latency_file,
+                    usb=usb,
+                )
+            )
+        return sorted(ports, key=lambda port: (not port.usb, _natural(port.path)))
+
+    def serial_port(self, path: str) -> SerialPort | None:
+        known = next((port for port in self.serial_ports() if self.same_file(port.path, path)), None)
+        if known is not None or not self._at(path).exists():
+            return known
+        node = self._node(path, "no adapter of this computer's", "")
+        node["holders"] = ()  # a pseudo-terminal is always held, by the program that is its other end
+        return SerialPort(**node, latency_ms=None, latency_file="", usb={})
+
+    def i2c_buses(self) -> list[Node]:
+        return self._nodes("sys/class/i2c-dev", "")
+
+    def cameras(self) -> list[Node]:
+        """Return the cameras; a device's further nodes, which carry no images, are left out."""
+        nodes = self._nodes("sys/class/video4linux", "dev/v4l/by-id")
+        return [n for n in nodes if self._text(f"/sys/class/video4linux/{Path(n.path).name}/index") in ("", "0")]
+
+    def same_file(self, one: str, other: str) -> bool:
+        return self._at(one).resolve() == self._at(other).resolve()
+
+    def joined(self, group: str) -> bool:
+        for line in self._text("/etc/group").splitlines():
+            name, _, rest = line.partition(":")
+            if name == group:
+                gid, _, members = rest.partition(":")[2].partition(":")
+                return self.user.name in members.split(",") or (gid.isdigit() and int(gid) in self.user.gids)
+        return False
+
+    def time_synchronised(self) -> bool | None:
+        if self._at("/run/systemd/timesync").is_dir():
+            return self._at("/run/systemd/timesync/synchronized").exists()
+        return True if any(self._at(f"/run/{name}").exists() for name in ("chrony", "ntpd.pid", "ptp4l")) else None
+
+    def disk(self, path: Path) -> Disk:
+        there = path.absolute()
+        while not there.exists():
+            there = there.parent
+        mounts = [line.split() for line in self._text("/proc/mounts").splitlines()]
+        holding = [m for m in mounts if len(m) > 2 and there.is_relative_to(m[1].replace("\\040", " "))]
+        kind = max(holding, key=lambda m: len(m[1]))[2] if holding else ""
+        return Disk(shutil.disk_usage(there).free, kind in _NETWORK_FILE_SYSTEMS, os.access(there, os.W_OK))
+
+    # -- opening ----------------------------------------------------------------------------------------------------
+
+    def open_wire(self, path: str, baud: int) -> "Wire":
+        from rig.devices.dynamixel.port import open_serial
+
+        return open_serial(path, baud)
+
+    def i2c_name(self, bus: int | str) -> str:
+        return bus if isinstance(bus, str) else f"/dev/i2c-{bus}"
+
+    def i2c_path(self, bus: int | str) -> str:
+        return self.i2c_name(bus)
+
+    def open_capture(self, source: int | str) -> "Capture":
+        from rig.devices.opencv_camera import open_capture
+
+        return open_capture(source)
+
+    # -- files ------------------------------------------------------------------------------------------------------
+
+    def _at(self, path: str) -> Path:
+        return self.root / path.lstrip("/")
+
+    def _text(self, path: str) -> str:
+        """Return what a small file says, nothing where it says nothing."""
+        try:
+            return self._at(path).read_text(encoding="utf-8", errors="replace").strip("\0\n ")
+        except OSError:
+            return ""
+
+    def _entries(self, folder: str) -> list[Path]:
+        try:
+            return sorted((self.root / folder).iterdir(), key=lambda entry: _natural(entry.name))
+        except OSError:
+            return []
+
+    def _nodes(self, folder: str, links: str) -> list[Node]:
+        return [
+            Node(**self._node(f"/dev/{entry.name}", self._text(f"/{folder}/{entry.name}/name"), links))
+            for entry in self._entries(folder)
+        ]
+
+    def _node(self, path: str, name: str, links: str) -> dict[str, Any]:
+        file = self._at(path)
+        stable = next((f"/{links}/{e.name}" for e in self._entries(links) if e.resolve() == file.resolve()), None)
+        try:
+            status = file.stat()
+        except OSError:
+            group, usable = "", False
+        else:
+            group, usable = self._group_name(status.st_gid), self._may_use(file, status)
+        return {
+            "path": path,
+            "name": name or Path(path).name,
+            "stable": stable if links else None,
+            "group": group,
+            "usable": usable,
+            "holders": tuple(self._holders(path)),
+        }
+
+    def _may_use(self, file: Path, status: os.stat_result) -> bool:
+        if self.user == User.current():
+            return os.access(file, os.R_OK | os.W_OK)  # knows of access lists, too
+        shift = 6 if status.st_uid == self.user.uid else 3 if status.st_gid in self.user.gids else 0
+        return self.user.uid == 0 or status.st_mode >> shift & 0o6 == 0o6
+
+    def _group_name(self, gid: int) -> str:
+        for line in self._text("/etc/group").splitlines():
+            parts = line.split(":")
+            if len(parts) > 2 and parts[2] == str(gid):
+                return parts[0]
+        with suppress(KeyError):
+            return grp.getgrgid(gid).gr_name
+        return str(gid)
+
+    def _holders(self, path: str) -> Iterator[Process]:
+        wanted = str(self._at(path).resolve())
+        for process in self._entries("proc"):
+            if not process.name.isdigit() or int(process.name) == os.getpid():
+                continue
+            try:
+                handles = [str(handle.readlink()) for handle in (process / "fd").iterdir()]
+            except OSError:  # another user's, or gone meanwhile
+                continue
+            if path in handles or wanted in handles:
+                command = self._text(f"/proc/{process.name}/cmdline").replace("\0", " ")
+                yield Process(int(process.name), command or self._text(f"/proc/{process.name}/comm"))
+
+    def _usb(self, device: Path) -> dict[str, str]:
+        """Return what the USB device says of itself, nothing for a port that is none."""
+        for folder in [(real := device.resolve()), *real.parents]:
+            if (folder / "idVendor").is_file():
+                names = ("idVendor", "idProduct", "manufacturer", "product", "serial")
+                found = {
+                    name: self._text("/" + str((folder / name).relative_to(self.root.resolve()))) for name in names
+                }
+                return {name: text for name, text in found.items() if text}
+            if folder == self.root.resolve():
+                break
+        return {}
+
+
+def _natural(name: str) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]

@@ -1,0 +1,149 @@
+"""The bench of real devices: servo on a serial port, IMU on I2C, camera through OpenCV."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any
+
+from pydantic import BaseModel
+
+from rig.bench import Bench, BenchKind
+from rig.config import RigConfig, Section
+from rig.core.clock import Clock, SystemClock
+from rig.core.errors import ConfigError, RigError, StateNotKept
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import Wire, open_serial
+from rig.devices.dynamixel.register_servo import prepare_servo
+from rig.devices.head.head import RigHead
+from rig.devices.head.opening import open_head, powered, switch_on
+from rig.devices.head.protocol import BAUD
+from rig.devices.imu import Imu
+from rig.devices.open_imu import open_imu
+from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
+from rig.devices.servo import Servo
+from rig.safety.saved_state import BenchLock, FileStore, StateStore
+
+
+class NoOptions(Section):
+    """The real bench is described by [servo], [table], [imu] and [camera] alone."""
+
+
+class HardwareBench:
+    """Opens the devices named in the configuration."""
+
+    options: type[BaseModel] = NoOptions
+
+    def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:  # noqa: ARG002
+        """Open the real devices on the system's clock; it has no options, and ``seed`` no meaning."""
+        clock, state_path = SystemClock(), config.state_path("hardware")
+        with ExitStack() as wires:
+            wires.callback(BenchLock(state_path, clock).close)
+            wire = open_serial(config.servo.port, config.servo.baud)
+            wires.callback(wire.close)
+            capture = open_capture(config.camera.source)
+            wires.callback(capture.release)
+            bench = assemble(
+                "hardware",
+                config,
+                clock,
+                wire=wire,
+                reopen_wire=lambda: open_serial(config.servo.port, config.servo.baud),
+                i2c_bus=config.imu.bus,
+                capture=capture,
+                reopen_camera=lambda: open_capture(config.camera.source),
+                state=FileStore(state_path),
+                head_port=lambda: open_serial(config.head.port, BAUD, "head"),
+            )
+            bench.wires = wires.pop_all()
+            return bench
+
+    @contextmanager
+    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:  # noqa: ARG002
+        """Open the servo alone; to stop it, it must be reached although nothing can be written to the disk."""
+        clock = SystemClock()
+        with ExitStack() as wires:
+            with suppress(StateNotKept):
+                wires.callback(BenchLock(config.state_path("hardware"), clock).close)
+            wires.enter_context(powered(config, lambda: open_serial(config.head.port, BAUD, "head"), clock))
+            wire = open_serial(config.servo.port, config.servo.baud)
+            wires.callback(wire.close)
+            yield open_servo(wire, config.servo, clock, config.table.mode)
+
+
+def assemble(
+    name: str,
+    config: RigConfig,
+    clock: Clock,
+    *,
+    wire: Wire,
+    reopen_wire: Callable[[], Wire] | None = None,
+    i2c_bus: int | str,
+    capture: Capture,
+    reopen_camera: Callable[[], Capture] | None = None,
+    state: StateStore,
+    head_port: Callable[[], Wire] | None = None,
+) -> Bench:
+    """Put the drivers on their wires; a simulated bench is assembled by the same lines as a real one.
+
+    Nothing moves, and torque stays as it was found; whether the table may move is then known (`Bench.safety`).
+
+    Raises
+    ------
+    DeviceNotFound, DeviceMismatch, DeviceSilent
+        A device is not there, is another one, or does not answer. The wires are left to the caller.
+    ConfigError
+        The servo cannot be what the configuration wants it to be, or does not reach the table's limits.
+    """
+    with ExitStack() as opened:
+        head: RigHead | None = None
+        fault: RigError | None = None
+        if config.imu.connection == "head" and head_port is not None:
+            head = open_head(config, head_port, clock)
+            opened.callback(head.close)
+            fault = switch_on(head, config.head, clock)  # first: the servo's supply may go through it
+        servo = open_servo(wire, config.servo, clock, config.table.mode, reopen_wire)
+        findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
+        _check_reach(config, servo)
+        imu: Imu = head or open_imu(config.imu, i2c_bus, clock)
+        opened.callback(imu.close)
+        camera = OpenCvCamera(
+            capture,
+            clock=clock,
+            settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
+            name=f"camera {config.camera.source}",
+            reopen=reopen_camera,
+        )
+        findings += tuple(
+            f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}"
+            for n in camera.not_taken
+        )
+        bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
+        bench.safety.connect()
+        if head is not None:
+            watched = head
+            bench.safety.watches.append(watched.check)
+            bench.safety.restores.append(lambda: switch_on(watched, config.head, clock))
+        if fault is not None:
+            bench.safety.latch(fault)
+        bench.safety.checks.append(imu.read_samples)
+        bench.findings += bench.safety.findings
+        opened.pop_all()
+    return bench
+
+
+def _check_reach(config: RigConfig, servo: Servo) -> None:
+    """Raise `ConfigError` where the table's limits lie beyond what the servo reaches."""
+    table, (low, high) = config.table, servo.reach_deg
+    first, last = sorted(table.direction * limit + table.zero_deg for limit in table.limits_deg)
+    if low - servo.resolution_deg <= first and last <= high + servo.resolution_deg:
+        return
+    reached = sorted(table.direction * (end - table.zero_deg) for end in (low, high))
+    raise ConfigError(
+        f"The servo reaches {low:.0f}° to {high:.0f}°; the table's limits would take it from {first:.0f}° to "
+        f"{last:.0f}°.",
+        next_step=f"Set table.limits_deg within [{reached[0]:.0f}, {reached[1]:.0f}], or put table.zero_deg, the "
+        "servo's angle at table angle 0, into the middle of what it reaches.",
+        evidence={"limits_deg": list(table.limits_deg), "zero_deg": table.zero_deg, "reach_deg": [low, high]},
+    )
+
+
+HARDWARE: BenchKind = HardwareBench()

@@ -1,0 +1,33 @@
+"""The circle around the table that two charts share: azimuths as seen from above."""
+
+from math import cos, radians, sin
+from typing import Final
+
+from rig.charts import svg
+from rig.charts.svg import Point
+
+SIZE: Final = 400.0
+CENTRE: Final = (SIZE / 2, SIZE / 2)
+RIM: Final = 160.0
+
+
+def polar(radius: float, azimuth_deg: float) -> Point:
+    """Return the point at an azimuth: 0° at the top, growing counter-clockwise.
+
+    With 0° at the top, a camera that goes to its left goes to the left of the page.
+    """
+    angle = radians(azimuth_deg)
+    return CENTRE[0] - radius * sin(angle), CENTRE[1] - radius * cos(angle)
+
+
+def rim(radius: float = RIM) -> list[str]:
+    """Draw the circle with its scale outside: ticks every 10°, numbers every 30°."""
+    parts = [svg.circle(CENTRE, radius, "rim")]
+    for azimuth in range(0, 360, 10):
+        named = azimuth % 30 == 0
+        tick = radius + (7 if named else 4)
+        parts.append(svg.line(polar(radius, azimuth), polar(tick, azimuth), "tick"))
+        if named:
+            x, y = polar(radius + 21, azimuth)
+            parts.append(svg.text(f"{azimuth}°", (x, y + 4), "axis"))
+    return parts

@@ -1,0 +1,133 @@
+"""Chart: what the dense search weighed before a turn, all around the object: the confusion left, and the motion."""
+
+from collections.abc import Sequence
+from math import exp
+from typing import Final
+
+from rig.charts import svg
+from rig.charts.compass import CENTRE, RIM, SIZE, polar, rim
+from rig.events.events import Weighed
+from rig.events.wording import azimuth_words, odds_words, short
+
+_INNER: Final = 34.0
+_OUTER: Final = 118.0
+_BARS: Final = (124.0, 154.0)
+_STOP_PX: Final = 7.0
+_LIST_X: Final = SIZE + 14
+_LIST_WIDTH: Final = 206.0
+_LIST_TOP: Final = 66.0
+_ROW: Final = 17.0
+_LETTERS: Final = 30
+
+
+def decision_chart(
+    here_deg: float,
+    weighed: Weighed,
+    rotation_deg: float,
+    *,
+    rivals: Sequence[str] = (),
+    seen_deg: Sequence[float] = (),
+    number: int = 1,
+) -> str:
+    """Draw the confusion that is expected after every turn, what the motion costs, and the turn that was chosen.
+
+    Parameters
+    ----------
+    here_deg
+        Azimuth of the view after which it was decided.
+    weighed
+        All turns.
+    rotation_deg
+        The chosen one, of the camera around the object.
+    rivals
+        The two objects that it separates; empty where no second one is likely.
+    seen_deg
+        Azimuths of the views so far.
+    number
+        Of that view, from 1.
+
+    Returns
+    -------
+    SVG markup. The curve lies further in where less confusion is left; bars outside it are as long as the motion's
+    cost; the dashed curve lies further in where the two rivals look less alike.
+    """
+    azimuth_deg = [here_deg + turn for turn in weighed.rotations_deg]
+    around = sorted(range(len(azimuth_deg)), key=lambda i: azimuth_deg[i] % 360)
+    curve = _radii(weighed.confusion)
+    parts = [*rim(RIM)]
+    parts += [svg.circle(CENTRE, radius, "grid") for radius in (_INNER, _OUTER)]
+    bars = _lengths(weighed.cost)
+    for i in around:
+        ends = polar(_BARS[0], azimuth_deg[i]), polar(_BARS[0] + bars[i], azimuth_deg[i])
+        parts.append(svg.line(*ends, "cost", svg.title(_words(weighed, i, azimuth_deg[i]))))
+    if weighed.alike is not None:
+        dashed = _radii(weighed.alike)
+        parts.append(svg.path([polar(dashed[i], azimuth_deg[i]) for i in around], "alike", close=True))
+    outline = [polar(curve[i], azimuth_deg[i]) for i in around]
+    parts.append(svg.path(outline, "confusion", close=len(around) > 2))
+    chosen = min(range(len(azimuth_deg)), key=lambda i: abs(weighed.rotations_deg[i] - rotation_deg))
+    goal = polar(curve[chosen], azimuth_deg[chosen])
+    parts.append(svg.line(CENTRE, polar(RIM, azimuth_deg[chosen]), "chosen"))
+    parts.append(svg.circle(goal, _STOP_PX, "stop last", svg.title(_words(weighed, chosen, azimuth_deg[chosen]))))
+    for k, seen in enumerate(seen_deg):
+        words = svg.title(f"view {k + 1} at {azimuth_words(seen)}°")
+        parts.append(svg.circle(polar(RIM, seen), _STOP_PX, "stop", words))
+        x, y = polar(RIM, seen)
+        parts.append(svg.text(str(k + 1), (x, y + 4), "stop-number"))
+    side = "left" if rotation_deg >= 0 else "right"
+    turn = f"{side} {abs(rotation_deg):.0f}°, to {azimuth_words(azimuth_deg[chosen])}°"
+    lines = [(f"view {number} → {number + 1}", "small"), (turn, "turn-name"), *_reasons(weighed, chosen, rivals)]
+    listed = [
+        svg.text(words, (_LIST_X, _LIST_TOP + _ROW * row), look, anchor="start")
+        for row, (words, look) in enumerate(lines)
+    ]
+    label = f"What was weighed after view {number}: " + ", ".join(words for words, _ in lines[1:] if words)
+    height = max(SIZE, _LIST_TOP + _ROW * len(lines))
+    return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *listed])
+
+
+def _reasons(weighed: Weighed, chosen: int, rivals: Sequence[str]) -> list[tuple[str, str]]:
+    if len(rivals) < 2 or weighed.alike is None:
+        reason = [("no second object is likely:", "small"), ("what is new helps its pose", "small")]
+        return [*reason, *_cost(weighed, chosen)]
+    least, most = min(weighed.alike), max(weighed.alike)
+    left, worst = (odds_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
+    return [
+        ("", "small"),
+        ("to tell", "small"),
+        (short(rivals[0], _LETTERS), "turn-name"),
+        ("from", "small"),
+        (short(rivals[1], _LETTERS), "turn-name"),
+        (f"alike there {weighed.alike[chosen]:.2f}", "small"),
+        (f"({least:.2f} to {most:.2f} all around)", "small"),
+        ("", "small"),
+        ("chance of confusion left", "small"),
+        (f"{left} there, {worst} at worst", "small"),
+        *_cost(weighed, chosen),
+    ]
+
+
+def _cost(weighed: Weighed, chosen: int) -> list[tuple[str, str]]:
+    return [
+        ("", "small"),
+        ("the motion costs", "small"),
+        (f"{weighed.cost[chosen]:.2f} of {max(weighed.cost):.2f}", "small"),
+    ]
+
+
+def _words(weighed: Weighed, i: int, azimuth_deg: float) -> str:
+    alike = "" if weighed.alike is None else f", rivals {weighed.alike[i]:.2f} alike"
+    confusion, cost = f"{weighed.confusion[i]:.2f}", f"{weighed.cost[i]:.2f}"
+    return f"to {azimuth_words(azimuth_deg)}°: log confusion {confusion}, motion {cost}{alike}"
+
+
+def _radii(values: Sequence[float]) -> list[float]:
+    """From the inner circle, for the smallest, to the outer one."""
+    low, high = min(values), max(values)
+    span = high - low
+    return [_INNER + (_OUTER - _INNER) * ((value - low) / span if span > 0 else 0.5) for value in values]
+
+
+def _lengths(values: Sequence[float]) -> list[float]:
+    most = max(values)
+    return [(_BARS[1] - _BARS[0]) * (value / most if most > 0 else 0.0) for value in values]

@@ -1,0 +1,146 @@
+"""Chart: where the camera stood during a retrieval, and how it got from view to view."""
+
+from collections.abc import Sequence
+from math import atan2, ceil, cos, hypot, sin
+from typing import Final, NamedTuple
+
+from rig.charts import svg
+from rig.charts.compass import CENTRE, SIZE, polar, rim
+from rig.charts.svg import Point
+from rig.events.wording import azimuth_words, distinct, short
+
+_STOP_PX: Final = 10.0
+_ARROW_PX: Final = 9.0
+_INNERMOST: Final = 58.0
+_OUTERMOST: Final = 140.0
+_ARC_STEP_DEG: Final = 4.0
+_LABEL_PX: Final = (46.0, 17.0)
+_LABEL_SPOTS: Final = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
+_LABEL_ASIDE_PX: Final = (22.0, -22.0)
+_LIST_X: Final = SIZE + 14
+_LIST_WIDTH: Final = 206.0
+_LIST_TOP: Final = 66.0
+_LIST_ROW: Final = 38.0
+_NOTE_LETTERS: Final = 28
+
+
+class Turn(NamedTuple):
+    """A rotation of the camera around the object, positive to the left, and the sums it was decided on (Eq. 6).
+
+    Where there are none, the two ``rivals`` that it is to tell apart, or nothing: the turn was fixed.
+    """
+
+    rotation_deg: float
+    s_left: float | None = None
+    s_right: float | None = None
+    rivals: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        return f"{'left' if self.rotation_deg >= 0 else 'right'} {abs(self.rotation_deg):.1f}°"
+
+
+def polar_path(start_deg: float, turns: Sequence[Turn], *, scale: str) -> str:
+    """Draw the camera's positions seen from above, numbered, and the rotations between them.
+
+    The path winds outwards view by view, so that it never runs over itself.
+
+    Parameters
+    ----------
+    start_deg
+        Azimuth of the first view.
+    turns
+        The rotations that followed, as the table made them.
+    scale
+        What the azimuths on the rim are of.
+
+    Returns
+    -------
+    SVG markup. View k lies at the sum of ``start_deg`` and the first k rotations; the arc to it ends there.
+    """
+    azimuth_deg = [start_deg]
+    for turn in turns:
+        azimuth_deg.append(azimuth_deg[-1] + turn.rotation_deg)
+    radii = _radii(len(azimuth_deg))
+    stops = [polar(radius, azimuth) for radius, azimuth in zip(radii, azimuth_deg, strict=True)]
+    arcs = [_arc((radii[k], azimuth_deg[k]), (radii[k + 1], azimuth_deg[k + 1])) for k in range(len(turns))]
+    parts = [*rim(), svg.circle(CENTRE, 24, "object"), svg.text("object", (CENTRE[0], CENTRE[1] + 4), "small")]
+    for k, (turn, arc) in enumerate(zip(turns, arcs, strict=True)):
+        parts.append(svg.path(arc, "turn", svg.title(f"view {k + 1} to {k + 2}: {turn.words}")))
+        parts.append(_arrowhead(arc))
+    for k, (x, y) in enumerate(stops):
+        look = " last" if k == len(turns) else ""
+        words = svg.title(f"view {k + 1} at {azimuth_words(azimuth_deg[k])}°")
+        parts.append(svg.circle((x, y), _STOP_PX, f"stop{look}", words))
+        parts.append(svg.text(str(k + 1), (x, y + 4), f"stop-number{look}"))
+    for turn, (x, y) in zip(turns, _label_spots(arcs, stops), strict=True):
+        parts.append(svg.text(f"{abs(turn.rotation_deg):.1f}°", (x, y + 4), "turn-label"))
+    where = ", ".join(f"{azimuth_words(a)}°" for a in azimuth_deg)
+    label = f"Camera positions seen from above, view by view: {where}"
+    height = max(SIZE, _LIST_TOP + _LIST_ROW * len(turns))
+    return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *_list(turns, scale)])
+
+
+def _radii(n: int) -> list[float]:
+    step = min(30.0, (_OUTERMOST - _INNERMOST) / max(1, n - 1))
+    first = (_INNERMOST + _OUTERMOST - step * (n - 1)) / 2
+    return [first + k * step for k in range(n)]
+
+
+def _arc(start: tuple[float, float], end: tuple[float, float]) -> list[Point]:
+    """Points of the spiral between two (radius, azimuth), both included."""
+    (r0, a0), (r1, a1) = start, end
+    steps = max(2, ceil(abs(a1 - a0) / _ARC_STEP_DEG))
+    return [polar(r0 + (r1 - r0) * i / steps, a0 + (a1 - a0) * i / steps) for i in range(steps + 1)]
+
+
+def _arrowhead(arc: Sequence[Point]) -> str:
+    """A triangle that points along the end of the arc and touches the view's disc."""
+    x, y = arc[-1]
+    before = next((p for p in reversed(arc) if hypot(p[0] - x, p[1] - y) >= _STOP_PX + _ARROW_PX), arc[0])
+    heading = atan2(y - before[1], x - before[0])
+
+    def at(back: float, aside: float) -> Point:
+        return x - back * cos(heading) - aside * sin(heading), y - back * sin(heading) + aside * cos(heading)
+
+    tail = _STOP_PX + _ARROW_PX
+    return svg.path([at(_STOP_PX, 0), at(tail, _ARROW_PX / 2), at(tail, -_ARROW_PX / 2)], "arrow", close=True)
+
+
+def _label_spots(arcs: Sequence[Sequence[Point]], stops: Sequence[Point]) -> list[Point]:
+    """A spot for each arc's label, on it or else beside it, where it covers no view and no other label."""
+    taken = [*stops, CENTRE]
+    for arc in arcs:
+        wanted = [arc[round(share * (len(arc) - 1))] for share in _LABEL_SPOTS]
+        wanted += [_outwards(wanted[0], aside) for aside in _LABEL_ASIDE_PX]
+        taken.append(next((p for p in wanted if not any(_covers(p, other) for other in taken)), wanted[0]))
+    return taken[len(stops) + 1 :]
+
+
+def _outwards(point: Point, by: float) -> Point:
+    x, y = point[0] - CENTRE[0], point[1] - CENTRE[1]
+    stretch = 1 + by / hypot(x, y)
+    return CENTRE[0] + x * stretch, CENTRE[1] + y * stretch
+
+
+def _covers(a: Point, b: Point) -> bool:
+    return abs(a[0] - b[0]) < _LABEL_PX[0] and abs(a[1] - b[1]) < _LABEL_PX[1]
+
+
+def _list(turns: Sequence[Turn], scale: str) -> list[str]:
+    """The turns one below the other, each with the sums it was decided on."""
+    parts = [
+        svg.text(scale, (_LIST_X, 16), "small", anchor="start"),
+        svg.text("left is counter-clockwise", (_LIST_X, 31), "small", anchor="start"),
+    ]
+    for k, turn in enumerate(turns):
+        y = _LIST_TOP + _LIST_ROW * k
+        parts.append(svg.text(f"{k + 1} → {k + 2}", (_LIST_X, y), "small", anchor="start"))
+        parts.append(svg.text(turn.words, (_LIST_X + 44, y), "turn-name", anchor="start"))
+        if turn.s_left is None or turn.s_right is None:
+            why = short(" or ".join(turn.rivals), _NOTE_LETTERS) or "fixed"
+        else:
+            left, right = distinct(turn.s_left, turn.s_right)
+            why = f"S left {left}, right {right}"
+        parts.append(svg.text(why, (_LIST_X + 44, y + 15), "small", anchor="start"))
+    return parts

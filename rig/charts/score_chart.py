@@ -1,0 +1,162 @@
+"""Chart: how the candidates' scores went as views were added."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from math import ceil, floor, inf
+from typing import Final
+
+from rig.charts import svg
+from rig.charts.svg import Point
+
+_WIDTH: Final = 520.0
+_HEIGHT: Final = 290.0
+_LEFT, _TOP, _RIGHT, _BOTTOM = 44.0, 22.0, 340.0, 244.0
+_NAME_X: Final = _RIGHT + 34
+_LINE_HEIGHT: Final = 16.0
+_NAME_LETTERS: Final = 17
+_FAR: Final = 3.0
+"""A threshold further from the scores than so many times their span is off the scale."""
+_STEPS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+
+
+def score_chart(
+    rounds: Sequence[Mapping[str, float]],
+    *,
+    winner: str | None = None,
+    truth: str | None = None,
+    min_score: float | None = None,
+    top: int = 5,
+) -> str:
+    """Draw the scores per view of the leading candidates over the views; names stand at the ends of their lines.
+
+    Parameters
+    ----------
+    rounds
+        After each view the scores of the leading candidates, by name.
+    winner
+        The answer; its line is the heavy one.
+    truth
+        What stood on the table; its name is marked.
+    min_score
+        Below this score an object counts as unknown; drawn dashed, at the edge where it lies far off the scores.
+    top
+        So many candidates are drawn: the best of the last round.
+
+    Returns
+    -------
+    SVG markup. A line has a gap where its candidate was not among the leading ones.
+
+    Raises
+    ------
+    ValueError
+        There is no round, or one without candidates.
+    """
+    if not rounds or not all(rounds):
+        raise ValueError("a score chart needs at least one round, and a candidate in each")
+    names = sorted(rounds[-1], key=lambda name: -rounds[-1][name])[:top]
+    shown = [scores[name] for scores in rounds for name in names if name in scores]
+    ticks = _ticks(shown, min_score, rivals=len(names) > 1)
+    low, high = ticks[0], ticks[-1]
+
+    def at(view: int, score: float) -> Point:
+        share = view / (len(rounds) - 1) if len(rounds) > 1 else 0.5
+        return (
+            _LEFT + 14 + (_RIGHT - _LEFT - 28) * share,
+            _BOTTOM - (_BOTTOM - _TOP) * (score - low) / (high - low),
+        )
+
+    parts = [svg.text("score per view", (2, 11), "small", anchor="start")]
+    for tick in ticks:
+        y = at(0, tick)[1]
+        parts.append(svg.line((_LEFT, y), (_RIGHT, y), "grid"))
+        parts.append(
+            svg.text(
+                f"{tick:.3f}" if ticks[1] - low < 0.009 else f"{tick:.2f}", (_LEFT - 6, y + 4), "axis", anchor="end"
+            )
+        )
+    parts += [svg.text(str(v + 1), (at(v, low)[0], _BOTTOM + 18), "axis") for v in range(len(rounds))]
+    parts.append(svg.text("views taken", ((_LEFT + _RIGHT) / 2, _BOTTOM + 38), "small"))
+    if min_score is not None:
+        y = at(0, min(max(min_score, low), high))[1]
+        words = f"unknown below {round(min_score, 3):g}"
+        if min_score < low:
+            words += ", further down ↓"
+        elif min_score > high:
+            words += ", further up ↑"
+        parts.append(svg.line((_LEFT, y), (_RIGHT, y), "threshold"))
+        above = y - 5 if min_score <= high else y + 13
+        parts.append(svg.text(words, (_LEFT + 3, above), "threshold-label", anchor="start"))
+    for rank in reversed(range(len(names))):  # the best is drawn last, on top
+        parts.extend(_line(rounds, names[rank], _look(rank, names[rank] == winner), at))
+    parts.extend(_legend(rounds, names, winner, truth, at))
+    finals = ", ".join(f"{name} {rounds[-1][name]:.3f}" for name in names)
+    label = f"Scores per view of the leading candidates after {len(rounds)} views: {finals}"
+    return svg.drawing(_WIDTH, _HEIGHT, label, parts)
+
+
+def _ticks(values: Sequence[float], min_score: float | None, *, rivals: bool) -> list[float]:
+    """Round numbers that span ``values``, three to seven of them, and ``min_score`` too.
+
+    Not a threshold that is far off, though: it would press the lines of ``rivals``, which may differ in the third
+    decimal, into one.
+    """
+    low, high = min(values), max(values)
+    if min_score is not None:
+        reach = _FAR * (high - low) if rivals else inf
+        if low - reach <= min_score <= high + reach:
+            low, high = min(low, min_score), max(high, min_score)
+    for step in _STEPS:
+        first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
+        if last - first <= 6:
+            break
+    return [step * i for i in range(min(first, last - 2), last + 1)]
+
+
+def _look(rank: int, wins: bool) -> str:
+    return f"candidate c{rank}{' winner' if wins else ''}"
+
+
+def _line(rounds: Sequence[Mapping[str, float]], name: str, look: str, at: Callable[[int, float], Point]) -> list[str]:
+    points = [at(view, scores[name]) if name in scores else None for view, scores in enumerate(rounds)]
+    parts = [svg.line(a, b, look) for a, b in pairwise(points) if a and b]
+    for view, point in enumerate(points):
+        if point:
+            words = f"{name} after view {view + 1}: {rounds[view][name]:.3f}"
+            parts.append(svg.circle(point, 4 if "winner" in look else 3, f"{look} dot", svg.title(words)))
+    return parts
+
+
+def _legend(
+    rounds: Sequence[Mapping[str, float]],
+    names: Sequence[str],
+    winner: str | None,
+    truth: str | None,
+    at: Callable[[int, float], Point],
+) -> list[str]:
+    """Names and last scores beside the plot, best first, each tied to the end of its line."""
+    ends = [at(len(rounds) - 1, rounds[-1][name]) for name in names]
+    rows = _spread([y for _, y in ends])
+    parts = []
+    for rank, (name, end, y) in enumerate(zip(names, ends, rows, strict=True)):
+        look = _look(rank, name == winner)
+        parts.append(svg.path([(end[0] + 5, end[1]), (_RIGHT + 8, end[1]), (_NAME_X - 5, y)], f"{look} leader"))
+        short = name if len(name) <= _NAME_LETTERS else f"{name[: _NAME_LETTERS - 1]}…"
+        mark = " ●" if name == truth else ""
+        words = f"{rounds[-1][name]:.3f} {short}{mark}"
+        parts.append(
+            svg.element("g", svg.title(name), svg.text(words, (_NAME_X, y + 4), f"{look} name", anchor="start"))
+        )
+    if truth in names:
+        parts.append(svg.text("● on the table", (_NAME_X, _BOTTOM + 38), "small", anchor="start"))
+    return parts
+
+
+def _spread(wanted: Sequence[float]) -> list[float]:
+    """Rows from top to bottom, near the ``wanted`` (ascending) ones, a line apart, within the plot."""
+    rows: list[float] = []
+    for y in wanted:
+        rows.append(max(y, rows[-1] + _LINE_HEIGHT) if rows else max(y, _TOP))
+    for i in reversed(range(len(rows))):
+        limit = _BOTTOM if i == len(rows) - 1 else rows[i + 1] - _LINE_HEIGHT
+        rows[i] = min(rows[i], limit)
+    return rows

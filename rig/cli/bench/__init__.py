@@ -1,0 +1,1 @@
+"""Commands for the bench: setup, doctor, find, table, servo, configuration."""

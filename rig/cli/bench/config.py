@@ -1,0 +1,198 @@
+"""`rig config ...`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+from rig.core.errors import ConfigError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from pydantic import BaseModel
+
+    from rig.config import RigConfig
+    from rig.config.values import Values
+    from rig.config.wording import KeyResults
+
+app = typer.Typer(help="Look at the configuration, judge it, and change it.", no_args_is_help=True)
+
+
+@app.command("check")
+@command
+def check(settings: Settings) -> None:
+    """Find every mistake in the configuration at once; exit code 3 if there is one.
+
+    Example: rig config check --config rig.toml
+    """
+    from rig.config.wording import key_facts
+
+    values, config, _ = _checked(settings)
+    given = sum(values.origin(facts.key) != "default" for facts in key_facts(type(config)))
+    where = str(values.path) if values.path else "No file: every key has its default"
+    if settings.json:
+        settings.print_json({"path": values.path, "valid": True, "keys_given": given})
+    else:
+        print(f"{where}: no mistakes, {given} key{'s' if given != 1 else ''} given.")
+
+
+@app.command("show")
+@command
+def show(
+    settings: Settings,
+    wanted: Annotated[
+        list[str] | None, typer.Argument(metavar="[KEY]...", help="Keys or sections; all where none is given.")
+    ] = None,
+    changed: Annotated[bool, typer.Option("--changed", help="Only what differs from the defaults.")] = False,
+) -> None:
+    """Show every key as TOML: its value, where that comes from where it is no default, and what it is for.
+
+    Example: rig config show servo table.limits_deg
+    """
+    from rig.config.wording import setting_line
+
+    values, config, options = _checked(settings)
+    rows = []
+    for facts, value in _keys(config, options):
+        named = not wanted or any(facts.name == name or facts.name.startswith(f"{name}.") for name in wanted)
+        if named and not (changed and value == facts.default):
+            rows.append((facts, value, values.origin(facts.key)))
+    if wanted and not rows and not changed:
+        raise _unknown(wanted[0], [facts.name for facts, _ in _keys(config, options)])
+    if settings.json:
+        settings.print_json(
+            {
+                "path": values.path,
+                "keys": {
+                    facts.name: {
+                        "value": value,
+                        "origin": origin,
+                        "default": facts.default,
+                        "allowed": facts.allowed,
+                        "unit": facts.unit,
+                        "description": facts.description,
+                    }
+                    for facts, value, origin in rows
+                },
+            }
+        )
+        return
+    print(f"# {values.path or 'no file: the defaults'}")
+    section = None
+    for facts, value, origin in rows:
+        if facts.key[:-1] != section:
+            section = facts.key[:-1]
+            print(f"\n[{'.'.join(section)}]" if section else "")
+        print(setting_line(facts, value, "" if origin == "default" else origin))
+
+
+@app.command("path")
+@command
+def path(settings: Settings) -> None:
+    """Say which file is in force.
+
+    Example: rig config path
+    """
+    from rig.config.values import default_path, search_paths
+
+    found = settings.config or default_path()
+    if settings.json:
+        settings.print_json({"path": found, "searched": search_paths()})
+    elif found:
+        print(found)
+    else:
+        print(f"No file: the defaults are in force. Looked for: {', '.join(map(str, search_paths()))}")
+
+
+@app.command("init")
+@command
+def init(settings: Settings) -> None:
+    """Write a rig.toml with every key as a comment; an existing file is left alone.
+
+    Example: rig config init --config rig.toml
+    """
+    from rig.config import RigConfig
+    from rig.config.toml_file import save
+    from rig.config.values import FILE_NAME
+    from rig.config.wording import blank_file
+
+    target = settings.config or Path(FILE_NAME)
+    if target.exists():
+        raise ConfigError(
+            f"{target} exists already, and is left as it is.",
+            next_step="Change single values with `rig config set KEY VALUE`, or write another: --config FILE.",
+        )
+    save(target, blank_file(RigConfig))
+    if settings.json:
+        settings.print_json({"path": target})
+    else:
+        print(f"Wrote {target}: all keys with their defaults, as comments. Next: rig setup")
+
+
+@app.command("set", context_settings={"ignore_unknown_options": True})
+@command
+def set_(
+    settings: Settings,
+    key: Annotated[str, typer.Argument(metavar="KEY", help="Key with its section, e.g. servo.port.")],
+    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value, as in TOML; quotes may be left out.")],
+) -> None:
+    """Change one key in the file; comments and everything else in it stay.
+
+    Example: rig config set servo.port /dev/ttyUSB1
+    """
+    from rig.config import load_config
+    from rig.config.toml_file import changed_lines, read_text, save, with_values
+    from rig.config.values import FILE_NAME, default_path, parsed
+
+    target = settings.config or default_path() or Path(FILE_NAME)
+    old = read_text(target) if target.exists() else ""
+    if "." not in key and key != "default_bench":
+        raise UsageError(f"{key!r} has no section.", next_step="Write SECTION.KEY, e.g. rig config set servo.id 2.")
+    load_config(target if target.exists() else None, [*settings.overrides, f"{key}={value}"])
+    new = with_values(old, {tuple(key.split(".")): parsed(value)})
+    if new != old:
+        save(target, new)
+    if settings.json:
+        settings.print_json({"path": target, "key": key, "changed": changed_lines(old, new)})
+        return
+    print("\n".join([f"{target}:", *changed_lines(old, new)]) if new != old else f"{target}: it is so already.")
+
+
+def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseModel]]":
+    from rig.bench import check_config
+    from rig.config.values import read_values
+
+    values = read_values(settings.config, settings.overrides)
+    return values, *check_config(values)
+
+
+def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyResults, Any]]":
+    """Yield the facts and the value in force of every key, those of the benches that have options last."""
+    from rig.config.wording import key_facts
+
+    for facts in key_facts(type(config)):
+        if facts.key != ("bench",):
+            yield facts, _value(config, facts.key)
+    for name, model in options.items():
+        for facts in key_facts(type(model), ("bench", name)):
+            yield facts, _value(model, facts.key[2:])
+
+
+def _value(model: Any, key: tuple[str, ...]) -> Any:
+    for part in key:
+        model = getattr(model, part)
+    return model
+
+
+def _unknown(wanted: str, names: list[str]) -> ConfigError:
+    from difflib import get_close_matches
+
+    names += sorted({name.rpartition(".")[0] for name in names} - {""})
+    near = get_close_matches(wanted, names, n=1)
+    return ConfigError(
+        f"There is no key {wanted!r}.",
+        next_step=f"Did you mean {near[0]}?" if near else "`rig config show` lists all keys.",
+    )

@@ -1,0 +1,58 @@
+"""What `rig doctor`, `rig find` and `rig setup` share: the bench under examination, its findings, the progress."""
+
+import sys
+from contextlib import contextmanager
+from textwrap import wrap
+from typing import TYPE_CHECKING
+
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.console import Console
+
+    from rig.doctor.case import Case
+    from rig.doctor.finding import Finding
+
+_TOPIC_WIDTH = 12
+_INDENT = 2 + _TOPIC_WIDTH
+
+
+@contextmanager
+def case_of(settings: Settings, *, default: bool = False) -> "Iterator[Case]":
+    """Yield the bench that the common options mean; with ``default`` as if there were no configuration."""
+    from rig.config import RigConfig
+    from rig.doctor.case import open_case
+
+    config = RigConfig() if default else settings.load()
+    file_options = ("--config", str(settings.config)) if settings.config else ()
+    options = (*(("--bench", settings.bench) if settings.bench else ()), *file_options)
+    options += tuple(part for override in settings.overrides for part in ("--set", override))
+    name = settings.bench or config.default_bench
+    with open_case(name, config, seed=settings.seed, options=options, file_options=file_options) as case:
+        yield case
+
+
+def print_finding(screen: "Console", finding: "Finding") -> None:
+    """Print a finding: its mark, its topic, what was found, and below it the command that mends it."""
+    from rich.text import Text
+
+    from rig.doctor.finding import MARKS, Level
+
+    style = {Level.FINE: "green", Level.WARNING: "yellow", Level.BAD: "bold red"}[finding.level]
+    width = max(screen.width - _INDENT, 24) if screen.is_terminal else 10_000
+    first, *more = wrap(finding.text, width, break_on_hyphens=False) or [""]
+    screen.print(
+        Text.assemble((MARKS[finding.level], style), f" {finding.topic:{_TOPIC_WIDTH}s}{first}"), soft_wrap=True
+    )
+    for line in more:
+        screen.print(Text(" " * _INDENT + line), soft_wrap=True)
+    if finding.mend:
+        screen.print(Text(f"{' ' * _INDENT}→ {finding.mend}", "bold"), soft_wrap=True)
+
+
+def say(text: str) -> None:
+    """Tell who waits at a terminal what is going on; it is gone with the next line."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text[:78]}\r", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,48 @@
+"""`rig stop` and `rig acknowledge`."""
+
+from typing import Annotated
+
+import typer
+
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+
+
+@command
+def stop(settings: Settings) -> None:
+    """Stop the table and take its torque off, also while another program drives it; its plan ends, and may be resumed.
+
+    Example: rig stop --bench sim
+    """
+    from rig.core.clock import SystemClock
+    from rig.motion.stop_request import stop as stop_bench
+
+    done = stop_bench(settings.bench_name, settings.load(), SystemClock(), seed=settings.seed)
+    who = done.holder
+    if who is None:
+        words = f"No program held the bench; the torque was {'on, and is off now' if done.torque_was_on else 'off'}."
+    elif done.ended:
+        words = f"Process {who.pid} (`{who.command}`) has ended: the table is stopped, its torque off."
+    else:
+        words = f"Process {who.pid} (`{who.command}`) has stopped the table and its torque; it still holds the bench."
+    report = {"bench": settings.bench_name, "pid": who.pid if who else None, "ended": done.ended}
+    settings.say(words, {**report, "torque_was_on": done.torque_was_on})
+
+
+@command
+def acknowledge(
+    settings: Settings,
+    reboot: Annotated[
+        bool, typer.Option("--reboot", help="Restart the servo first: only that clears its own hardware errors.")
+    ] = False,
+) -> None:
+    """Acknowledge a latched fault: servo, supply, settings and angle are verified; while the cause is there it stays.
+
+    Example: rig acknowledge --reboot --bench sim
+    """
+    with settings.open_bench() as bench:
+        fault = bench.safety.fault
+        state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
+    words = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
+    report = {"acknowledged": fault.model_dump() if fault else None, "state": str(state), "doubt": doubt or None}
+    settings.say(f"{words}\nThe table is {state}{f': {doubt}' if doubt else ''}.", report)

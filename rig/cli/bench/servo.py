@@ -1,0 +1,176 @@
+"""`rig servo ...`."""
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.ui.ask import agreed
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.doctor.case import Case
+    from rig.doctor.lone_servo import LoneServo
+
+app = typer.Typer(help="Look at the servo's registers, and set it up.", no_args_is_help=True)
+
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+
+
+@app.command("info")
+@command
+def info(settings: Settings) -> None:
+    """Show every register of the servo on the bus, in words and units; reads only.
+
+    Example: rig servo info --bench sim
+    """
+    from rig.cli.bench.examination import case_of, say
+    from rig.doctor.lone_servo import lone_servo
+    from rig.doctor.register_words import words
+
+    with case_of(settings) as case, lone_servo(case, say) as servo:
+        values = servo.read()
+    if settings.json:
+        settings.print_json(
+            {
+                **_identity(servo),
+                "registers": {
+                    name: {
+                        "address": servo.table[name].address,
+                        "value": value,
+                        "meaning": words(servo.table, name, value),
+                        "kept_without_supply": servo.table[name].address < servo.table.ram_start,
+                    }
+                    for name, value in values.items()
+                },
+            }
+        )
+        return
+    say("")
+    print(servo.found)
+    kept = None
+    for name, value in values.items():
+        register = servo.table[name]
+        if (now := register.address < servo.table.ram_start) is not kept:
+            kept = now
+            print("\nkept without supply (EEPROM)" if kept else "\nlost without supply (RAM)")
+        print(f"  {register.address:3d}  {name:24s}{value:12d}  {words(servo.table, name, value)}".rstrip())
+
+
+@app.command("settings")
+@command
+def settings_(
+    settings: Settings,
+    write: Annotated[
+        bool, typer.Option("--write", help="Write what differs, with the torque off, and read it back.")
+    ] = False,
+    yes: YesOption = False,
+) -> None:
+    """Compare the servo's permanent settings (EEPROM) with what the rig needs; exit code 4 where they differ.
+
+    Example: rig servo settings --write --bench sim
+    """
+    from rig.cli.bench.examination import case_of, say
+    from rig.devices.dynamixel.settings import ServoMode, compare
+    from rig.devices.dynamixel.settings import write as write_settings
+    from rig.doctor.lone_servo import lone_servo
+
+    with case_of(settings) as case, lone_servo(case, say) as servo:
+        say("")
+        differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(case.config.table.mode))
+        if not settings.json:
+            print(servo.found)
+            print("\n".join(f"  {difference}" for difference in differences) or "  as the rig needs it")
+        written = bool(differences) and write and (yes or settings.json or agreed("Write these settings?"))
+        if written:
+            write_settings(servo.bus, servo.found.bus_id, servo.table, differences)
+    if settings.json:
+        rows = [{"register": d.register, "found": d.found, "wanted": d.wanted, "reason": d.reason} for d in differences]
+        settings.print_json({**_identity(servo), "differences": rows, "written": written})
+    elif written:
+        print("Written, and read back.")
+    elif differences:
+        print(f"To write them: {case.rig('servo settings --write')}")
+    if differences and not written:
+        raise typer.Exit(4)
+
+
+@app.command("set-id")
+@command
+def set_id(
+    settings: Settings,
+    new: Annotated[int, typer.Argument(metavar="ID", min=0, max=252, help="New id.")],
+    yes: YesOption = False,
+) -> None:
+    """Give the only servo on the bus another id, with its torque off, and verify it; rig.toml follows.
+
+    Example: rig servo set-id 2 --bench sim --yes
+    """
+    _change(settings, "id", new, yes)
+
+
+@app.command("set-baud")
+@command
+def set_baud(
+    settings: Settings,
+    rate: Annotated[int, typer.Argument(metavar="RATE", min=1, help="New baud rate, e.g. 1000000.")],
+    yes: YesOption = False,
+) -> None:
+    """Give the only servo on the bus another baud rate, with its torque off, and verify it; rig.toml follows.
+
+    Example: rig servo set-baud 1000000 --bench sim --yes
+    """
+    _change(settings, "baud", rate, yes)
+
+
+def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
+    from rig.cli.bench.examination import case_of, say
+    from rig.doctor.lone_servo import lone_servo
+
+    with case_of(settings) as case, lone_servo(case, say) as servo:
+        say("")
+        old = servo.found.bus_id if what == "id" else servo.found.baud
+        if not settings.json:
+            print(servo.found)
+        if old != new:
+            if not (yes or settings.json or agreed(f"Change its {what} from {old} to {new}, with its torque off?")):
+                print("Nothing was changed.")
+                return
+            if what == "id":
+                servo.set_id(new)
+            else:
+                servo.set_baud(new)
+    followed = _follow(settings, case, what, old, new)
+    if settings.json:
+        settings.print_json({**_identity(servo), what: new, "was": old, "config_changed": followed or None})
+        return
+    print(f"It has {what} {new} already." if old == new else f"Its {what} is {new} now, verified.")
+    if followed:
+        print(f"{followed}: servo.{what} = {new}")
+    elif getattr(case.config.servo, what) != new:
+        print(f"For the rig to find it: {case.set(f'servo.{what}', new)}")
+
+
+def _follow(settings: Settings, case: "Case", what: str, old: int, new: int) -> str:
+    """Let the configuration file say what the servo says now, where it said what the servo said before."""
+    from rig.config.toml_file import read_text, save, with_values
+    from rig.config.values import default_path
+
+    path = settings.config or default_path()
+    configured = getattr(case.config.servo, what)
+    if path is None or not path.exists() or configured != old or configured == new:
+        return ""
+    save(path, with_values(read_text(path), {("servo", what): new}))
+    return str(path)
+
+
+def _identity(servo: "LoneServo") -> dict[str, Any]:
+    found = servo.found
+    return {
+        "model": found.model,
+        "model_number": found.model_number,
+        "firmware": found.firmware,
+        "id": found.bus_id,
+        "baud": found.baud,
+        "protocol": found.protocol,
+    }

@@ -1,0 +1,1 @@
+"""Commands for objects: enroll, identify, evaluate, runs."""

@@ -1,0 +1,268 @@
+"""`rig enroll`."""
+
+import os
+import shlex
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.ui.command import command
+from rig.cli.ui.complete import object_names
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.bench import Bench
+    from rig.catalog import Catalog
+    from rig.events.events import Event
+    from rig.report import EnrollmentRecord
+
+
+@command
+def enroll(
+    settings: Settings,
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME", help="Name of the object that stands on the table.", autocompletion=object_names
+        ),
+    ] = None,
+    views: Annotated[int | None, typer.Option(min=4, max=720, help="Views in a turn; enroll.views otherwise.")] = None,
+    step: Annotated[
+        float | None, typer.Option(min=0.5, max=90, metavar="DEGREES", help="Angle between two views, instead.")
+    ] = None,
+    label: Annotated[list[str] | None, typer.Option(help="A label, to sort and filter by. Repeatable.")] = None,
+    note: Annotated[str | None, typer.Option(help="A remark.")] = None,
+    tray: Annotated[
+        Path | None,
+        typer.Option("--list", metavar="FILE", help="Enroll all objects of a CSV file: name, label, note, views."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Take the missing views of an interrupted enrollment.")
+    ] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Enroll anew; the old views stay in use until the new ones are complete.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what would be done, how long it takes and where the table goes.")
+    ] = False,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a page with all views and what was measured.")
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask for an empty table: go on with its picture, or without.")
+    ] = False,
+) -> None:
+    """Enroll an object: one turn of the table, a checked view at every step.
+
+    Once a day the table is to be left empty first, for the picture that objects are found by (rig empty-table).
+    p or the space bar pauses and goes on, Ctrl+Z too; Ctrl+C stops and keeps the views.
+
+    Example: rig enroll mug-white --bench sim --views 36 --report mug.html
+
+    Example: rig enroll --list tray.csv --bench sim
+    """
+    from rig.plans.tray import read_tray
+
+    views = _views(views, step)
+    _check(name, tray, label=label, note=note, resume=resume, replace=replace)
+    if report is not None:
+        _check_folder(report)
+    items = read_tray(tray) if tray else ()
+    labels = ", ".join(label) if label else None
+    if dry_run:
+        _dry_run(settings, [name] if name else [item.name for item in items], views, resume=resume, replace=replace)
+        return
+
+    def again(rerun: str) -> list[str]:
+        words = ["rig", "enroll", *([name, "--resume"] if name else ["--list", str(tray)]), *settings.arguments()]
+        return [f"The views taken so far are kept. {rerun}", f"  {shlex.join(words)}"]
+
+    with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
+        from rig.bench import ObjectStandsThere
+        from rig.cli.catalog.catalog import tell_other_regions
+        from rig.cli.objects.empty_table import see_to_empty_table
+        from rig.cli.ui.operator_prompts import Person
+        from rig.plans.enroll import enroll as enroll_one
+        from rig.plans.tray import Hands, enroll_tray
+
+        tell_other_regions(settings, catalog, bench)
+        see_to_empty_table(settings, bench, ask=not yes, then=name)
+        job = _Job(settings, bench, catalog)
+        if name is not None:
+            events = enroll_one(
+                bench, catalog, name, views=views, label=labels, note=note, resume=resume, replace=replace
+            )
+            job.run(events, lambda: again("Go on with:"), report)
+        else:
+            person = isinstance(bench.operator, ObjectStandsThere)
+            attendant = Person(job.quiet) if person else Hands()
+            job.run(
+                enroll_tray(bench, catalog, items, views=views, attendant=attendant),
+                lambda: again("The same command goes on with the others:"),
+                report,
+            )
+            job.sum_up(len(items))
+
+
+class _Job:
+    """Runs the plan of one or more enrollments, shows it, and writes the report."""
+
+    def __init__(self, settings: Settings, bench: "Bench", catalog: "Catalog") -> None:
+        from rig.cli.ui.live import EnrollView
+        from rig.cli.ui.present import console
+
+        self._settings = settings
+        self._bench = bench
+        self._catalog = catalog
+        self._screen = console(stderr=settings.json)
+        self._view: EnrollView | None = None
+        self._heading = ""
+        self._records: list[EnrollmentRecord] = []
+        self._kept = 0
+        self._done = 0
+
+    def quiet(self) -> None:
+        """Take the live table off the screen."""
+        if self._view is not None:
+            self._view.__exit__(None, None, None)
+            self._view = None
+
+    def run(self, events: Any, how_on: Callable[[], list[str]], report: Path | None) -> None:
+        from rig.events.events import Enrolled, Item
+        from rig.plans.similar_objects import insight
+
+        try:
+            for event in events:
+                if isinstance(event, Item):
+                    self.quiet()
+                    self._heading = f"{event.number} of {event.of} "
+                if isinstance(event, Enrolled):  # it is in the catalog; that stays the last word about it
+                    self._tell(insight(self._catalog.views().views, event.name))
+                self._tell(event)
+                if isinstance(event, Enrolled):
+                    self._done += 1
+                    self._complete()
+                    self._kept = 0
+        except BaseException:
+            self.quiet()
+            if self._kept or self._done:
+                print("\n".join(how_on()), file=sys.stderr)
+            raise
+        finally:
+            events.close()
+            self.quiet()
+            if report is not None and self._records:
+                self._write(report)
+
+    def sum_up(self, items: int) -> None:
+        if not self._settings.json:
+            print(f"{self._done} enrolled now; {items} in the list.", file=sys.stderr)
+
+    def _tell(self, event: "Event") -> None:
+        from rig.cli.ui.live import EnrollView
+        from rig.events.events import Accepted, Started, event_dict
+        from rig.report import EnrollmentRecord
+
+        if self._settings.json:
+            self._settings.print_json(event_dict(event))
+        if isinstance(event, Started):
+            self.quiet()
+            self._records.append(EnrollmentRecord(region=self._bench.config.view.roi))
+        if self._view is None:
+            self._view = EnrollView(self._screen, self._bench.config, self._heading)
+            self._view.__enter__()
+        self._kept += isinstance(event, Accepted)
+        if self._records:
+            self._records[-1].add(event)
+        # people's lines would be the same as the JSON, once more, where neither is looked at
+        if not self._settings.json or self._screen.is_terminal:
+            self._view.add(event)
+
+    def _complete(self) -> None:
+        """Put the views of earlier sittings into the record of a resumed enrollment."""
+        record = self._records[-1]
+        stored = self._catalog.object(record.name).views
+        if len(stored) > len(record.views):
+            record.complete((view.record, self._catalog.read_image(view)) for view in stored)
+
+    def _write(self, path: Path) -> None:
+        from rig.events.wording import counted
+        from rig.report import Meta, render_report, write_report
+
+        names = ", ".join(record.name for record in self._records[:3])
+        title = names if len(self._records) <= 3 else counted(len(self._records), "object")
+        meta = Meta(conditions=self._records[-1].conditions, wall_clock={"date": f"{self._bench.clock.utc():%Y-%m-%d}"})
+        write_report(path, render_report(f"Enrolled: {title}", "", self._records, [], meta=meta))
+        print(f"Report: {path}", file=sys.stderr)
+
+
+def _views(views: int | None, step: float | None) -> int | None:
+    from rig.core.errors import UsageError
+
+    if step is None:
+        return views
+    if views is not None:
+        raise UsageError("Both --views and --step say how many views there are.", next_step="Give one of them.")
+    count = round(360.0 / step)
+    if abs(count * step - 360.0) > 1e-6:
+        raise UsageError(
+            f"Steps of {step:g}° do not divide a turn evenly.",
+            next_step=f"Give --views {count}, which are {360.0 / count:.2f}° apart, or a step that divides 360.",
+        )
+    return count
+
+
+def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, **texts: Any) -> None:
+    from rig.core.errors import UsageError
+
+    if (name is None) == (tray is None):
+        raise UsageError(
+            "There is no object to enroll." if name is None else f"Both {name!r} and a list are to be enrolled.",
+            next_step="Give the name of the object, or a list of objects with --list FILE.",
+        )
+    given = [f"--{key}" for key, value in {**texts, "resume": resume, "replace": replace}.items() if value]
+    if tray is not None and given:
+        raise UsageError(
+            f"{', '.join(given)} cannot be used with a list.",
+            next_step="Labels and notes are columns of the list, and it resumes by itself; "
+            "enroll single objects anew with rig enroll NAME --replace.",
+        )
+
+
+def _check_folder(report: Path) -> None:
+    """Refuse a page that could not be written, before the hours that it is to tell of."""
+    from rig.core.errors import UsageError
+
+    reason = "it is a folder" if report.is_dir() else ""
+    try:
+        report.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+    if not reason and not os.access(report.parent, os.W_OK):
+        reason = "its folder may not be written to"
+    if reason:
+        raise UsageError(
+            f"The report cannot be written to {report}.",
+            next_step="Name another file with --report.",
+            evidence={"reason": reason},
+        )
+
+
+def _dry_run(settings: Settings, names: list[str], views: int | None, *, resume: bool, replace: bool) -> None:
+    """Print what an enrollment would do; moves nothing and stores nothing."""
+    from rig.cli.ui.present import console, dry_run_lines
+    from rig.events.events import plain
+    from rig.plans.estimate import dry_run
+
+    with settings.open_bench() as bench, settings.catalog_there() or nullcontext() as catalog:
+        found = dry_run(bench, catalog, names, views=views, resume=resume, replace=replace)
+    if settings.json:
+        settings.print_json({"rehearsal": plain(found)})
+        return
+    screen = console()
+    for line in dry_run_lines(found):
+        screen.print(line, markup=False, highlight=False, soft_wrap=not screen.is_terminal)

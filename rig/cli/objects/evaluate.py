@@ -1,0 +1,284 @@
+"""`rig eval`."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.ui.command import EXIT_INTERRUPTED, command
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from hbr.evaluation.datasets import Dataset
+    from rig.evaluation.plan import Plan
+
+#: How often other objects are left out.
+_DRAWS = 5
+
+
+@command
+def evaluate(
+    settings: Settings,
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FOLDER]", help="Images obj{N}__{angle}.png or .jpg; the catalog where none is named."),
+    ] = None,
+    noise: Annotated[
+        str, typer.Option(help="Noise of the queries: none, gn, gn:VARIANCE, mb, mb:PIXELS:DEGREES, gn+mb.")
+    ] = "none",
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            help="Methods or groups, separated by commas: all (the paper), beyond (the dense filter "
+            "and its baselines), omega-sweep, list-sweep. all for CEDD, beyond for other descriptors."
+        ),
+    ] = None,
+    descriptor: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="What views are described by: cedd, edges+colours, ...; see hbr.descriptors."
+        ),
+    ] = "cedd",
+    perturb: Annotated[
+        str,
+        typer.Option(help="What else differs for queries, as KIND:STRENGTH joined by +: shift:2+gain:1, all:3."),
+    ] = "none",
+    enrolled: Annotated[
+        int | None, typer.Option(min=1, metavar="VIEWS", help="Enroll so many views of each object, query the others.")
+    ] = None,
+    trials: Annotated[int, typer.Option(min=1, help="Trials of each object.")] = 10,
+    views: Annotated[int, typer.Option(min=1, help="Queries of a trial.")] = 8,
+    removal: Annotated[
+        str | None,
+        typer.Option(
+            help="Views taken out of the model: near (closer than 10° to a query), paper79, queries. near; queries "
+            "with --enrolled."
+        ),
+    ] = None,
+    size: Annotated[int | None, typer.Option(min=2, metavar="PIXELS", help="Longer side of all images.")] = None,
+    orientation_noise: Annotated[
+        float, typer.Option(min=0, metavar="DEGREES", help="Standard deviation of each measured orientation.")
+    ] = 2.0,
+    drift: Annotated[
+        float, typer.Option(metavar="DEGREES", help="What the measured orientation gains with each view.")
+    ] = 0.0,
+    rotate: Annotated[
+        float, typer.Option(min=0, max=180, metavar="DEGREES", help="Turn queries in their plane, by up to so much.")
+    ] = 0.0,
+    background: Annotated[
+        str, typer.Option(help="Behind a query's object: same, uniform, textured; bench, other-bench (drawn benches).")
+    ] = "same",
+    reference: Annotated[
+        str,
+        typer.Option(
+            help="Picture of the empty table for queries on a bench: own, enrollment (of the bench enrolled on), none "
+            "(nor for enrolled views)."
+        ),
+    ] = "own",
+    enrolled_noise: Annotated[
+        str, typer.Option(metavar="NOISE", help="Describe enrolled views under noise, too; as for --noise.")
+    ] = "none",
+    prefilter: Annotated[
+        float, typer.Option(min=0, metavar="PIXELS", help="Blur all images by a Gaussian of this standard deviation.")
+    ] = 0.0,
+    matrix: Annotated[
+        bool,
+        typer.Option(
+            "--matrix",
+            help="One perturbation at a time, each at three strengths, by the dense filter and a sweep of 90°; needs "
+            "--enrolled.",
+        ),
+    ] = False,
+    leave_out: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="OBJECTS",
+            help="Leave so many objects out, five times, and look for them, too: false accepts and false rejects.",
+        ),
+    ] = None,
+    objects: Annotated[
+        str | None, typer.Option(metavar="FIRST-LAST", help="These objects alone, counted from 1; e.g. 51-100.")
+    ] = None,
+    report: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FIRST-LAST", help="Results of these objects alone, among all; with --resume of old runs."
+        ),
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option(min=0, help="Lead a view that ends a search; identify.margin otherwise.")
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; one for each core otherwise.")] = None,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the results are written.")] = Path("rig-eval"),
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with what the folder has.")] = False,
+) -> None:
+    """Measure retrieval on a folder of photographs in the layout of COIL-100, or on the catalog.
+
+    Example: rig eval coil-100 --noise mb --methods all --trials 10
+    """
+    from hbr.descriptors import PAPERS
+    from hbr.evaluation.condition import Condition
+    from hbr.evaluation.methods import choose_methods
+    from hbr.evaluation.noise import Noise
+    from hbr.evaluation.perturb import Perturbations
+    from hbr.evaluation.protocol import Protocol
+    from rig.cli.ui.present import Progress
+    from rig.core.errors import UsageError
+    from rig.evaluation.plan import Plan
+    from rig.evaluation.report import contest_sentences, curve_rows, decision_rows
+    from rig.evaluation.run import enrolled_views, run_plan
+    from rig.evaluation.store import Store
+    from rig.evaluation.write import write_results
+
+    jobs = jobs or os.cpu_count() or 1
+    try:
+        plan = Plan.of(
+            _dataset(settings, folder, objects),
+            Condition(
+                size,
+                Noise.parse(noise),
+                rotate,
+                background,  # type: ignore[arg-type]
+                prefilter,
+                Perturbations.parse(perturb),
+                descriptor,
+                reference,  # type: ignore[arg-type]
+                Noise.parse(enrolled_noise),
+            ),
+            choose_methods((methods or ("all" if descriptor in PAPERS else "beyond")).split(",")),
+            Protocol(
+                trials,
+                views,
+                removal or ("queries" if enrolled else "near"),  # type: ignore[arg-type]
+                10.0,
+                orientation_noise,
+                drift,
+                settings.seed or 0,
+                enrolled,
+            ),
+        )
+        dataset = plan.dataset
+        reported = None if report is None else _range(report)
+        if reported is not None:
+            dataset.subset(*reported)  # refuses what is not there
+        note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
+        print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
+        if leave_out is not None:
+            _strangers(settings, plan, leave_out, jobs, out)
+            return
+        if matrix:
+            _matrix(settings, plan, jobs, out)
+            return
+        store = Store(out / "runs", plan.settings(), resume=resume)
+
+        def tell(progress: Progress, event: str) -> Callable[[str], None]:
+            progress.start(len(dataset.objects))
+
+            def advance(name: str) -> None:
+                progress.advance()
+                if settings.json:
+                    settings.print_json({"event": event, "object": name})
+
+            return advance
+
+        with Progress("describing") as progress:
+            model = enrolled_views(plan, jobs, tell(progress, "described"))
+        with Progress("searching") as progress:
+            runs = run_plan(plan, model, store, jobs, tell(progress, "searched"))
+    except ValueError as error:
+        raise UsageError(
+            str(error), next_step="Correct the options or the data set and go on; --resume keeps what is done."
+        ) from error
+    except KeyboardInterrupt:
+        print(
+            f"\nInterrupted; what is done is kept in {out}. Go on with the same command and --resume.", file=sys.stderr
+        )
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+    rule = settings.load().identify
+    results = write_results(plan, runs, rule.margin if margin is None else margin, rule.min_views, out, reported)
+    if settings.json:
+        settings.print_json({"event": "finished", **results})
+        return
+    from rich.console import Console
+
+    console = Console()
+    console.print(curve_rows(results).terminal())
+    console.print()
+    console.print(decision_rows(results).terminal())
+    console.print()
+    for sentence in contest_sentences(results):
+        console.print(sentence, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+    print(f"Written: {out / 'report.html'}, results.json, results.csv and the figures beside it.", file=sys.stderr)
+
+
+def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
+    from rich.console import Console
+
+    from rig.cli.ui.present import Progress
+    from rig.evaluation.matrix import matrix_rows, run_matrix
+    from rig.evaluation.write import write_json
+
+    if plan.protocol.enrolled is None:
+        raise ValueError("--matrix takes its queries from the views that are not enrolled; give --enrolled 18 or fewer")
+    with Progress("enrolling, searching") as progress:
+        progress.start(2 * len(plan.dataset.objects))
+
+        def advance(_name: str) -> None:
+            progress.advance()
+
+        results = run_matrix(plan, jobs, advance)
+    write_json(results, out / "matrix.json")
+    if settings.json:
+        settings.print_json({"event": "finished", **results})
+        return
+    Console().print(matrix_rows(results).terminal())
+    print(f"Written: {out / 'matrix.json'}, with Wilson's intervals.", file=sys.stderr)
+
+
+def _strangers(settings: Settings, plan: "Plan", count: int, jobs: int, out: Path) -> None:
+    from rich.console import Console
+
+    from rig.cli.ui.present import Progress
+    from rig.evaluation.run import enrolled_views
+    from rig.evaluation.unknown_objects import run_strangers, stranger_rows
+    from rig.evaluation.write import write_json
+
+    with Progress("enrolling, searching") as progress:
+        progress.start(2 * len(plan.dataset.objects))
+
+        def advance(_name: str) -> None:
+            progress.advance()
+
+        results = run_strangers(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
+    write_json(results, out / "strangers.json")
+    if settings.json:
+        settings.print_json({"event": "finished", **results})
+        return
+    Console().print(stranger_rows(results).terminal())
+    print(f"Written: {out / 'strangers.json'}, with Wilson's intervals.", file=sys.stderr)
+
+
+def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "Dataset":
+    from hbr.evaluation.datasets import load_coil
+    from rig.evaluation.plan import load_catalog
+
+    if folder is None:
+        with settings.open_catalog(read_only=True) as catalog:
+            dataset = load_catalog(catalog, settings.load().view.roi)
+    else:
+        dataset = load_coil(folder)
+    if objects is None:
+        return dataset
+    return dataset.subset(*_range(objects))
+
+
+def _range(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("-")
+    if not (first.isdecimal() and last.isdecimal()):
+        raise ValueError(f"objects {text!r} is no range; give the first and the last, e.g. 51-100")
+    return int(first), int(last)

@@ -1,0 +1,110 @@
+"""`rig replay` and `rig report`: what `rig identify --save-run` has kept."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.search.saved_run import SavedRun
+
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")]
+SHOWN = 20
+
+
+@command
+def replay(
+    settings: Settings,
+    run: RunArgument,
+    check: Annotated[
+        bool, typer.Option("--check", help="Compute every decision again from the frames; exit code 6 if one differs.")
+    ] = False,
+) -> None:
+    """Walk through a saved run: what was seen, thought and decided.
+
+    Example: rig replay runs/1 --check
+    """
+    from rig.search.saved_run import load_run
+
+    saved = load_run(run)
+    if check:
+        _check(settings, saved)
+        return
+    from rig.cli.ui.live import IdentifyView
+    from rig.cli.ui.present import console
+    from rig.events.events import event_dict
+
+    if settings.json:
+        for event in saved.events():
+            settings.print_json(event_dict(event))
+        return
+    about = saved.about
+    print(f"{about['bench']}, {about['started_utc']}, {len(saved.views.object_names)} objects enrolled")
+    with IdentifyView(console(plain=True)) as view:
+        for event in saved.events():
+            view.show(event)
+    if saved.error:
+        print(f"Error {saved.error['code']} ({saved.error['error']}): {saved.error['what']}")
+
+
+@command
+def report(
+    settings: Settings,
+    run: RunArgument,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Where the page is written; report.html in the run otherwise.")
+    ] = None,
+) -> None:
+    """Write a page about a saved run: the camera's way, the candidates' scores, the frames and decisions.
+
+    Example: rig report runs/1 --out run-1.html
+    """
+    from rig.events.wording import answer_words
+    from rig.report import IdentificationRecord, Meta, render_report, write_report
+    from rig.search.saved_run import load_run
+
+    saved = load_run(run)
+    record = IdentificationRecord(region=saved.config.view.roi)
+    for event in saved.events():
+        record.add(event)
+    answer = record.answer
+    found = "no answer" if answer is None else answer.name or "unknown"
+    summary = answer_words(answer) if answer else "The search ended before an answer."
+    about = saved.about
+    meta = Meta(
+        conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
+        wall_clock={"date": about["started_utc"], "software": about["software"]},
+    )
+    path = out or run / "report.html"
+    write_report(path, render_report(f"Search: {found}", summary, [], [record], meta=meta))
+    if settings.json:
+        settings.print_json({"report": str(path)})
+    else:
+        print(f"Report: {path}")
+
+
+def _check(settings: Settings, saved: "SavedRun") -> None:
+    from rig.core.errors import ReplayMismatch
+    from rig.events.events import plain
+    from rig.events.wording import counted
+    from rig.search.replay import check
+
+    found = check(saved)
+    words = f"{counted(found.views, 'view')} described and {counted(found.decisions, 'decision')} made again"
+    if found.differences:
+        more = len(found.differences) - SHOWN
+        listed = [str(difference) for difference in found.differences[:SHOWN]]
+        raise ReplayMismatch(
+            f"{words}: {counted(len(found.differences), 'number')} came out otherwise.",
+            next_step="The frames or events were changed, or this program decides otherwise than "
+            f"{saved.about['software']}, which saved them.",
+            evidence={"differences": [*listed, f"and {more} more"] if more > 0 else listed},
+        )
+    if settings.json:
+        settings.print_json(plain(found))
+    else:
+        print(f"{words}: all as saved.", file=sys.stdout)

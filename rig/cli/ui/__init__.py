@@ -1,0 +1,1 @@
+"""What the commands share: options, live display, questions, progress."""

@@ -1,0 +1,38 @@
+"""What the shell offers on Tab; reads no more than it must, and says nothing where something is wrong."""
+
+from contextlib import closing, suppress
+from importlib.metadata import entry_points
+
+import typer
+
+
+def object_names(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Return the names of the enrolled objects that begin with what was typed."""
+    import sqlite3
+
+    from rig.cli.ui.settings import Settings
+
+    # a line that is being typed may hold anything: an unknown bench, a file that is no configuration
+    with suppress(Exception):
+        given = {**(ctx.parent.params if ctx.parent else {}), **ctx.params}
+        settings = Settings().merged(given.get("bench"), given.get("config"), given.get("overrides"), None, False)
+        path = settings.load().catalog_path(settings.bench_name) / "catalog.sqlite"
+        # sqlite3 itself: SQLAlchemy takes longer to import than a person waits for a name
+        with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=0.2)) as database:
+            rows = database.execute(
+                "SELECT name FROM objects WHERE substr(name, 1, ?) = ? AND deleted_utc IS NULL ORDER BY name",
+                (len(incomplete), incomplete),
+            )
+            return [str(name) for (name,) in rows]
+    return []
+
+
+def bench_names(incomplete: str) -> list[str]:
+    """Return the names of the installed benches."""
+    return sorted(point.name for point in entry_points(group="rig.benches") if point.name.startswith(incomplete))
+
+
+def strategy_names(incomplete: str) -> list[str]:
+    """Return the names of the strategies of a search."""
+    plugged = [point.name for point in entry_points(group="rig.strategies")]
+    return [name for name in ("dense", "ahbr", "hbr", "sweep", "random", *plugged) if name.startswith(incomplete)]

@@ -1,0 +1,92 @@
+"""Long jobs of the catalog on a terminal, and the questions before what cannot be undone."""
+
+import sys
+from collections.abc import Generator, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import typer
+
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.catalog.jobs import Progressed
+
+_T = TypeVar("_T")
+
+
+def run_job(title: str, job: "Generator[Progressed, None, _T]", *, interrupted: str) -> _T:
+    """Carry a job out with a bar on stderr and return its result; ``interrupted`` is what Ctrl+C leaves behind."""
+    from rig.cli.ui.present import Progress
+
+    try:
+        with Progress(title) as progress:
+            while True:
+                try:
+                    at = next(job)
+                except StopIteration as end:
+                    result: _T = end.value
+                    return result
+                if not at.done:
+                    progress.start(at.total)
+                progress.at(at.done)
+    except KeyboardInterrupt:
+        print(interrupted, file=sys.stderr)
+        raise
+    finally:
+        job.close()
+
+
+def somebody_there() -> bool:
+    """Tell whether a person can answer."""
+    return sys.stdin.isatty()
+
+
+def confirm(question: str, *, yes: bool, settings: Settings) -> None:
+    """Ask before a deletion; without a person at the terminal ``--yes`` is the answer, or nothing is done."""
+    from rig.core.errors import UsageError
+
+    if yes:
+        return
+    if settings.json or not somebody_there():
+        raise UsageError(f"{question} Nobody is there to answer.", next_step="give --yes if you mean it")
+    if not typer.confirm(question, err=True):
+        print("Nothing was changed.", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
+    """Print a table as wide as the terminal has it; into a pipe in full, a line a row."""
+    from rich.console import Console
+    from rich.measure import Measurement
+    from rich.table import Table
+
+    from rig.cli.ui.present import console
+
+    table: Table = Table(box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(_plain(cell) for cell in row))
+    screen: Console = console()
+    if screen.is_terminal:
+        screen.print(table)
+        return
+    screen.width = max(screen.width, Measurement.get(screen, screen.options.update(width=10_000), table).maximum)
+    with screen.capture() as lines:
+        screen.print(table)
+    print("\n".join(line.rstrip() for line in lines.get().splitlines()), flush=True)
+
+
+def size_words(size: float) -> str:
+    """Write a number of bytes as people read it."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if size < 1000 or unit == "GB":
+            return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
+        size /= 1000
+    raise AssertionError
+
+
+def _plain(cell: Any) -> Any:
+    from rich.text import Text
+
+    return Text(str(cell))  # names may hold what rich takes for markup

@@ -1,0 +1,378 @@
+"""What a person watches while a plan runs: tables that grow on a terminal, a line for each view in a pipe."""
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Self
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from rig.cli.ui.keys import HINT, Pause
+from rig.cli.ui.present import line
+from rig.config import RigConfig
+from rig.events.events import (
+    Accepted,
+    Candidate,
+    Decided,
+    Enrolled,
+    Event,
+    Identified,
+    Insight,
+    Moved,
+    Ranked,
+    Rejected,
+    Started,
+)
+from rig.events.wording import (
+    azimuth_words,
+    counted,
+    decision_words,
+    duration_words,
+    insight_words,
+    move_words,
+    odds_words,
+    signed,
+)
+from rig.motion.motion_model import MotionModel
+from rig.plans.estimate import TimeLeft
+from rig.views.capture import ViewEvidence
+
+ROWS: Final = 12
+"""Views that the table shows at once."""
+WIDE, NARROW = 84, 60
+"""Columns that a terminal needs for all of a table, and for most of it."""
+
+
+class LiveView(AbstractContextManager["LiveView"]):
+    """Shows the events of a plan while it runs, and lets it pause; use it in a ``with`` block.
+
+    Parameters
+    ----------
+    console
+        Where; what is no terminal gets plain lines.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live: Live | None = None
+        self._pause = Pause(keys=console.is_terminal)
+
+    def __enter__(self) -> Self:
+        self._pause.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop()
+        self._pause.__exit__(kind, error, trace)
+
+    def add(self, event: Event) -> None:
+        """Take the next event; returns when the plan may go on."""
+        if self.show(event):
+            self._pause.point(self.note)
+
+    def show(self, event: Event) -> bool:
+        """Show an event; whether the plan may rest after it."""
+        raise NotImplementedError
+
+    def note(self, text: str) -> None:
+        """Show a line that stays."""
+        if text:
+            self._console.print(text, markup=False, highlight=False, soft_wrap=not self._console.is_terminal)
+
+    def render(self) -> RenderableType:
+        """Return what is on the screen now."""
+        raise NotImplementedError
+
+    def _start(self) -> None:
+        if self._console.is_terminal and self._live is None:
+            self._live = Live(
+                console=self._console, get_renderable=self.render, refresh_per_second=8, redirect_stderr=False
+            )
+            self._live.start()
+
+    def _stop(self) -> None:
+        """Leave the last picture on the screen; what is told from now on stands below it."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    @property
+    def _hint(self) -> str:
+        stop = "Ctrl+C stops"
+        return f"{HINT}, {stop}" if self._pause.listens else stop
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """A frame as the table shows it."""
+
+    number: int
+    asked_deg: float | None
+    encoder_deg: float | None
+    imu_deg: float | None
+    sigma_deg: float | None
+    evidence: ViewEvidence
+    verdict: str
+    accepted: bool
+
+
+class EnrollView(LiveView):
+    """The table of an enrollment: angle asked, encoder, IMU, sharpness, exposure, and whether the view was taken.
+
+    Parameters
+    ----------
+    console
+        Where.
+    config
+        Of the bench, for the time that is left.
+    heading
+        Before the object's name, such as "3 of 25".
+    """
+
+    def __init__(self, console: Console, config: RigConfig, heading: str = "") -> None:
+        super().__init__(console)
+        self._model = MotionModel(config)
+        self._heading = heading
+        self._name = ""
+        self._of = 0
+        self._taken = 0
+        self._rows: list[_Row] = []
+        self._move: Moved | None = None
+        self._left: TimeLeft | None = None
+        self._findings: list[str] = []
+        self._ended = False
+
+    def show(self, event: Event) -> bool:
+        if self._left is not None:
+            self._left.add(event)
+        match event:
+            case Started():
+                self._name, self._of = event.name or "", event.views
+                self._left = TimeLeft(self._model, event.angles_deg)
+                self._start()
+                if not self._console.is_terminal:
+                    self.note(f"{self._title}: {counted(self._of, 'view')}, about {duration_words(self._left.seconds)}")
+            case Moved():
+                self._move = event
+                if not event.agrees:
+                    self.note(f"  {move_words(event)}")
+            case Rejected():
+                self._add(event.evidence, f"taken again: {'; '.join(event.reasons)}", accepted=False)
+            case Accepted():
+                self._taken += 1
+                self._add(event.evidence, "accepted", accepted=True)
+            case Enrolled():
+                self._ended = True
+                self._stop()
+                self.note(line(event))
+                for words in self._findings:
+                    self.note(f"  {words}")
+            case Insight():
+                self._findings = insight_words(event)
+            case _:
+                self.note(line(event))
+        return isinstance(event, Accepted)
+
+    @property
+    def _title(self) -> str:
+        return f"{self._heading} {self._name}".strip()
+
+    def _add(self, evidence: ViewEvidence, verdict: str, *, accepted: bool) -> None:
+        move = self._move
+        imu_deg = None
+        if move is not None and move.rotation_imu_deg is not None:
+            imu_deg = move.encoder_deg - move.rotation_encoder_deg + move.rotation_imu_deg
+        row = _Row(
+            number=self._taken if accepted else self._taken + 1,
+            asked_deg=move.commanded_deg if move else None,
+            encoder_deg=move.encoder_deg if move else None,
+            imu_deg=imu_deg,
+            sigma_deg=move.imu_sigma_deg if move else None,
+            evidence=evidence,
+            verdict=verdict,
+            accepted=accepted,
+        )
+        self._rows.append(row)
+        del self._rows[:-ROWS]
+        if not self._console.is_terminal:
+            self.note(self._plain(row))
+
+    def _plain(self, row: _Row) -> str:
+        evidence = row.evidence
+        left = f"  {duration_words(self._left.seconds)} left" if self._left and row.accepted else ""
+        return (
+            f"view {row.number} of {self._of}  asked {_angle(row.asked_deg)}  encoder {_angle(row.encoder_deg)}  "
+            f"IMU {_with_sigma(row)}  sharpness {evidence.sharpness:.1f}  level {evidence.mean_level:.0f}  "
+            f"saturated {evidence.saturated_share:.0%}  {row.verdict}{left}"
+        )
+
+    def render(self) -> RenderableType:
+        width = self._console.width
+        table = Table(box=None, pad_edge=False, expand=False)
+        table.add_column("view", justify="right")
+        if width >= NARROW:
+            table.add_column("asked", justify="right")
+        table.add_column("encoder", justify="right")
+        if width >= NARROW:
+            table.add_column("IMU", justify="right", no_wrap=True)
+            table.add_column("sharpness", justify="right")
+        if width >= WIDE:
+            table.add_column("level", justify="right")
+            table.add_column("saturated", justify="right")
+        table.add_column("", overflow="fold")
+        rows = max(3, min(ROWS, self._console.height - 6))
+        for row in self._rows[-rows:]:
+            cells = [str(row.number)]
+            if width >= NARROW:
+                cells.append(_angle(row.asked_deg))
+            cells.append(_angle(row.encoder_deg))
+            if width >= NARROW:
+                cells += [
+                    _with_sigma(row) if width >= WIDE else _angle(row.imu_deg),
+                    f"{row.evidence.sharpness:.1f}",
+                ]
+            if width >= WIDE:
+                cells += [f"{row.evidence.mean_level:.0f}", f"{row.evidence.saturated_share:.0%}"]
+            verdict = Text(f"✓ {row.verdict}" if row.accepted else f"✗ {row.verdict}")
+            verdict.stylize("green" if row.accepted else "yellow")
+            table.add_row(*cells, verdict)
+        if self._ended:
+            return table
+        bar = Table.grid(padding=(0, 1))
+        left = f"{duration_words(self._left.seconds)} left" if self._left and self._of else ""
+        bar.add_row(
+            Text(self._title, style="bold"),
+            ProgressBar(
+                total=max(1, self._of), completed=self._taken, width=max(8, min(40, width - 60)), complete_style="cyan"
+            ),
+            f"{self._taken}/{self._of}",
+            left,
+            Text(self._hint, style="dim") if width >= WIDE else "",
+        )
+        return Group(table, bar) if self._rows else Group(bar)
+
+
+class IdentifyView(LiveView):
+    """The candidates after each view, with scores, lead and pose, and each decision in words.
+
+    Parameters
+    ----------
+    console
+        Where.
+    """
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console)
+        self._notes: tuple[str, ...] = ()
+        self._ranked: Ranked | None = None
+        self._taken = 0
+        self._of = 0
+        self._azimuth_deg = 0.0
+        self._ended = False
+
+    def show(self, event: Event) -> bool:
+        plain = not self._console.is_terminal
+        match event:
+            case Started():
+                self._ranked, self._taken, self._of, self._ended = None, 0, event.views, False
+                self._start()
+                if event.notes != self._notes:  # of one search after the other, once
+                    self._notes = event.notes
+                    self.note(line(event))
+            case Moved() if plain:
+                self.note(line(event))
+            case Moved(agrees=False):
+                self.note(f"  {move_words(event)}")
+            case Moved():
+                pass
+            case Accepted():
+                self._taken, self._azimuth_deg = event.index + 1, event.azimuth_deg
+                if plain:
+                    self.note(line(event))
+            case Ranked():
+                self._ranked = event
+                if plain:
+                    self.note(line(event))
+            case Decided() if plain:
+                self.note(f"  {self._verdict}" if self._verdict else "")
+                self.note(line(event))
+            case Decided():
+                verdict = f"{self._verdict}; " if self._verdict else ""
+                self.note(f"view {self._taken}  {self._leading}  {verdict}{decision_words(event)}")
+            case Identified():
+                self._ended = True
+                self._stop()
+                self.note(line(event))
+            case _:
+                self.note(line(event))
+        return isinstance(event, Decided)
+
+    @property
+    def _leading(self) -> str:
+        if self._ranked is None:
+            return ""
+        best = self._ranked.candidates[0]
+        return f"{best.name} {_odds(best) or signed(self._ranked.margin, 3)}"
+
+    @property
+    def _verdict(self) -> str:
+        return "" if self._ranked is None else self._ranked.verdict
+
+    def render(self) -> RenderableType:
+        table = Table(box=None, pad_edge=False, expand=False)
+        for heading in ("", "candidate"):
+            table.add_column(heading)
+        for heading in ("score", "behind", "pose"):
+            table.add_column(heading, justify="right")
+        candidates = self._ranked.candidates if self._ranked else ()
+        likely = any(one.probability is not None for one in candidates)
+        if likely:
+            table.add_column("probability", justify="right")
+        wide = self._console.width >= NARROW
+        if wide:
+            table.add_column("")
+        for place, one in enumerate(candidates, 1):
+            behind = "" if place == 1 else signed(one.score - candidates[0].score, 3)
+            cells: list[RenderableType] = [
+                str(place),
+                Text(one.name, style="bold" if place == 1 else ""),
+                f"{one.score:.3f}",
+                behind,
+                f"{azimuth_words(one.pose_deg)}°",
+                *([_odds(one)] if likely else []),
+            ]
+            if wide:
+                share = one.score if one.probability is None else one.probability
+                cells.append(
+                    ProgressBar(total=1.0, completed=max(0.0, min(1.0, share)), width=24, complete_style="cyan")
+                )
+            table.add_row(*cells)
+        if self._ended:
+            return table if candidates else Group()
+        where = f", azimuth {azimuth_words(self._azimuth_deg)}°" if self._taken else ""
+        lead = f", sure lead {signed(self._ranked.margin, 3)}" if self._ranked else ""
+        status = Text(f"view {self._taken} of {self._of} at most{where}{lead}", style="bold")
+        status.append(f"   {self._hint}", style="dim")
+        verdict = [Text(self._verdict)] if self._verdict else []
+        return Group(table, *verdict, status) if candidates else Group(status)
+
+
+def _odds(one: Candidate) -> str:
+    return "" if one.probability is None else odds_words(one.probability)
+
+
+def _angle(angle_deg: float | None) -> str:
+    return "–" if angle_deg is None else f"{angle_deg:.2f}°"
+
+
+def _with_sigma(row: _Row) -> str:
+    if row.imu_deg is None:
+        return "–"
+    sigma = "" if row.sigma_deg is None else f" ± {row.sigma_deg:.2f}"
+    return f"{row.imu_deg:.2f}{sigma}°"

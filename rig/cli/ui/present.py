@@ -1,0 +1,180 @@
+"""How the events of a plan read on a terminal."""
+
+import sys
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
+
+from rig.events.events import (
+    Accepted,
+    Candidate,
+    Decided,
+    Enrolled,
+    Event,
+    Failed,
+    Identified,
+    Insight,
+    Item,
+    Moved,
+    Ranked,
+    Rejected,
+    Started,
+    TablePicture,
+    Unwinding,
+    Waiting,
+    Warned,
+)
+from rig.events.wording import (
+    answer_words,
+    azimuth_words,
+    counted,
+    decision_words,
+    duration_words,
+    insight_words,
+    move_words,
+    odds_words,
+    signed,
+    unwinding_words,
+)
+from rig.plans.estimate import DryRun
+
+SHOWN = 3
+
+
+class _Screen(Console):
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError  # for `rig.cli.ui.command`, which knows how to end
+
+
+def console(*, stderr: bool = False, plain: bool = False) -> Console:
+    """Return the screen, or the pipe: colours and width are as the terminal, NO_COLOR and COLUMNS have them.
+
+    ``plain`` writes lines as into a pipe, on a terminal too.
+    """
+    return _Screen(stderr=stderr, force_terminal=False if plain else None)
+
+
+def line(event: Event) -> str:
+    """Return what an event means to the person at the bench; empty where there is nothing to say."""
+    match event:
+        case Started():
+            return "\n".join(f"Note: {note}." for note in event.notes)
+        case Moved():
+            return f"  at {event.encoder_deg:.2f}° (asked {event.commanded_deg:.2f}°): {move_words(event)}"
+        case Unwinding():
+            return f"  {unwinding_words(event)}"
+        case Rejected():
+            return f"view {event.index + 1}, attempt {event.attempt}: not taken, {'; '.join(event.reasons)}"
+        case Accepted():
+            return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
+        case Ranked():
+            leaders = ", ".join(_leader(c) for c in event.candidates[:SHOWN])
+            return f"  leading: {leaders} (sure lead {signed(event.margin, 3)})"
+        case Decided():
+            return f"  {decision_words(event)} The table goes to {event.target_deg:.1f}°."
+        case Enrolled():
+            retakes = f", {counted(event.retakes, 'frame')} taken again" if event.retakes else ""
+            took = duration_words(event.seconds)
+            return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
+        case Identified():
+            return (
+                f"{answer_words(event)}\n  score {event.score:.3f} a view (unknown below {event.min_score:.3f}), "
+                + ("" if event.probability is None else f"probability {odds_words(event.probability)}, ")
+                + f"sure lead {signed(event.margin, 3)}, {counted(event.views, 'view')}, "
+                f"{event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
+            )
+        case Item(action="skip"):
+            return f"{event.number} of {event.of}  {event.name}: left out, {event.why}"
+        case Item():
+            return ""
+        case Insight():
+            return "\n".join(f"  {words}" for words in insight_words(event))
+        case TablePicture():
+            turning = "" if event.turning_share is None else f", {event.turning_share:.1%} of it turns with the table"
+            return f"Picture of the empty table: {event.width} x {event.height} pixels{turning}"
+        case Warned():
+            return f"Warning: {event.what}.\nNext step: {event.next_step}"
+        case Waiting():
+            return f"Waiting for {event.why}; Ctrl+C ends."
+        case Failed():
+            return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
+
+
+def _leader(one: Candidate) -> str:
+    odds = "" if one.probability is None else f" ({odds_words(one.probability)})"
+    return f"{one.name} {one.score:.3f}{odds} at {azimuth_words(one.pose_deg)}°"
+
+
+def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
+    """Return what enrollments would do, in lines."""
+    lines = []
+    for one in found:
+        if not one.views:
+            lines.append(f"{one.name}: {'left out' if one.action == 'skip' else 'would be refused'}, {one.why}")
+            continue
+        lines.append(
+            f"{one.name}: {one.action}, {counted(one.views, 'view')}, about {duration_words(one.seconds)} of the bench"
+        )
+        if len(found) > 1:
+            continue
+        first, last = one.angles_deg[0], one.angles_deg[-1]
+        lines += [
+            f"  The table stands at {one.table_deg:.1f}° and "
+            + _beginning(one.table_deg, first)
+            + f", goes up to {last:.1f}° and back to 0°: {one.travel_deg:.0f}° of travel.",
+            f"  Its cable reaches from {one.limits_deg[0]:g}° to {one.limits_deg[1]:g}°.",
+            "  Table angles: " + ", ".join(f"{angle:.1f}" for angle in one.angles_deg),
+            "  Azimuths:     " + ", ".join(azimuth_words(azimuth) for azimuth in one.azimuths_deg),
+        ]
+    if len(found) > 1:
+        views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
+        lines.append(f"{counted(len(found), 'object')}, {counted(views, 'view')}, about {duration_words(seconds)}")
+    return [*lines, "Nothing was moved or stored."]
+
+
+def _beginning(table_deg: float, first_deg: float) -> str:
+    if abs(table_deg - first_deg) < 1:
+        return "begins there"
+    return f"first {'unwinds' if abs(table_deg) - abs(first_deg) > 180 else 'turns'} to {first_deg:.1f}°"
+
+
+class Progress:
+    """A progress bar on stderr; where that is no terminal, notes alone."""
+
+    def __init__(self, title: str) -> None:
+        self._bar = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console(stderr=True),
+            disable=not sys.stderr.isatty(),
+        )
+        self._task = self._bar.add_task(title, total=None, start=False)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def start(self, total: int) -> None:
+        self._bar.start_task(self._task)
+        self._bar.update(self._task, total=total)
+
+    def advance(self) -> None:
+        self._bar.advance(self._task)
+
+    def at(self, done: int) -> None:
+        """Show that so many are done."""
+        self._bar.update(self._task, completed=done)
+
+    def note(self, text: str) -> None:
+        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=not self._bar.console.is_terminal)

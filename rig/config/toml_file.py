@@ -1,0 +1,324 @@
+"""`rig.toml` as people wrote it: single values are changed, their comments, order and spacing stay.
+
+`tomllib` reads and judges; this module only finds where in the text a value stands. Every edit is read back, and given
+up if it would have changed anything else.
+"""
+
+import difflib
+import json
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rig.core.errors import ConfigError
+from rig.core.files import write
+
+Key = tuple[str, ...]
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """A ``key = value`` or a ``[table]`` of a document; the offsets count characters.
+
+    ``key`` is the whole path; ``table`` the path of the table above it. ``start`` is where the line begins, ``value``
+    where the value does (a header has none), ``end`` the end of the value or header, ``comments`` those inside a value
+    of several lines.
+    """
+
+    key: Key
+    table: Key
+    line: int
+    start: int
+    value: int | None
+    end: int
+    comments: tuple[str, ...] = ()
+
+
+def statements(text: str) -> Iterator[Statement]:
+    """Yield what a valid document states, in its order; inside arrays of tables nothing is told."""
+    position, addressable = 0, True
+    table: Key = ()
+    while position < len(text):
+        start = position
+        while position < len(text) and text[position] in " \t":
+            position += 1
+        line = text.count("\n", 0, start) + 1
+        if position < len(text) and text[position] not in "#\r\n":
+            if text[position] == "[":
+                double = text.startswith("[[", position)
+                content = position + 1 + double
+                position = _skip(text, content, "]")
+                addressable = not double
+                table = _parts(text[content:position])
+                position += 1 + double
+                if addressable:
+                    yield Statement(table, table, line, start, None, position)
+            else:
+                begin = position
+                position = _skip(text, position, "=")
+                key = table + _parts(text[begin:position])
+                value = position + 1
+                while text[value] in " \t":
+                    value += 1
+                position, comments = _value_end(text, value)
+                if addressable:
+                    yield Statement(key, table, line, start, value, position, comments)
+        position = _line_end(text, position)
+
+
+def line_numbers(text: str) -> dict[Key, int]:
+    """Return the line of each key and table of a valid document."""
+    return {statement.key: statement.line for statement in statements(text)}
+
+
+def with_values(text: str, changes: Mapping[Key, Any]) -> str:
+    """Return the document with some values set; what they are already is left as it stands.
+
+    Raises
+    ------
+    ConfigError
+        The document is no TOML, or holds a key in a form that cannot be changed without touching something else.
+    """
+    try:
+        before = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(
+            "The file is no TOML.", next_step="Mend the line named.", evidence={"reason": str(error)}
+        ) from (error)
+    for key, value in changes.items():
+        expected = deepcopy(before)
+        here = expected
+        for part in key[:-1]:
+            here = here.setdefault(part, {})
+            if not isinstance(here, dict):
+                raise _cannot_edit(key, value, f"{part} is a value, no table")
+        if key[-1] in here and _same(here[key[-1]], value):
+            continue
+        here[key[-1]] = value
+        edited = _edited(text, key, value, before)
+        try:
+            after = tomllib.loads(edited)
+        except tomllib.TOMLDecodeError as error:
+            raise _cannot_edit(key, value, str(error)) from error
+        if not _same(after, expected):
+            raise _cannot_edit(key, value, "it would change something else as well")
+        text, before = edited, after
+    return text
+
+
+def changed_lines(old: str, new: str) -> list[str]:
+    """Return the lines that differ, those taken away with ``-`` and those added with ``+`` before them."""
+    lines = difflib.ndiff(old.splitlines(), new.splitlines())
+    return [line.rstrip() for line in lines if line[0] in "+-" and line[2:].strip()]
+
+
+def read_text(path: Path) -> str:
+    """Return a configuration file's text, its line ends as they are.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or is no text.
+    """
+    try:
+        return path.read_bytes().decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"Cannot read the configuration {path}.",
+            next_step="Give an existing file with --config, or leave the option out for the defaults.",
+            evidence={"reason": getattr(error, "strerror", None) or str(error)},
+        ) from error
+
+
+def save(path: Path, text: str) -> None:
+    """Write a configuration file: all of it or, when that fails, nothing; a link keeps pointing to where it does.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be written.
+    """
+    target = path.resolve()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write(target, text.encode("utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"Cannot write the configuration {path}.",
+            next_step="Give a file in a folder that you may write to: --config FILE.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+
+
+def toml(value: Any) -> str:
+    """Return a value in TOML's notation, on one line; a string for what TOML does not know."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case int() | float():
+            return repr(value)
+        case list() | tuple():
+            return f"[{', '.join(map(toml, value))}]"
+        case Mapping():
+            inner = ", ".join(f"{_written((str(name),))} = {toml(item)}" for name, item in value.items())
+            return f"{{ {inner} }}" if inner else "{}"
+        case _:
+            return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def stated(key: Key, value: Any) -> str:
+    """Return a key's value in TOML's notation, as people write it: addresses are hexadecimal."""
+    return f"{value:#04x}" if key[-1] == "address" and type(value) is int else toml(value)
+
+
+# -- where things stand ---------------------------------------------------------------------------------------------
+
+
+def _edited(text: str, key: Key, value: Any, values: Mapping[str, Any]) -> str:
+    known = list(statements(text))
+    newline = "\r\n" if "\r\n" in text else "\n"
+    for statement in known:
+        if statement.value is not None and statement.key == key[: len(statement.key)]:
+            inline = _merged(values, statement.key, key[len(statement.key) :], value)
+            kept = "".join(f"{comment}{newline}" for comment in statement.comments)
+            before = text[: statement.start] + kept + text[statement.start : statement.value]
+            return before + stated(statement.key, inline) + text[statement.end :]
+    siblings = [s for s in known if s.value is not None and s.key[:-1] == key[:-1]]
+    if siblings:
+        last = siblings[-1]
+        indent = text[last.start : last.start + len(text[last.start :]) - len(text[last.start :].lstrip(" \t"))]
+        line = f"{indent}{_written(key[len(last.table) :])} = {stated(key, value)}{newline}"
+        return _inserted(text, _default_line_end(text, last, key, known) or _line_end(text, last.end), line, newline)
+    line = f"{_written(key[-1:])} = {stated(key, value)}{newline}"
+    headers = [s for s in known if s.value is None and s.key == key[:-1]]
+    if headers:
+        header = headers[-1]
+        end = _default_line_end(text, header, key, known) or _line_end(text, header.end)
+        return _inserted(text, end, line, newline)
+    if len(key) == 1:
+        first = next((s.start for s in known if s.value is None), len(text))
+        return _inserted(text, _above_comments(text, first), line + newline * (first < len(text)), newline)
+    return _inserted(text, len(text), f"{newline * bool(text.strip())}[{_written(key[:-1])}]{newline}{line}", newline)
+
+
+def _merged(values: Mapping[str, Any], table: Key, rest: Key, value: Any) -> Any:
+    """Return what an inline table holds once ``rest`` inside it is set; ``value`` where nothing is left of the key."""
+    inline: Any = values
+    for part in table:
+        inline = inline[part]
+    if not rest:
+        return value
+    inline = deepcopy(inline)
+    here = inline
+    for part in rest[:-1]:
+        here = here.setdefault(part, {})
+    here[rest[-1]] = value
+    return inline
+
+
+def _default_line_end(text: str, near: Statement, key: Key, known: Iterable[Statement]) -> int | None:
+    """Return where the line ends that holds the key as a comment (``# key = default``) in the same table, if any."""
+    headers = [s for s in known if s.value is None]
+    begin = max((s.end for s in headers if s.start <= near.start), default=0)
+    end = min((s.start for s in headers if s.start > near.start), default=len(text))
+    found = re.compile(rf"^[ \t]*#[ \t]*{re.escape(key[-1])}[ \t]*=.*$", re.MULTILINE).search(text, begin, end)
+    return _line_end(text, found.end()) if found else None
+
+
+def _above_comments(text: str, position: int) -> int:
+    """Return where the lines of comment begin that stand directly above ``position``."""
+    while position and text[text.rfind("\n", 0, position - 1) + 1 : position].lstrip(" \t").startswith("#"):
+        position = text.rfind("\n", 0, position - 1) + 1
+    return position
+
+
+def _inserted(text: str, position: int, lines: str, newline: str) -> str:
+    before = text[:position]
+    return before + (newline if before and not before.endswith("\n") else "") + lines + text[position:]
+
+
+def _line_end(text: str, position: int) -> int:
+    end = text.find("\n", position)
+    return len(text) if end < 0 else end + 1
+
+
+def _skip(text: str, position: int, wanted: str) -> int:
+    """Return where ``wanted`` stands outside of quotes."""
+    while text[position] != wanted:
+        position = _string_end(text, position) if text[position] in "\"'" else position + 1
+    return position
+
+
+def _value_end(text: str, position: int) -> tuple[int, tuple[str, ...]]:
+    """Return where the value that begins at ``position`` ends, and the comments inside it."""
+    depth, end = 0, position
+    comments = []
+    while position < len(text):
+        character = text[position]
+        if character == "#":
+            if not depth:
+                break
+            line_end = _line_end(text, position)
+            comments.append(text[position:line_end].rstrip())
+            position = line_end
+            continue
+        if character in "\r\n" and not depth:
+            break
+        if character in "\"'":
+            position = end = _string_end(text, position)
+            continue
+        depth += (character in "[{") - (character in "]}")
+        position += 1
+        if character not in " \t":
+            end = position
+    return end, tuple(comments)
+
+
+def _string_end(text: str, position: int) -> int:
+    quote = text[position]
+    if text.startswith(quote * 3, position):
+        quote *= 3
+    end = position + len(quote)
+    while not text.startswith(quote, end):
+        end += 2 if text[end] == "\\" and quote[0] == '"' else 1
+    end += len(quote)
+    while len(quote) == 3 and text.startswith(quote[0], end):  # up to two more of them belong to the string
+        end += 1
+    return end
+
+
+def _parts(dotted: str) -> Key:
+    """Return the parts of a dotted key, which may be quoted."""
+    here: Any = tomllib.loads(f"{dotted.strip()} = 0")
+    parts = []
+    while isinstance(here, dict):
+        ((part, here),) = here.items()
+        parts.append(part)
+    return tuple(parts)
+
+
+def _written(key: Key) -> str:
+    return ".".join(part if _BARE_KEY.fullmatch(part) else toml(part) for part in key)
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Compare as TOML does: 1 and 1.0 and true are three values, and not-a-number is itself."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return type(one) is type(other) and (one == other or (one != one and other != other))
+
+
+def _cannot_edit(key: Key, value: Any, reason: str) -> ConfigError:
+    return ConfigError(
+        f"Cannot set {'.'.join(key)} in this file without touching something else.",
+        next_step=f"Write it yourself, in [{'.'.join(key[:-1])}]: {key[-1]} = {toml(value)}",
+        evidence={"reason": reason},
+    )

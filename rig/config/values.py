@@ -1,0 +1,161 @@
+"""Reads what a configuration file and the command line say, and judges it: every mistake at once, with its place."""
+
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import platformdirs
+from pydantic import BaseModel, ValidationError
+
+from rig.config.toml_file import Key, line_numbers, read_text
+from rig.config.wording import mistakes
+from rig.core.errors import ConfigError
+
+M = TypeVar("M", bound=BaseModel)
+
+APP = "hbr-rig"
+FILE_NAME = "rig.toml"
+
+_PATHS: tuple[Key, ...] = (("catalog", "path"), ("state_dir",), ("calibration_dir",))
+
+
+def default_path() -> Path | None:
+    """Return the configuration in force without `--config`: ./rig.toml, else the user's; None where neither exists."""
+    return next((path for path in search_paths() if path.is_file()), None)
+
+
+def search_paths() -> list[Path]:
+    """Return where a configuration is looked for without `--config`, first the one that wins."""
+    return [Path(FILE_NAME), Path(platformdirs.user_config_dir(APP)) / FILE_NAME]
+
+
+@dataclass(frozen=True, slots=True)
+class Values:
+    """What a file and the command line say, not yet judged, and where each of it stands."""
+
+    path: Path | None
+    values: dict[str, Any]
+    places: dict[Key, str]
+
+    def origin(self, key: Key) -> str:
+        """Return where a key's value comes from: ``rig.toml line 3``, ``--set``, or ``default``."""
+        place = next((self.places[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.places), None)
+        if place is None or not _holds(self.values, key):
+            return "default"
+        return f"{self.path.name} {place}" if self.path and place.startswith("line") else place
+
+
+def read_values(path: Path | None = None, overrides: Iterable[str] = ()) -> Values:
+    """Read a configuration file (None: the one in force, if any) and apply ``overrides``, without judging the values.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing or is no TOML, or an override is none.
+    """
+    values: dict[str, Any] = {}
+    places: dict[Key, str] = {}
+    source = path or default_path()
+    if source is not None:
+        text = read_text(source)
+        try:
+            values = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(
+                f"{source} is not a TOML file.",
+                next_step="Mend the line named.",
+                evidence={"reason": str(error), **_line_named(text, str(error))},
+            ) from error
+        places = {key: f"line {line}" for key, line in line_numbers(text).items()}
+        for key in _PATHS:
+            _resolve(values, key, source.resolve().parent)
+    for override in overrides:
+        places[_apply(values, override)] = "--set"
+    return Values(source, values, places)
+
+
+def validate(
+    model: type[M],
+    values: Mapping[str, Any],
+    *,
+    where: str,
+    prefix: str = "",
+    places: Mapping[Key, str] | None = None,
+) -> M:
+    """Return ``values`` as ``model``; every mistake at once in one `ConfigError`.
+
+    ``prefix`` is the model's path in the configuration, ``places`` says where in a file each key stands.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        above = tuple(prefix.split(".")) if prefix else ()
+        found = mistakes(model, values, error.errors(include_url=False), above, places or {})
+    raise mistaken(found, where)
+
+
+def mistaken(found: list[str], where: str) -> ConfigError:
+    """Return the error of a configuration with the mistakes that were found."""
+    return ConfigError(
+        f"{len(found)} mistake{'s' if len(found) > 1 else ''} in {where}.",
+        next_step="Mend the keys listed; `rig config check` looks again.",
+        evidence={"mistakes": found},
+    )
+
+
+def _resolve(values: dict[str, Any], key: Key, folder: Path) -> None:
+    """Take a path in a file as relative to that file, not to where the command happens to be run."""
+    here: Any = values
+    for part in key[:-1]:
+        here = here.get(part) if isinstance(here, dict) else None
+    if isinstance(here, dict) and isinstance(here.get(key[-1]), str):
+        here[key[-1]] = os.path.normpath(folder / Path(here[key[-1]]).expanduser())
+
+
+def _holds(values: Mapping[str, Any], key: Key) -> bool:
+    here: Any = values
+    for part in key:
+        if not isinstance(here, Mapping) or part not in here:
+            return False
+        here = here[part]
+    return True
+
+
+def _line_named(text: str, reason: str) -> dict[str, str]:
+    """Return the line that a message of `tomllib` names, as evidence."""
+    named = re.search(r"at line (\d+)", reason)
+    lines = text.splitlines()
+    if named is None or not 0 < int(named[1]) <= len(lines):
+        return {}
+    return {f"line {named[1]}": lines[int(named[1]) - 1].strip()}
+
+
+def _apply(values: dict[str, Any], override: str) -> Key:
+    """Set what an override says, and return its key."""
+    key, sign, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not sign or not all(parts):
+        raise ConfigError(
+            f"Cannot read the setting {override!r}.",
+            next_step="Write SECTION.KEY=VALUE, e.g. --set identify.max_views=4.",
+        )
+    here = values
+    for part in parts[:-1]:
+        inner = here.setdefault(part, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{part} in {override!r} is not a section.", next_step="Write SECTION.KEY=VALUE.")
+        here = inner
+    here[parts[-1]] = parsed(text)
+    return tuple(parts)
+
+
+def parsed(text: str) -> Any:
+    """Return a value as a person types it: TOML, or else a bare word."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text.strip()

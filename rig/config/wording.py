@@ -1,0 +1,191 @@
+"""What the configuration's keys mean, in words: for its mistakes, for `rig config`, and for the file that is begun."""
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from rig.config.toml_file import Key, stated
+
+_UNITS = {"baud": "bit/s", "width": "px", "height": "px", "fps": "frames/s", "roi": "px"}
+_UNIT_SUFFIXES = {
+    "_deg": "°",
+    "_dps": "°/s",
+    "_dps2": "°/s²",
+    "_s": "s",
+    "_us": "µs",
+    "_hz": "Hz",
+    "_k": "K",
+    "_c": "°C",
+    "_v": "V",
+    "_mm": "mm",
+    "_percent": "%",
+    "_turns": "turns",
+}
+_KINDS: Mapping[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: 'a text in "quotes"',
+    Path: 'a path in "quotes"',
+}
+
+
+@dataclass(frozen=True, slots=True)
+class KeyResults:
+    """A key of the configuration: what it may be, in which unit (empty where there is none), and what it is for."""
+
+    key: Key
+    default: Any
+    allowed: str
+    unit: str
+    description: str
+
+    @property
+    def name(self) -> str:
+        return ".".join(self.key)
+
+
+def key_facts(model: type[BaseModel], above: Key = ()) -> Iterator[KeyResults]:
+    """Yield the keys of a model and of the sections in it, in their order."""
+    for name, field in model.model_fields.items():
+        if (inner := _section(field)) is not None:
+            yield from key_facts(inner, (*above, name))
+        else:
+            default = field.get_default(call_default_factory=True, validated_data={})
+            yield KeyResults((*above, name), default, allowed(field), unit(name), field.description or "")
+
+
+def blank_file(model: type[BaseModel]) -> str:
+    """Return a configuration file that sets nothing: every key that has a default as a comment, with its meaning."""
+    lines = ["# Configuration of the rig. A line without its first # is in force; `rig config check` judges the file."]
+    section: Key = ()
+    for facts in key_facts(model):
+        if isinstance(facts.default, dict):
+            continue  # the benches' own sections
+        if facts.key[:-1] != section:
+            section = facts.key[:-1]
+            lines += ["", f"[{'.'.join(section)}]"]
+        meaning = f"{facts.description} ({facts.allowed}{' ' * bool(facts.unit)}{facts.unit})"
+        lines += wrap(meaning, 100, initial_indent="# ", subsequent_indent="#   ")
+        lines.append(f"#{facts.key[-1]} = {_shown(facts, facts.default)}".rstrip())
+    return "\n".join(lines) + "\n"
+
+
+def setting_line(facts: KeyResults, value: Any, origin: str) -> str:
+    """Return a key in force as a line of TOML (one that is not set as a comment): value, unit, origin and meaning."""
+    stated = f"{'#' * (value is None)}{facts.key[-1]} = {_shown(facts, value)}".rstrip()
+    note = "; ".join(part for part in (facts.unit, origin, facts.description) if part)
+    return f"{stated:30s} # {note}"
+
+
+def _shown(facts: KeyResults, value: Any) -> str:
+    return "" if value is None else stated(facts.key, value)
+
+
+def unit(name: str) -> str:
+    """Return the unit that a key's name carries."""
+    return _UNITS.get(name) or next((u for suffix, u in _UNIT_SUFFIXES.items() if name.endswith(suffix)), "")
+
+
+def allowed(field: FieldInfo) -> str:
+    """Return what a field takes: ``a whole number from 9600 to 4500000``."""
+    return _kind(field.annotation, field.metadata)
+
+
+def mistakes(
+    model: type[BaseModel], values: Mapping[str, Any], errors: Sequence[Any], above: Key, places: Mapping[Key, str]
+) -> list[str]:
+    """Return pydantic's ``errors`` as one line a key: where it stands, what it must be, and what was found.
+
+    ``above`` is the path of ``model`` in the whole configuration, ``places`` says where in a file a key stands.
+    """
+    told: dict[Key, str] = {}
+    for error in errors:
+        key, field = _field(model, error["loc"])
+        told.setdefault(key, _mistake(model, values, key, field, error))
+    return [f"{_place(above + key, places)}{'.'.join(above + key)}: {text}".lstrip(": ") for key, text in told.items()]
+
+
+def _mistake(model: type[BaseModel], values: Mapping[str, Any], key: Key, field: FieldInfo | None, error: Any) -> str:
+    if error["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(key[-1], _names(model, key[:-1]), n=1)
+        return "unknown key" + (f"; did you mean {near[0]}?" if near else "")
+    found: Any = values
+    for part in key:
+        found = found[part] if isinstance(found, Mapping) and part in found else error["input"]
+    shown = "" if isinstance(found, Mapping | BaseModel) else f" (found {found!r})"
+    if error["type"] == "value_error" or field is None:
+        return str(error["msg"]).removeprefix("Value error, ") + shown
+    return f"must be {allowed(field)}{' ' * bool(unit(key[-1]))}{unit(key[-1])}{shown}"
+
+
+def _field(model: type[BaseModel], path: Sequence[Any]) -> tuple[Key, FieldInfo | None]:
+    """Return the part of pydantic's ``path`` that is a key, and its field; what follows are members of a union."""
+    key: Key = ()
+    field = None
+    for part in path:
+        if field is not None and _section(field) is None:
+            break
+        model = model if field is None else _section(field) or model
+        key, field = (*key, str(part)), model.model_fields.get(str(part))
+        if field is None:
+            break
+    return key, field
+
+
+def _place(key: Key, places: Mapping[Key, str]) -> str:
+    known = next((places[key[:n]] for n in range(len(key), 0, -1) if key[:n] in places), None)
+    return f"{known}: " if known else ""
+
+
+def _names(model: type[BaseModel], path: Key) -> list[str]:
+    for part in path:
+        inner = _section(model.model_fields[part])
+        if inner is None:
+            return []
+        model = inner
+    return list(model.model_fields)
+
+
+def _section(field: FieldInfo) -> type[BaseModel] | None:
+    kind = field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+
+
+def _kind(annotation: Any, metadata: Sequence[Any] = ()) -> str:
+    members = get_args(annotation)
+    if get_origin(annotation) in (Union, UnionType):
+        return " or ".join(_kind(member, metadata) for member in members if member is not NoneType)
+    if get_origin(annotation) is Literal:
+        return f"one of {', '.join(map(repr, members))}"
+    if get_origin(annotation) is tuple:
+        return f"[{', '.join(_kind(member) for member in members)}]"
+    if hasattr(annotation, "__metadata__"):  # Annotated
+        inner = [
+            m for part in annotation.__metadata__ for m in (part.metadata if isinstance(part, FieldInfo) else [part])
+        ]
+        return _kind(annotation.__origin__, inner)
+    if get_origin(annotation) in (dict, list):
+        return "a table" if get_origin(annotation) is dict else "a list"
+    return _KINDS.get(annotation, "a value") + (_range(metadata) if annotation in (int, float) else "")
+
+
+def _range(metadata: Sequence[Any]) -> str:
+    bounds = {type(m): m for m in metadata}
+    low = f"{bounds[Ge].ge:.10g}" if Ge in bounds else None
+    above = f"{bounds[Gt].gt:.10g}" if Gt in bounds else None
+    high = f"{bounds[Le].le:.10g}" if Le in bounds else None
+    below = f"{bounds[Lt].lt:.10g}" if Lt in bounds else None
+    if low and high:
+        return f" from {low} to {high}"
+    start = f"of at least {low}" if low else f"above {above}" if above else ""
+    end = f"of at most {high}" if high and not start else f"up to {high}" if high else f"below {below}" if below else ""
+    return f" {start}, {end}" if start and end else f" {start}{end}" if start or end else ""

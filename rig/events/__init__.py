@@ -1,0 +1,1 @@
+"""The events of running plans, and the sentences that describe them."""

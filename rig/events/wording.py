@@ -1,0 +1,183 @@
+"""What happened, in words: the same on the terminal and in the report."""
+
+from collections.abc import Iterable, Sequence
+from math import isfinite
+
+from hbr import Verdict
+from rig.events.events import Decided, Identified, Insight, Moved, Resemblance, Unwinding
+
+
+def decision_words(decided: Decided) -> str:
+    """Return why the camera goes to a side, and how far: "left: the rivals look less alike there …; turning 47.3°."."""
+    turning = f"turning {abs(decided.rotation_deg):.1f}°"
+    # A step of AHBR is at most 90°; what exceeds it leads past views that were taken before (`hbr.next_view`).
+    compared = decided.s_left is not None
+    past = " past what was seen already" if compared and round(abs(decided.rotation_deg), 1) > 90 else ""
+    return f"{decided.side}: {decided.why}; {turning}{past}."
+
+
+def likeness_words(side: str, s_left: float, s_right: float, rivals: Sequence[str]) -> str:
+    """Return why a side was chosen: how alike the rivals look from the left and from the right (Eq. 6)."""
+    if len(rivals) < 2:
+        return "no second candidate is in sight to be told apart"
+    left, right = distinct(s_left, s_right)
+    leading = "the two leading candidates" if len(rivals) == 2 else "the leading candidates"
+    if s_left == s_right:
+        return f"{leading} look as much alike on both sides: S_left {left} = S_right {right}"
+    if side == "left":
+        return f"{leading} look less alike there: S_left {left} < S_right {right}"
+    return f"{leading} look less alike there: S_right {right} < S_left {left}"
+
+
+def separation_words(rivals: Sequence[str], alike: Sequence[float] | None, chosen: int) -> str:
+    """Return what a turn of the dense search is to show: which two objects it separates, and how well."""
+    if len(rivals) < 2 or alike is None:
+        return "no second object is likely, and that side is new"
+    here = alike[chosen]
+    least, most = min(alike), max(alike)
+    return f"to tell {rivals[0]} from {rivals[1]}, {here:.2f} alike there ({least:.2f} to {most:.2f} all around)"
+
+
+def verdict_words(verdict: Verdict, *, certainty: float, least: float, views: int) -> str:
+    """Return what the rules of the dense search say after ``views`` views, and why.
+
+    Parameters
+    ----------
+    verdict
+        Theirs.
+    certainty
+        Probability that ends a search.
+    least
+        Familiarity that enrolled objects reach; not finite where nothing may be called unknown.
+    views
+        That were taken.
+    """
+    probability, familiarity = odds_words(verdict.probability), f"{verdict.familiarity:.3f}"
+    familiar = not isfinite(least) or verdict.familiarity >= least
+    known = f" and a familiarity of {familiarity} the {least:.3f} of enrolled objects" if isfinite(least) else ""
+    if verdict.kind == "unknown":
+        return f"a familiarity of {familiarity} stays below the {least:.3f} that enrolled objects reach"
+    if verdict.kind == "look" and not familiar:
+        return f"not familiar yet: {familiarity}, and enrolled objects reach {least:.3f}"
+    if verdict.kind == "look":
+        return f"not sure yet: a probability of {probability}, and {odds_words(certainty)} ends the search"
+    if verdict.probability >= certainty:
+        return f"a probability of {probability} reaches {odds_words(certainty)}{known}"
+    return (
+        f"the best after {counted(views, 'view')}, with a probability of {probability}; {odds_words(certainty)} is sure"
+    )
+
+
+def odds_words(probability: float) -> str:
+    """Return a probability in percent; what is nearly none or nearly all as such."""
+    if probability > 0.999:
+        return ">99.9%"
+    return "<0.1%" if probability < 0.001 else f"{probability:.1%}"
+
+
+def move_words(moved: Moved) -> str:
+    """Return how far the table turned by encoder and gyro, and whether they agree."""
+    words = f"table {signed(moved.rotation_encoder_deg, 2)}° by the encoder"
+    if moved.rotation_imu_deg is None:
+        return f"{words}, the gyro has no answer"
+    sigma = "" if moved.imu_sigma_deg is None else f" ± {moved.imu_sigma_deg:.2f}"
+    words += f", {signed(moved.rotation_imu_deg, 2)}{sigma}° by the gyro"
+    if moved.agrees:
+        return words
+    bound = "" if moved.bound_deg is None else f" by more than {moved.bound_deg:.2f}°"
+    return f"{words}; they disagree{bound}, the gyro is believed"
+
+
+def unwinding_words(unwinding: Unwinding) -> str:
+    """Return that the table goes the long way round, and why."""
+    low_deg, high_deg = unwinding.limits_deg
+    return (
+        f"unwinding the cable: the table goes the long way, from {unwinding.from_deg:.1f}° to {unwinding.to_deg:.1f}° "
+        f"({counted(unwinding.turns, 'turn')} back; the cable reaches from {low_deg:g}° to {high_deg:g}°)"
+    )
+
+
+def answer_words(answer: Identified) -> str:
+    """Return the answer, how sure it is and why the search ended; an unknown object with its nearest three."""
+    if answer.name is None:
+        nearest = ", ".join(f"{c.name} {c.score:.3f}" for c in answer.candidates[:3])
+        found = f"Unknown: the nearest are {nearest}"
+    else:
+        found = f"{answer.name}, standing {answer.yaw_deg:.1f}° counter-clockwise of how it was enrolled"
+        if answer.margin <= 0 and len(answer.candidates) > 1:
+            found += f"; not sure, {answer.candidates[1].name} looks as likely"
+    return f"{found}. {sentence(answer.reason)}"
+
+
+def symmetry_words(insight: Insight) -> str:
+    """Return what an object's views say about its pose; nothing where they say nothing."""
+    if insight.period_deg is None or insight.neighbours is None or insight.alike is None:
+        return ""
+    numbers = f"similarity {insight.alike:.3f}, of neighbouring views {insight.neighbours:.3f}"
+    if insight.period_deg == 0:
+        return f"looks alike from everywhere (least {numbers}): its pose will not be known"
+    if insight.period_deg < 360:
+        return f"looks the same every {insight.period_deg:g}° ({numbers}): its pose will be known up to that"
+    return ""
+
+
+def resemblance_words(one: Resemblance) -> str:
+    """Return from which sides an object looks like another one: "looks like mug-03 from 120–200°"."""
+    if one.arcs_deg == ((0.0, 360.0),):
+        return f"looks like {one.name} from all sides"
+    arcs = [f"{a:.0f}°" if a == b else f"{a:.0f}–{b:.0f}°" for a, b in one.arcs_deg]
+    several = f"{', '.join(arcs[:-1])} and {arcs[-1]}" if len(arcs) > 1 else arcs[0]
+    return f"looks like {one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {several}"
+
+
+def insight_words(insight: Insight) -> list[str]:
+    """Return what an object will be taken for, a line for each finding."""
+    lines = [words] if (words := symmetry_words(insight)) else []
+    lines += [f"{resemblance_words(one)} (similarity up to {one.similarity:.3f})" for one in insight.lookalikes]
+    return lines if insight.lookalikes else [*lines, "looks like no other enrolled object"]
+
+
+def duration_words(seconds: float) -> str:
+    """Return a time as people read it: "43 s", "2 min 05 s", "1 h 20 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def sentence(words: str) -> str:
+    """Return ``words`` with a capital and a full stop."""
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def azimuth_words(azimuth_deg: float) -> str:
+    """Return an azimuth to a tenth of a degree, from 0.0 to 359.9, without its sign for degrees."""
+    return f"{round(azimuth_deg, 1) % 360:.1f}"
+
+
+def counted(n: int, noun: str) -> str:
+    """Return "1 view", "2 views"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def short(words: str, letters: int) -> str:
+    """Return words cut to so many letters, the last of them "…"."""
+    return words if len(words) <= letters else f"{words[: letters - 1]}…"
+
+
+def listed(items: Iterable[str]) -> str:
+    """Return distinct items, in the order of their first appearance, separated by semicolons."""
+    return "; ".join(dict.fromkeys(items))
+
+
+def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:
+    """Return two numbers with as many decimals as tell them apart: ``decimals`` at least, five at most."""
+    enough = next((d for d in range(decimals, 5) if f"{a:.{d}f}" != f"{b:.{d}f}"), 5) if a != b else decimals
+    return f"{a:.{enough}f}", f"{b:.{enough}f}"
+
+
+def signed(value: float, decimals: int) -> str:
+    """Return a number with its sign, a real minus."""
+    return f"{value:+.{decimals}f}".replace("-", "−")

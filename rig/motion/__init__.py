@@ -1,0 +1,1 @@
+"""Moves the table, and explains why a motion failed."""

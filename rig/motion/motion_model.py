@@ -1,0 +1,42 @@
+"""How long moves and views take."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+from rig.config import RigConfig
+from rig.devices.servo import MotionProfile
+from rig.motion.turntable import FIRST_REST_S, motion_seconds
+
+FRAMES: Final = 1.5
+"""Frames that pass until one was exposed whole after the table came to rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionModel:
+    """The time that moves and views take, from the table's profile and the camera's frame rate."""
+
+    config: RigConfig
+
+    def move_s(self, distance_deg: float) -> float:
+        """Return the time of a move by ``distance_deg`` until the table is at rest; downwards it goes a bit below."""
+        table = self.config.table
+        profile = MotionProfile(table.velocity_dps, table.acceleration_dps2)
+        seconds = table.settle_s + motion_seconds(distance_deg, profile)
+        if distance_deg < 0:
+            seconds += motion_seconds(table.approach_deg, profile) + 2 * table.poll_s
+        return seconds
+
+    @property
+    def view_s(self) -> float:
+        """The time until a frame is there."""
+        return FRAMES / self.config.camera.fps
+
+    def enrollment_s(self, start_deg: float, angles_deg: Sequence[float]) -> float:
+        """Return the time of views at these table angles, begun at ``start_deg``, and of the way back to 0."""
+        if not angles_deg:
+            return 0.0
+        stops = [start_deg, *angles_deg]
+        moves = sum(self.move_s(b - a) for a, b in pairwise(stops))
+        return FIRST_REST_S + moves + len(angles_deg) * self.view_s + self.move_s(-angles_deg[-1])

@@ -1,0 +1,350 @@
+"""A retrieval kept in a folder of open formats: what is needed to look at it again, and to compute it again.
+
+``run.json`` has the conditions and settings, ``model.jsonl`` the enrolled views, an object a line, ``events.jsonl``
+what happened, an event a line, and ``frames/000.png``, ... the accepted frames, lossless. Of a dense search
+``search_rules.json`` has the rules that it went by, ``empty_table.png`` the picture that the object was found with.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from importlib.metadata import version
+from math import nan
+from pathlib import Path
+from types import NoneType, TracebackType, UnionType
+from typing import Any, Final, Self, TextIO, Union, get_args, get_origin, get_type_hints
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import hbr
+from hbr.descriptors import descriptor, unpack_rows
+from rig.bench import Bench
+from rig.config import RigConfig
+from rig.config.values import validate
+from rig.core.errors import CatalogError, RigError, UsageError
+from rig.core.files import write
+from rig.events.events import Accepted, Event, Started, event_dict
+from rig.search.model import Model, empty_table_for, model_of
+from rig.search.stopping_rules import FILE as RULES
+from rig.search.stopping_rules import read_rules, write_rules
+from rig.views import image_files as images
+
+FORMAT: Final = "hbr-rig run"
+VERSION: Final = 2
+"""Raised when a program that knows less could not compute a run again; version 1 knew no dense search."""
+EMPTY_TABLE: Final = "empty_table.png"
+
+_KINDS: Final[dict[str, type]] = {kind.__name__.lower(): kind for kind in get_args(Event)}
+
+
+class RunWriter:
+    """Keeps one retrieval while it runs: what has been seen of it is in the folder, wherever it ends.
+
+    Parameters
+    ----------
+    folder
+        New or empty; missing folders above it are made.
+    bench
+        The bench that the retrieval runs on.
+    model : Model or hbr.ViewIndex
+        What is enrolled.
+    empty_table : uint8 array (H, W, 3), optional
+        As `rig.plans.identify.identify` is given it.
+
+    Raises
+    ------
+    UsageError
+        The folder holds something already, or cannot be written to.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        bench: Bench,
+        model: Model | hbr.ViewIndex,
+        *,
+        empty_table: NDArray[np.uint8] | None = None,
+    ) -> None:
+        self._folder = folder
+        model = Model(model) if isinstance(model, hbr.ViewIndex) else model
+        views = model.views
+        kind = descriptor(views.descriptor)
+        started_utc = bench.clock.utc().isoformat()
+        try:
+            (folder / "frames").mkdir(parents=True, exist_ok=True)
+            if len(list(folder.iterdir())) > 1:
+                raise UsageError(
+                    f"The folder {folder} is not empty.", next_step="Give a new folder for each run with --save-run."
+                )
+            write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
+            if model.rules is not None and isinstance(model.index, hbr.DenseIndex):
+                write_rules(folder / RULES, model.rules, model.index, made_utc=started_utc)
+            if empty_table is None:
+                empty_table, _ = empty_table_for(bench, model)
+            if empty_table is not None:
+                write(folder / EMPTY_TABLE, images.encode(empty_table))
+            about = {
+                "format": FORMAT,
+                "version": VERSION,
+                "software": f"hbr-rig {version('hbr-rig')}",
+                "started_utc": started_utc,
+                "bench": bench.name,
+                "devices": bench.devices(),
+                "conditions": dict(bench.conditions),
+                "findings": list(bench.findings),
+                "descriptor": {"name": kind.name, "version": kind.version},
+                "config": bench.config.model_dump(mode="json"),
+            }
+            write(folder / "run.json", (json.dumps(about, indent=2, default=str) + "\n").encode())
+            self._events: TextIO = (folder / "events.jsonl").open("x", encoding="utf-8")
+        except OSError as error:
+            raise _not_writable(folder, error) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, RigError):
+            self._line(error.as_dict())
+        self.close()
+
+    def close(self) -> None:
+        self._events.close()
+
+    def add(self, event: Event) -> None:
+        """Take the next event of the stream; a frame is in the folder before its event.
+
+        Raises
+        ------
+        UsageError
+            The disk is full or fails.
+        """
+        try:
+            if isinstance(event, Accepted):
+                write(frame_path(self._folder, event.index), images.encode(event.image_bgr))
+            self._line(event_dict(event))
+        except OSError as error:
+            raise _not_writable(self._folder, error) from error
+
+    def _line(self, value: dict[str, Any]) -> None:
+        self._events.write(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str) + "\n")
+        self._events.flush()
+
+
+@dataclass(frozen=True, slots=True)
+class SavedRun:
+    """A run as its folder has it.
+
+    Attributes
+    ----------
+    folder
+        Where it is.
+    about
+        Bench, devices, conditions and software, as JSON values.
+    config
+        The settings it ran under.
+    model : Model
+        The enrolled views, and the rules, that it was decided by.
+    empty_table : uint8 array (H, W, 3), or None
+        The bench without an object.
+    error
+        What ended it, where that was an error, as `RigError.as_dict` tells it.
+    """
+
+    folder: Path
+    about: dict[str, Any]
+    config: RigConfig
+    model: Model
+    empty_table: NDArray[np.uint8] | None
+    error: dict[str, Any] | None
+    _lines: tuple[dict[str, Any], ...]
+
+    @property
+    def views(self) -> hbr.Views:
+        """The enrolled views it was decided by."""
+        return self.model.views
+
+    def events(self) -> Iterator[Event]:
+        """Yield the events in their order, frames included.
+
+        Raises
+        ------
+        UsageError
+            An event is none that this program knows, or a frame is missing.
+        """
+        for number, line in enumerate(self._lines, 1):
+            try:
+                yield event_of(line, self._frame)
+            except (KeyError, TypeError, ValueError) as error:
+                raise _damaged(self.folder, f"events.jsonl, line {number}: {error}") from error
+
+    @property
+    def started(self) -> Started:
+        """How the run began.
+
+        Raises
+        ------
+        UsageError
+            It does not say.
+        """
+        first = next(self.events(), None)
+        if not isinstance(first, Started):
+            raise _damaged(self.folder, "events.jsonl does not begin with the event started")
+        return first
+
+    def _frame(self, index: int) -> NDArray[np.uint8]:
+        return _image(frame_path(self.folder, index))
+
+
+def load_run(folder: Path) -> SavedRun:
+    """Read a saved run; a last event that was cut off while it was written is left out.
+
+    Raises
+    ------
+    UsageError
+        The folder holds no run, a damaged one, or one of a newer version.
+    """
+    try:
+        about = json.loads(_bytes(folder / "run.json"))
+        if about.get("format") != FORMAT:
+            raise ValueError("run.json is not that of a saved run")
+        if about["version"] not in range(1, VERSION + 1):
+            raise UsageError(
+                f"The run {folder} has the format version {about['version']}; this program reads 1 to {VERSION}.",
+                next_step="Use the program that saved it, or a newer one.",
+            )
+        used = about["descriptor"]
+        if used["version"] != descriptor(used["name"]).version:
+            raise ValueError(f"it was described by {used['name']} {used['version']}, which this program has not")
+        config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
+        views = _views(_json_lines(_bytes(folder / "model.jsonl")), used["name"])
+        stored = read_rules(folder)
+        model = model_of(views, rules=None if stored is None else stored.adapted(views))
+        empty_table = _image(folder / EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
+        lines = _json_lines(_bytes(folder / "events.jsonl"), cut=True)
+    except CatalogError as error:
+        raise _damaged(folder, f"{error.what}: {error.evidence['reason']}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _damaged(folder, str(error)) from error
+    failed = lines.pop() if lines and "event" not in lines[-1] else None
+    return SavedRun(folder, about, config, model, empty_table, failed, tuple(lines))
+
+
+def frame_path(folder: Path, index: int) -> Path:
+    """Return where the frame of an accepted view is kept."""
+    return folder / "frames" / f"{index:03d}.png"
+
+
+def event_of(values: dict[str, Any], frame: Any) -> Event:
+    """Return the event that `event_dict` made ``values`` of; ``frame`` gives the picture of an accepted view.
+
+    Numbers that were not finite come back as nan: what they were is not known.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        It is no event, or its fields are not those of its kind.
+    """
+    values = dict(values)
+    name = values.pop("event")
+    if name not in _KINDS:
+        raise ValueError(f"there is no event {name!r}")
+    if name == "accepted":
+        values["image_bgr"] = frame(values["index"])
+        if "front_end" in values:  # its name in runs of version 2 and before
+            values["segmentation"] = values.pop("front_end")
+    event: Event = built(_KINDS[name], values)
+    return event
+
+
+def built(kind: Any, value: Any) -> Any:
+    """Return JSON values as the type that is meant; fields that a newer program added are left out."""
+    origin = get_origin(kind)
+    if is_dataclass(kind):
+        hints = get_type_hints(kind)
+        given = {f.name: built(hints[f.name], value[f.name]) for f in fields(kind) if f.name in value}
+        return kind(**given)  # type: ignore[operator]
+    if origin in (Union, UnionType):
+        if value is None and NoneType in get_args(kind):
+            return None
+        return built(next(k for k in get_args(kind) if k is not NoneType), value)
+    if origin is tuple:
+        items = get_args(kind)
+        return tuple(built(items[0] if items[-1] is Ellipsis else items[i], item) for i, item in enumerate(value))
+    if kind is float:
+        return nan if value is None else float(value)
+    if kind in (str, bool, int) and type(value) is not kind:
+        raise TypeError(f"{value!r} is no {kind.__name__}")
+    return value
+
+
+def _model_lines(views: hbr.Views) -> Iterator[str]:
+    pack = descriptor(views.descriptor).pack
+    for number, name in enumerate(views.object_names):
+        rows = views.of(number)
+        line = {
+            "object": name,
+            "azimuth_deg": views.azimuth_deg[rows].tolist(),
+            "descriptors": [pack(levels).hex() for levels in views.descriptors[rows]],
+        }
+        yield json.dumps(line, ensure_ascii=False) + "\n"
+
+
+def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
+    parts = [
+        hbr.Views.of_object(
+            line["object"],
+            unpack_rows(descriptor(kind), bytes.fromhex("".join(line["descriptors"]))),
+            line["azimuth_deg"],
+            kind,
+        )
+        for line in lines
+    ]
+    return hbr.Views.concatenate(parts) if parts else hbr.Views.empty(kind)
+
+
+def _image(path: Path) -> NDArray[np.uint8]:
+    image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(f"{path.name} is no image")
+    return np.asarray(image, np.uint8)
+
+
+def _json_lines(content: bytes, *, cut: bool = False) -> list[dict[str, Any]]:
+    """Return the values of JSON Lines; with ``cut``, a last line without its end is left out."""
+    text = content.decode()
+    lines = text.splitlines()
+    if cut and lines and not text.endswith("\n"):
+        lines.pop()
+    return [json.loads(line) for line in lines]
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UsageError(
+            f"There is no saved run in {path.parent}: {path.name} cannot be read.",
+            next_step="Give a folder that rig identify --save-run has written.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+
+
+def _damaged(folder: Path, reason: str) -> UsageError:
+    return UsageError(
+        f"The run in {folder} cannot be read.",
+        next_step="Take it from a backup, or look at its files: they are PNG and JSON Lines.",
+        evidence={"reason": reason},
+    )
+
+
+def _not_writable(folder: Path, error: OSError) -> UsageError:
+    return UsageError(
+        f"The run cannot be saved in {folder}.",
+        next_step="Give a new folder, on a disk with space, with --save-run.",
+        evidence={"reason": error.strerror or str(error)},
+    )

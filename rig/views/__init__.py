@@ -1,0 +1,1 @@
+"""Views: capture, acceptance, description, and the empty-table image."""

@@ -1,0 +1,147 @@
+"""Images of views: encoding and file names."""
+
+import hashlib
+import re
+import unicodedata
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.core.errors import CatalogError, UsageError
+
+IMAGE_FOLDER: Final = "images"
+MAX_SLUG_LENGTH: Final = 40
+
+MAX_FILE_BYTES: Final = 256_000_000
+MAX_SIDE: Final = 20_000
+MAX_PIXELS: Final = 100_000_000
+"""Of one image; more than any camera of such a bench has, and 300 MB decoded."""
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG: Final = b"\xff\xd8\xff"
+
+# The fastest lossless settings for camera frames, and among the smallest: noise hides the repeats that the other
+# strategies search for. OpenCV before 4.12 chooses its filter by itself.
+PNG_SETTINGS: Final = [
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+    *([cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG] if hasattr(cv2, "IMWRITE_PNG_FILTER") else []),
+]
+
+
+def encode(image_bgr: NDArray[np.uint8]) -> bytes:
+    """Encode an image, uint8 (H, W, 3) BGR, as PNG, without loss.
+
+    Raises
+    ------
+    UsageError
+        The image has another type or shape, or is empty.
+    """
+    if image_bgr.dtype != np.uint8 or image_bgr.ndim != 3 or image_bgr.shape[2] != 3 or not image_bgr.size:
+        raise UsageError(
+            f"an image of {image_bgr.dtype} with shape {image_bgr.shape}",
+            next_step="store BGR images as uint8 with shape (H, W, 3)",
+        )
+    encoded, png = cv2.imencode(".png", np.ascontiguousarray(image_bgr), PNG_SETTINGS)
+    if not encoded:
+        raise UsageError(
+            f"an image of shape {image_bgr.shape} cannot be encoded as PNG", next_step="store a smaller image"
+        )
+    return png.tobytes()
+
+
+def digest(png: bytes) -> str:
+    """Return the SHA-256 of an image file, 64 hexadecimal digits."""
+    return hashlib.sha256(png).hexdigest()
+
+
+class BadImage(ValueError):
+    """Bytes that are no image the catalog can keep; the message says why."""
+
+
+def decode(content: bytes) -> NDArray[np.uint8]:
+    """Return the pixels of a PNG or JPEG file of anybody's making, uint8 (H, W, 3) BGR.
+
+    What the file says of its size is looked at before memory is spent on it.
+
+    Raises
+    ------
+    BadImage
+        It is another kind of file, cut off, damaged or absurdly large.
+    """
+    if len(content) > MAX_FILE_BYTES:
+        raise BadImage(f"{len(content)} bytes, more than {MAX_FILE_BYTES}")
+    if content.startswith(_PNG):
+        size, end = _png_size(content), b"IEND\xaeB`\x82"
+    elif content.startswith(_JPEG):
+        size, end = _jpeg_size(content), b"\xff\xd9"
+    else:
+        raise BadImage("neither a PNG nor a JPEG file")
+    if size is None or end not in content[-4096:]:  # padding after the end is legal
+        raise BadImage("cut off or damaged")
+    width, height = size
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise BadImage(f"{width} x {height} pixels; at most {MAX_PIXELS} and {MAX_SIDE} a side are taken")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise BadImage("damaged") from error
+    if image is None:
+        raise BadImage("damaged")
+    return np.asarray(image, np.uint8)
+
+
+def suffix(content: bytes) -> str:
+    """Return the suffix of a file name for an image that `decode` takes."""
+    return ".png" if content.startswith(_PNG) else ".jpg"
+
+
+def _png_size(content: bytes) -> tuple[int, int] | None:
+    if content[12:16] != b"IHDR" or len(content) < 24:
+        return None
+    return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int] | None:
+    """The size that the frame header (SOF, ITU-T T.81 B.2.2) tells."""
+    at = 2
+    while at + 9 < len(content) and content[at] == 0xFF:
+        marker = content[at + 1]
+        if marker == 0xFF:  # fill
+            at += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return int.from_bytes(content[at + 7 : at + 9], "big"), int.from_bytes(content[at + 5 : at + 7], "big")
+        at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+    return None
+
+
+def read(path: Path, sha256: str) -> NDArray[np.uint8]:
+    """Return the stored pixels, uint8 (H, W, 3) BGR.
+
+    Raises
+    ------
+    CatalogError
+        The file is missing or is not the one that was stored.
+    """
+    mend = "look for a copy of it: rig catalog verify --repair; else enroll the object again with --replace"
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError as error:
+        raise CatalogError(f"the image {path} is missing", next_step=mend) from error
+    if digest(content) != sha256:
+        raise CatalogError(f"the image {path} is not the one that was stored", next_step=mend)
+    try:
+        return decode(content)
+    except BadImage as error:
+        raise CatalogError(f"the image {path} cannot be read: {error}", next_step=mend) from error
+
+
+def folder(object_id: int, object_name: str, enrollment_id: int) -> Path:
+    """Return an enrollment's folder, relative to the catalog; the id makes it unique, the name is for people."""
+    ascii_name = unicodedata.normalize("NFKD", object_name).encode("ascii", "ignore").decode().lower()
+    slug = re.sub(r"[^a-z0-9]+", "-", ascii_name)[:MAX_SLUG_LENGTH].strip("-")
+    return Path(IMAGE_FOLDER, f"{object_id:06d}-{slug}".rstrip("-"), f"{enrollment_id:06d}")

@@ -1,0 +1,133 @@
+"""A ChArUco board on the platter, seen through a true camera."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from math import cos, radians, sin
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.views.charuco_board import Board
+from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
+from sim.optics import SUPERSAMPLING, Optics
+from sim.world import Thing
+
+TEXTURE_PX_MM = 10
+
+
+@dataclass(frozen=True)
+class BoardOnPlatter:
+    """The printed board on its stand.
+
+    Attributes
+    ----------
+    board
+        Its layout as printed.
+    optics
+        Of the camera that looks at it.
+    tilt_deg
+        How far its top leans away from the camera when the table stands at 0.
+    swing_deg, roll_deg
+        How far it is turned about the vertical, and in its own plane.
+    centre_mm
+        Where its middle is in the platter's frame: x to the right, y away, z up.
+    loose_deg
+        How far it may swing about the vertical whenever the table has moved.
+    """
+
+    board: Board = field(default_factory=Board)
+    optics: Optics = field(default_factory=Optics)
+    tilt_deg: float = 15.0
+    swing_deg: float = 0.0
+    roll_deg: float = 0.0
+    centre_mm: tuple[float, float, float] = (0.0, 0.0, 75.0)
+    loose_deg: float = 0.0
+    name: str = "calibration-board"
+
+    def put(self, *, tilt_deg: float, swing_deg: float = 0.0, roll_deg: float = 0.0) -> "BoardOnPlatter":
+        """Return the board put differently on its stand."""
+        return replace(self, tilt_deg=tilt_deg, swing_deg=swing_deg, roll_deg=roll_deg)
+
+    def pose(self, table_deg: float) -> tuple[Floats, Floats]:
+        """Return rotation (3, 3) and translation (3,), mm, from the board's frame into the camera's.
+
+        The board's frame is OpenCV's: x to its right, y down, from its first corner.
+        """
+        loose = self.loose_deg * sin(table_deg * 7.3) if self.loose_deg else 0.0
+        turn = radians(self.swing_deg + loose)
+        about = np.array([[cos(turn), -sin(turn), 0.0], [sin(turn), cos(turn), 0.0], [0.0, 0.0, 1.0]])
+        lean = radians(self.tilt_deg)
+        upright = np.array([[1.0, 0.0, 0.0], [0.0, -sin(lean), cos(lean)], [0.0, -cos(lean), -sin(lean)]])
+        c, s = cos(radians(self.roll_deg)), sin(radians(self.roll_deg))
+        rolled = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        on_platter = about @ upright @ rolled
+        width, height = self.board.size_mm
+        corner = np.array(self.centre_mm) - on_platter @ np.array([width / 2, height / 2, 0.0])
+        rotation, translation = self.optics.to_camera(table_deg)
+        return rotation @ on_platter, rotation @ corner + translation
+
+    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:  # noqa: ARG002
+        """Draw the board into ``image``; where it was put on the platter is its own, not ``offset_mm``."""
+        rotation, translation = self.pose(azimuth_deg)
+        normal = rotation[:, 2]
+        if float(normal @ translation) <= 0:  # its back
+            return
+        # A ray r meets the board's plane where the homography [r1 r2 t]⁻¹ takes it.
+        to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation]))
+        rays = self.optics.rays()
+        at = rays @ to_board[:, :2].T.astype(np.float32) + to_board[:, 2].astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = at[:, :2] / at[:, 2:] * TEXTURE_PX_MM - 0.5
+        size = (HEIGHT * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
+        margin = TEXTURE_PX_MM * self.board.margin_mm
+        maps = np.nan_to_num(places + np.float32(margin), nan=-1e4, posinf=-1e4, neginf=-1e4).reshape(*size, 2)
+        maps = np.clip(maps, -1e4, 1e4).astype(np.float32)
+        fine = cv2.remap(self._texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+        seen = cv2.resize(fine, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
+        cover = seen[..., 1:] / 255
+        image[:] = np.clip(seen[..., :1] + image * (1 - cover), 0, 255).astype(np.uint8)
+
+    @cached_property
+    def _texture(self) -> NDArray[np.uint8]:
+        """The print (grey, premultiplied) and what it covers, uint8 (rows, columns, 2)."""
+        return _texture(self.board)
+
+
+@lru_cache(maxsize=4)
+def _texture(board: Board) -> NDArray[np.uint8]:
+    grey = board.picture(TEXTURE_PX_MM)
+    paper = np.clip(grey.astype(np.float32) * (215 - 25) / 255 + 25, 0, 255).astype(np.uint8)
+    return np.dstack([paper, np.full_like(paper, 255)])
+
+
+@dataclass(frozen=True)
+class GreyCard:
+    """A plain card that fills the frame."""
+
+    level: int = 170
+    name: str = "grey-card"
+
+    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:  # noqa: ARG002
+        """Fill ``image``."""
+        image[:] = self.level
+
+
+def utensils(optics: Optics, board: Board | None = None) -> dict[str, Thing]:
+    """Return what the calibrations of the camera ask to be put up, by name: the grey card, and the board's stands."""
+    return {GreyCard().name: GreyCard(), **boards(optics, board)}
+
+
+def boards(optics: Optics, board: Board | None = None) -> dict[str, BoardOnPlatter]:
+    """Return the board as the calibrations ask for it to stand, by name."""
+    layout = board or Board()
+    return {
+        "calibration-board upright": BoardOnPlatter(layout, optics, tilt_deg=4.0),
+        "calibration-board back": BoardOnPlatter(layout, optics, tilt_deg=31.0, centre_mm=(0.0, 10.0, 70.0)),
+        "calibration-board left": BoardOnPlatter(
+            layout, optics, tilt_deg=8.0, roll_deg=12.0, centre_mm=(-70.0, 0.0, 110.0)
+        ),
+        "calibration-board right": BoardOnPlatter(
+            layout, optics, tilt_deg=18.0, roll_deg=-15.0, centre_mm=(70.0, -10.0, 60.0)
+        ),
+    }

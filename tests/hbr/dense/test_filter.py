@@ -1,0 +1,124 @@
+"""The dense Hough filter against its formula written out."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hbr import DenseIndex, Views, believe, tanimoto
+from hbr.dense.filter import BINS, Belief
+from tests.hbr.dense.searches import believe_all
+
+
+def catalog(seed: int, objects: int = 4, *, ragged: bool = True) -> Views:
+    rng = np.random.default_rng(seed)
+    parts = []
+    for j in range(objects):
+        count = int(rng.integers(1, 9)) if ragged else 8
+        azimuth = rng.uniform(0, 360, count) if ragged else np.arange(8) * 45.0
+        levels = rng.integers(0, 8, (count, 144)) * (rng.random((count, 144)) < 0.2)
+        parts.append(Views.of_object(f"object {j}", levels.astype(np.uint8), azimuth))
+    return Views.concatenate(parts)
+
+
+def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: float, power: float = 4.0) -> np.ndarray:
+    """A_n(j, φ), object by object, bin by bin, view by view."""
+    total = np.zeros((len(views.object_names), BINS))
+    for j in range(len(views.object_names)):
+        rows = views.of(j)
+        for b in range(BINS):
+            for query, angle in zip(queries, angles, strict=True):
+                best = -np.inf
+                for k in rows:
+                    others = [(views.azimuth_deg[i] - views.azimuth_deg[k]) % 360 for i in rows if i != k] or [360.0]
+                    left, right = min(others) / 2, (360 - max(others)) / 2 if len(rows) > 1 else 180.0
+                    turned = (b * 5 + angle - angles[0] - views.azimuth_deg[k]) % 360
+                    away = max(0.0, min(turned - left, 360 - turned - right))
+                    similar = float(tanimoto(query, views.descriptors[k])[0, 0])
+                    best = max(best, similar**power - omega * away / 360)
+                total[j, b] += best
+    return total
+
+
+@settings(max_examples=12)
+@given(
+    st.integers(0, 10**6),
+    st.floats(0, 8),
+    st.sampled_from([1.0, 2.5, 4.0]),
+    st.lists(st.floats(-720, 720), min_size=1, max_size=3),
+)
+def test_support_is_the_formula_s_at_every_azimuth_of_every_object(
+    seed: int, omega: float, power: float, angles: list[float]
+) -> None:
+    views = catalog(seed, objects=3)
+    queries = catalog(seed + 1, ragged=False).descriptors[: len(angles)]
+    belief = believe_all(queries, angles, DenseIndex(views, omega=omega, power=power))
+    wanted = written_out(queries, angles, views, omega, power)
+    np.testing.assert_allclose(belief.support, wanted, atol=2e-5)
+    ranking = belief.ranking()
+    assert ranking.object_index[0] in np.flatnonzero(wanted.max(axis=1) >= wanted.max() - 1e-4)
+    mean = np.maximum(wanted.max(axis=1), 0) / len(angles)
+    np.testing.assert_allclose(np.sort(ranking.scores) ** power, np.sort(mean), atol=2e-5)
+    assert belief.posterior(30.0).sum() == pytest.approx(1)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 3))
+@settings(max_examples=20)
+def test_those_who_are_kept_are_the_strongest_and_score_as_if_all_were(seed: int, kept: int) -> None:
+    views = catalog(seed, objects=6)
+    index = DenseIndex(views)
+    queries = catalog(seed + 1, ragged=False).descriptors[:2]
+    every = believe(queries[0], 0.0, index)
+    few = believe(queries[0], 0.0, index, kept=kept)
+    strongest = np.sort(np.argsort(-every.support.max(axis=1), kind="stable")[:kept])
+    np.testing.assert_array_equal(few.support.max(axis=1), every.support[strongest].max(axis=1))
+    np.testing.assert_array_equal(few.index.object_index, strongest)
+    later, whole = believe(queries[1], 77.0, few), believe(queries[1], 77.0, every)
+    np.testing.assert_array_equal(later.support, whole.support[strongest])
+
+
+def test_a_view_that_is_left_out_counts_no_more() -> None:
+    views = catalog(5, ragged=False)
+    index = DenseIndex(views)
+    query = views.descriptors[11]
+    gone = np.array([11, 3])
+    fewer = believe(query, 0.0, index.without(gone))
+    again = written_out(query[None], [0.0], views.select(np.setdiff1d(np.arange(len(views)), gone)), 2.0)
+    np.testing.assert_allclose(fewer.support, again, atol=2e-5)
+    assert believe(query, 0.0, index).scores()[1] == pytest.approx(1)
+    with pytest.raises(ValueError, match="without any view"):
+        index.without(views.of(2))
+
+
+def test_turned_queries_agree_on_an_azimuth_and_its_mean_lies_between_the_bins() -> None:
+    views = catalog(7, ragged=False)
+    rows = views.of(2)
+    belief = believe_all(views.descriptors[rows[[1, 3, 6]]], [10.0, 100.0, 235.0], DenseIndex(views))
+    ranking = belief.ranking()
+    assert ranking.object_index[0] == 2
+    assert abs((ranking.pose_deg[0] - views.azimuth_deg[rows[6]] + 180) % 360 - 180) < 2.5
+
+
+def test_turning_the_zero_of_the_orientations_changes_nothing() -> None:
+    views = catalog(9)
+    queries = catalog(10, ragged=False).descriptors[:3]
+    index = DenseIndex(views)
+    one = believe_all(queries, [0.0, 40.0, 170.0], index)
+    other = believe_all(queries, [-300.0, -260.0, 230.0], index)
+    np.testing.assert_allclose(one.support, other.support, atol=1e-6)
+
+
+def test_what_is_no_query_is_refused() -> None:
+    index = DenseIndex(catalog(1))
+    query = np.zeros(144, np.uint8)
+    assert isinstance(believe(query, 0.0, index), Belief)
+    with pytest.raises(ValueError, match="cedd has uint8 of"):
+        believe(query[:100], 0.0, index)
+    with pytest.raises(ValueError, match="finite angle"):
+        believe(query, float("nan"), index)
+    with pytest.raises(ValueError, match="kept is 0"):
+        believe(query, 0.0, index, kept=0)
+    with pytest.raises(ValueError, match="enroll at least one object"):
+        DenseIndex(Views.empty())
+    with pytest.raises(ValueError, match=r"power is 0\.5"):
+        DenseIndex(catalog(1), power=0.5)

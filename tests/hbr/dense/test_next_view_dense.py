@@ -1,0 +1,117 @@
+"""The next view: the turn after which the hypotheses differ most, in the cable's reach and worth its way."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hbr import DenseIndex, Views, next_look
+from hbr.dense.filter import BINS, believe
+from hbr.dense.next_view import most_informative_turn
+
+STEP = 15
+
+
+def twins() -> Views:
+    """Two objects that differ from 180 to 210 degrees only, and a third that is nothing like them."""
+    rng = np.random.default_rng(0)
+    azimuth = np.arange(0, 360, STEP, dtype=float)
+    turn = np.radians(azimuth)[:, None]
+    parts = []
+    base = rng.uniform(1, 6, 144) * (rng.random(144) < 0.3)
+    swing, phase = rng.uniform(0, 2, 144) * (base > 0), rng.uniform(0, 7, 144)
+    plain = np.rint(np.clip(base + swing * np.sin(turn + phase), 0, 7)).astype(np.uint8)
+    marked = plain.copy()
+    marked[(azimuth >= 180) & (azimuth <= 210), 60:110] = 5
+    parts = [Views.of_object("plain", plain, azimuth), Views.of_object("marked", marked, azimuth)]
+    other = np.where(rng.random((24, 144)) < 0.2, 6, 0).astype(np.uint8)
+    return Views.concatenate([*parts, Views.of_object("other", other, azimuth)])
+
+
+VIEWS = twins()
+INDEX = DenseIndex(VIEWS)
+
+
+def looked(azimuth: float) -> np.ndarray:
+    return VIEWS.descriptors[VIEWS.of(0)[int(azimuth // STEP)]]
+
+
+@pytest.mark.parametrize(("azimuth", "low", "high"), [(30.0, 145, 185), (300.0, -125, -85)])
+def test_twins_are_told_apart_where_they_differ(azimuth: float, low: float, high: float) -> None:
+    look = next_look(believe(looked(azimuth), 0.0, INDEX), beta=60.0)
+    assert low <= look.rotation_deg <= high
+    assert look.pair in ((0, 1), (1, 0))
+    assert look.orientation_deg == look.rotation_deg % 360
+    # the baseline sees it, too
+    assert low <= most_informative_turn(believe(looked(azimuth), 0.0, INDEX), beta=60.0) <= high
+
+
+def test_only_turns_that_the_cable_allows_are_chosen() -> None:
+    belief = believe(looked(30.0), 0.0, INDEX)
+    allowed = np.array([-90.0, -40.0, 20.0, 70.0])
+    look = next_look(belief, beta=60.0, rotations_deg=allowed)
+    assert look.rotation_deg in allowed
+    assert len(look.confusion) == len(look.cost) == 4
+
+
+def test_time_that_a_turn_takes_is_weighed_against_what_it_tells() -> None:
+    belief = believe(looked(30.0), 0.0, INDEX)
+    turns = np.arange(-175.0, 181.0, 5)
+    quick = next_look(belief, beta=60.0, rotations_deg=turns, seconds=np.zeros(len(turns)))
+    slow = next_look(belief, beta=60.0, rotations_deg=turns, seconds=np.abs(turns) / 10, second_costs=5.0)
+    assert abs(slow.rotation_deg) < abs(quick.rotation_deg)
+
+
+def test_where_one_was_already_nothing_new_is_expected() -> None:
+    first = believe(looked(30.0), 0.0, INDEX)
+    second = believe(looked(180.0), 150.0, first)
+    look = next_look(second, beta=60.0, seconds=np.zeros(BINS - 1))
+    landing = (150 + look.rotations_deg) % 360
+    visited = np.isin(landing, [0.0, 150.0])
+    assert look.confusion[visited].min() >= look.confusion.max() - 1e-9
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 23), st.floats(5, 100))
+def test_the_expected_confusion_is_that_of_the_formula(start: int, sharpness: float) -> None:
+    """Once more from the posterior of single hypotheses that the decision keeps, written out."""
+    from hbr.dense.next_view import _strongest
+
+    belief = believe(looked(start * STEP), 20.0, INDEX)
+    turns = np.array([-120.0, 33.0, 90.0])
+    look = next_look(belief, beta=40.0, sharpness=sharpness, rotations_deg=turns)
+    probability, place, bins = _strongest(belief.posterior(40.0))
+    for turn, confusion in zip(turns, look.confusion, strict=True):
+        novelty = 1 - np.exp(-0.5 * (min(abs(turn), 360 - abs(turn)) / 15) ** 2)
+        away = [
+            np.abs((VIEWS.azimuth_deg[VIEWS.of(j)] - b * 5 - turn + 180) % 360 - 180)
+            for j, b in zip(place.tolist(), bins.tolist(), strict=True)
+        ]
+        shown = [VIEWS.descriptors[VIEWS.of(j)[own.argmin()]] for j, own in zip(place.tolist(), away, strict=True)]
+        known = np.exp(-0.5 * (np.array([own.min() for own in away]) / 15) ** 2)
+        similar = np.array([[_tanimoto(a, b) for b in shown] for a in shown])
+        rivals = np.outer(probability, probability) * (place[:, None] != place)
+        assert confusion == pytest.approx(
+            np.log((rivals * np.exp(-sharpness * novelty * np.sqrt(np.outer(known, known)) * (1 - similar))).sum()),
+            abs=1e-6,
+        )
+
+
+def test_one_object_alone_is_looked_at_from_a_new_side() -> None:
+    alone = DenseIndex(VIEWS.select(VIEWS.of(0)))
+    look = next_look(believe(looked(30.0), 0.0, alone), beta=60.0)
+    assert look.pair is None
+    assert abs(look.rotation_deg) >= 50
+
+
+def test_what_is_no_choice_is_refused() -> None:
+    belief = believe(looked(0.0), 0.0, INDEX)
+    with pytest.raises(ValueError, match="the cable's limits"):
+        next_look(belief, beta=1.0, rotations_deg=[])
+    with pytest.raises(ValueError, match="one finite time each"):
+        next_look(belief, beta=1.0, rotations_deg=[10.0, 20.0], seconds=[1.0])
+
+
+def _tanimoto(a: np.ndarray, b: np.ndarray) -> float:
+    x, y = a.astype(float), b.astype(float)
+    return float(x @ y / (x @ x + y @ y - x @ y))

@@ -1,0 +1,103 @@
+"""The trials of the dense filter: fewer views enrolled, strangers, and walks of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hbr import DenseIndex, believe, next_look
+from hbr.core.angles import wrap180
+from hbr.evaluation.methods import METHODS, choose_methods
+from hbr.evaluation.protocol import Protocol, Runs, _Trials, run_object
+from hbr.evaluation.results import contests, method_results
+from tests.hbr.dense.searches import believe_all
+from tests.hbr.evaluation.test_protocol import QUERIES, STEP, VIEWS
+
+PROTOCOL = Protocol(trials=3, max_views=4, enrolled=8, removal="queries")
+
+
+def run(name: str, j: int = 2, protocol: Protocol = PROTOCOL) -> Runs:
+    return run_object(j, QUERIES[VIEWS.of(j)], VIEWS, choose_methods(name.split(",")), protocol)
+
+
+@pytest.mark.parametrize("protocol", [PROTOCOL, Protocol(trials=2, max_views=4, near_deg=20)])
+@pytest.mark.parametrize("name", ["dense", "dense-90", "dense-random", "dense-coin"])
+def test_a_trial_equals_the_protocol_written_out(name: str, protocol: Protocol) -> None:
+    j = 2
+    own = VIEWS.of(j)
+    runs = run(name, j, protocol)
+    trials = _Trials(j, QUERIES[own], VIEWS, protocol, lambda: 0)
+    ring = np.arange(24)
+    kept = ring % 3 == 0 if protocol.enrolled else ring >= 0
+    for t in range(protocol.trials):
+        draws = trials.draw(t)
+        seen = [int(draws.order[0])]
+        for n in range(protocol.max_views):
+            angles = np.array(seen) * STEP
+            mine = kept.copy()
+            if not protocol.enrolled:
+                mine &= [min(abs((i * STEP - a + 180) % 360 - 180) for a in angles) >= 20 for i in ring]
+            mask = np.tile(kept, 6)
+            whole = DenseIndex(VIEWS.select(mask), omega=METHODS[name].omega)
+            gone = own[kept & ~mine]
+            index = whole.without(np.searchsorted(np.flatnonzero(mask), gone))
+            belief = believe_all(QUERIES[own[seen]], angles + draws.error_deg[: n + 1], index)
+            ranking = belief.ranking()
+            assert runs.rank[0, 0, t, n] == ranking.object_index.tolist().index(j) + 1
+            assert runs.score[0, 0, t, n] == ranking.scores[0]
+            assert runs.posterior[0, 0, t, n] == belief.posterior().sum(axis=1).max()
+            match name:
+                case "dense":
+                    turn = next_look(belief).rotation_deg
+                case "dense-coin":
+                    turn = abs(next_look(belief).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
+                case "dense-90":
+                    turn = 90.0
+                case _:
+                    turn = wrap180(float(draws.order[(n + 1) % 4] * STEP - angles[-1]))
+            left = [i for i in ring if i not in seen and not (protocol.enrolled and kept[i])]
+            seen.append(min(left, key=lambda i: abs((i * STEP - angles[-1] - turn + 180) % 360 - 180)))
+
+
+def test_only_views_that_are_not_enrolled_are_looked_at() -> None:
+    trials = _Trials(1, QUERIES[VIEWS.of(1)], VIEWS, PROTOCOL, lambda: 0)
+    for t in range(20):
+        assert (trials.draw(t).order % 3 != 0).all()
+    assert (np.array([trials._nearest([1], turn) for turn in np.arange(0, 360, 7.0)]) % 3 != 0).all()
+    with pytest.raises(ValueError, match="16 views; for 16 queries"):
+        run("dense-90", protocol=replace(PROTOCOL, max_views=16))
+
+
+def test_strangers_are_looked_for_among_the_others() -> None:
+    protocol = replace(PROTOCOL, absent=("object 2", "object 4"))
+    stranger, known = run("dense", 2, protocol), run("dense", 1, protocol)
+    assert (stranger.rank == 0).all()
+    assert np.isnan(stranger.pose_error_deg).all()
+    assert (known.rank == 1).all()
+    assert stranger.score.max() < known.score.min()
+    # the same scores as a filter that never heard of them
+    trials = _Trials(2, QUERIES[VIEWS.of(2)], VIEWS, protocol, lambda: 0)
+    first = int(trials.draw(0).order[0])
+    others = VIEWS.select(np.isin(VIEWS.object_index, [0, 1, 3, 5]) & (VIEWS.azimuth_deg % 45 == 0))
+    belief = believe(QUERIES[VIEWS.of(2)[first]], 0.0, DenseIndex(others, omega=METHODS["dense"].omega))
+    assert stranger.score[0, 0, 0, 0] == pytest.approx(belief.scores().max())
+    with pytest.raises(ValueError, match="dense filter"):
+        run("hbr", 1, protocol)
+
+
+def test_the_oracle_leads_at_least_as_much_as_a_fixed_step() -> None:
+    leads = {
+        name: np.mean([run(name, j).lead[0, 0, :, 1].mean() for j in range(6)]) for name in ("dense-oracle", "dense-90")
+    }
+    assert leads["dense-oracle"] > leads["dense-90"]
+
+
+def test_a_search_by_the_filter_ends_by_its_probability_and_methods_are_compared() -> None:
+    methods = choose_methods(["dense", "dense-90", "dense-mutual", "hbr"])
+    runs = Runs.concatenate([run("dense,dense-90,dense-mutual,hbr", j) for j in range(6)])
+    runs.posterior[0] = np.linspace(0.96, 0.99, 4)
+    stopping = method_results(runs, methods, margin=10.0)[0].stopping
+    assert stopping.views_mean == 3  # 0.96, 0.97, 0.98
+    assert method_results(runs, methods, margin=10.0)[3].stopping.views_mean == 4
+    asked = {(c.first, c.first_views, c.second) for c in contests(runs, methods, np.random.default_rng(0))}
+    assert {("dense", 3, "dense-90"), ("dense", 2, "dense-mutual")} <= asked

@@ -1,0 +1,108 @@
+"""How alike an object is to itself from other sides, and to others."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import hbr
+from hbr.model.symmetry import _arcs, lookalikes, symmetry
+
+COUNT = 36
+STEP_DEG = 360.0 / COUNT
+
+
+def ring(period: int, seed: int = 0, spread: int = 3) -> np.ndarray:
+    """Return descriptors, uint8 (36, 144), that change smoothly around the object and repeat after ``period`` views."""
+    rng = np.random.default_rng(seed)
+    keys = rng.integers(0, 8, (period, 144)).astype(float)
+    smooth = sum(np.roll(keys, shift, axis=0) for shift in range(-spread, spread + 1)) / (2 * spread + 1)
+    return np.tile(np.rint(smooth).astype(np.uint8), (COUNT // period, 1))
+
+
+def views_of(*objects: np.ndarray) -> hbr.Views:
+    return hbr.Views.concatenate(
+        [hbr.Views.of_object(f"o{i}", d, np.arange(len(d)) * 360.0 / len(d)) for i, d in enumerate(objects)]
+    )
+
+
+@pytest.mark.parametrize(("period", "expected_deg"), [(36, 360), (18, 180), (12, 120), (9, 90)])
+def test_the_period_is_found(period, expected_deg):
+    found = symmetry(views_of(ring(period)), 0)
+    assert found is not None
+    assert found.period_deg == pytest.approx(expected_deg)
+    if expected_deg < 360:
+        assert found.alike == pytest.approx(1.0)
+
+
+def test_a_round_object_looks_alike_from_everywhere_and_few_views_say_nothing():
+    same = np.tile(np.arange(144, dtype=np.uint8) % 8, (COUNT, 1))
+    found = symmetry(views_of(same), 0)
+    assert found is not None
+    assert (found.period_deg, found.neighbours, found.alike) == (0.0, 1.0, 1.0)
+    assert symmetry(views_of(same[:17]), 0) is None
+
+
+@given(turn=st.integers(0, COUNT - 1), period=st.sampled_from([36, 18, 12]), order=st.randoms())
+def test_where_a_ring_begins_and_in_which_order_it_is_stored_does_not_matter(turn, period, order):
+    descriptors = ring(period)
+    rows = list(range(COUNT))
+    order.shuffle(rows)
+    azimuth_deg = (np.array(rows) + turn) % COUNT * STEP_DEG
+    shuffled = symmetry(hbr.Views.of_object("a", descriptors[rows], azimuth_deg), 0)
+    straight = symmetry(views_of(descriptors), 0)
+    assert shuffled is not None
+    assert straight is not None
+    assert shuffled.period_deg == straight.period_deg
+    assert shuffled.alike == pytest.approx(straight.alike)
+
+
+@given(start=st.integers(0, COUNT - 1), length=st.integers(1, COUNT - 8))
+def test_a_twin_that_differs_on_one_side_is_found_on_the_other_to_two_steps(start, length):
+    """Views start .. start + length - 1 are the same on both objects; their neighbours are nearly so."""
+    mine, other = ring(36), ring(36, seed=1)
+    same = (start + np.arange(length)) % COUNT
+    other[same] = mine[same]
+    (twin,) = lookalikes(views_of(mine, other), 0)
+    assert twin.object_index == 1
+    assert twin.similarity == 1.0
+    assert length / COUNT <= twin.share <= (length + 4) / COUNT
+    ((begin_deg, end_deg),) = twin.arcs_deg
+    assert 0 <= (start - begin_deg / STEP_DEG) % COUNT <= 2
+    assert 0 <= (end_deg / STEP_DEG - (start + length - 1)) % COUNT <= 2
+
+
+def test_twins_come_before_others_and_strangers_not_at_all():
+    mine, half, stranger = ring(36), ring(36, seed=1), ring(36, seed=2)
+    half[:18] = mine[:18]
+    found = lookalikes(views_of(mine, stranger, half, mine), 0)
+    assert [one.object_index for one in found] == [3, 2]
+    assert found[0].arcs_deg == ((0.0, 360.0),)
+    assert lookalikes(views_of(mine), 0) == ()
+    assert lookalikes(views_of(mine[:2], mine), 0) == ()
+
+
+def test_one_view_that_differs_does_not_part_an_arc_but_two_do():
+    alike = np.zeros(COUNT, bool)
+    alike[[3, 4, 6, 7, 10]] = True
+    assert _arcs(np.arange(COUNT) * STEP_DEG, alike) == ((30.0, 70.0), (100.0, 100.0))
+
+
+@given(st.lists(st.booleans(), min_size=3, max_size=40).filter(any))
+def test_arcs_hold_every_view_that_is_alike_and_end_at_such(held):
+    alike = np.array(held)
+    azimuth_deg = np.arange(len(alike)) * 360.0 / len(alike)
+    covered = np.zeros(len(alike), bool)
+    for begin_deg, end_deg in _arcs(azimuth_deg, alike):
+        if (begin_deg, end_deg) == (0.0, 360.0):
+            covered[:] = True
+            continue
+        begin, end = round(begin_deg / 360 * len(alike)), round(end_deg / 360 * len(alike))
+        assert alike[begin]
+        assert alike[end]
+        rows = (begin + np.arange((end - begin) % len(alike) + 1)) % len(alike)
+        assert not covered[rows].any()
+        covered[rows] = True
+    assert covered[alike].all()
+    gaps = covered & ~alike  # single views at most
+    assert not (gaps & np.roll(gaps, 1)).any() or covered.all()

@@ -1,0 +1,193 @@
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hbr import Extension, Ranking, ViewIndex, Views, retrieve
+from tests.hbr.paper.retrieval_reference import Enumeration
+
+EXTENSIONS = get_args(Extension)
+
+
+def one_hot(*levels: tuple[int, int]) -> np.ndarray:
+    row = np.zeros(144, np.uint8)
+    for bin_, level in levels:
+        row[bin_] = level
+    return row
+
+
+@st.composite
+def small_cases(draw: st.DrawFn) -> tuple[np.ndarray, list[float], Views, float, int]:
+    """Few bins and few levels, so that similarities tie; azimuths regular or not, wrapped around 0."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    count = draw(st.integers(1, 14))
+    steps = draw(st.integers(1, 4))
+    objects = draw(st.integers(1, 4))
+    bins, top = draw(st.integers(1, 6)), draw(st.sampled_from([1, 7]))
+
+    def rows(n: int) -> np.ndarray:
+        descriptors = np.zeros((n, 144), np.uint8)
+        descriptors[:, :bins] = rng.integers(0, top + 1, (n, bins))
+        return descriptors
+
+    # multiples of an eighth of a degree: differences are exact, so that the oracle's ties are ties
+    azimuth = (5 * rng.integers(0, 72, count)).astype(np.float64)
+    if draw(st.booleans()):
+        azimuth = rng.integers(0, 2880, count) / 8.0
+    views = Views(rows(count), azimuth, rng.integers(0, objects, count), tuple("abcd"[:objects]))
+    orientations = (rng.integers(-2880, 2880, steps) / 8).tolist()
+    return rows(steps), orientations, views, draw(st.sampled_from([0.0, 0.5, 2.0])), draw(st.integers(1, 5))
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+@settings(max_examples=100, deadline=None)
+@given(small_cases())
+def test_equals_the_enumeration_of_all_paths(
+    extension: Extension, case: tuple[np.ndarray, list[float], Views, float, int]
+) -> None:
+    queries, orientations, views, omega, length = case
+    expected = Enumeration(queries, orientations, views, omega, length, extension)
+    ranking = retrieve(queries, orientations, ViewIndex(views), omega=omega, list_length=length, extension=extension)
+    assert [rows.tolist() for rows in ranking.lists] == expected.lists
+    assert sorted(ranking.object_index.tolist()) == expected.candidates
+    for j, score, pose, path in zip(
+        ranking.object_index.tolist(), ranking.scores.tolist(), ranking.pose_deg, ranking.paths.tolist(), strict=True
+    ):
+        assert score == pytest.approx(expected.scores[j], abs=1e-12)
+        assert all(v in nodes for v, nodes in zip(path, expected.nodes[j], strict=True))
+        assert expected.value(path) == pytest.approx(score, abs=1e-12)
+        assert pose == views.azimuth_deg[path[-1]]
+    order = list(zip(-ranking.scores, ranking.object_index, strict=True))
+    assert order == sorted(order)
+
+
+@settings(max_examples=30, deadline=None)
+@given(small_cases(), st.integers(-720, 720))
+def test_the_zero_of_the_orientations_does_not_matter(
+    case: tuple[np.ndarray, list[float], Views, float, int], zero_deg: int
+) -> None:
+    queries, orientations, views, omega, length = case
+    index = ViewIndex(views)
+    plain = retrieve(queries, orientations, index, omega=omega, list_length=length)
+    shifted = retrieve(queries, np.add(orientations, zero_deg), index, omega=omega, list_length=length)
+    assert shifted.object_index.tolist() == plain.object_index.tolist()
+    assert shifted.scores == pytest.approx(plain.scores, abs=1e-12)
+    assert shifted.paths.tolist() == plain.paths.tolist()
+
+
+# Two objects for the examples by hand. Query 1 is seen at 0 degrees, query 2 at 90.
+#   a: view 0 at 0   = query 1     view 1 at 90  = half like query 2     view 2 at 180 = query 2
+#   b: view 3 at 0   = query 2
+# T(query 2, view 1): (2, 0) against (1, 1) is 2 / (4 + 2 - 2) = 0.5
+Q1 = one_hot((0, 2))
+Q2 = one_hot((1, 2))
+HAND = Views(
+    np.stack([Q1, one_hot((1, 1), (2, 1)), Q2, Q2]),
+    np.array([0.0, 90.0, 180.0, 0.0]),
+    np.array([0, 0, 0, 1]),
+    ("a", "b"),
+)
+
+
+def by_hand(extension: Extension, omega: float, list_length: int = 1) -> tuple[Any, Ranking]:
+    ranking = retrieve([Q1, Q2], [0, 90], ViewIndex(HAND), omega=omega, list_length=list_length, extension=extension)
+    return list(zip(ranking.names, ranking.scores.tolist(), ranking.paths.tolist(), strict=True)), ranking
+
+
+@pytest.mark.parametrize(
+    ("extension", "omega", "expected"),
+    [
+        # lists: {view 0}, {view 2}; view 2 is 180 from view 0, a quarter turn more than the camera's 90: 2 - 1 * 0.25
+        ("visual", 1.0, [("a", 1.75, [0, 2])]),
+        ("orient", 1.0, [("a", 1.75, [0, 2])]),
+        # view 0 leads to view 1 at the second query (1 + 0.5, no penalty), view 2 back to view 1 at the first
+        ("orient_all", 1.0, [("a", 1.75, [0, 2])]),
+        ("orient_all", 4.0, [("a", 1.5, [0, 1])]),
+        ("orient", 4.0, [("a", 1.0, [0, 2])]),
+    ],
+)
+def test_extensions_by_hand(extension: Extension, omega: float, expected: list[tuple[str, float, list[int]]]) -> None:
+    assert by_hand(extension, omega)[0] == expected
+
+
+def test_a_missing_object_by_hand() -> None:
+    """b is on the second list only: its one view stands in at the first query too, a quarter turn off."""
+    for extension in EXTENSIONS:
+        found, ranking = by_hand(extension, 1.0, list_length=2)
+        assert [rows.tolist() for rows in ranking.lists] == [[0, 1], [2, 3]]
+        assert found == [("a", 1.75, [0, 2]), ("b", 0.75, [3, 3])]
+        assert ranking.margin == 1.0
+        assert ranking.pose_deg.tolist() == [180.0, 0.0]
+
+
+def test_orient_takes_the_turned_view_where_visual_takes_the_likest() -> None:
+    """Object a misses the second list; visual takes its view 2 (T = 1/2, wrong turn), orient view 1 (T = 0, right)."""
+    half = one_hot((1, 1), (2, 1))
+    views = Views(
+        np.stack([Q1, one_hot((5, 1)), half, Q2]),
+        np.array([0.0, 90.0, 270.0, 0.0]),
+        np.array([0, 0, 0, 1]),
+        ("a", "b"),
+    )
+    paths = {}
+    for extension in EXTENSIONS:
+        ranking = retrieve([Q1, Q2], [0, 90], ViewIndex(views), omega=1.0, list_length=1, extension=extension)
+        a = ranking.names.index("a")
+        paths[extension] = ranking.paths[a].tolist(), ranking.scores[a]
+    assert paths == {"visual": ([0, 2], 1.0), "orient": ([0, 1], 1.0), "orient_all": ([0, 1], 1.0)}
+
+
+def test_one_query_ranks_by_the_best_view() -> None:
+    ranking = retrieve(Q2[None], [33.0], ViewIndex(HAND), list_length=4)
+    assert ranking.names == ("a", "b")  # equal scores: the lower object first
+    assert ranking.scores.tolist() == [1.0, 1.0]
+    assert ranking.paths.tolist() == [[2], [3]]
+    assert ranking.margin == 0.0
+
+
+def test_a_single_candidate_has_its_whole_score_as_margin() -> None:
+    ranking = retrieve(Q1[None], [0.0], ViewIndex(HAND), list_length=1)
+    assert len(ranking) == 1
+    assert ranking.margin == 1.0
+
+
+def test_object_indices_need_not_follow_the_order_of_views() -> None:
+    """Views of the objects interleaved, and in another order: the same scores by name."""
+    rng = np.random.default_rng(3)
+    descriptors = rng.integers(0, 3, (24, 144), dtype=np.uint8)
+    azimuth = np.repeat(np.arange(6) * 60.0, 4)
+    views = Views(descriptors, azimuth, np.tile(np.arange(4), 6), tuple("abcd"))
+    order = rng.permutation(24)
+    queries, turn = rng.integers(0, 3, (3, 144), dtype=np.uint8), [0, 60, 180]
+    plain = retrieve(queries, turn, ViewIndex(views))
+    shuffled = retrieve(queries, turn, ViewIndex(views.select(order)))
+    assert plain.names == shuffled.names
+    assert plain.scores.tolist() == shuffled.scores.tolist()
+    assert plain.paths.tolist() == order[shuffled.paths].tolist()
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "message"),
+    [
+        ({"queries": np.zeros((0, 144), np.uint8), "orientation_deg": []}, ValueError, "at least one"),
+        ({"queries": Q1}, ValueError, r"\(N, 144\)"),
+        ({"queries": np.zeros((2, 144))}, TypeError, "uint8"),
+        ({"orientation_deg": [0.0]}, ValueError, "each of 2 queries"),
+        ({"orientation_deg": [0.0, np.nan]}, ValueError, "finite"),
+        ({"index": ViewIndex(Views.empty())}, ValueError, "enroll"),
+        ({"omega": -0.1}, ValueError, "omega"),
+        ({"omega": np.inf}, ValueError, "omega"),
+        ({"list_length": 0}, ValueError, "list_length"),
+        ({"extension": "both"}, ValueError, "visual, orient, orient_all"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changed: dict[str, Any], error: type[Exception], message: str) -> None:
+    arguments: dict[str, Any] = {
+        "queries": np.stack([Q1, Q2]),
+        "orientation_deg": [0.0, 90.0],
+        "index": ViewIndex(HAND),
+    }
+    with pytest.raises(error, match=message):
+        retrieve(**(arguments | changed))

@@ -1,0 +1,157 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hbr import Ranking, ViewIndex, Views, next_view, retrieve
+from tests.hbr.paper.retrieval_reference import next_view_reference
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 5), st.integers(1, 12), st.integers(1, 12))
+def test_equals_the_literal_definition(seed: int, steps: int, objects: int, list_length: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(objects, 6 * objects + 1))
+    owner = np.concatenate([np.arange(objects), rng.integers(0, objects, count - objects)])
+    azimuth = (5 * rng.integers(0, 72, count)).astype(np.float64)
+    if seed % 2:
+        azimuth = rng.uniform(0, 360, count)
+    views = Views(rng.integers(0, 8, (count, 144), dtype=np.uint8), azimuth, owner, tuple(map(str, range(objects))))
+    queries = rng.integers(0, 8, (steps, 144), dtype=np.uint8)
+    ranking = retrieve(queries, rng.integers(-72, 72, steps) * 5.0, ViewIndex(views), list_length=list_length)
+
+    decision = next_view(ranking)
+    here = float(ranking.orientation_deg[-1])
+    side, rotation_deg, s_left, s_right = next_view_reference(
+        views,
+        list(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True)),
+        ranking.lists[-1].tolist(),
+        here,
+        ranking.orientation_deg.tolist(),
+    )
+    assert decision.s_left == pytest.approx(s_left, abs=1e-9)
+    assert decision.s_right == pytest.approx(s_right, abs=1e-9)
+    if abs(s_left - s_right) > 1e-9:
+        assert decision.side == side
+        assert decision.rotation_deg == pytest.approx(rotation_deg, abs=1e-9)
+    assert 0 < abs(decision.rotation_deg) - decision.detour_deg <= 90
+    assert (decision.rotation_deg > 0) == (decision.side == "left")
+    assert 0 <= decision.orientation_deg < 360
+    assert np.cos(np.radians(decision.orientation_deg - here - decision.rotation_deg)) == pytest.approx(1)
+
+
+def flat(level: int, bin_: int) -> np.ndarray:
+    row = np.zeros(144, np.uint8)
+    row[bin_] = level
+    return row
+
+
+def pair(left_alike: bool, pose_deg: float = 0.0, orientations: tuple[float, ...] = (0.0, 0.0)) -> Ranking:
+    """Objects a and b seen at `pose_deg`, alike on one side of azimuth 0 and different on the other."""
+    descriptors, azimuths, owners = [], [], []
+    for owner in (0, 1):
+        for azimuth in np.arange(0, 360, 5.0):
+            on_left = azimuth < 180
+            descriptors.append(flat(4, 1 if on_left == left_alike else 2 + owner))
+            azimuths.append(azimuth)
+            owners.append(owner)
+    views = Views(np.array(descriptors), np.array(azimuths), np.array(owners), ("a", "b"))
+    rows = [int(np.flatnonzero((views.azimuth_deg == pose_deg) & (views.object_index == j))[0]) for j in (0, 1)]
+    return Ranking(
+        object_index=np.array([0, 1]),
+        scores=np.array([1.0, 0.9]),
+        pose_deg=np.full(2, pose_deg),
+        paths=np.repeat(np.array(rows)[:, None], len(orientations), axis=1),
+        lists=(np.array(rows),) * len(orientations),
+        orientation_deg=np.array(orientations),
+        views=views,
+    )
+
+
+def test_the_table_turns_to_the_side_that_tells_the_candidates_apart() -> None:
+    decision = next_view(pair(left_alike=True))
+    assert (decision.side, decision.rotation_deg) == ("right", -45.0)
+    assert (decision.s_left, decision.s_right) == (1.0, 0.0)
+    assert decision.candidates == (0, 1)
+    assert decision.orientation_deg == 315.0
+    decision = next_view(pair(left_alike=False))
+    assert (decision.side, decision.rotation_deg) == ("left", 45.0)
+
+
+def test_equal_sides_go_left() -> None:
+    decision = next_view(pair(left_alike=True, pose_deg=90.0, orientations=(0.0, 90.0)))
+    assert decision.s_left == decision.s_right == 1.0  # 90 lies between two sectors that look alike
+    assert (decision.side, decision.rotation_deg) == ("left", 45.0)
+
+
+@pytest.mark.parametrize(("pose_deg", "rotation_deg"), [(45.0, 90.0), (50.0, 85.0), (40.0, 95.0), (355.0, 50.0)])
+def test_the_turn_ends_at_the_next_sector_centre(pose_deg: float, rotation_deg: float) -> None:
+    """From a centre to the next one; 5 degrees before a centre the turn would hardly leave the place, so it goes on."""
+    decision = next_view(pair(left_alike=False, pose_deg=pose_deg, orientations=(200.0, 0.0)))
+    assert (decision.side, decision.rotation_deg) == ("left", rotation_deg)
+
+
+@pytest.mark.parametrize(
+    ("visited", "rotation_deg", "detour_deg"),
+    [
+        ((), 45.0, 0.0),
+        ((34.0,), 45.0, 0.0),
+        ((35.0,), 135.0, 90.0),
+        ((55.0 - 360.0,), 135.0, 90.0),
+        ((45.0, 135.0), 225.0, 180.0),
+        ((45.0, 135.0, 225.0), 315.0, 270.0),
+        ((45.0, 135.0, 225.0, 315.0), 45.0, 0.0),
+    ],
+)
+def test_visited_orientations_are_passed_over(
+    visited: tuple[float, ...], rotation_deg: float, detour_deg: float
+) -> None:
+    decision = next_view(pair(left_alike=False), visited_deg=visited)
+    assert (decision.rotation_deg, decision.detour_deg) == (rotation_deg, detour_deg)
+
+
+def test_visited_orientations_are_the_queries_by_default() -> None:
+    decision = next_view(pair(left_alike=False, orientations=(45.0, 0.0)))
+    assert (decision.rotation_deg, decision.detour_deg) == (135.0, 90.0)
+    assert next_view(pair(left_alike=False, orientations=(45.0, 0.0)), visited_deg=[]).rotation_deg == 45.0
+    assert next_view(pair(left_alike=False, orientations=(54.0, 0.0)), revisit_deg=5.0).rotation_deg == 45.0
+
+
+def test_the_detour_keeps_its_side() -> None:
+    decision = next_view(pair(left_alike=True), visited_deg=[-45.0])
+    assert (decision.side, decision.rotation_deg, decision.orientation_deg) == ("right", -135.0, 225.0)
+
+
+def test_a_catalog_of_one_object_goes_left() -> None:
+    views = Views.of_object("a", np.ones((4, 144), np.uint8), [0, 90, 180, 270])
+    decision = next_view(retrieve(np.ones((2, 144), np.uint8), [0, 90], ViewIndex(views)))
+    assert (decision.side, decision.s_left, decision.s_right, decision.candidates) == ("left", 0.0, 0.0, (0,))
+
+
+def test_one_query_is_too_few() -> None:
+    views = Views.of_object("a", np.ones((1, 144), np.uint8), [0])
+    with pytest.raises(ValueError, match="needs two queries"):
+        next_view(retrieve(np.ones((1, 144), np.uint8), [0], ViewIndex(views)))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [({"visited_deg": [np.nan]}, "not known"), ({"revisit_deg": 45.0}, "revisit"), ({"revisit_deg": -1.0}, "revisit")],
+)
+def test_what_does_not_fit_is_refused(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        next_view(pair(left_alike=True), **changed)
+
+
+def test_a_given_side_replaces_the_decision_and_keeps_the_step() -> None:
+    ranking = pair(left_alike=True, pose_deg=20.0)
+    decided, forced = next_view(ranking), next_view(ranking, side="left")
+    assert decided.side == "right" == next_view(ranking, side="right").side
+    assert next_view(ranking, side="right") == decided
+    assert forced.side == "left"
+    assert forced.rotation_deg > 0 > decided.rotation_deg
+    assert (forced.s_left, forced.s_right) == (decided.s_left, decided.s_right)
+    with pytest.raises(ValueError, match="left or right"):
+        next_view(ranking, side="up")  # type: ignore[arg-type]

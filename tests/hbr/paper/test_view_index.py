@@ -1,0 +1,167 @@
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hbr import ViewIndex, Views, tanimoto
+from hbr.paper.index import Method, _best, _Bound, _Flat, _promising
+
+METHODS = get_args(Method)
+EXACT: tuple[Method, ...] = ("flat", "bound", "kdtree")
+
+
+def views_of(descriptors: np.ndarray) -> Views:
+    return Views.of_object("object", descriptors, np.zeros(len(descriptors)))
+
+
+def adversarial(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Rows of the kinds that break a search: zeros, equal rows, ties, one-hot, saturated, sparse, dense."""
+    kinds = [
+        np.zeros((1, 144), np.uint8),
+        np.full((1, 144), 7, np.uint8),
+        np.eye(144, dtype=np.uint8) * rng.integers(1, 8, dtype=np.uint8),
+        rng.integers(0, 8, (30, 144), dtype=np.uint8),
+        rng.integers(0, 8, (30, 144), dtype=np.uint8) * (rng.random((30, 144)) < 0.1).astype(np.uint8),
+        np.repeat(rng.integers(0, 2, (3, 144), dtype=np.uint8), 10, axis=0),
+    ]
+    chosen = [kind for kind in kinds if rng.random() < 0.6] or kinds
+    pool = np.concatenate(chosen)
+    return pool[rng.integers(len(pool), size=count)]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 5, 63, 64, 65, 700, 2600, 2700]), st.integers(1, 40))
+def test_equals_brute_force(seed: int, count: int, k: int) -> None:
+    rng = np.random.default_rng(seed)
+    descriptors = adversarial(rng, count)
+    query = descriptors[rng.integers(count)] if rng.random() < 0.5 else adversarial(rng, 1)[0]
+    similarities = tanimoto(query, descriptors)[0]
+    expected = np.lexsort((np.arange(count), -similarities))[:k]
+    for method in EXACT:
+        rows, values = ViewIndex(views_of(descriptors), method).search(query, k)
+        assert rows.tolist() == expected.tolist(), method
+        assert values.tolist() == similarities[expected].tolist(), method
+
+
+def test_the_bound_refines_a_small_part_and_equals_brute_force_on_a_large_set() -> None:
+    """Sparse clustered rows, as views are; above the size where the bound is the default."""
+    rng = np.random.default_rng(5)
+    centres = rng.integers(0, 8, (400, 144)) * (rng.random((400, 144)) < 0.15)
+    rows = np.repeat(centres, 50, axis=0) + rng.integers(-1, 2, (20_000, 144)) * (rng.random((20_000, 144)) < 0.1)
+    descriptors = np.clip(rows, 0, 7).astype(np.uint8)
+    flat, bound = ViewIndex(views_of(descriptors), "flat"), ViewIndex(views_of(descriptors))
+    for query in descriptors[::1999]:
+        expected, found = flat.search(query, 10), bound.search(query, 10)
+        assert found[0].tolist() == expected[0].tolist()
+        assert found[1].tolist() == expected[1].tolist()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 900), min_size=1, max_size=4), st.sampled_from(METHODS))
+def test_an_index_that_was_extended_equals_one_that_was_built(seed: int, sizes: list[int], method: Method) -> None:
+    rng = np.random.default_rng(seed)
+    parts = [views_of(adversarial(rng, size)) for size in sizes]
+    grown = ViewIndex(Views.empty(), method)
+    for part in parts:
+        before, count = grown, len(grown)
+        grown = grown.extended(part)
+        assert len(before) == count
+    whole = ViewIndex(Views.concatenate(parts), method)
+    query = adversarial(rng, 1)[0]
+    for found, expected in zip(grown.search(query, 12), whole.search(query, 12), strict=True):
+        assert found.tolist() == expected.tolist()
+
+
+def test_extending_projects_the_new_views_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = adversarial(np.random.default_rng(0), 3000)
+    index = ViewIndex(views_of(rows[:2000]), "bound")
+    projected = []
+    project = _Bound._project
+
+    def counted(self: _Bound, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        projected.append(len(rows))
+        return project(self, rows)
+
+    monkeypatch.setattr(_Bound, "_project", counted)
+    grown = index.extended(views_of(rows[2000:]))
+    assert projected == [1000]
+    assert index.search(rows[0], 5)[0].max() < 2000  # projects the query
+    grown.extended(views_of(rows[:1001]))  # twice the views the axes were fitted to: all anew
+    assert projected[2:] == [4001]
+
+
+def test_answers_are_remembered_for_a_while_and_belong_to_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = np.random.default_rng(0).integers(0, 8, (100, 144), dtype=np.uint8)
+    index = ViewIndex(views_of(rows))
+    searched = []
+    top = _Flat.top
+
+    def counted(self: _Flat, query: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        searched.append(k)
+        return top(self, query, k)
+
+    monkeypatch.setattr(_Flat, "top", counted)
+    expected = [part.tolist() for part in index.search(rows[3], 5)]
+    for part in index.search(rows[3], 5):
+        part[:] = 0
+    assert [part.tolist() for part in index.search(rows[3], 5)] == expected
+    assert searched == [5]
+    index.search(rows[3], 6)
+    assert searched == [5, 6]
+    for row in rows[10:80]:
+        index.search(row, 5)
+        assert len(index._remembered) <= 64
+    index.search(rows[3], 5)
+    assert len(searched) == 2 + 70 + 1
+
+
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=400), st.integers(1, 10))
+def test_best_of_tied_values_by_lower_index(values: list[int], k: int) -> None:
+    rows, best = _best(np.array(values, float), k)
+    expected = sorted(range(len(values)), key=lambda i: (-values[i], i))[:k]
+    assert rows.tolist() == expected
+    assert best.tolist() == [values[i] for i in expected]
+
+
+@given(st.integers(1, 5), st.integers(1, 2000))
+def test_promising_rows_are_distinct_and_enough(k: int, count: int) -> None:
+    values = np.random.default_rng(count).random(count, np.float32)
+    rows = _promising(values, k)
+    assert len(set(rows.tolist())) == len(rows) >= min(k, count)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_more_than_there_are_gives_all(method: Method) -> None:
+    index = ViewIndex(views_of(np.eye(3, 144, dtype=np.uint8)), method)
+    rows, similarities = index.search(np.eye(1, 144, 1, dtype=np.uint8)[0], 10)
+    assert rows.tolist() == [1, 0, 2]
+    assert similarities.tolist() == [1, 0, 0]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_empty_index_finds_nothing(method: Method) -> None:
+    index = ViewIndex(Views.empty(), method)
+    rows, similarities = index.search(np.ones(144, np.uint8), 10)
+    assert len(index) == len(rows) == len(similarities) == 0
+
+
+@pytest.mark.parametrize(
+    ("query", "k", "error", "message"),
+    [
+        (np.zeros(144), 1, TypeError, "uint8"),
+        (np.zeros((1, 144), np.uint8), 1, ValueError, "144"),
+        (np.zeros(54, np.uint8), 1, ValueError, "54"),
+        (np.full(144, 8, np.uint8), 1, ValueError, "level of 8"),
+        (np.zeros(144, np.uint8), 0, ValueError, "k is 0"),
+    ],
+)
+def test_what_is_no_query_is_refused(query: np.ndarray, k: int, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        ViewIndex(views_of(np.ones((1, 144), np.uint8))).search(query, k)
+
+
+def test_an_unknown_method_is_refused() -> None:
+    with pytest.raises(ValueError, match="auto, flat, bound, kdtree"):
+        ViewIndex(Views.empty(), "hash")  # type: ignore[arg-type]

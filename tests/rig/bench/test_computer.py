@@ -1,0 +1,142 @@
+"""What files of Linux tell of a computer's devices."""
+
+import os
+
+import pytest
+
+from rig.bench.computer import LinuxHost, Process, User
+from sim.host import Computer
+
+GID = os.getgid()
+
+
+@pytest.fixture
+def computer(tmp_path):
+    return Computer(tmp_path)
+
+
+def host(computer: Computer, *gids: int, uid: int = 4242) -> LinuxHost:
+    return LinuxHost(computer.root, user=User("ada", uid, frozenset(gids)))
+
+
+def test_a_serial_port_tells_its_adapter_its_lasting_name_and_its_latency(computer):
+    computer.serial_port("ttyUSB10", serial="FT1", latency_ms=16)
+    computer.serial_port("ttyUSB9", serial="FT2", latency_ms=None)
+    first, second = host(computer).serial_ports()
+    assert (first.path, second.path) == ("/dev/ttyUSB9", "/dev/ttyUSB10")  # as people count
+    assert (first.latency_ms, second.latency_ms) == (None, 16)
+    assert second.name == "FTDI USB <-> Serial Converter"
+    assert second.usb["serial"] == "FT1"
+    assert second.stable == "/dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_FT1-if00-port0"
+    assert host(computer).same_file(second.stable, second.path)
+    assert not host(computer).same_file(second.stable, first.path)
+
+
+def test_terminals_and_ports_with_nothing_behind_them_are_no_ports(computer):
+    computer.write("sys/class/tty/tty1/dev", "4:1")
+    computer.write("sys/class/tty/ttyUSB0/dev", "188:0")  # no device: it was pulled out just now
+    reserved = computer.root / "sys/devices/platform/serial8250/ttyS3"
+    reserved.mkdir(parents=True)
+    computer.link("sys/class/tty/ttyS3/device", reserved)
+    soldered = computer.root / "sys/devices/soc/uart0"
+    soldered.mkdir(parents=True)
+    computer.link("sys/class/tty/ttyAMA0/device", soldered)
+    computer.write("dev/ttyAMA0")
+    ports = host(computer).serial_ports()
+    assert [port.path for port in ports] == ["/dev/ttyAMA0"]
+    assert ports[0].usb == {}
+
+
+def test_a_port_that_no_adapter_makes_can_be_named(computer):
+    computer.write("dev/pts/3")
+    named = host(computer, uid=0).serial_port("/dev/pts/3")
+    assert (named.path, named.usb, named.usable) == ("/dev/pts/3", {}, True)
+    assert host(computer).serial_port("/dev/pts/4") is None
+    computer.serial_port()
+    stable = "/dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_SIM00001-if00-port0"
+    assert host(computer).serial_port(stable).path == "/dev/ttyUSB0"
+
+
+def test_ports_on_usb_come_first(computer):
+    soldered = computer.root / "sys/devices/soc/uart0"
+    soldered.mkdir(parents=True)
+    computer.link("sys/class/tty/ttyAMA0/device", soldered)
+    computer.write("dev/ttyAMA0")
+    computer.serial_port()
+    assert [port.path for port in host(computer).serial_ports()] == ["/dev/ttyUSB0", "/dev/ttyAMA0"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "gids", "uid", "usable"),
+    [
+        (0o660, (GID,), 4242, True),
+        (0o660, (), 4242, False),
+        (0o640, (GID,), 4242, False),  # may read, not write
+        (0o606, (), 4242, True),
+        (0o606, (GID,), 4242, False),  # the group's bits count for its members
+        (0o600, (), os.getuid(), True),
+        (0o000, (), 0, True),
+    ],
+)
+def test_permissions_are_those_of_the_file_for_this_user(computer, mode, gids, uid, usable):
+    computer.group("dialout", GID, "ada")
+    computer.serial_port(mode=mode)
+    (port,) = host(computer, *gids, uid=uid).serial_ports()
+    assert port.usable is usable
+    assert port.group == "dialout"
+
+
+def test_a_membership_counts_from_the_next_login_on(computer):
+    computer.group("dialout", GID, "eve", "ada")
+    computer.group("i2c", GID + 1)
+    outside = host(computer)
+    assert outside.joined("dialout")
+    assert not outside.joined("i2c")
+    assert host(computer, GID + 1).joined("i2c")
+    assert not outside.joined("video")
+
+
+def test_who_has_a_port_open_is_found_under_either_of_its_names(computer):
+    computer.serial_port()
+    (port,) = host(computer).serial_ports()
+    computer.process(312, "dynamixel_wizard --fast", port.stable)
+    computer.process(313, "cat", "/dev/null")
+    (computer.root / "proc" / "self").mkdir()
+    (port,) = host(computer).serial_ports()
+    assert port.holders == (Process(312, "dynamixel_wizard --fast"),)
+
+
+def test_a_camera_is_the_node_that_carries_images(computer):
+    computer.camera(0, "HD Webcam", index=0)
+    computer.camera(1, "HD Webcam", index=1)
+    (camera,) = host(computer).cameras()
+    assert (camera.path, camera.name) == ("/dev/video0", "HD Webcam")
+    assert camera.stable == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
+
+
+def test_an_empty_computer_has_nothing_and_says_so(tmp_path):
+    bare = host(Computer(tmp_path))
+    assert (bare.serial_ports(), bare.i2c_buses(), bare.cameras()) == ([], [], [])
+    assert bare.time_synchronised() is None
+
+
+def test_the_service_that_keeps_the_time_tells_whether_it_reached_a_server(computer):
+    computer.keeps_time(synchronised=False)
+    assert host(computer).time_synchronised() is False
+    computer.keeps_time()
+    assert host(computer).time_synchronised() is True
+
+
+def test_a_network_disk_is_told_from_a_local_one(computer, tmp_path):
+    computer.write("proc/mounts", f"/dev/sda1 / ext4 rw 0 0\nnas:/x {tmp_path}/with\\040space nfs4 rw 0 0\n")
+    (tmp_path / "with space").mkdir()
+    assert host(computer).disk(tmp_path / "with space" / "not" / "yet").network
+    assert not host(computer).disk(tmp_path / "other").network
+    assert host(computer).disk(tmp_path).free_bytes > 0
+
+
+def test_this_very_computer_can_be_looked_at():
+    here = LinuxHost()
+    for node in [*here.serial_ports(), *here.i2c_buses(), *here.cameras()]:
+        assert node.path.startswith("/dev/")
+    assert here.user.gids

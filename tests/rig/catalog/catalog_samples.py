@@ -1,0 +1,123 @@
+"""Views for the tests of the catalog; as a program, a process that enrolls them.
+
+    python catalog_samples.py CATALOG NAME COUNT [DIE_BEFORE]
+
+It reports each view on a line once it is stored, and kills itself before durable step DIE_BEFORE (from 1: sync of the
+image, rename, sync of the folder, commit; then those of the next view).
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Generator
+from itertools import count
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sqlalchemy import Engine, event
+
+import hbr
+from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.catalog.jobs import Progressed
+from rig.core.clock import SystemClock
+from rig.views.description import within
+
+_T = TypeVar("_T")
+
+PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, {"noise": "defaults"})
+
+
+def without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have nothing but the database wait for the disk: what is durable is proved in test_catalog_durability."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    monkeypatch.setattr(os, "sync", lambda: None)
+
+
+def plan(views: int) -> list[float]:
+    return [i * 360 / views for i in range(views)]
+
+
+def image(seed: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (12, 16, 3), np.uint8)
+
+
+def record(index: int, /, **changes: Any) -> ViewRecord:
+    values: dict[str, Any] = {
+        "index": index,
+        "commanded_deg": -5.0 * index,
+        "encoder_deg": -5.0 * index + 0.03,
+        "azimuth_deg": 5.0 * index % 360,
+        "descriptor": np.random.default_rng(index).integers(0, 8, 144, np.uint8),
+        "captured_ns": 0,
+    }
+    return ViewRecord(**values | changes)
+
+
+def fill(catalog: Catalog, name: str, views: int, **begin: Any) -> None:
+    enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **begin)
+    for index in range(views):
+        enrollment.add(record(index), image(index))
+    enrollment.finish()
+
+
+def described(index: int, seed: int, region: tuple[int, int, int, int] | None = None, **changes: Any) -> ViewRecord:
+    """A view whose descriptor is that of ``image(seed)``."""
+    levels = hbr.describe(within(image(seed), region))
+    return record(index, descriptor=levels, region=region, **changes)
+
+
+def true_fill(
+    catalog: Catalog, name: str, views: int, seed: int, region: tuple[int, int, int, int] | None = None, **begin: Any
+) -> None:
+    """Enroll an object whose descriptors and images belong together."""
+    enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **begin)
+    for index in range(views):
+        enrollment.add(described(index, seed + index, region), image(seed + index))
+    enrollment.finish()
+
+
+def finished(job: Generator[Progressed, None, _T]) -> _T:
+    """Carry a job of the catalog out and return its result."""
+    while True:
+        try:
+            next(job)
+        except StopIteration as end:
+            return cast(_T, end.value)
+
+
+def main() -> None:
+    path, name, views, die_before = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+    with Catalog.open(path, clock=SystemClock()) as catalog:
+        enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE)
+        if die_before:
+            die_at(die_before)
+        for index in range(views):
+            enrollment.add(record(index), image(index))
+            print(index, flush=True)
+        enrollment.finish()
+
+
+def die_at(step: int) -> None:
+    steps = count(1)
+
+    def counted(call: Any) -> Any:
+        def maybe_die(*args: Any) -> Any:
+            if next(steps) == step:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return call(*args)
+
+        return maybe_die
+
+    os.fsync, os.replace = counted(os.fsync), counted(os.replace)
+    event.listen(Engine, "commit", counted(lambda _: None))
+
+
+def spawn_arguments(path: Path, name: str, views: int, die_before: int = 0) -> list[str]:
+    return [sys.executable, __file__, str(path), name, str(views), str(die_before)]
+
+
+if __name__ == "__main__":
+    main()

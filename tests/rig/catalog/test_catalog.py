@@ -1,0 +1,433 @@
+"""What goes into a catalog comes out of it, and only complete enrollments are retrieved."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from rig.catalog import Catalog, Enrollment, EnrollmentStatus, Provenance, ViewRecord, clean_name
+from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
+from sim.clock import EPOCH, VirtualClock
+from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, plan, record
+
+NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=20)
+ANGLES = st.floats(-1e6, 1e6)
+EVIDENCE = st.dictionaries(
+    st.text(max_size=8),
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=8),
+    max_size=4,
+)
+DESCRIPTORS = hnp.arrays(np.uint8, 144, elements=st.integers(0, 7))
+IMAGES = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)))
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def catalog(tmp_path: Path, clock: VirtualClock) -> Iterator[Catalog]:
+    with Catalog.open(tmp_path / "catalog", clock=clock) as catalog:
+        yield catalog
+
+
+def begin(catalog: Catalog, name: str, views: int = 3, **options: object) -> Enrollment:
+    return catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **options)  # type: ignore[arg-type]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    name=NAMES.filter(lambda name: clean_name(name) == name),
+    commanded_deg=ANGLES,
+    encoder_deg=ANGLES,
+    azimuth_deg=st.floats(0, 360, exclude_max=True),
+    imu=st.none() | st.tuples(ANGLES, st.floats(0, 10)),
+    captured_ns=st.integers(0, 2**62),
+    descriptor=DESCRIPTORS,
+    evidence=EVIDENCE,
+    image_bgr=IMAGES,
+)
+def test_a_view_comes_back_as_it_was_stored(
+    name: str,
+    commanded_deg: float,
+    encoder_deg: float,
+    azimuth_deg: float,
+    imu: tuple[float, float] | None,
+    captured_ns: int,
+    descriptor: np.ndarray,
+    evidence: dict[str, object],
+    image_bgr: np.ndarray,
+) -> None:
+    imu_deg, imu_sigma_deg = imu or (None, None)
+    clock = VirtualClock()
+    clock.advance_to(captured_ns)
+    given_record = ViewRecord(
+        index=0,
+        commanded_deg=commanded_deg,
+        encoder_deg=encoder_deg,
+        azimuth_deg=azimuth_deg,
+        descriptor=descriptor,
+        captured_ns=captured_ns,
+        imu_deg=imu_deg,
+        imu_sigma_deg=imu_sigma_deg,
+        evidence=evidence,
+    )
+    with TemporaryDirectory() as folder:
+        with Catalog.open(folder, clock=clock) as catalog:
+            enrollment = begin(catalog, name, views=1)
+            enrollment.add(given_record, image_bgr[::-1])
+            enrollment.finish()
+        with Catalog.open(folder, clock=clock, read_only=True) as catalog:
+            (stored,) = catalog.object(name).views
+            assert np.array_equal(catalog.read_image(stored), image_bgr[::-1])
+            assert catalog.image_path(stored).resolve().is_relative_to(Path(folder, "images").resolve())
+            model, view_ids = catalog.views()
+    for field in ("index", "commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg", "captured_ns"):
+        assert getattr(stored.record, field) == getattr(given_record, field)
+    assert stored.record.evidence == evidence
+    assert np.array_equal(stored.record.descriptor, descriptor)
+    assert stored.sitting.provenance == PROVENANCE
+    assert model.object_names == (name,)
+    assert np.array_equal(model.descriptors, descriptor[None])
+    assert model.azimuth_deg.tolist() == [azimuth_deg]
+    assert view_ids.tolist() == [stored.id]
+
+
+def test_models_are_ordered_by_object_and_index(catalog: Catalog) -> None:
+    fill(catalog, "tin", 3)
+    begin(catalog, "unfinished").add(record(0), image(0))
+    mug = begin(catalog, "mug", 4)
+    for index in (3, 1, 0, 2):
+        mug.add(record(index), image(index))
+    mug.finish()
+    model, view_ids = catalog.views()
+    assert model.object_names == ("tin", "mug")
+    assert model.object_index.tolist() == [0, 0, 0, 1, 1, 1, 1]
+    assert model.azimuth_deg.tolist() == [0, 5, 10, 0, 5, 10, 15]
+    assert [catalog.view(view_id).record.index for view_id in view_ids] == [0, 1, 2, 0, 1, 2, 3]
+    assert {catalog.view(view_id).object_name for view_id in view_ids[3:]} == {"mug"}
+
+
+def test_an_empty_catalog_has_no_models(catalog: Catalog) -> None:
+    model, view_ids = catalog.views()
+    assert (len(model), len(view_ids), catalog.objects()) == (0, 0, [])
+
+
+def test_times_are_those_of_the_injected_clock(catalog: Catalog, clock: VirtualClock) -> None:
+    enrollment = begin(catalog, "mug", 1)
+    clock.sleep(2.0)
+    exposed_ns = clock.now_ns()
+    clock.sleep(0.25)
+    enrollment.add(record(0, captured_ns=exposed_ns), image(0))
+    clock.sleep(1.0)
+    enrollment.finish()
+    details = catalog.object("mug")
+    assert details.summary.created_utc == EPOCH
+    assert details.summary.enrolled_utc == EPOCH + timedelta(seconds=3.25)
+    assert details.views[0].captured_utc == EPOCH + timedelta(seconds=2)
+    assert details.views[0].captured_utc.tzinfo is UTC
+
+
+def test_other_zones_are_stored_as_utc(tmp_path: Path) -> None:
+    noon = datetime(2026, 7, 1, 12, tzinfo=timezone(timedelta(hours=2)))
+    with Catalog.open(tmp_path, clock=VirtualClock(noon)) as catalog:
+        begin(catalog, "mug")
+        assert catalog.objects()[0].created_utc == datetime(2026, 7, 1, 10, tzinfo=UTC)
+
+
+def test_reenrollment_keeps_the_old_views_until_it_is_complete(catalog: Catalog) -> None:
+    fill(catalog, "mug", 2, label="cup", note="chipped")
+    with pytest.raises(ObjectExists, match="2 views") as refused:
+        begin(catalog, "mug")
+    assert "--replace" in refused.value.next_step
+    again = begin(catalog, "mug", 3, replace=True, label="mug")
+    for index in range(3):
+        assert len(catalog.views().views) == 2
+        again.add(record(index), image(index))
+    again.finish()
+    details = catalog.object("mug")
+    assert (details.summary.views, details.summary.label, details.summary.note) == (3, "mug", "chipped")
+    assert [e.status for e in details.enrollments] == [EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED]
+    assert len(catalog.views().views) == 3
+
+
+def test_abandoned_replacement_leaves_the_old_views(catalog: Catalog) -> None:
+    fill(catalog, "mug", 2)
+    again = begin(catalog, "mug", 3, replace=True)
+    again.add(record(0), image(0))
+    again.abandon()
+    assert len(catalog.views().views) == 2
+    with pytest.raises(CatalogError, match="abandoned"):
+        again.add(record(1), image(1))
+    begin(catalog, "mug", replace=True)
+
+
+def test_an_interrupted_enrollment_is_found_and_resumed_elsewhere(tmp_path: Path, clock: VirtualClock) -> None:
+    with Catalog.open(tmp_path, clock=clock) as catalog:
+        enrollment = begin(catalog, "mug", 4)
+        enrollment.add(record(0), image(0))
+        enrollment.add(record(2), image(2))
+    with Catalog.open(tmp_path, clock=clock) as catalog:
+        with pytest.raises(CatalogError, match="2 of 4") as refused:
+            begin(catalog, "mug", 4)
+        assert "--resume" in refused.value.next_step
+        unfinished = catalog.resumable("mug")
+        assert unfinished is not None
+        assert (unfinished.present, unfinished.missing) == ((0, 2), (1, 3))
+        assert catalog.objects()[0].unfinished_views == 2
+        elsewhere = Provenance("bench-2", {"servo": {"model": "XM430", "id": 7}})
+        enrollment = catalog.resume("mug", provenance=elsewhere)
+        assert enrollment.planned_azimuth_deg == tuple(plan(4))
+        for index in enrollment.missing():
+            enrollment.add(record(index), image(index))
+        enrollment.finish()
+        assert catalog.resumable("mug") is None
+        benches = [view.sitting.provenance.bench for view in catalog.object("mug").views]
+    assert benches == ["bench-1", "bench-2", "bench-1", "bench-2"]
+
+
+def test_nothing_to_resume(catalog: Catalog) -> None:
+    fill(catalog, "mug", 1)
+    with pytest.raises(CatalogError, match="no unfinished"):
+        catalog.resume("mug", provenance=PROVENANCE)
+
+
+def test_an_enrollment_is_not_finished_with_views_missing(catalog: Catalog) -> None:
+    enrollment = begin(catalog, "mug", 3)
+    enrollment.add(record(1), image(1))
+    with pytest.raises(CatalogError, match="2 of the 3") as refused:
+        enrollment.finish()
+    assert refused.value.evidence == {"missing_views": [0, 2]}
+    assert len(catalog.views().views) == 0
+
+
+def test_a_stored_view_is_never_overwritten(catalog: Catalog) -> None:
+    begin(catalog, "mug").add(record(0), image(0))
+    rival = catalog.resume("mug", provenance=PROVENANCE)
+    with pytest.raises(CatalogError, match="stored already"):
+        rival.add(record(0), image(99))
+    for index in rival.missing():
+        rival.add(record(index), image(index))
+    rival.finish()
+    assert np.array_equal(catalog.read_image(catalog.object("mug").views[0]), image(0))
+
+
+@pytest.mark.parametrize(
+    ("asked", "known"), [("mug-whit", "mug-white"), ("MUG-WHITE", "mug-white"), ("tea tin", "Tea-Tin")]
+)
+def test_unknown_names_are_answered_with_near_ones(catalog: Catalog, asked: str, known: str) -> None:
+    fill(catalog, known, 1)
+    with pytest.raises(ObjectNotFound) as refused:
+        catalog.object(asked)
+    assert repr(known) in refused.value.next_step
+
+
+def test_names_are_compared_composed_and_without_outer_blanks(catalog: Catalog) -> None:
+    fill(catalog, " Ta\u0308sse ", 1)
+    assert catalog.object("T\u00e4sse").summary.views == 1
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "a/b", "..", ".", "CON", "杯子", "x" * 100, "a\\b", "~", "-rf"])
+def test_any_name_makes_a_safe_file_name(catalog: Catalog, name: str) -> None:
+    fill(catalog, name, 1)
+    stored = catalog.object(name).views[0]
+    path = catalog.image_path(stored)
+    assert stored.object_name == name
+    assert path.resolve().is_relative_to(catalog.path / "images")
+    assert all(part.isascii() and part[0].isdigit() and len(part) <= 50 for part in Path(stored.image).parts[1:])
+    assert cv2.imread(str(path)) is not None
+
+
+@pytest.mark.parametrize("name", ["", "  ", "a\nb", "a\x00b", "\ud800", "x" * 101])
+def test_names_that_are_refused(catalog: Catalog, name: str) -> None:
+    with pytest.raises(UsageError):
+        begin(catalog, name)
+    assert catalog.objects() == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"index": -1},
+        {"azimuth_deg": 360.0},
+        {"azimuth_deg": -1e-9},
+        {"azimuth_deg": np.nan},
+        {"encoder_deg": np.inf},
+        {"imu_deg": 1.0},
+        {"imu_sigma_deg": 1.0},
+        {"imu_deg": 1.0, "imu_sigma_deg": -0.1},
+        {"evidence": {"sharpness": np.nan}},
+        {"evidence": {"frame": np.zeros(3)}},
+    ],
+)
+def test_views_that_are_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(UsageError):
+        record(0, **changes)
+
+
+def test_text_that_cannot_be_stored_is_refused(catalog: Catalog) -> None:
+    with pytest.raises(UsageError, match="label"):
+        begin(catalog, "mug", label="\udcff")
+    assert catalog.objects() == []
+
+
+def test_a_view_may_be_numpy_scalars(catalog: Catalog) -> None:
+    given_record = record(
+        0,
+        azimuth_deg=np.float32(0.5),
+        captured_ns=np.int64(7),
+        imu_deg=np.float32(2),
+        imu_sigma_deg=np.int8(1),
+    )
+    enrollment = begin(catalog, "mug", 1)
+    enrollment.add(given_record, image(0))
+    enrollment.finish()
+    stored = catalog.object("mug").views[0].record
+    assert (stored.azimuth_deg, stored.captured_ns, stored.imu_deg, stored.imu_sigma_deg) == (0.5, 7, 2.0, 1.0)
+
+
+def test_evidence_may_hold_numpy_scalars() -> None:
+    assert record(0, evidence={"locked": np.bool_(True), "gain": np.float32(0.5)}).evidence == {
+        "locked": True,
+        "gain": 0.5,
+    }
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4, 3))],
+)
+def test_images_that_are_refused(catalog: Catalog, bad: np.ndarray) -> None:
+    enrollment = begin(catalog, "mug")
+    with pytest.raises(UsageError):
+        enrollment.add(record(0), bad)
+    assert enrollment.missing() == (0, 1, 2)
+
+
+def test_views_outside_the_plan_and_bad_descriptors_are_refused(catalog: Catalog) -> None:
+    enrollment = begin(catalog, "mug", 3)
+    with pytest.raises(UsageError, match="3 planned"):
+        enrollment.add(record(3), image(3))
+    with pytest.raises(ValueError, match=r"0\.\.7"):
+        enrollment.add(record(0, descriptor=np.full(144, 8, np.uint8)), image(0))
+    assert enrollment.missing() == (0, 1, 2)
+    with pytest.raises(UsageError):
+        begin(catalog, "bowl", 0)
+    with pytest.raises(UsageError):
+        catalog.begin("bowl", planned_azimuth_deg=[360.0], provenance=PROVENANCE)
+
+
+def test_changed_and_missing_images_are_noticed(catalog: Catalog) -> None:
+    fill(catalog, "mug", 2)
+    first, second = catalog.object("mug").views
+    catalog.image_path(first).write_bytes(catalog.image_path(second).read_bytes())
+    with pytest.raises(CatalogError, match="not the one"):
+        catalog.read_image(first)
+    catalog.image_path(second).unlink()
+    with pytest.raises(CatalogError, match="missing"):
+        catalog.read_image(second)
+
+
+def test_an_unknown_view_is_refused(catalog: Catalog) -> None:
+    with pytest.raises(CatalogError, match="no view 5"):
+        catalog.view(5)
+
+
+class CatalogMachine(RuleBasedStateMachine):
+    """Any order of enrolling, abandoning, resuming and reopening, against a model in two dictionaries."""
+
+    names = st.sampled_from(["mug", "tin"])
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = TemporaryDirectory()
+        self.clock = VirtualClock()
+        self.catalog = Catalog.open(self.folder.name, clock=self.clock)
+        self.complete: dict[str, int] = {}
+        self.unfinished: dict[str, tuple[int, set[int]]] = {}
+
+    def teardown(self) -> None:
+        self.catalog.close()
+        self.folder.cleanup()
+
+    @rule(name=names, views=st.integers(1, 3), replace=st.booleans())
+    def begin(self, name: str, views: int, replace: bool) -> None:
+        if not replace and (name in self.complete or name in self.unfinished):
+            with pytest.raises(CatalogError):
+                begin(self.catalog, name, views)
+            return
+        begin(self.catalog, name, views, replace=replace)
+        self.unfinished[name] = (views, set())
+
+    @rule(name=names, index=st.integers(0, 2))
+    @precondition(lambda self: self.unfinished)
+    def add(self, name: str, index: int) -> None:
+        if name not in self.unfinished:
+            return
+        views, present = self.unfinished[name]
+        enrollment = self.catalog.resume(name, provenance=PROVENANCE)
+        if index >= views or index in present:
+            with pytest.raises((UsageError, CatalogError)):
+                enrollment.add(record(index), image(index))
+            return
+        enrollment.add(record(index), image(index))
+        present.add(index)
+
+    @rule(name=names, abandon=st.booleans())
+    @precondition(lambda self: self.unfinished)
+    def end(self, name: str, abandon: bool) -> None:
+        if name not in self.unfinished:
+            return
+        views, present = self.unfinished[name]
+        enrollment = self.catalog.resume(name, provenance=PROVENANCE)
+        if abandon:
+            enrollment.abandon()
+        elif len(present) < views:
+            with pytest.raises(CatalogError):
+                enrollment.finish()
+            return
+        else:
+            enrollment.finish()
+            self.complete[name] = views
+        del self.unfinished[name]
+
+    @rule()
+    def reopen(self) -> None:
+        self.catalog.close()
+        self.catalog = Catalog.open(self.folder.name, clock=self.clock)
+
+    @invariant()
+    def agrees_with_the_model(self) -> None:
+        summaries = {summary.name: summary for summary in self.catalog.objects()}
+        assert {name: s.views for name, s in summaries.items() if s.enrolled_utc} == self.complete
+        assert {name: s.unfinished_views for name, s in summaries.items() if s.unfinished_views is not None} == {
+            name: len(present) for name, (_, present) in self.unfinished.items()
+        }
+        model, _ = self.catalog.views()
+        counts = np.bincount(model.object_index, minlength=len(model.object_names))
+        assert dict(zip(model.object_names, counts.tolist(), strict=True)) == self.complete
+
+
+TestCatalogMachine = CatalogMachine.TestCase
+TestCatalogMachine.settings = settings(max_examples=20, stateful_step_count=20, deadline=None)
+
+
+def test_only_an_enrollment_without_views_can_be_taken_back(catalog: Catalog) -> None:
+    begin(catalog, "typo").discard()
+    assert catalog.objects() == []
+    fill(catalog, "mug", 3)
+    begin(catalog, "mug", replace=True).discard()
+    assert catalog.object("mug").summary.views == 3
+    again = begin(catalog, "mug", replace=True)
+    again.add(record(0), image(0))
+    with pytest.raises(CatalogError, match="holds views"):
+        again.discard()

@@ -1,0 +1,194 @@
+"""A stored view survives a killed process, a full disk and other processes at the same catalog."""
+
+import errno
+import os
+import signal
+import sqlite3
+import subprocess
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import Engine, event
+
+from rig.catalog import Catalog, Enrollment
+from rig.catalog.database import Database
+from rig.core.errors import CatalogBusy, CatalogError
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, plan, record, spawn_arguments
+
+VIEWS = 12
+
+
+def spawn(path: Path, name: str, views: int = VIEWS, die_before: int = 0) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        spawn_arguments(path, name, views, die_before), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def begin(catalog: Catalog, name: str, views: int = VIEWS) -> Enrollment:
+    return catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE)
+
+
+def assert_resumes_whole(path: Path, name: str, reported: set[int]) -> None:
+    """Check that every reported view is stored, at most one more is, and all of them with their pixels."""
+    with Catalog.open(path, clock=VirtualClock()) as catalog:
+        unfinished = catalog.resumable(name)
+        assert unfinished is not None
+        assert reported <= set(unfinished.present)
+        assert len(unfinished.present) <= len(reported) + 1
+        enrollment = catalog.resume(name, provenance=PROVENANCE)
+        for index in enrollment.missing():
+            enrollment.add(record(index), image(index))
+        enrollment.finish()
+        views = catalog.object(name).views
+        assert [view.record.index for view in views] == list(range(VIEWS))
+        for view in views:
+            assert np.array_equal(catalog.read_image(view), image(view.record.index))
+            assert np.array_equal(view.record.descriptor, record(view.record.index).descriptor)
+        assert {file.name for file in catalog.image_path(views[0]).parent.iterdir()} == {
+            f"{index:03d}.png" for index in range(VIEWS)
+        }
+
+
+@pytest.mark.parametrize("die_before", [5, 6, 7, 8], ids=["sync-image", "rename", "sync-folder", "commit"])
+def test_a_process_killed_inside_add_loses_only_that_view(tmp_path: Path, die_before: int) -> None:
+    with spawn(tmp_path, "mug", die_before=die_before) as child:
+        out, err = child.communicate()
+    assert child.returncode == -signal.SIGKILL, err
+    assert out.split() == ["0"]
+    assert_resumes_whole(tmp_path, "mug", {0})
+
+
+@pytest.mark.parametrize("reports", [1, 4, 9])
+def test_a_process_killed_at_any_moment_keeps_what_it_reported(tmp_path: Path, reports: int) -> None:
+    with spawn(tmp_path, "mug") as child:
+        assert child.stdout is not None
+        reported = {int(child.stdout.readline()) for _ in range(reports)}
+        child.kill()
+        reported |= {int(line) for line in child.stdout}
+    assert_resumes_whole(tmp_path, "mug", reported)
+
+
+def test_the_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def record_fsync(descriptor: int) -> None:
+        steps.append(f"sync {Path(f'/proc/self/fd/{descriptor}').readlink().name}")
+        fsync(descriptor)
+
+    def record_replace(source: Path, target: Path) -> None:
+        steps.append(f"rename {source.name} {target.name}")
+        replace(source, target)
+
+    def record_commit(_: object) -> None:
+        steps.append("commit")
+
+    with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
+        enrollment = begin(catalog, "mug")
+        monkeypatch.setattr(os, "fsync", record_fsync)
+        monkeypatch.setattr(os, "replace", record_replace)
+        event.listen(Engine, "commit", record_commit)
+        try:
+            enrollment.add(record(0), image(0))
+        finally:
+            event.remove(Engine, "commit", record_commit)
+    assert steps == ["sync 000.png.part", "rename 000.png.part 000.png", f"sync {enrollment.folder.name}", "commit"]
+
+
+def test_commits_are_durable_and_references_are_kept(tmp_path: Path) -> None:
+    database = Database(tmp_path, create=True, read_only=False, busy_timeout_s=1.0)
+    with database.write() as connection:
+        settings = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()
+            for name in ("journal_mode", "synchronous", "foreign_keys")
+        }
+    database.close()
+    assert settings == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}
+
+
+def fail_fsync(_: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def fail_replace(_source: Path, _target: Path) -> None:
+    raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
+
+
+@pytest.mark.parametrize(("call", "failure"), [("fsync", fail_fsync), ("replace", fail_replace)])
+def test_a_full_disk_loses_only_the_view_at_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, failure: Callable[..., Any]
+) -> None:
+    with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
+        enrollment = begin(catalog, "mug", 2)
+        enrollment.add(record(0), image(0))
+        with monkeypatch.context() as patch:
+            patch.setattr(os, call, failure)
+            with pytest.raises(CatalogError, match=r"full.*earlier ones are safe") as refused:
+                enrollment.add(record(1), image(1))
+        assert "free some space" in refused.value.next_step
+        assert enrollment.missing() == (1,)
+        assert [file.name for file in (tmp_path / enrollment.folder).iterdir()] == ["000.png"]
+        enrollment.add(record(1), image(1))
+        enrollment.finish()
+
+
+def test_a_database_that_cannot_grow_is_a_full_disk(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
+        enrollment = begin(catalog, "mug", 1)
+        with catalog._database.write() as connection:
+            pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
+            connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
+        with pytest.raises(CatalogError, match="full"):
+            enrollment.add(record(0, evidence={"long": "x" * 20_000}), image(0))
+        assert enrollment.missing() == (0,)
+
+
+def test_an_object_whose_folder_cannot_be_made_is_not_begun(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
+        (tmp_path / "images").write_text("in the way")
+        with pytest.raises(CatalogError):
+            begin(catalog, "mug")
+        assert catalog.objects() == []
+
+
+def test_a_second_writer_waits_and_is_then_told(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path, clock=VirtualClock(), busy_timeout_s=0.02) as catalog:
+        fill(catalog, "tin", 1)
+        enrollment = begin(catalog, "mug", 1)
+        with closing(sqlite3.connect(tmp_path / "catalog.sqlite", isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            with pytest.raises(CatalogBusy, match=r"0\.02 s; nothing was changed") as refused:
+                enrollment.add(record(0), image(0))
+            assert refused.value.exit_code == 9
+            assert len(catalog.views().views) == 1  # readers do not wait
+        assert not (tmp_path / enrollment.folder / "000.png").exists()
+        enrollment.add(record(0), image(0))
+
+
+def test_processes_create_enroll_and_read_one_catalog_together(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "catalog"
+    children = {name: spawn(path, name) for name in ("mug", "tin")}
+    for child in children.values():
+        assert child.stdout is not None
+        first = child.stdout.readline()
+        assert first == "0\n", child.communicate()
+    seen = [0]
+    with Catalog.open(path, clock=VirtualClock(), read_only=True) as catalog:
+        while any(child.poll() is None for child in children.values()):
+            summaries = catalog.objects()
+            seen.append(sum(s.views + (s.unfinished_views or 0) for s in summaries))
+            assert len(catalog.views().views) in (0, VIEWS, 2 * VIEWS)
+        for child in children.values():
+            _, err = child.communicate()
+            assert child.returncode == 0, err
+        assert seen == sorted(seen)
+        model, view_ids = catalog.views()
+        assert sorted(model.object_names) == ["mug", "tin"]
+        for view_id in view_ids:
+            view = catalog.view(view_id)
+            assert np.array_equal(catalog.read_image(view), image(view.record.index))

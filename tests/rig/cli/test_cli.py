@@ -1,0 +1,185 @@
+"""The command line as its users call it, in processes of its own where that matters."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.catalog import Catalog
+from rig.cli.main import app
+from rig.core.clock import SystemClock
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+
+
+@pytest.fixture
+def rig(tmp_path, monkeypatch):
+    """Return a function that runs `rig ...` in an empty folder, with a small catalog of its own."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
+
+    def run(*arguments: str):
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+def lines(output: str) -> list[dict]:
+    return [json.loads(line) for line in output.splitlines()]
+
+
+def test_enroll_list_show_identify(rig):
+    done = rig("enroll", "mug-dots", "--views", "8", "--label", "kitchen")
+    assert done.exit_code == 0, done.output
+    assert rig("enroll", "lamp", "--views", "8").exit_code == 0
+
+    listed = json.loads(rig("catalog", "list", "--json").stdout)
+    assert {o["name"]: (o["label"], o["views"]) for o in listed["objects"]} == {
+        "mug-dots": ("kitchen", 8),
+        "lamp": ("", 8),
+    }
+    shown = rig("catalog", "show", "mug-dots")
+    assert "8 of 8 views" in shown.stdout
+    assert Path("catalog/images").is_dir()
+
+    found = rig("identify", "--set", "bench.sim.object=lamp", "--json", "--seed", "5", "--strategy", "ahbr")
+    events = lines(found.stdout)
+    assert found.exit_code == 0
+    assert events[0]["event"] == "started"
+    assert events[-1]["event"] == "identified"
+    assert events[-1]["name"] == "lamp"
+    assert {e["event"] for e in events} >= {"moved", "accepted", "ranked", "decided"}
+
+
+def test_views_are_dated_by_the_clock_of_their_bench(rig):
+    assert rig("enroll", "dice", "--views", "4").exit_code == 0
+    told = json.loads(rig("catalog", "show", "dice", "--json").stdout)
+    (enrollment,) = told["enrollments"]
+    captured = [view["captured_utc"] for view in told["views"]]
+    assert enrollment["started_utc"] < captured[0]
+    assert captured == sorted(captured)
+    assert captured[-1] < enrollment["finished_utc"]
+
+
+def test_a_seed_determines_the_catalog_to_the_byte(rig):
+    def enrolled(seed: str, folder: str) -> tuple[list[bytes], bytes]:
+        assert rig("enroll", "dice", "--views", "4", "--seed", seed, "--set", f"catalog.path={folder}").exit_code == 0
+        with Catalog.open(folder, clock=SystemClock(), read_only=True) as catalog:
+            descriptors = catalog.views().views.descriptors.tobytes()
+        return [path.read_bytes() for path in sorted(Path(folder, "images").rglob("*.png"))], descriptors
+
+    images, descriptors = enrolled("7", "first")
+    assert len(images) == 4 + 1  # and the empty table
+    assert enrolled("7", "again") == (images, descriptors)
+    assert enrolled("8", "other")[0] != images
+
+
+def test_an_unknown_object_ends_with_exit_code_8(rig):
+    rig("enroll", "mug-dots", "--views", "8")
+    done = rig("identify", "--set", "bench.sim.object=clock", "--max-views", "3")
+    assert done.exit_code == 8
+    assert "Unknown: the nearest are mug-dots" in done.stdout
+
+
+def test_identify_without_a_catalog_says_what_to_do(rig):
+    done = rig("identify")
+    assert done.exit_code == 7
+    assert "Next step:" in done.stderr
+
+
+def test_a_second_enrollment_of_a_name_needs_a_decision(rig):
+    rig("enroll", "dice", "--views", "4")
+    again = rig("enroll", "dice", "--views", "4")
+    assert again.exit_code == 7
+    assert "--replace" in again.stderr
+    assert "--resume" not in again.stderr  # this command has stored nothing
+    assert rig("enroll", "dice", "--views", "4", "--replace").exit_code == 0
+
+
+def test_an_object_that_is_not_on_the_shelf_is_told_with_those_that_are(rig):
+    done = rig("enroll", "unicorn", "--views", "4")
+    assert done.exit_code == 7
+    assert "mug-white" in done.stderr
+
+
+def test_goto_turns_and_tells_encoder_and_gyro(rig):
+    told = json.loads(rig("goto", "-90", "--json").stdout)
+    assert told["encoder_deg"] == pytest.approx(-90, abs=0.3)
+    assert told["rotation_imu_deg"] == pytest.approx(-90, abs=4)
+    assert told["agrees"] is True
+
+
+def test_goto_beyond_the_cable_is_a_motion_error(rig):
+    done = rig("goto", "500")
+    assert done.exit_code == 5
+    assert "limits_deg" in done.stderr
+
+
+def test_status_tells_the_devices_and_moves_nothing(rig):
+    told = json.loads(rig("status", "--json").stdout)
+    assert told["servo"]["model"] == "xl430_w250"
+    assert told["imu"]["who_am_i"] == 0x68
+    assert told["camera"]["width"] == 640
+    assert told["camera"]["locks"]["auto_exposure"] is False
+    assert told["table_deg"] == pytest.approx(0, abs=0.3)
+    text = rig("status").stdout
+    assert "moving no" in text
+    assert "gain –" in text
+
+
+def test_mistakes_in_the_configuration_come_all_at_once_and_in_json_too(rig):
+    done = rig("status", "--set", "servo.baud=1", "--set", "view.roy=3", "--json")
+    assert done.exit_code == 3
+    error = json.loads(done.stdout)
+    assert error["code"] == 300
+    assert len(error["evidence"]["mistakes"]) == 2
+    assert error["next_step"]
+
+
+def test_common_options_may_stand_before_or_after_the_command(rig):
+    before = rig("--seed", "3", "--json", "goto", "30")
+    after = rig("goto", "30", "--seed", "3", "--json")
+    assert before.exit_code == after.exit_code == 0
+    assert before.stdout == after.stdout
+    assert rig("goto", "30", "--seed", "4", "--json").stdout != after.stdout
+
+
+def test_an_unknown_bench_and_an_unknown_command(rig):
+    assert rig("status", "--bench", "mars").exit_code == 3
+    assert rig("fly").exit_code == 2
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_signals_end_an_enrollment_with_their_code_and_it_resumes(tmp_path, number, code):
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
+    process = subprocess.Popen(
+        [*RIG, "enroll", "dice", "--views", "36", "--json"],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    stored = 0
+    for line in process.stdout:
+        stored += json.loads(line)["event"] == "accepted"
+        if stored == 3:
+            process.send_signal(number)
+            break
+    rest, errors = process.communicate(timeout=60)
+    stored += sum(json.loads(line).get("event") == "accepted" for line in rest.splitlines())
+    assert process.returncode == code
+    assert "--resume" in errors
+    resumed = subprocess.run(
+        [*RIG, "enroll", "dice", "--resume", "--json"], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    events = lines(resumed.stdout)
+    assert events[0]["views"] == 36 - stored
+    assert events[-1] == {**events[-1], "event": "enrolled", "views": 36}

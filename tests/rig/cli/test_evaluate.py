@@ -1,0 +1,263 @@
+"""`rig eval` as its users call it, on folders of small drawn photographs."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.cli.objects.evaluate import evaluate
+from rig.core.clock import SystemClock
+
+app = typer.Typer()
+app.command("eval")(evaluate)
+
+PROGRAM = "import typer; from rig.cli.objects.evaluate import evaluate; typer.run(evaluate)"
+QUICK = ("--methods", "hbr,ahbr", "--trials", "2", "--views", "4", "--jobs", "1")
+
+
+def drawing(number: int, angle: float, size: int = 40) -> np.ndarray:
+    """A disc with a coloured spot that goes around it."""
+    rng = np.random.default_rng(number)
+    image = np.zeros((size, size, 3), np.uint8)
+    cv2.circle(image, (size // 2, size // 2), size // 2 - 2, rng.integers(60, 256, 3).tolist(), -1)
+    x, y = size / 2 + size / 4 * np.cos(np.radians(angle)), size / 2 - size / 4 * np.sin(np.radians(angle))
+    cv2.circle(image, (round(x), round(y)), size // 7, rng.integers(0, 256, 3).tolist(), -1)
+    return image
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for number in range(1, 5):
+        for angle in range(0, 360, 30):
+            assert cv2.imwrite(str(folder / f"obj{number}__{angle}.png"), drawing(number, angle))
+    return folder
+
+
+def run(*arguments: str | Path):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def results(folder: Path) -> dict:
+    found = json.loads((folder / "results.json").read_text())
+    found.pop("wall_clock")
+    return found
+
+
+def test_an_evaluation_leaves_its_results_in_every_form(photographs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = run(photographs, "--noise", "gn", "--methods", "all,omega-sweep", *QUICK[2:], "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "AHBR ω = 0.5 at N = 4" in done.output
+    assert "McNemar p" in done.output
+    found = results(out)
+    assert found["settings"]["condition"]["noise"] == "gn:0.012"
+    assert found["settings"]["dataset"]["views"] == 48
+    assert found["bytes_per_view"] == 54
+    hbr = next(method for method in found["methods"] if method["name"] == "hbr")
+    assert [point["views"] for point in hbr["curve"]] == [1, 2, 3, 4]
+    assert all(point["trials"] == 8 for point in hbr["curve"])
+    assert hbr["curve"][-1]["hit_rate_low"] <= hbr["curve"][-1]["hit_rate"] <= hbr["curve"][-1]["hit_rate_high"]
+    rows = list(csv.DictReader((out / "results.csv").read_text().splitlines()))
+    assert len(rows) == sum(len(method["curve"]) for method in found["methods"])
+    assert float(rows[-1]["hit_rate"]) == found["methods"][-1]["curve"][-1]["hit_rate"]
+    for name in ("hit-rate", "travel", "pose", "omega-sweep"):
+        picture = cv2.imread(str(out / f"{name}.png"))
+        assert picture is not None
+        assert picture.std() > 5
+        assert (out / f"{name}.svg").read_text().startswith("<svg")
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 4
+    assert "McNemar" in page
+    assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
+
+
+def test_equal_commands_give_equal_results_whatever_the_processes(photographs: Path, tmp_path: Path) -> None:
+    for out, jobs in (("one", "1"), ("two", "2")):
+        done = run(photographs, *QUICK, "--noise", "mb:5", "--out", tmp_path / out, "--jobs", jobs)
+        assert done.exit_code == 0, done.output
+    assert results(tmp_path / "one") == results(tmp_path / "two")
+    assert (tmp_path / "one/hit-rate.svg").read_bytes() == (tmp_path / "two/hit-rate.svg").read_bytes()
+    assert run(photographs, *QUICK, "--noise", "mb:5", "--out", tmp_path / "three", "--seed", "1").exit_code == 0
+    assert results(tmp_path / "one")["methods"] != results(tmp_path / "three")["methods"]
+
+
+def test_an_interrupted_evaluation_keeps_what_is_done_and_goes_on(photographs: Path, tmp_path: Path) -> None:
+    arguments = [str(photographs), *QUICK, "--json"]
+    command = [sys.executable, "-c", PROGRAM, *arguments, "--trials", "60", "--out", str(tmp_path / "out")]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if json.loads(line)["event"] == "searched":
+            process.send_signal(signal.SIGINT)
+            break
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "--resume" in errors
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out/runs").glob("*.npz")}
+    assert 1 <= len(kept) < 4
+    more = ("--trials", "60", "--out")
+    assert run(*arguments, *more, tmp_path / "out").exit_code == 2  # not without --resume
+    assert run(*arguments, *more, tmp_path / "out", "--resume").exit_code == 0
+    assert all(path.stat().st_mtime_ns == written for path, written in kept.items())
+    assert run(*arguments, *more, tmp_path / "whole").exit_code == 0
+    assert results(tmp_path / "out") == results(tmp_path / "whole")
+
+
+def test_runs_of_other_settings_are_not_mixed(photographs: Path, tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "out")
+    assert run(photographs, *QUICK, *out).exit_code == 0
+    done = run(photographs, *QUICK, *out, "--resume", "--noise", "gn")
+    assert done.exit_code == 2
+    assert "other settings" in done.output
+    assert "condition" in done.output
+
+
+def test_some_objects_are_reported_alone_though_all_are_enrolled(photographs: Path, tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "out")
+    assert run(photographs, *QUICK, *out).exit_code == 0
+    whole = results(tmp_path / "out")
+    assert run(photographs, *QUICK, *out, "--resume", "--report", "3-4").exit_code == 0
+    part = results(tmp_path / "out")
+    assert part["settings"] == whole["settings"]
+    assert (whole["reported"], part["reported"]) == (None, [3, 4])
+    assert [method["curve"][0]["trials"] for method in part["methods"]] == [4, 4]
+    assert part["methods"][0]["pose_rmse_deg_by_object"] == whole["methods"][0]["pose_rmse_deg_by_object"][2:]
+    assert "Reported: objects 3 to 4." in (tmp_path / "out/report.html").read_text()
+
+
+def test_a_damaged_file_of_runs_is_run_again(photographs: Path, tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "out")
+    assert run(photographs, *QUICK, *out).exit_code == 0
+    before = results(tmp_path / "out")
+    damaged = tmp_path / "out/runs/obj2.npz"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    assert run(photographs, *QUICK, *out, "--resume").exit_code == 0
+    assert results(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--noise", "fog"), "noise 'fog' is unknown"),
+        (("--methods", "guess"), "method 'guess' is unknown"),
+        (("--removal", "all"), "removal 'all' is unknown"),
+        (("--background", "sea"), "background 'sea' is unknown"),
+        (("--objects", "3"), "no range"),
+        (("--objects", "3-9"), "has 4"),
+        (("--views", "12"), "obj1 has 12 views"),
+    ],
+)
+def test_wrong_options_end_with_a_next_step(photographs: Path, tmp_path: Path, options: tuple, message: str) -> None:
+    done = run(photographs, *QUICK, "--out", tmp_path / "out", *options)
+    assert done.exit_code == 2
+    assert message in done.output
+    assert "Next step" in done.output
+
+
+def test_a_broken_photograph_is_named(photographs: Path, tmp_path: Path) -> None:
+    broken = photographs / "obj3__60.png"
+    broken.write_bytes(broken.read_bytes()[:200])
+    for jobs in ("1", "2"):
+        done = run(photographs, *QUICK, "--out", tmp_path / jobs, "--jobs", jobs)
+        assert done.exit_code == 2
+        assert "obj3__60.png is cut off" in done.output
+    done = run(tmp_path / "nowhere", *QUICK)
+    assert done.exit_code == 2
+    assert "nowhere is not a folder" in done.output
+
+
+def test_the_catalog_is_evaluated_where_no_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n[view]\nroi = [4, 0, 40, 40]\n')
+    with Catalog.open("catalog", clock=SystemClock()) as catalog:
+        for number, name in enumerate(("mug", "tea box")):
+            enrollment = catalog.begin(
+                name, planned_azimuth_deg=list(range(0, 360, 30)), provenance=Provenance("bench", {}, {})
+            )
+            for index in range(12):
+                record = ViewRecord(index, 0.0, 0.0, 30.0 * index + 0.25, np.zeros(144, np.uint8), 0)
+                enrollment.add(record, cv2.copyMakeBorder(drawing(number, 30 * index), 0, 0, 4, 4, 0))
+            enrollment.finish()
+    done = run(*QUICK, "--out", "out")
+    assert done.exit_code == 0, done.output
+    assert results(Path("out"))["settings"]["dataset"]["objects"] == ["mug", "tea box"]
+    assert results(Path("out"))["methods"][0]["curve"][0]["hit_rate"] > 0.5
+
+
+def test_the_matrix_has_every_perturbation_at_three_strengths(photographs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    few = ("--enrolled", "6", "--trials", "1", "--views", "2", "--jobs", "1", "--objects", "1-2")
+    done = run(photographs, "--matrix", "--descriptor", "edges+colours", *few, "--out", out)
+    assert done.exit_code == 0, done.output
+    found = json.loads((out / "matrix.json").read_text())
+    kinds = {row["kind"] for row in found["matrix"]}
+    assert {"none", "gn", "mb", "defocus", "gain", "white-balance", "shift", "scale", "elevation"} <= kinds
+    assert {"occlusion", "background"} <= kinds
+    assert all(
+        {row["strength"] for row in found["matrix"] if row["kind"] == kind} == {1, 2, 3} for kind in kinds - {"none"}
+    )
+    assert all(len(row["hit_rate"]) == 2 and row["trials"] == 2 for row in found["matrix"])
+    assert found["matrix"][0]["hit_rate"][-1] == 1
+    assert "white-balance" in done.output
+    assert run(photographs, "--matrix", "--descriptor", "edges", "--out", out).exit_code == 2
+
+
+def test_other_descriptors_are_judged_by_the_dense_filter(photographs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ("--descriptor", "edges+colours", "--perturb", "shift:1+gain:1", "--enrolled", "6", *QUICK[2:])
+    done = run(photographs, "--methods", "dense,dense-90", *options, "--out", out)
+    assert done.exit_code == 0, done.output
+    found = results(out)
+    assert found["bytes_per_view"] == 160
+    assert found["settings"]["condition"]["perturbations"] == "shift:1+gain:1"
+    assert found["settings"]["protocol"]["enrolled"] == 6
+    assert [method["name"] for method in found["methods"]] == ["dense", "dense-90"]
+    assert "probability of" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--descriptor", "sift"), "'sift' is unknown"),
+        (("--perturb", "fog"), "'fog' is unknown"),
+        (("--report", "3"), "'3' is no range"),
+        (("--report", "3-5"), "has 4; count from 1"),
+        (("--descriptor", "edges", "--methods", "hbr"), "compares CEDD alone"),
+        (("--background", "bench", "--rotate", "10"), "leave one of them"),
+        (("--enrolled", "12", "--methods", "dense"), "queries it needs more"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_in_words(
+    photographs: Path, tmp_path: Path, options: tuple[str, ...], words: str
+) -> None:
+    done = run(photographs, *options, *QUICK[2:], "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert words in " ".join(done.output.split())
+
+
+def test_objects_that_are_left_out_are_looked_for_too(photographs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ("--descriptor", "edges+colours", "--enrolled", "6", "--leave-out", "2", "--trials", "3")
+    done = run(photographs, *options, "--views", "2", "--jobs", "1", "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "false rejects / accepts" in done.output
+    found = json.loads((out / "strangers.json").read_text())
+    assert {row["stranger_trials"] for row in found["strangers"]} == {30}
+    # rehearsed rules are judged by all trials, others by the third that they do not come from
+    assert {(row["rehearsed"], row["known_trials"]) for row in found["strangers"]} == {(False, 10), (True, 30)}
+    # two calibration trials can promise nothing: nobody is called unknown
+    assert all(row["false_rejects"] == 0 and row["false_accepts"] == 30 for row in found["strangers"])
+    assert run(photographs, *options[:4], "--leave-out", "3", "--out", out).exit_code == 2

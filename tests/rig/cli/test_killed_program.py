@@ -1,0 +1,170 @@
+"""A servo in real time, and the real process that drives it: killed, stopped, terminated in the middle of a motion."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+from rig.config import load_config
+from rig.core.clock import SystemClock
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import open_serial
+
+CLOCK = SystemClock()
+
+PROGRAM = """
+import numpy as np
+import typer
+from rig.bench import Bench
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import open_serial
+from rig.devices.dynamixel.register_servo import prepare_servo
+from rig.devices.imu import ImuIdentity, ImuSamples
+from rig.safety.saved_state import BenchLock, FileStore
+from rig.motion.turntable import Turntable
+
+CLOCK = SystemClock()
+
+class StillImu:
+    identity = ImuIdentity("none", 0x68, 0x68, 0.005)
+    rate_hz, range_dps = 200.0, 250.0
+
+    def __init__(self):
+        self.until_ns = CLOCK.now_ns()
+
+    def read_samples(self):
+        time_ns = np.arange(self.until_ns, CLOCK.now_ns(), 5_000_000, dtype=np.int64)
+        self.until_ns += 5_000_000 * time_ns.size
+        return ImuSamples(time_ns, np.zeros((time_ns.size, 3)))
+
+@command
+def go(settings: Settings) -> None:
+    config = settings.load()
+    lock = BenchLock(config.state_path("hardware"), CLOCK)
+    wire = open_serial(config.servo.port, config.servo.baud)
+    servo = open_servo(wire, config.servo, CLOCK)
+    prepare_servo(servo, write=True)
+    bench = Bench("hardware", config, CLOCK, servo, StillImu(), None, state=FileStore(config.state_path("hardware")))
+    bench.safety.connect()
+    if bench.safety.doubt:
+        bench.safety.declare(0.0)
+    print(*bench.safety.findings, sep="; ", flush=True)
+    with Turntable(bench, trust_gyro=False) as table:
+        print("moving", flush=True)
+        table.goto(350.0 if table.rest_deg < 175.0 else 0.0)
+
+app = typer.Typer()
+app.command()(go)
+app()
+"""
+
+
+@pytest.fixture
+def servo(tmp_path):
+    """Return the settings that lead to a simulated servo in a process of its own, in real time."""
+    start = "from rig.cli.main import main; main()"
+    link = tmp_path / "servo"
+    process = subprocess.Popen(
+        [sys.executable, "-c", start, "sim-servo", "--json", "--seconds", "60", "--link", str(link)],
+        stdout=subprocess.PIPE,
+    )
+    assert json.loads(process.stdout.readline())["ids"] == [1]
+    yield [
+        f"servo.port={str(link)!r}",
+        f"state_dir={str(tmp_path / 'state')!r}",
+        "table.velocity_dps=60",
+        "table.watchdog_s=1.2",
+    ]
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+def moving(settings: list[str]) -> tuple[subprocess.Popen, str]:
+    """Start the program; return it when it has been moving for a while, and what it said about the servo it found."""
+    options = [word for setting in settings for word in ("--set", setting)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *options],
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    findings = process.stdout.readline()
+    assert process.stdout.readline() == "moving\n", process.stderr.read()
+    CLOCK.sleep(0.8)
+    return process, findings
+
+
+def ended(process: subprocess.Popen) -> tuple[int, str]:
+    _, errors = process.communicate(timeout=20)
+    return process.returncode, errors
+
+
+def look(settings: list[str]) -> tuple[bool, bool, bool]:
+    """Return whether the servo turns, whether its torque is on, and whether its watchdog has tripped."""
+    config = load_config(None, settings)
+    wire = open_serial(config.servo.port, config.servo.baud)
+    try:
+        servo = open_servo(wire, config.servo, CLOCK)
+        first = servo.read_state()
+        CLOCK.sleep(0.1)
+        turns = abs(servo.read_state().position_deg - first.position_deg) > 0.3
+        condition = servo.read_condition()
+        return turns, condition.torque, condition.watchdog_tripped
+    finally:
+        wire.close()
+
+
+def rig(settings: list[str], *words: str):
+    options = [word for setting in settings for word in ("--set", setting)]
+    return CliRunner().invoke(app, [*words, "--bench", "hardware", *options])
+
+
+def test_however_a_program_ends_in_the_middle_of_a_motion_the_table_stops(servo, tmp_path):
+    process, findings = moving(servo)
+    assert findings == "\n"
+    process.send_signal(signal.SIGKILL)
+    ended(process)
+    CLOCK.sleep(load_config(None, servo).table.watchdog_s + 0.3)
+    assert look(servo) == (False, True, True)
+    path = json.loads(Path(tmp_path, "state", "hardware", "state.json").read_text())["table"]["path_deg"]
+    assert path == pytest.approx([180.0, 530.0], abs=0.5)
+
+    process, findings = moving(servo)  # the next program says so, and goes on from where the table stands
+    for told in ("torque was on", "watchdog had stopped it", "cut off in the middle of a motion"):
+        assert told in findings
+    done = rig(servo, "stop", "--json")  # it opens the servo alone: the bench's camera and IMU need not be there
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == {"bench": "hardware", "pid": process.pid, "ended": True, "torque_was_on": False}
+    code, errors = ended(process)
+    assert code == 5
+    assert "Error 512 (stopped)" in errors
+    assert look(servo) == (False, False, False)
+
+    process, _ = moving(servo)
+    process.send_signal(signal.SIGTERM)
+    assert ended(process)[0] == 143
+    assert look(servo) == (False, False, False)
+
+    process, _ = moving(servo)
+    process.send_signal(signal.SIGINT)
+    assert ended(process)[0] == 130
+    assert look(servo) == (False, False, False)
+
+    process, _ = moving(servo)
+    process.send_signal(signal.SIGKILL)
+    ended(process)
+    (tmp_path / "full").write_text("")  # nothing can be written, and the servo is stopped all the same
+    told = json.loads(rig([*servo, f"state_dir={str(tmp_path / 'full')!r}"], "stop", "--json").stdout)
+    assert (told["pid"], told["torque_was_on"]) == (None, True)
+    assert look(servo) == (False, False, False)

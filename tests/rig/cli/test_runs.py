@@ -1,0 +1,362 @@
+"""rig identify, replay and report as a technician uses them; dry runs, reports, completion and closed pipes."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.bench import ObjectStandsThere
+from rig.catalog import Catalog
+from rig.cli.main import app
+from rig.cli.objects.identify import _Model
+from rig.core.clock import SystemClock
+from rig.events.events import Insight
+from rig.views.object_presence import TableWatcher
+from sim.bench import SimBenchKind
+from sim.objects.shelf import shelf
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+SMALL = (
+    'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
+    "[view]\nroi = [40, 0, 240, 240]\n[enroll]\nviews = 8\n"
+)
+
+
+@pytest.fixture(scope="module")
+def enrolled(tmp_path_factory):
+    """Return a folder with two enrolled objects, the report of one, and a saved run."""
+    folder = tmp_path_factory.mktemp("day")
+    (folder / "rig.toml").write_text(SMALL, encoding="utf-8")
+    outputs = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name, words in {
+            "lamp": ["enroll", "lamp", "--label", "kitchen", "--label", "brass", "--report", "lamp.html"],
+            "dice": ["enroll", "dice", "--json"],
+            "run": [
+                "identify",
+                "--strategy",
+                "ahbr",
+                "--set",
+                "bench.sim.object=dice",
+                "--seed",
+                "4",
+                "--save-run",
+                "runs/1",
+            ],
+        }.items():
+            done = CliRunner().invoke(app, words)
+            assert done.exit_code == 0, done.output
+            outputs[name] = done
+    return folder, outputs
+
+
+@pytest.fixture
+def rig(enrolled, monkeypatch):
+    folder, _ = enrolled
+    monkeypatch.chdir(folder)
+
+    def run(*arguments: str):
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+def test_enrollment_ends_with_what_the_object_may_be_taken_for_and_a_report(enrolled):
+    folder, outputs = enrolled
+    assert "looks like no other enrolled object" in outputs["lamp"].stdout
+    told = [json.loads(line) for line in outputs["dice"].stdout.splitlines()]
+    assert told[-2].keys() == {"event", *(Insight.__dataclass_fields__)}
+    assert told[-1]["event"] == "enrolled"
+    page = (folder / "lamp.html").read_text(encoding="utf-8")
+    assert "Contact sheet of lamp: 8 views" in page
+    assert "Ring of 8 views by azimuth" in page
+    assert "looks like" in page
+    assert not re.search(r'(src|href)="(?!data:|#)', page)  # needs nothing but itself
+
+
+def test_labels_may_be_repeated(rig):
+    listed = json.loads(rig("catalog", "list", "--json").stdout)
+    assert next(o["label"] for o in listed["objects"] if o["name"] == "lamp") == "kitchen, brass"
+
+
+def test_a_saved_run_is_walked_through_checked_and_reported(rig, enrolled):
+    folder, outputs = enrolled
+    walked = rig("replay", "runs/1")
+    assert walked.exit_code == 0
+    assert walked.stdout.splitlines()[1:] == outputs["run"].stdout.splitlines()
+    events = [json.loads(line) for line in rig("replay", "runs/1", "--json").stdout.splitlines()]
+    assert (events[0]["event"], events[-1]["event"]) == ("started", "identified")
+    checked = rig("replay", "runs/1", "--check")
+    assert checked.exit_code == 0
+    assert "all as saved" in checked.stdout
+    assert json.loads(rig("replay", "runs/1", "--check", "--json").stdout)["differences"] == []
+    assert rig("report", "runs/1").exit_code == 0
+    page = (folder / "runs" / "1" / "report.html").read_text(encoding="utf-8")
+    assert "dice" in page
+    assert "The camera’s way around the object" in page
+    assert rig("report", "runs/1", "--out", "elsewhere.html", "--json").exit_code == 0
+    assert Path("elsewhere.html").exists()
+
+
+def test_a_run_that_decides_otherwise_ends_with_code_6_and_says_where(rig, tmp_path):
+    import shutil
+
+    shutil.copytree("runs/1", tmp_path / "run")
+    lines = (tmp_path / "run" / "events.jsonl").read_text().splitlines()
+    for number, line in enumerate(lines):
+        event = json.loads(line)
+        if event["event"] == "decided":
+            lines[number] = json.dumps(event | {"rotation_deg": -event["rotation_deg"]})
+    (tmp_path / "run" / "events.jsonl").write_text("\n".join(lines) + "\n")
+    done = rig("replay", str(tmp_path / "run"), "--check")
+    assert done.exit_code == 6
+    assert "Error 602 (replay mismatch)" in done.stderr
+    assert "view 1, rotation_deg: saved -90.0, computed 90.0" in done.stderr
+
+
+def test_runs_that_are_not_there_or_would_be_overwritten(rig):
+    assert rig("replay", "nowhere").exit_code == 2
+    assert rig("report", "nowhere").exit_code == 2
+    again = rig("identify", "--save-run", "runs/1")
+    assert again.exit_code == 2
+    assert "not empty" in again.stderr
+
+
+def test_an_identification_that_fails_is_kept_with_its_error(rig):
+    done = rig("identify", "--save-run", "runs/dark", "--set", "view.min_mean=250", "--set", "view.retakes=0")
+    assert done.exit_code == 6
+    walked = rig("replay", "runs/dark")
+    assert walked.exit_code == 0
+    assert "Error 600 (view rejected)" in walked.stdout
+    assert rig("report", "runs/dark").exit_code == 0
+    assert rig("replay", "runs/dark", "--check").exit_code == 0
+
+
+@pytest.mark.parametrize("strategy", ["hbr", "ahbr", "sweep", "random"])
+def test_every_strategy_answers(rig, strategy):
+    done = rig(
+        "identify", "--strategy", strategy, "--max-views", "3", "--top", "1", "--json", "--set", "bench.sim.object=lamp"
+    )
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert events[0]["strategy"] == strategy
+    assert (events[-1]["event"], events[-1]["name"]) == ("identified", "lamp")
+    assert all(len(e["candidates"]) == 1 for e in events if e["event"] == "ranked")
+    assert len([e for e in events if e["event"] == "accepted"]) == (3 if strategy == "hbr" else 2)
+
+
+def test_the_bench_searches_by_its_own_strategy_where_its_catalog_is_described_for_it(rig, enrolled):
+    def searched(*words: str) -> tuple[list[dict], str]:
+        done = rig("identify", "--json", "--set", "bench.sim.object=lamp", *words)
+        return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
+
+    events, _ = searched("--top", "1", "--save-run", "runs/own")
+    started, *_, answer = (event for event in events if event["event"] != "tablepicture")
+    assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
+    assert 0.9 < answer["probability"] <= 1
+    assert answer["familiarity"] >= answer["min_familiarity"]
+    assert "cannot promise" in started["notes"][0]
+    assert rig("replay", "runs/own", "--check").exit_code == 0
+    assert rig("report", "runs/own").exit_code == 0
+    page = (enrolled[0] / "runs" / "own" / "report.html").read_text(encoding="utf-8")
+    assert ("What was weighed before each turn" in page) == any(e["event"] == "decided" for e in events)
+    events, _ = searched("--set", "identify.strategy=ahbr")
+    assert next(e for e in events if e["event"] == "started")["strategy"] == "ahbr"
+
+
+def test_rules_are_rehearsed_kept_and_used(rig, enrolled):
+    told = rig("catalog", "calibrate", "--false-reject", "0.1")
+    assert told.exit_code == 0, told.output
+    assert re.search(r"^\d+ rehearsed searches of 4 views for 2 objects", told.stdout)
+    assert "Not promised: An error rate of 1.0% takes 100 rehearsed searches" in told.stdout
+    kept = enrolled[0] / "catalog" / "search_rules.json"
+    assert told.stdout.rstrip().endswith(str(kept))
+    values = json.loads(rig("catalog", "calibrate", "--json").stdout)
+    assert values["false_reject"] == 0.02
+    assert values["rehearsed"]["views"] == 4
+    assert json.loads(kept.read_text(encoding="utf-8"))["searches"] == values["searches"]
+    kept.write_text("{", encoding="utf-8")
+    done = rig("identify", "--set", "bench.sim.object=lamp")
+    assert done.exit_code == 0
+    assert "cannot be read; rig catalog calibrate makes them anew" in done.stdout
+    kept.unlink()
+
+
+def test_a_catalog_of_before_is_searched_by_the_paper_and_says_what_to_do(enrolled, tmp_path, monkeypatch):
+    import shutil
+    import sqlite3
+    from contextlib import closing
+
+    shutil.copytree(enrolled[0] / "catalog", tmp_path / "catalog")
+    (tmp_path / "rig.toml").write_text(SMALL, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    with closing(sqlite3.connect("catalog/catalog.sqlite")) as database, database:
+        database.execute("DELETE FROM descriptors WHERE name != 'cedd'")
+    run = CliRunner().invoke
+    done = run(app, ["identify", "--set", "bench.sim.object=lamp"])
+    assert done.exit_code == 0, done.output
+    assert "rig catalog redescribe --descriptor edges+colours adds it" in done.stdout
+    assert "S_left" in done.stdout or "fixed" in done.stdout
+    for words in (["identify", "--strategy", "dense"], ["catalog", "calibrate"]):
+        refused = run(app, words)
+        assert refused.exit_code == 7
+        assert "rig catalog redescribe --descriptor edges+colours" in refused.stderr
+    assert run(app, ["catalog", "redescribe", "--descriptor", "edges+colours"]).exit_code == 0
+    again = run(app, ["identify", "--json", "--set", "bench.sim.object=lamp"])
+    assert '"strategy": "dense"' in again.stdout
+
+
+def test_a_strategy_that_is_not_there_is_said_before_anything_moves(rig):
+    done = rig("identify", "--strategy", "swep")
+    assert done.exit_code == 2
+    assert "Did you mean sweep?" in done.stderr
+
+
+def test_a_dry_run_says_all_and_does_nothing(rig):
+    before = sorted(Path("catalog").rglob("*.png"))
+    done = rig("enroll", "clock", "--step", "60", "--dry-run")
+    assert done.exit_code == 0
+    assert "clock: enroll, 6 views, about" in done.stdout
+    assert "Table angles: 0.0, 60.0, 120.0, 180.0, 240.0, 300.0" in done.stdout
+    assert "travel" in done.stdout
+    assert "would be refused, it is enrolled already" in rig("enroll", "lamp", "--dry-run").stdout
+    (told,) = json.loads(rig("enroll", "lamp", "--replace", "--dry-run", "--json").stdout)["rehearsal"]
+    assert (told["action"], told["views"]) == ("replace", 8)
+    assert sorted(Path("catalog").rglob("*.png")) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("enroll",), "There is no object"),
+        (("enroll", "clock", "--list", "x.csv"), "Both 'clock' and a list"),
+        (("enroll", "clock", "--views", "8", "--step", "45"), "Both --views and --step"),
+        (("enroll", "clock", "--step", "50"), "--views 7"),
+        (("enroll", "--list", "x.csv", "--replace", "--label", "a"), "--label, --replace"),
+        (("enroll", "--list", "x.csv"), "cannot be read"),
+        (("enroll", "clock", "--report", "/proc/nowhere/clock.html"), "The report cannot be written"),
+        (("enroll", "clock", "--report", "catalog"), "The report cannot be written"),
+    ],
+)
+def test_what_cannot_be_enrolled_is_said(rig, arguments, words):
+    done = rig(*arguments)
+    assert done.exit_code == 2
+    assert words in done.stderr
+    assert "Next step:" in done.stderr
+
+
+def test_a_resumed_enrollment_has_all_its_views_in_the_report(rig, enrolled):
+    folder, _ = enrolled
+    rehearsed = ["enroll", "candle", "--json"]
+    process = subprocess.Popen([*RIG, *rehearsed], cwd=folder, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if json.loads(line).get("index") == 4 and "accepted" in line:
+            process.kill()
+            break
+    process.communicate()
+    done = rig("enroll", "candle", "--resume", "--report", "candle.html")
+    assert done.exit_code == 0, done.output
+    assert "Contact sheet of candle: 8 views" in Path("candle.html").read_text(encoding="utf-8")
+
+
+def test_a_reader_that_has_seen_enough_ends_the_command_quietly(enrolled):
+    folder, _ = enrolled
+    command = (
+        f"{sys.executable} -c 'from rig.cli.main import main; main()' identify | head -n 1; echo ${{PIPESTATUS[0]}}"
+    )
+    done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] in ("0", "8", "141")  # it may be ready before head is
+    assert "Traceback" not in done.stderr
+    assert "Error" not in done.stderr
+
+
+def test_the_shell_completes_objects_benches_and_strategies(enrolled):
+    folder, _ = enrolled
+
+    def complete(*words: str) -> set[str]:
+        environment = {
+            **os.environ, "_RIG_COMPLETE": "complete_bash", "COMP_WORDS": "rig " + " ".join(words),
+            "COMP_CWORD": str(len(words)),
+        }  # fmt: skip
+        code = "from rig.cli.main import app; app(prog_name='rig')"
+        done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=folder, capture_output=True, text=True)
+        return set(done.stdout.split())
+
+    assert complete("enroll", "l") == {"lamp"}
+    assert complete("enroll", "--bench", "s") == {"sim"}
+    assert complete("identify", "--strategy", "s") == {"sweep"}
+    assert complete("ide") == {"identify"}
+    assert complete("enroll", "--config", "nonsense.toml", "l") == set()
+
+
+@pytest.fixture
+def without_hands(monkeypatch):
+    """Have the simulated bench opened as a real one is: nobody puts objects on the table; return its world."""
+    opened = []
+    really = SimBenchKind.open
+
+    def open_without(self, config, options, seed):
+        bench = really(self, config, options, seed)
+        opened.append(bench.operator.world)
+        bench.operator = ObjectStandsThere()
+        return bench
+
+    monkeypatch.setattr(SimBenchKind, "open", open_without)
+    return opened
+
+
+def test_on_a_bench_without_hands_a_person_is_asked_for_each_object(rig, without_hands, tmp_path):
+    Path("tray.csv").write_text("name,label\nlamp,\nradio,desk\nclock,\nbook-atlas,\n", encoding="utf-8")
+    done = CliRunner().invoke(
+        app, ["enroll", "--list", "tray.csv", "--views", "4", "--set", "view.min_sharpness=0"], input="\ns\nq\n"
+    )
+    assert done.exit_code == 0, done.output
+    assert "1 of 4  lamp: left out, it is enrolled already" in done.stdout
+    assert "2 of 4: put radio (desk) on the table" in done.stderr
+    assert "3 of 4: put clock on the table" in done.stderr
+    assert "3 of 4  clock: left out, as asked" in done.stdout
+    assert "4 of 4: put book-atlas on the table" in done.stderr
+    assert "1 enrolled now; 4 in the list." in done.stderr
+    names = {o["name"] for o in json.loads(rig("catalog", "list", "--json").stdout)["objects"]}
+    assert "radio" in names
+    assert not {"clock", "book-atlas"} & names
+
+
+def test_on_a_bench_without_hands_watching_goes_by_the_camera(rig, without_hands, monkeypatch):
+    class Comes(TableWatcher):
+        """The world that changes while it is waited."""
+
+        def place(self, name):
+            (world,) = without_hands
+            if self._empty is not None:
+                raise KeyboardInterrupt
+            world.clock.call_at(world.clock.now_ns() + 3 * 10**9, lambda: world.put(shelf()["lamp"], 33.0))
+            super().place(name)
+
+    monkeypatch.setattr("rig.views.object_presence.TableWatcher", Comes)
+    done = rig("identify", "--watch", "--json")
+    assert done.exit_code == 130
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [e["name"] for e in events if e["event"] == "identified"] == ["lamp"]
+    assert [e["why"] for e in events if e["event"] == "waiting"] == [
+        "the first object, on the empty table",
+        "the next object",
+    ]
+
+
+def test_what_is_enrolled_while_a_desk_watches_is_found_at_once(rig, enrolled):
+    """No retraining: the model is loaded anew when the catalog has changed, and only then."""
+    folder, _ = enrolled
+    with Catalog.open(folder / "catalog", clock=SystemClock(), read_only=True) as catalog:
+        model = _Model(catalog)
+        before = model()
+        assert model() is before
+        assert rig("enroll", "amphora", "--views", "4").exit_code == 0
+        assert "amphora" not in before.views.object_names
+        assert "amphora" in model().views.object_names

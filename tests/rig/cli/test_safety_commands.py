@@ -1,0 +1,233 @@
+"""`rig home`, `rig stop`, `rig acknowledge`, and what a killed program leaves to the next one, in real processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+from rig.config import load_config
+from rig.core.clock import SystemClock
+from rig.core.errors import Stalled
+from rig.motion.stop_request import stop
+from rig.safety.saved_state import Fault, FileStore, holder
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+SMALL = ("--set", "camera.width=320", "--set", "camera.height=240", "--set", "view.roi=[40, 0, 240, 240]")
+ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+
+
+@pytest.fixture
+def rig(tmp_path, monkeypatch):
+    """Return a function that runs `rig ...` on one and the same simulated bench, which remembers."""
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text('default_bench = "sim"\nstate_dir = "state"\n[catalog]\npath = "catalog"\n')
+
+    def run(*arguments: str):
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+@pytest.fixture
+def running(rig):
+    """Return a function that starts an enrollment of many views and returns it when the third is stored."""
+    processes = []
+
+    def start() -> subprocess.Popen:
+        process = subprocess.Popen(
+            [*RIG, "enroll", "dice", "--views", "720", "--json", *SMALL],
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        processes.append(process)
+        accepted = 0
+        for line in process.stdout:
+            accepted += json.loads(line)["event"] == "accepted"
+            if accepted == 3:
+                break
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        process.stderr.close()
+
+
+def state() -> dict:
+    return json.loads(Path("state/sim/state.json").read_text())
+
+
+def test_the_table_is_where_the_last_program_left_it(rig):
+    assert rig("goto", "370").exit_code == 0
+    told = json.loads(rig("status", "--json").stdout)
+    assert told["state"] == "ready"
+    assert told["table_deg"] == pytest.approx(370, abs=0.3)
+    assert "forgot 1 of its turns" in " ".join(told["findings"])
+    done = rig("home", "--json")
+    unwinding, moved = (json.loads(line) for line in done.stdout.splitlines())
+    assert unwinding["event"] == "unwinding"
+    assert unwinding["turns"] == 1
+    assert moved["encoder_deg"] == pytest.approx(0, abs=0.3)
+
+
+def test_a_move_beyond_the_budget_is_refused_with_from_to_and_limits(rig):
+    rig("goto", "30")
+    done = rig("goto", "401")
+    assert done.exit_code == 5
+    assert "from 30.0° to 401.0°" in done.stderr
+    assert "-400° to 400° (-1.11 to +1.11 turns)" in done.stderr
+
+
+def test_doubt_is_told_and_resolved_by_a_person(rig):
+    rig("goto", "90")
+    kept = state()
+    kept["table"]["path_deg"] = [200.0, 600.0]  # killed in a motion, and the supply was off since
+    Path("state/sim/state.json").write_text(json.dumps(kept))
+    told = json.loads(rig("status", "--json").stdout)
+    assert told["state"] == "unreferenced"
+    assert told["table_deg"] is None
+    refused = rig("goto", "0")
+    assert refused.exit_code == 5
+    assert "rig home --turns 0" in refused.stderr
+    assert rig("home").exit_code == 5
+    assert rig("home", "--turns", "0", "--here").exit_code == 2
+    done = rig("home", "--turns", "0", "--json")
+    assert json.loads(done.stdout)["rotation_encoder_deg"] == pytest.approx(-90, abs=0.3)
+    assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
+
+
+def test_zero_may_be_declared_where_the_table_stands(rig):
+    rig("goto", "90")
+    assert rig("home", "--here").exit_code == 0
+    assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(0, abs=0.1)
+    moved = json.loads(rig("goto", "10", "--json").stdout)
+    assert moved["rotation_encoder_deg"] == pytest.approx(10, abs=0.3)
+
+
+def test_a_fault_is_told_by_every_command_until_it_is_acknowledged(rig):
+    rig("goto", "5")
+    store = FileStore(Path("state/sim"))
+    stalled = Stalled(
+        "The table is blocked at 7.0°.", next_step="Free it. Then `rig acknowledge`.", evidence={"load_percent": 99}
+    )
+    store.save(store.load().model_copy(update={"fault": Fault.of(stalled, "2026-01-02T03:04:05+00:00")}))
+    for refused in (
+        rig("goto", "0"),
+        rig("home"),
+        rig("home", "--here"),
+        rig("enroll", "dice", "--views", "4", *SMALL),
+    ):
+        assert refused.exit_code == 5
+        assert "2026-01-02T03:04:05+00:00: The table is blocked at 7.0°." in refused.stderr
+        assert "Free it. Then `rig acknowledge`." in refused.stderr
+    told = rig("status")
+    assert told.exit_code == 0
+    assert "fault 505" in told.stdout
+    assert json.loads(rig("status", "--json").stdout)["fault"]["evidence"] == {"load_percent": 99}
+    done = rig("acknowledge")
+    assert done.exit_code == 0
+    assert "Acknowledged: The table is blocked at 7.0°.\nThe table is ready." in done.stdout
+    assert rig("acknowledge").stdout.startswith("No fault was latched.")
+    assert rig("goto", "0").exit_code == 0
+
+
+def test_a_servo_that_shut_down_is_rebooted_on_request(rig):
+    jammed = rig("goto", "300", "--set", 'bench.sim.faults=["overload@move0+0.2s"]')
+    assert jammed.exit_code == 4
+    assert json.loads(rig("acknowledge", "--reboot", "--json").stdout)["acknowledged"]["code"] == 404
+
+
+def test_a_running_plan_keeps_others_out_and_is_ended_by_rig_stop(rig, running):
+    process = running()
+    refused = rig("goto", "0")
+    assert refused.exit_code == 9
+    assert f"process {process.pid} " in refused.stderr
+    assert "enroll dice --views 720" in refused.stderr
+    assert "rig stop" in refused.stderr
+
+    done = rig("stop", "--json")
+    assert done.exit_code == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report == {"bench": "sim", "pid": process.pid, "ended": True, "torque_was_on": False}
+    rest, errors = process.communicate(timeout=30)
+    assert process.returncode == 5
+    assert "Error 512 (stopped)" in errors
+    assert "--resume" in errors
+    assert json.loads(rest.splitlines()[-1])["code"] == 512
+    assert state()["table"]["path_deg"] is None
+    assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
+    assert "No program held the bench" in rig("stop").stdout
+
+
+def test_after_sigkill_the_bench_is_free_and_the_next_command_says_what_happened(rig, running):
+    process = running()
+    process.kill()
+    process.wait()
+    assert holder(Path("state/sim")) is None
+    # The simulated servo died with its world, as in a power cut: where it was in a motion, its turns are in doubt.
+    cut_off = state()["table"]["path_deg"] is not None
+    told = json.loads(rig("status", "--json").stdout)
+    assert told["state"] == ("unreferenced" if cut_off else "ready")
+    assert rig("home", "--turns", "0").exit_code == 0
+    assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
+
+
+@pytest.mark.parametrize(("handler", "number"), [("", signal.SIGINT), ("unwinding", signal.SIGTERM)])
+def test_a_program_that_is_not_in_its_control_loop_gets_the_signal_that_unwinds_it(tmp_path, handler, number):
+    code = f"""
+import signal, sys, time
+from pathlib import Path
+from rig.core.clock import SystemClock
+from rig.safety.saved_state import BenchLock
+def unwind(number, frame):
+    raise SystemExit(128 + number)
+if {handler!r}:
+    signal.signal(signal.SIGTERM, unwind)
+lock = BenchLock(Path({str(tmp_path / "sim")!r}), SystemClock())
+print("held", flush=True)
+try:
+    time.sleep(60)
+finally:
+    print("torque off", flush=True)
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert process.stdout.readline() == "held\n"
+    done = stop("sim", load_config(None, [f"state_dir={str(tmp_path)!r}"]), SystemClock())
+    assert (done.holder.pid, done.signalled, done.ended) == (process.pid, True, True)
+    assert process.communicate(timeout=10)[0] == "torque off\n"
+    assert process.returncode == (143 if handler else -number)
+
+
+def test_a_program_that_does_not_react_is_told_how_to_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("rig.motion.stop_request.HEED_S", 0.1)
+    monkeypatch.setattr("rig.motion.stop_request.END_S", 0.3)
+    code = f"""
+import signal, time
+from pathlib import Path
+from rig.core.clock import SystemClock
+from rig.safety.saved_state import BenchLock
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+lock = BenchLock(Path({str(tmp_path / "sim")!r}), SystemClock())
+print("held", flush=True)
+time.sleep(60)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    done = CliRunner().invoke(app, ["stop", "--bench", "sim", "--set", f"state_dir={str(tmp_path)!r}"])
+    process.kill()
+    process.communicate()
+    assert done.exit_code == 9
+    assert f"kill -9 {process.pid}" in done.stderr
+    assert "0.5 s" in done.stderr

@@ -1,0 +1,311 @@
+"""`rig setup`, `rig doctor`, `rig find` and `rig servo` as a technician meets them, on simulated parts."""
+
+import io
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rig.bench.hardware import NoOptions
+from rig.cli.bench.setup import setup
+from rig.cli.main import app
+from rig.cli.ui.settings import Settings
+from rig.config import load_config
+from tests.rig.doctor.doctor_parts import unopened
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """An empty folder, and no configuration of the user's."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / "home" / name))
+    return tmp_path
+
+
+def rig(*arguments: str, answers: str = ""):
+    return CliRunner().invoke(app, list(arguments), input=answers)
+
+
+@pytest.fixture
+def parts(home, monkeypatch):
+    """A bench whose parts lie on the table as from the factory; the command line looks at it."""
+    with unopened() as bench:
+
+        class Kind:
+            options = NoOptions
+
+            @contextmanager
+            def host(self, config, options, seed):
+                bench.case.host._port = config.servo.port
+                yield bench.case.host
+
+        monkeypatch.setattr("rig.doctor.case.bench_kind", lambda _: Kind())
+        yield bench
+
+
+# -- set-up -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_box_of_parts_becomes_a_commented_file_that_the_bench_works_with(home):
+    done = rig("setup", "--bench", "sim", answers="360\ny\n")
+    assert done.exit_code == 0, done.output
+    text = (home / "rig.toml").read_text(encoding="utf-8")
+    assert "# cable budget" in text
+    config = load_config(home / "rig.toml")
+    assert config.default_bench == "sim"
+    assert config.servo.port.startswith("/dev/serial/by-id/")
+    assert config.table.limits_deg == (-360, 360)
+    assert "No problems" in done.stdout
+    assert "rig goto 90" in done.stdout
+    assert rig("goto", "10", "--json").exit_code == 0
+
+
+def test_a_second_run_changes_nothing_and_asks_nothing(home):
+    assert rig("setup", "--bench", "sim", answers="\ny\n").exit_code == 0
+    before = (home / "rig.toml").read_bytes()
+    again = rig("setup")
+    assert again.exit_code == 0, again.output
+    assert "left as it is" in again.stdout
+    assert (home / "rig.toml").read_bytes() == before
+
+
+def test_a_persons_file_keeps_what_they_wrote(parts, home):
+    file = home / "rig.toml"
+    file.write_text(
+        '# bench 7\n[servo]\nport = "/dev/ttyUSB0" # red dot\nid = 9  # the old one\n[table]\n'
+        "limits_deg = [-400, 400] # measured\n",
+        encoding="utf-8",
+    )
+    done = rig("setup", "--yes")
+    assert file.read_text(encoding="utf-8").startswith(
+        '# bench 7\n[servo]\nport = "/dev/ttyUSB0" # red dot\nid = 1  # the old one\n'
+    )
+    assert "limits_deg = [-400, 400] # measured" in file.read_text(encoding="utf-8")
+    assert done.exit_code == 4  # the factory's settings are still in the servo
+    assert "rig servo settings --write" in done.stdout
+
+
+def test_permanent_settings_are_written_only_with_consent(parts, home):
+    memory = parts.parts.servo.memory
+    rig("setup", answers="n\n\ny\n")
+    assert memory["Operating Mode"] == 3
+    done = rig("setup", answers="y\n")
+    assert memory["Operating Mode"] == 4
+    assert "Written, and read back." in done.stdout
+
+
+def test_without_anybody_to_answer_it_says_what_to_do_and_changes_nothing(home):
+    done = rig("setup", "--bench", "sim")
+    assert done.exit_code == 2
+    assert "--yes" in done.stderr
+    assert not (home / "rig.toml").exists()
+    assert rig("setup", "--bench", "sim", answers="\nn\n").exit_code == 0  # asked, and refused
+    assert not (home / "rig.toml").exists()
+
+
+def test_nonsense_is_asked_again(home):
+    done = rig("setup", "--bench", "sim", answers="far\n90\n720\nperhaps\ny\n")
+    assert done.exit_code == 0
+    assert load_config(home / "rig.toml").table.limits_deg == (-720, 720)
+    assert "one whole turn is needed" in done.stderr
+    assert "Answer y or n." in done.stderr
+
+
+def test_a_broken_file_is_refused_and_stays(home):
+    (home / "rig.toml").write_text("[servo\n", encoding="utf-8")
+    done = rig("setup", "--bench", "sim", "--yes")
+    assert done.exit_code == 3
+    assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo\n"
+
+
+def test_of_several_servos_the_one_that_is_meant_is_chosen(parts, home):
+    parts.add_servo(7, 1_000_000, "xm430_w350")
+    done = rig("setup", answers="3\n2\n\ny\n")
+    config = load_config(home / "rig.toml")
+    assert (config.servo.id, config.servo.baud, config.servo.model) == (7, 1_000_000, "xm430_w350"), done.output
+    (home / "rig.toml").unlink()
+    done = rig("setup", "--yes")
+    assert "2 devices could be the servo" in done.stdout
+    assert "\nid =" not in (home / "rig.toml").read_text(encoding="utf-8")
+
+
+class Hands(io.StringIO):
+    """Answers, each with something that the person does before."""
+
+    def __init__(self, *lines) -> None:
+        super().__init__()
+        self.lines = list(lines)
+
+    def readline(self, *_):
+        line, act = self.lines.pop(0)
+        act()
+        return line
+
+
+def test_an_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
+    monkeypatch.setattr("rig.doctor.survey.BAUD_RATES_1", (1_000_000,))
+    parts.parts.servo_bus.detach(parts.parts.servo)  # nothing answers: the ports cannot be told apart
+    parts.computer.serial_port("ttyUSB5", serial="OTHER")
+    class_file = parts.computer.root / "sys/class/tty/ttyUSB5"
+    aside = parts.computer.root / "aside"
+    hands = Hands(
+        ("n\n", lambda: None),  # look for servos again?
+        ("o\n", lambda: None),
+        ("\n", lambda: shutil.move(class_file, aside)),
+        ("\n", lambda: shutil.move(aside, class_file)),
+        ("\n", lambda: None),
+        ("y\n", lambda: None),
+    )
+    monkeypatch.setattr("rig.cli.ui.ask.sys.stdin", hands)
+    with pytest.raises(typer.Exit) as ended:
+        setup.__wrapped__(Settings(), yes=False)
+    assert ended.value.exit_code == 4
+    assert load_config(home / "rig.toml").servo.port.endswith("OTHER-if00-port0")
+
+
+def test_ctrl_c_leaves_the_old_file_untouched(home):
+    (home / "rig.toml").write_text('default_bench = "sim" # mine\n', encoding="utf-8")
+    process = subprocess.Popen(
+        [*RIG, "setup"], cwd=home, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    asked = ""
+    while "taut" not in asked:
+        asked += process.stderr.read(1)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert (home / "rig.toml").read_text(encoding="utf-8") == 'default_bench = "sim" # mine\n'
+
+
+def test_json_is_lines_of_json(home):
+    done = rig("setup", "--bench", "sim", "--json")
+    written, examined = (json.loads(line) for line in done.stdout.splitlines())
+    assert written["written"] is True
+    assert written["settings"]["servo.id"] == 1
+    assert examined["bad"] == 0
+
+
+# -- doctor and find --------------------------------------------------------------------------------------------------
+
+
+def test_the_doctor_prints_a_line_a_finding_and_its_code_is_the_worst(parts, home):
+    done = rig("doctor")
+    assert done.exit_code == 4
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("✓ config      no rig.toml")
+    assert all(line[0] in "✓!✗ " or line == lines[-1] for line in lines)
+    marked = [i for i, line in enumerate(lines) if line[0] in "!✗"]
+    assert all(lines[i + 1].strip().startswith("→ ") for i in marked)
+    assert lines[-1].endswith("fine.")
+
+
+def test_the_doctor_in_json(parts, home):
+    told = json.loads(rig("doctor", "--json").stdout)
+    assert told["exit_code"] == 4
+    bad = [finding for finding in told["findings"] if finding["level"] == "bad"]
+    assert len(bad) == told["bad"] > 0
+    assert all(finding["mend"] for finding in bad)
+    voltage = next(f for f in told["findings"] if "voltage_v" in f["evidence"])
+    assert voltage["evidence"]["voltage_v"] == pytest.approx(12, abs=0.5)
+
+
+def test_the_doctor_goes_on_with_the_defaults_when_the_configuration_is_broken(home):
+    (home / "rig.toml").write_text("[servo]\nbaud = 3\nprot = 1\n", encoding="utf-8")
+    done = rig("doctor", "--bench", "sim")
+    assert done.exit_code == 3
+    assert done.stdout.count("→ rig config check") == 2
+    assert "XL430-W250" in done.stdout
+
+
+def test_the_doctor_on_a_bench_that_is_not_there(home):
+    assert rig("doctor", "--bench", "mars").exit_code == 3
+
+
+def test_rules_for_udev_are_all_that_is_printed(home):
+    done = rig("doctor", "--udev", "--bench", "sim")
+    assert done.exit_code == 0
+    assert all(line.startswith(("#", "ACTION", "SUBSYSTEM")) for line in done.stdout.splitlines())
+
+
+def test_find_says_what_to_write_and_it_is_right(parts, home):
+    done = rig("find")
+    assert done.exit_code == 0
+    (home / "rig.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
+    config = load_config(home / "rig.toml")
+    assert (config.servo.baud, config.servo.id, config.imu.address) == (57_600, 1, 0x68)
+    told = json.loads(rig("find", "--json").stdout)
+    assert told["settings"]["camera.source"] == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
+
+
+def test_a_rig_head_is_found_on_its_port(home):
+    done = rig("find", "--bench", "sim", "--set", "imu.connection=head")
+    assert done.exit_code == 0
+    assert "a rig head" in done.stdout
+    (home / "rig.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
+    config = load_config(home / "rig.toml")
+    assert config.imu.connection == "head"
+    assert config.head.port.endswith("SIM00002-if00-port0")
+
+
+def test_find_on_an_empty_computer(parts, home):
+    for folder in ("sys/class", "dev"):
+        shutil.rmtree(parts.computer.root / folder)
+    done = rig("find")
+    assert done.exit_code == 4
+    assert done.stdout.count("→") == 3
+
+
+# -- servo ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_file_follows_the_servos_new_id_and_rate(parts, home):
+    (home / "rig.toml").write_text("[servo]\nid = 1 # sticker\n", encoding="utf-8")
+    assert "verified" in rig("servo", "set-id", "4", "--yes").stdout
+    assert rig("servo", "set-baud", "1000000", answers="y\n").exit_code == 0
+    assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo]\nid = 4 # sticker\nbaud = 1000000\n"
+    assert "already" in rig("servo", "set-id", "4", "--yes").stdout
+
+
+def test_a_question_that_nobody_answers_or_that_is_denied_changes_nothing(parts, home):
+    assert rig("servo", "set-id", "4").exit_code == 2
+    assert "Nothing was changed." in rig("servo", "set-id", "4", answers="n\n").stdout
+    assert parts.parts.servo.memory["ID"] == 1
+    assert rig("servo", "set-id", "300", "--yes").exit_code == 2
+
+
+def test_with_two_servos_on_the_bus_nothing_is_shown_or_set(parts, home):
+    parts.add_servo(2, 1_000_000)
+    for command in (
+        ["info"],
+        ["settings", "--write", "--yes"],
+        ["set-id", "3", "--yes"],
+        ["set-baud", "9600", "--yes"],
+    ):
+        done = rig("servo", *command)
+        assert done.exit_code == 4, command
+        assert "There are 2 servos" in done.stderr
+
+
+def test_info_shows_every_register_once(parts, home):
+    told = json.loads(rig("servo", "info", "--json").stdout)
+    assert told["registers"]["Present Input Voltage"]["meaning"] == "12.0 V"
+    assert told["registers"]["Operating Mode"]["kept_without_supply"] is True
+    text = rig("servo", "info").stdout
+    assert all(name in text for name in told["registers"])
+
+
+def test_settings_are_shown_and_written_on_request(parts, home):
+    shown = rig("servo", "settings")
+    assert shown.exit_code == 4
+    assert "Operating Mode: 3 → 4" in shown.stdout
+    assert rig("servo", "settings", "--write", "--yes").exit_code == 0
+    assert rig("servo", "settings").exit_code == 0

@@ -1,0 +1,133 @@
+"""`rig empty-table`, and the question for it at the start of a day."""
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from rig.bench import ObjectStandsThere
+from rig.cli.main import app
+from rig.cli.objects.empty_table import see_to_empty_table
+from rig.cli.ui.settings import Settings
+from rig.views.empty_table import EmptyTables
+
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text('default_bench = "sim"\nstate_dir = "state"\n[catalog]\npath = "catalog"\n')
+
+    def run(*arguments: str) -> Any:
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+def test_it_is_taken_told_and_shown(rig: Callable[..., Any]) -> None:
+    nothing = rig("empty-table", "--show", "empty.png")
+    assert nothing.exit_code == 2
+    assert "no picture of the empty table was taken yet" in nothing.stderr
+    taken = json.loads(rig("empty-table", "--json").stdout)
+    assert (taken["event"], taken["width"], taken["height"]) == ("tablepicture", 640, 480)
+    shown = rig("empty-table", "--show", "empty.png", "--json")
+    assert json.loads(shown.stdout)["doubts"] == []
+    assert cv2.imread("empty.png").shape == (480, 640, 3)
+    assert rig("empty-table", "--show", "nowhere/empty.png").exit_code == 2
+    assert rig("empty-table", "--show", "empty.png", "--anyway").exit_code == 2
+
+
+def test_an_enrollment_takes_it_once_a_day_and_says_what_came_of_it(rig: Callable[..., Any]) -> None:
+    small = [word for setting in SMALL for word in ("--set", setting)]
+    first, second = (rig("enroll", name, "--views", "4", *small) for name in ("dice", "lamp"))
+    assert "Picture of the empty table" in first.stderr
+    assert "Picture of the empty table" not in second.stderr
+    assert rig("empty-table", *small).exit_code == 0
+    assert "photographed the empty table" in rig("log").stdout
+    shown = rig("catalog", "show", "dice")
+    assert "object found in 4 of 4 views, light normalised in 4" in shown.stdout
+    told = json.loads(rig("catalog", "show", "lamp", "--json").stdout)
+    assert told["sightings"]["found"] == 4
+    assert told["views"][0]["record"]["segmentation"]["agreement"] > 0.65
+
+
+class Answers(io.StringIO):
+    """A person who types these lines at a terminal, and takes the object off and puts it on as asked."""
+
+    def __init__(self, text: str, asked: Callable[[], None] = lambda: None) -> None:
+        super().__init__(text)
+        self._asked = asked
+
+    def isatty(self) -> bool:
+        return True
+
+    def readline(self, size: int | None = -1) -> str:
+        self._asked()
+        return super().readline(-1 if size is None else size)
+
+
+@pytest.fixture
+def asked(
+    simulated: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[Any, str]]:
+    """Return a function that asks a person with an object on the table; their answers, one a line, in the end."""
+
+    def run(
+        answers: Answers | io.StringIO, *, ask: bool = True, as_json: bool = False, stays: bool = False
+    ) -> tuple[Any, str]:
+        s = simulated(*SMALL)
+        s.operator.place("toy-car")
+        s.bench.operator = ObjectStandsThere()
+        if isinstance(answers, Answers) and not stays:
+            times = iter(range(99))
+            answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
+        monkeypatch.setattr("sys.stdin", answers)
+        see_to_empty_table(Settings(json=as_json), s.bench, ask=ask, then="toy-car")
+        return EmptyTables.standing(s.bench).table, capsys.readouterr().err
+
+    return run
+
+
+def test_a_person_is_asked_again_when_the_object_was_forgotten(asked: Callable[..., tuple[Any, str]]) -> None:
+    table, said = asked(Answers("\n\n\n"))
+    assert table is not None
+    assert "No picture of the empty table was taken yet. Take everything off the table." in said
+    assert "Something stands on the table" in said
+    assert said.count("Enter takes its picture") == 2
+    assert "Now put toy-car on the table" in said
+
+
+def test_what_always_turns_with_the_table_is_kept_when_asked(asked: Callable[..., tuple[Any, str]]) -> None:
+    table, said = asked(Answers("k\n\nk\n\n"), stays=True)
+    assert table is not None
+    assert table.evidence["turning_share"] > 0.004
+    assert said.count("Enter takes its picture, s goes on") == 2  # nothing is kept unseen: k counts once it was refused
+    assert said.count("k takes it with what always stays there") == 1
+
+
+@pytest.mark.parametrize("answer", ["s\n", "what?\ns\n", ""])
+def test_a_person_may_go_on_without_and_knows_what_that_means(
+    asked: Callable[..., tuple[Any, str]], answer: str
+) -> None:
+    table, said = asked(Answers(answer))
+    assert table is None
+    assert "s goes on without\n  (objects are found before a plain background only" in said
+    assert "Now put" not in said
+
+
+@pytest.mark.parametrize("options", [{"ask": False}, {"as_json": True}])
+def test_automation_is_never_asked(asked: Callable[..., tuple[Any, str]], options: dict[str, bool]) -> None:
+    table, said = asked(Answers("\n\n\n"), **options)
+    assert table is None
+    assert said.startswith("Note: no picture of the empty table was taken yet;")
+    assert "rig empty-table takes one" in said
+
+
+def test_without_a_terminal_nobody_is_asked(asked: Callable[..., tuple[Any, str]]) -> None:
+    assert asked(io.StringIO("\n\n\n"))[0] is None

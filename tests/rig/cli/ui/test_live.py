@@ -1,0 +1,279 @@
+"""What a person sees while a plan runs, on terminals of all sizes and in a pipe; pausing; being asked."""
+
+import io
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import termios
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from rig.catalog import ObjectSummary
+from rig.cli.ui.live import EnrollView, IdentifyView, LiveView
+from rig.cli.ui.operator_prompts import Person
+from rig.config import load_config
+from rig.core.clock import SystemClock
+from rig.core.errors import UsageError, ViewRejected
+from rig.events.events import Event, Insight, Item, Moved, Resemblance, Waiting
+from rig.plans.tray import Answer, TrayItem
+from tests.rig.report.report_samples import enrolling, identifying, searching_densely
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+INSIGHT = Insight("mug-white", 180.0, 0.95, 0.96, (Resemblance("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
+
+
+def enrolled_with_insight() -> list[Event]:
+    *before, last = enrolling(views=8, retaken=(3,))
+    return [*before, INSIGHT, last]
+
+
+def screen(width: int, *, terminal: bool = True) -> Console:
+    return Console(file=io.StringIO(), width=width, height=30, force_terminal=terminal, legacy_windows=False)
+
+
+def shown(console: Console, view: LiveView, events: list[Event]) -> str:
+    with view:
+        for event in events:
+            view.add(event)
+        picture = console.render_lines(view.render(), pad=False) if console.is_terminal else []
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    for line in picture:
+        assert sum(len(segment.text) for segment in line) <= console.width
+    return ESCAPE.sub("", text)
+
+
+@pytest.mark.parametrize("width", [30, 40, 60, 72, 84, 100, 200])
+def test_the_table_of_an_enrollment_fits_the_terminal(width):
+    console = screen(width)
+    text = shown(console, EnrollView(console, load_config(), "3 of 25"), enrolled_with_insight())
+    assert "accepted" in text.replace("\n", "")
+    assert ("asked" in text) == (width >= 60)
+    assert ("saturated" in text) == (width >= 84)
+    assert "8 views enrolled" in " ".join(text.split())
+
+
+def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
+    console = screen(80, terminal=False)
+    view = EnrollView(console, load_config(), "3 of 25")
+    text = shown(console, view, enrolled_with_insight())
+    lines = text.splitlines()
+    assert lines[0].startswith("3 of 25 mug-white: 8 views, about ")
+    views = [line for line in lines if line.startswith("view ")]
+    assert len(views) == 9
+    assert re.fullmatch(
+        r"view 4 of 8  asked 135.00°  encoder 135.04°  IMU 135.14 ± 0.10°  sharpness 2.0  level 90  saturated 0%  "
+        r"taken again: blurred \(sharpness 2.0 < 3\)",
+        views[3],
+    )
+    assert re.search(r"accepted  \d+ s left$", views[4])
+    assert lines[-2:] == [
+        "  looks the same every 180° (similarity 0.960, of neighbouring views 0.950): "
+        "its pose will be known up to that",
+        "  looks like mug-03 from 120–200° (similarity up to 0.990)",
+    ]
+
+
+@pytest.mark.parametrize("width", [30, 60, 120])
+@pytest.mark.parametrize("answer", ["mug-white", None])
+def test_the_candidates_are_seen_after_each_view_and_every_decision_in_words(width, answer):
+    console = screen(width)
+    text = shown(console, IdentifyView(console), [Waiting("the next object"), *identifying(answer)])
+    flat = " ".join(text.split())
+    assert "candidate" in flat
+    assert "S_left 0.41 < S_right 0.66; turning 47.3°" in flat
+    assert ("Unknown: the nearest are mug-white" if answer is None else "mug-white, standing 30.0°") in flat
+    assert "9.5 s" in flat
+
+
+def test_a_search_in_a_pipe_reads_as_lines():
+    console = screen(80, terminal=False)
+    events = list(identifying())
+    move = next(e for e in events if isinstance(e, Moved) and e.index == 1)
+    text = shown(console, IdentifyView(console), events)
+    assert f"at {move.encoder_deg:.2f}°" in text
+    assert "leading: mug-white 0.910 at 60.0°" in text
+    assert "turning 47.3°" in text
+    assert max(map(len, text.splitlines())) > 100  # no line is broken for a terminal that is not there
+
+
+@pytest.mark.parametrize("width", [30, 60, 120])
+@pytest.mark.parametrize("answer", ["mug-white", None])
+def test_a_dense_search_shows_probabilities_and_what_the_rules_say(width, answer):
+    console = screen(width)
+    text = shown(console, IdentifyView(console), list(searching_densely(answer)))
+    flat = " ".join(text.split())
+    assert "Note: rehearse them." in flat
+    assert "mug-white 60.0% not sure yet: a probability of 60.0%" in flat
+    assert "to tell mug-white from mug-star, 0.50 alike there (0.50 to 0.95 all around); turning 80.0°" in flat
+    assert "probability 100.0%" in flat or "probability >99.9%" in flat
+    assert ("Unknown: the nearest are mug-white 0.900, mug-star 0.800, teapot 0.700" in flat) == (answer is None)
+
+
+def test_a_dense_search_in_a_pipe_reads_as_lines():
+    console = screen(80, terminal=False)
+    lines = shown(console, IdentifyView(console), list(searching_densely())).splitlines()
+    assert lines[0] == "Note: rehearse them."
+    assert "  leading: mug-white 0.900 (60.0%) at 330.0°, mug-star 0.800 (40.0%) at 330.0°" in lines[3]
+    assert lines[4] == "  not sure yet: a probability of 60.0%, and 95.0% ends the search"
+    assert lines[5].startswith("  left: to tell mug-white from mug-star")
+
+
+class Keyboard:
+    """A terminal with a program in it; what it prints is gathered."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self._master, slave = pty.openpty()
+        self.before = termios.tcgetattr(slave)
+        self.slave = slave
+        self.process = subprocess.Popen(
+            [*RIG, *arguments],
+            cwd=folder,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "100", "LINES": "40", "TERM": "xterm"},
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+        )
+        self.seen = ""
+
+    def type(self, keys: str) -> None:
+        os.write(self._master, keys.encode())
+
+    def until(self, words: str) -> None:
+        """Read until these words come."""
+        while words not in self.seen:
+            ended = self.process.poll() is not None
+            if not select.select([self._master], [], [], 0 if ended else 30)[0]:
+                raise AssertionError(f"{words!r} did not come: {self.seen}")
+            self.seen += ESCAPE.sub("", os.read(self._master, 4096).decode(errors="replace"))
+
+    def end(self) -> int:
+        return self.process.wait(timeout=60)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._master)
+        os.close(self.slave)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "rig.toml").write_text(
+        'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
+        "[view]\nroi = [40, 0, 240, 240]\n",
+        encoding="utf-8",
+    )
+    return tmp_path
+
+
+@pytest.fixture
+def keyboard(folder):
+    """Return a terminal in which an enrollment of many views has begun."""
+    keyboard = Keyboard(folder, "enroll", "dice", "--views", "24")
+    keyboard.until("p pauses")
+    yield keyboard
+    keyboard.close()
+
+
+def test_a_key_pauses_and_goes_on_and_the_terminal_is_left_as_it_was(keyboard):
+    keyboard.type(" ")
+    keyboard.until("Paused, the table holds its place")
+    assert "24 views enrolled" not in keyboard.seen
+    keyboard.type("xyzp")
+    keyboard.until("24 views enrolled")
+    assert keyboard.end() == 0
+    assert "Going on." in keyboard.seen
+    assert termios.tcgetattr(keyboard.slave) == keyboard.before
+
+
+def test_ctrl_c_during_a_pause_keeps_the_views_and_says_how_to_go_on(keyboard):
+    keyboard.type("p")
+    keyboard.until("Paused")
+    keyboard.process.send_signal(signal.SIGINT)
+    keyboard.until("rig enroll dice --resume")
+    assert keyboard.end() == 130
+    assert termios.tcgetattr(keyboard.slave) == keyboard.before
+
+
+def wait(condition: Callable[[], bool]) -> None:
+    clock = SystemClock()
+    for _ in range(2000):
+        if condition():
+            return
+        clock.sleep(0.01)
+    raise AssertionError("it did not come to that")
+
+
+def test_sigtstp_stops_between_two_views_and_sigcont_goes_on(folder):
+    process = subprocess.Popen(
+        [*RIG, "enroll", "dice", "--views", "12"], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    lines = [process.stdout.readline()]
+    while not lines[-1].startswith("view 2"):
+        lines.append(process.stdout.readline())
+    process.send_signal(signal.SIGTSTP)
+    wait(lambda: Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
+    process.send_signal(signal.SIGCONT)
+    rest, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "Paused: fg (or SIGCONT) goes on." in rest
+    assert "12 views enrolled" in rest
+
+
+def asked(answers: str, kept: ObjectSummary | None = None) -> tuple[Answer, str]:
+    questions = io.StringIO()
+    person = Person(questions=questions, answers=io.StringIO(answers))
+    return person.bring(TrayItem(2, "mug", "kitchen"), 3, 25, kept), questions.getvalue()
+
+
+def test_a_person_is_asked_for_the_next_object():
+    answer, question = asked("\n")
+    assert answer is Answer.GO
+    assert question.startswith("3 of 25: put mug (kitchen) on the table")
+    assert "\a" not in question  # in a pipe nobody hears it
+    assert asked("s\n")[0] is Answer.SKIP
+    assert asked("what?\nn\nQ\n")[0] is Answer.STOP  # what is no answer is asked again
+    assert asked("")[0] is Answer.STOP
+
+
+def test_a_person_is_asked_whether_an_interrupted_object_was_moved():
+    clock = SystemClock()
+    kept = ObjectSummary("mug", "", "", clock.utc(), None, 0, 31)
+    answer, question = asked("n\n", kept)
+    assert answer is Answer.ANEW
+    assert "31 views from before" in question
+    assert asked("\n", kept)[0] is Answer.GO
+
+
+def test_a_person_decides_what_becomes_of_an_object_that_failed():
+    error = ViewRejected("View 3 was not acceptable: too dark.", next_step="Look at the light.")
+    for said, expected in (("\n", Answer.GO), ("s\n", Answer.SKIP), ("q\n", Answer.STOP)):
+        questions = io.StringIO()
+        person = Person(questions=questions, answers=io.StringIO(said))
+        assert person.trouble(TrayItem(2, "mug"), error) is expected
+        assert "too dark" in questions.getvalue()
+        assert "Look at the light" in questions.getvalue()
+
+
+def test_where_nobody_can_be_asked_that_is_said():
+    class Closed(io.StringIO):
+        def readline(self, *_: object) -> str:
+            raise OSError("no input")
+
+    with pytest.raises(UsageError):
+        Person(questions=io.StringIO(), answers=Closed()).bring(TrayItem(2, "mug"), 1, 1, None)
+
+
+def test_items_that_are_skipped_are_told():
+    console = screen(80, terminal=False)
+    text = shown(console, EnrollView(console, load_config()), [Item(1, 2, "mug", "skip", "it is enrolled already")])
+    assert text == "1 of 2  mug: left out, it is enrolled already\n"

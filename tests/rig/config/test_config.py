@@ -1,0 +1,116 @@
+"""The configuration: every mistake at once, each with its key."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.bench import bench_names, open_bench
+from rig.config import RigConfig, load_config
+from rig.core.errors import ConfigError, DeviceNotFound
+
+
+def test_the_defaults_are_valid_and_need_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_config() == RigConfig()
+
+
+def test_all_mistakes_are_told_at_once_with_range_and_suggestion(tmp_path):
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        '[servo]\nbaud = 3\nprot = "/dev/ttyUSB1"\n[table]\nlimits_deg = [0, 90]\nvelocity_dps = -1\n'
+        "[identify]\nmax_view = 3\nmax_views = 1\n[camera]\nwidth = 320\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_config(file)
+    mistakes = "\n".join(caught.value.evidence["mistakes"])
+    assert len(caught.value.evidence["mistakes"]) == 7
+    assert "line 2: servo.baud: must be a whole number from 9600 to 4500000 bit/s (found 3)" in mistakes
+    assert "line 3: servo.prot: unknown key; did you mean port?" in mistakes
+    assert "table.limits_deg: must span at least one turn" in mistakes
+    assert "line 6: table.velocity_dps: must be a number above 0, up to 200 °/s (found -1)" in mistakes
+    assert "identify.min_views: must not be above max_views, which is 1 (found 2)" in mistakes
+    assert "view: roi [80, 0, 480, 480] does not lie within the camera's frame of 320x480" in mistakes
+    assert "identify.max_view: unknown key; did you mean max_views?" in mistakes
+    assert caught.value.exit_code == 3
+
+
+def test_a_file_that_is_not_there_and_one_that_is_no_toml(tmp_path):
+    with pytest.raises(ConfigError, match="Cannot read"):
+        load_config(tmp_path / "none.toml")
+    broken = tmp_path / "rig.toml"
+    broken.write_text("[servo\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match="not a TOML file") as caught:
+        load_config(broken)
+    assert "line 1" in caught.value.evidence["reason"]
+
+
+@pytest.mark.parametrize("roi", ["[-1, 0, 9, 9]", "[0, 0, 0, 9]", "[0, 0, 641, 480]", "[0, 1, 640, 480]"])
+def test_a_region_outside_the_frame_is_refused(roi):
+    with pytest.raises(ConfigError, match="1 mistake"):
+        load_config(None, [f"view.roi={roi}"])
+    assert load_config(None, ["view.roi=[0, 0, 640, 480]"]).view.roi == (0, 0, 640, 480)
+
+
+def test_overrides_win_over_the_file_and_bare_words_are_strings(tmp_path):
+    file = tmp_path / "rig.toml"
+    file.write_text("[identify]\nmax_views = 3\n", encoding="utf-8")
+    config = load_config(file, ["identify.max_views=5", "servo.port=/dev/ttyACM0", "table.limits_deg=[-720, 720]"])
+    assert config.identify.max_views == 5
+    assert config.servo.port == "/dev/ttyACM0"
+    assert config.table.limits_deg == (-720.0, 720.0)
+
+
+@given(st.text(max_size=30).filter(lambda text: "=" not in text or text.startswith("=")))
+def test_a_setting_without_key_or_value_is_a_configuration_error(text):
+    with pytest.raises(ConfigError):
+        load_config(None, [text])
+
+
+def test_a_catalog_path_is_relative_to_its_file_and_benches_do_not_share_by_default(tmp_path):
+    file = tmp_path / "rig.toml"
+    text = 'state_dir = "kept"\ncalibration_dir = "/facts"\n[catalog]\npath = "data/objects"\n'
+    file.write_text(text, encoding="utf-8")
+    assert load_config(file).catalog_path("hardware") == tmp_path / "data" / "objects"
+    assert load_config(file).state_path("hardware") == tmp_path / "kept" / "hardware"
+    assert load_config(file).calibration_path("hardware") == Path("/facts/hardware")
+    assert RigConfig().catalog_path("sim") != RigConfig().catalog_path("hardware")
+
+
+def test_benches_are_plugins_and_an_unknown_one_is_named_with_those_there_are():
+    assert {"hardware", "sim"} <= set(bench_names())
+    with pytest.raises(ConfigError) as caught:
+        open_bench("simm")
+    assert "sim" in caught.value.next_step
+    with pytest.raises(ConfigError, match="There is no bench 'sin'"):
+        open_bench("sim", load_config(None, ["bench.sin.object=dice"]))
+
+
+def test_mistakes_in_a_benchs_own_section_carry_its_key():
+    with pytest.raises(ConfigError) as caught:
+        open_bench("sim", load_config(None, ["bench.sim.noise={backlash_degrees=1.0}", "bench.sim.objekt=dice"]))
+    mistakes = "\n".join(caught.value.evidence["mistakes"])
+    assert "bench.sim.noise: unknown: backlash_degrees" in mistakes
+    assert "bench.sim.objekt: unknown key; did you mean object?" in mistakes
+
+
+@pytest.mark.parametrize("setting", ["servo.port=nowhere", "servo.port=/dev/null"])
+def test_a_real_bench_without_its_servo_says_what_to_check(setting):
+    with pytest.raises(DeviceNotFound, match="servo") as caught:
+        open_bench("hardware", load_config(None, [setting]))
+    assert caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("table.watchdog_s=0.1", "twice poll_s"),
+        ("table.limits_deg=[-1e9, 1e9]", "within ±90000"),
+    ],
+)
+def test_settings_that_would_stop_or_overrun_the_servo_are_refused(setting, words):
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [setting, "table.poll_s=0.06"])
+    assert words in caught.value.evidence["mistakes"][0]

@@ -1,0 +1,190 @@
+"""Edits of rig.toml: the value changes, everything that a person wrote around it stays."""
+
+import tomllib
+
+import pytest
+from hypothesis import event, given
+from hypothesis import strategies as st
+
+from rig.config.toml_file import changed_lines, line_numbers, read_text, save, toml, with_values
+from rig.core.errors import ConfigError
+
+BY_HAND = """\
+# The bench by the window.
+
+default_bench = "hardware"   # not the simulated one
+[servo]
+  port = '/dev/ttyUSB0' # the U2D2 with the red dot
+#baud = 57600
+\t
+# don't touch: [table] = "# not a header"
+[table]
+limits_deg = [ # the cable
+    -400,      # taut here
+    400,
+]
+[bench.sim]
+noise = {backlash_deg=0.1}
+text = \"\"\"[servo]
+port = "no" # no comment\"\"\"
+"""
+
+
+def test_a_value_is_changed_where_it_stands():
+    edited = with_values(BY_HAND, {("servo", "port"): "/dev/ttyUSB7"})
+    assert changed_lines(BY_HAND, edited) == [
+        "-   port = '/dev/ttyUSB0' # the U2D2 with the red dot",
+        '+   port = "/dev/ttyUSB7" # the U2D2 with the red dot',
+    ]
+
+
+def test_a_new_value_stands_below_its_commented_default_indented_as_its_table():
+    edited = with_values(BY_HAND, {("servo", "baud"): 1_000_000})
+    assert "#baud = 57600\n  baud = 1000000\n" in edited
+
+
+def test_new_keys_tables_and_top_level_keys_find_their_place():
+    edited = with_values(BY_HAND, {("servo", "id"): 3, ("imu", "bus"): "/dev/i2c-3", ("state_dir",): "x"})
+    assert edited.startswith(
+        '# The bench by the window.\n\ndefault_bench = "hardware"   # not the simulated one\nstate_dir'
+    )
+    assert "  port = '/dev/ttyUSB0' # the U2D2 with the red dot\n  id = 3\n" in edited
+    assert edited.endswith('\n[imu]\nbus = "/dev/i2c-3"\n')
+
+
+def test_comments_inside_a_value_of_several_lines_move_above_it():
+    edited = with_values(BY_HAND, {("table", "limits_deg"): [-720, 720]})
+    assert "# the cable\n# taut here\nlimits_deg = [-720, 720]\n" in edited
+
+
+def test_an_inline_table_keeps_its_other_values():
+    edited = with_values(BY_HAND, {("bench", "sim", "noise", "camera_read"): 2.5})
+    assert "noise = { backlash_deg = 0.1, camera_read = 2.5 }" in edited
+
+
+def test_the_first_key_of_a_file_of_comments_stands_before_the_first_table():
+    text = "# mine\n\n# about the servo\n[servo]\nid = 1"
+    edited = with_values(text, {("default_bench",): "sim", ("servo", "baud"): 57600})
+    assert edited == '# mine\n\ndefault_bench = "sim"\n\n# about the servo\n[servo]\nid = 1\nbaud = 57600\n'
+
+
+def test_windows_line_ends_stay_and_an_empty_file_is_filled():
+    assert with_values("a = 1\r\n", {("servo", "id"): 2}) == "a = 1\r\n\r\n[servo]\r\nid = 2\r\n"
+    assert with_values("", {("servo", "id"): 2}) == "[servo]\nid = 2\n"
+
+
+def test_dotted_keys_get_a_sister():
+    assert with_values('servo.port = "x"\n', {("servo", "id"): 2}) == 'servo.port = "x"\nservo.id = 2\n'
+
+
+def test_what_is_so_already_is_not_touched():
+    assert with_values(BY_HAND, {("servo", "port"): "/dev/ttyUSB0", ("table", "limits_deg"): [-400, 400]}) == BY_HAND
+
+
+@pytest.mark.parametrize("text", ["[[servo]]\nid = 1\n", "servo = 3\n"])
+def test_a_form_that_cannot_be_edited_is_refused_with_the_line_to_write(text):
+    with pytest.raises(ConfigError, match=r"Cannot set servo\.id") as caught:
+        with_values(text, {("servo", "id"): 2})
+    assert "id = 2" in caught.value.next_step
+
+
+def test_a_file_is_replaced_whole_and_a_link_stays_a_link(tmp_path):
+    real, link = tmp_path / "real.toml", tmp_path / "rig.toml"
+    real.write_text("old = 1\n")
+    link.symlink_to(real)
+    save(link, "new = 2\n")
+    assert link.is_symlink()
+    assert read_text(real) == "new = 2\n"
+    with pytest.raises(ConfigError, match="Cannot write"):
+        save(real / "below" / "rig.toml", "")
+
+
+# -- any document ---------------------------------------------------------------------------------------------------
+
+names = st.sampled_from(["servo", "id", "port", "a-b", "x y", "#", "="])
+strings = st.text(st.sampled_from("ab#=[]{}\"'\\\n\t\x7fé,"), max_size=8)
+scalars = st.booleans() | st.integers(-9999, 9999) | st.floats() | strings
+values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=3), max_leaves=4)
+comments = st.sampled_from(["", " # [servo]", "\t# id = 3 \"'", "#"])
+
+
+@st.composite
+def written_values(draw):
+    """A value in one of TOML's spellings, with its comments."""
+    value = draw(values)
+    match draw(st.integers(0, 3)):
+        case 0 if isinstance(value, list):
+            inner = "".join(f"  {toml(item)}, # {draw(st.integers(0, 9))} ]\n" for item in value)
+            return f"[ # begins\n{inner}# ends\n]"
+        case 1:
+            return "'''" + draw(st.sampled_from(["", "a # b", '"""', "\n[servo]\nid = 4\n", "''"])) + "'''"
+        case 2:
+            return '"""' + draw(st.sampled_from(["", 'x\\"""y', "\n# no\n[servo]\n", "'''", '""'])) + '"""'
+    return toml(value)
+
+
+@st.composite
+def documents(draw):
+    lines, tables = [], [()]
+    for _ in range(draw(st.integers(0, 3))):
+        table = tuple(draw(st.lists(names, min_size=1, max_size=2, unique=True)))
+        if not any(table[: len(known)] == known[: len(table)] for known in tables if known):
+            tables.append(table)
+    for table in tables:
+        if table:
+            lines += [
+                draw(st.sampled_from(["", "# above", "  "])),
+                f"[ {'.'.join(map(toml, table))} ]" + draw(comments),
+            ]
+        for name in draw(st.lists(names, unique=True, max_size=3)):
+            if not any(other[: len(table) + 1] == (*table, name) for other in tables):
+                space = draw(st.sampled_from(["", "  "]))
+                lines.append(f"{space}{toml(name)}{space}= {draw(written_values())}{draw(comments)}")
+        lines.append(draw(st.sampled_from(["", f"# {draw(names)} = 1"])))
+    text = "\n".join(lines) + draw(st.sampled_from(["", "\n"]))
+    tomllib.loads(text)
+    return text
+
+
+def nothing_else(text: str, key: tuple[str, ...]) -> dict:
+    """Return the document's values without ``key``."""
+    values = here = tomllib.loads(text)
+    for part in key[:-1]:
+        here = here.setdefault(part, {})
+        if not isinstance(here, dict):
+            return values
+    here.pop(key[-1], None)
+    return values
+
+
+def impossible(text: str, key: tuple[str, ...]) -> bool:
+    """Return whether a value stands where ``key`` needs a table, or a table where it needs a value."""
+    here = tomllib.loads(text)
+    for part in key:
+        if not isinstance(here, dict):
+            return True
+        here = here.get(part, {})
+    return isinstance(here, dict) and any(known[: len(key)] == key for known in line_numbers(text))
+
+
+@given(documents(), st.lists(names, min_size=1, max_size=3, unique=True).map(tuple), values)
+def test_in_any_document_one_value_changes_and_all_comments_and_other_lines_stay(text, key, value):
+    if impossible(text, key):
+        event("refused")
+        with pytest.raises(ConfigError):
+            with_values(text, {key: value})
+        return
+    event("edited")
+    edited = with_values(text, {key: value})
+    here = tomllib.loads(edited)
+    for part in key:
+        here = here[part]
+    assert repr(here) == repr(value)
+    assert repr(nothing_else(edited, key)) == repr(nothing_else(text, key))
+    for comment in ("# above", "# [servo]", "# id = 3 \"'", "# begins", "# ends"):
+        assert edited.count(comment) == text.count(comment), comment
+    known = line_numbers(text)
+    line = known.get(key)
+    if line is None and not any(key[: len(other)] == other for other in known if len(other) < len(key)):
+        kept = iter(edited.splitlines())
+        assert all(line in kept for line in text.splitlines())  # in their order, with new lines between them

@@ -1,0 +1,25 @@
+"""Work over processes ends in words when one of them is lost."""
+
+import os
+import signal
+
+import pytest
+
+from rig.core.errors import RigError
+from rig.core.processes import over_processes
+
+
+def work(item: int) -> int:
+    if item == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item * item
+
+
+def test_a_killed_process_is_told_with_the_way_out() -> None:
+    with pytest.raises(RigError, match="ended before it was done") as lost:
+        list(over_processes(work, range(6), 2))
+    assert "--jobs 1" in lost.value.next_step
+
+
+def test_one_process_is_this_one() -> None:
+    assert list(over_processes(work, [1, 2], 1)) == [(1, 1), (2, 4)]

@@ -1,0 +1,210 @@
+"""The BNO055 driver over the real smbus2, against the simulated sensor; what all IMUs keep is in tests/contract."""
+
+from collections.abc import Iterator
+from contextlib import closing
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.devices.bno055 import Bno055
+from rig.motion.turntable import Turntable
+from sim.i2c import SimI2cBus
+from sim.imu.bno055 import SILENT_S, SimBno055
+from sim.motion import to_position, to_velocity
+from sim.noise import NoiseModel
+from sim.world import World
+
+AT = 0x28
+
+
+class Bench:
+    """A world and the sensor in it, powered for a while."""
+
+    def __init__(self, noise: NoiseModel | None = None, chip_id: int = 0xA0, *, powered_s: float = 2.0) -> None:
+        self.world = World(noise=noise or NoiseModel.none())
+        self.clock = self.world.clock
+        self.sensor = SimBno055(self.world, chip_id=chip_id)
+        self.bus = SimI2cBus(self.clock)
+        self.bus.attach(AT, self.sensor)
+        self.clock.sleep(powered_s)
+
+    def open(self) -> Bno055:
+        return Bno055(self.bus.path, clock=self.clock)
+
+    def turn(self, dps: float) -> None:
+        self.world.drive(to_velocity(self.clock.now_ns() * 1e-9, self.world.table_deg(), dps, dps, 1.0))
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    yield bench
+    bench.bus.close()
+
+
+# -- opening -----------------------------------------------------------------------------------------------------------
+
+
+def test_it_waits_for_a_sensor_that_has_just_been_switched_on() -> None:
+    bench = Bench(powered_s=0.0)
+    with closing(bench.bus), closing(bench.open()) as imu:
+        assert bench.clock.now_ns() > SILENT_S * 1e9
+        assert (imu.identity.model, imu.identity.who_am_i) == ("BNO055", 0xA0)
+
+
+def test_opening_waits_until_the_sensor_has_learned_its_zero() -> None:
+    bench = Bench(NoiseModel())
+    with closing(bench.bus), closing(bench.open()) as imu:
+        assert imu.calibration().gyro == 3
+        imu.read_samples()
+        turned = 0.0
+        for _ in range(100):
+            bench.clock.sleep(0.04)
+            turned += imu.read_samples().gyro_dps[:, 2].sum() / imu.rate_hz
+        assert abs(turned) < 0.3
+
+
+def test_a_table_that_never_rests_does_not_hold_up_opening_for_ever(bench: Bench) -> None:
+    bench.turn(20.0)
+    with closing(bench.open()) as imu:
+        assert imu.calibration().gyro == 0
+        assert bench.clock.now_ns() < 6.5e9
+
+
+@pytest.mark.parametrize(("chip_id", "likely"), [(0x00, "SDA held low"), (0xFF, "not connected"), (0x42, "BNO085")])
+def test_another_chip_is_named(chip_id: int, likely: str) -> None:
+    bench = Bench(chip_id=chip_id)
+    with closing(bench.bus), pytest.raises(DeviceMismatch, match=likely) as caught:
+        bench.open()
+    assert caught.value.evidence == {"got": chip_id, "expected": 0xA0}
+    assert bench.sensor._registers[0x3D] == 0  # nothing was written to the stranger
+
+
+def test_nobody_there_says_where_and_what_to_do(bench: Bench) -> None:
+    bench.bus.detach(AT)
+    with pytest.raises(DeviceNotFound, match="0x28") as caught:
+        bench.open()
+    for hint in ("ADR", "i2cdetect -y", "SDA"):
+        assert hint in caught.value.next_step
+
+
+# -- readings ----------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=12)
+@given(
+    angles=st.lists(st.floats(-300.0, 300.0), min_size=1, max_size=3),
+    pause_s=st.floats(0.012, 0.3),
+    speed=st.floats(20.0, 200.0),
+)
+def test_however_it_is_read_the_samples_add_up_to_the_rotation(
+    angles: list[float], pause_s: float, speed: float
+) -> None:
+    bench = Bench()
+    with closing(bench.bus), closing(bench.open()) as imu:
+        imu.read_samples()
+        for angle in angles:
+            start_s, start_deg = bench.clock.now_ns() * 1e-9, bench.world.table_deg()
+            bench.world.drive(to_position(start_s, start_deg, 0.0, start_deg + angle, speed, 300.0))
+            turned, done_s = 0.0, abs(angle) / speed + speed / 300.0 + 1.0
+            while bench.clock.now_ns() * 1e-9 < start_s + done_s:
+                bench.clock.sleep(pause_s)
+                samples = imu.read_samples()
+                assert samples.lost == 0
+                turned += samples.gyro_dps[:, 2].sum() / imu.rate_hz
+            assert turned == pytest.approx(angle, abs=0.03)
+
+
+def test_the_heading_is_counter_clockwise_and_within_a_turn(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        start = imu.heading_deg()
+        now_s = bench.clock.now_ns() * 1e-9
+        bench.world.drive(to_position(now_s, 0.0, 0.0, 90.0, 90.0, 300.0))
+        bench.clock.sleep(3.0)
+        assert (imu.heading_deg() - start) % 360 == pytest.approx(90.0, abs=0.1)
+
+
+def test_a_gap_that_may_hide_half_a_turn_is_told(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        imu.read_samples()
+        bench.clock.sleep(0.6)
+        assert imu.read_samples().lost == 60
+        assert imu.statistics.overflows == 1
+        bench.clock.sleep(0.1)
+        assert imu.read_samples().lost == 0
+
+
+def test_saturation_reaches_the_stated_range(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        imu.read_samples()
+        bench.turn(2100.0)
+        bench.clock.sleep(0.1)
+        imu.read_samples()
+        bench.clock.sleep(0.02)
+        assert np.abs(imu.read_samples().gyro_dps).max() >= imu.range_dps
+
+
+# -- what goes wrong ---------------------------------------------------------------------------------------------------
+
+
+def test_a_reset_while_running_is_found(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        bench.sensor.power_cycle()
+        with pytest.raises(DeviceSilent, match="acknowledge"):
+            imu.read_samples()
+        bench.clock.sleep(SILENT_S)
+        for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c, imu.heading_deg, imu.calibration):
+            with pytest.raises(DeviceFault, match="supply was interrupted") as caught:
+                reading()
+        assert caught.value.evidence["operating_mode"] == {"got": 0, "expected": 8}
+
+
+def test_a_fusion_that_stopped_is_found(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        bench.sensor.fail(0x0A)
+        with pytest.raises(DeviceFault, match="fusion") as caught:
+            imu.read_samples()
+        assert caught.value.evidence["system_error"] == 0x0A
+        assert "i2c-gpio" in caught.value.next_step
+
+
+def test_other_units_are_found(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        bench.sensor._registers[0x3B] = 0x02  # another program wants radians
+        with pytest.raises(DeviceFault) as caught:
+            imu.read_samples()
+        assert caught.value.evidence["unit_selection"] == {"got": 2, "expected": 0}
+
+
+def test_a_stuck_bus_is_told_from_a_missing_sensor(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        bench.bus.stuck = True
+        with pytest.raises(DeviceSilent, match="stuck") as caught:
+            imu.read_samples()
+        assert "SDA" in caught.value.next_step
+
+
+def test_one_broken_transfer_is_repeated(bench: Bench) -> None:
+    with closing(bench.open()) as imu:
+        imu.read_samples()
+        bench.clock.sleep(0.1)
+        bench.bus.nack(1)
+        assert imu.read_samples().time_ns.size == pytest.approx(10, abs=1)
+        assert imu.statistics.retries == 1
+
+
+# -- on a bench --------------------------------------------------------------------------------------------------------
+
+
+def test_a_bench_with_a_bno055_turns_settles_and_agrees(simulated) -> None:
+    b = simulated("imu.model=bno055", seed=3)
+    assert b.bench.imu.identity.bus_address == AT
+    with Turntable(b.bench) as table:
+        for angle in (30.0, 60.0, -90.0, 0.0):
+            move = table.goto(angle)
+            assert move.agreement is not None, move.gyro.reason
+            assert move.agreement.agrees
+            assert move.gyro.angle_deg == pytest.approx(move.rotation_encoder_deg, abs=1.5)

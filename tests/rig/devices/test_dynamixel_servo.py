@@ -1,0 +1,156 @@
+"""The servo driver on the byte-true simulator."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
+from rig.devices.dynamixel.register_servo import prepare_servo
+from rig.devices.dynamixel.registers import control_table, model_numbers
+from rig.devices.dynamixel.servo import DEG_PER_COUNT, DynamixelServo
+from rig.devices.servo import MotionProfile
+from sim.noise import NoiseModel
+from tests.rig.bench_parts import open_bus, open_servo, servo_wires
+
+
+def test_a_factory_fresh_servo_is_refused_with_a_list_of_what_differs():
+    wires = servo_wires()
+    servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
+    with pytest.raises(DeviceMismatch) as caught:
+        prepare_servo(servo, write=False)
+    told = {register: text.partition(":")[0] for register, text in caught.value.evidence.items()}
+    assert told == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
+    assert all(text.partition(": ")[2] for text in caught.value.evidence.values())  # each with its reason
+    assert "write_settings" in caught.value.next_step
+
+
+def test_settings_are_written_once_and_told():
+    wires = servo_wires()
+    servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
+    assert prepare_servo(servo, write=True) == (
+        "servo: Operating Mode was 3, is now 4",
+        "servo: Return Delay Time was 250, is now 0",
+    )
+    assert prepare_servo(servo, write=False) == ()
+
+
+def test_opening_moves_nothing_and_writes_nothing():
+    wires = servo_wires()
+    DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
+    assert {frame[7] for frame in wires.instructions} <= {1, 2}  # Ping and Read
+    assert wires.device.memory["Torque Enable"] == 0
+
+
+def test_another_model_is_named():
+    wires = servo_wires(model="xm430_w350")
+    with pytest.raises(DeviceMismatch) as caught:
+        DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
+    assert caught.value.evidence["got"] == "xm430_w350"
+    assert 'servo.model = "xm430_w350"' in caught.value.next_step
+
+
+def test_nobody_at_the_id():
+    wires = servo_wires()
+    with pytest.raises(DeviceNotFound, match="id 9"):
+        DynamixelServo(open_bus(wires, retries=0), bus_id=9, model="xl430_w250", clock=wires.world.clock)
+
+
+def test_torque_on_holds_the_present_position_before_it_acts():
+    wires = servo_wires()
+    servo = open_servo(wires)
+    wires.device.turn_by_hand(123.0)
+    wires.world.clock.sleep(3.0)
+    before = wires.world.shaft()[0]
+    servo.torque_on()
+    wires.world.clock.sleep(1.0)
+    assert abs(wires.world.shaft()[0] - before) < 0.2
+
+
+@settings(max_examples=15, deadline=None)
+@given(goal_deg=st.floats(-700, 700))
+def test_a_goal_is_reached_within_one_count_over_many_turns(goal_deg):
+    wires = servo_wires(NoiseModel.none())
+    servo = open_servo(wires)
+    servo.set_profile(MotionProfile(300.0, 3000.0))
+    servo.torque_on()
+    start = servo.read_state().position_deg
+    servo.move_to(start + goal_deg)
+    wires.world.clock.sleep(6.0)
+    state = servo.read_state()
+    assert state.position_deg == pytest.approx(start + goal_deg, abs=DEG_PER_COUNT)
+    assert state.in_position
+    assert not state.moving
+
+
+def test_the_profile_is_never_the_servos_unlimited_zero():
+    wires = servo_wires()
+    got = open_servo(wires).set_profile(MotionProfile(0.01, 0.01))
+    assert got.velocity_dps > 0
+    assert got.acceleration_dps2 > 0
+    assert wires.device.memory["Profile Velocity"] == 1
+
+
+def test_a_hardware_error_is_told_and_forbids_torque():
+    wires = servo_wires()
+    servo = open_servo(wires)
+    wires.device.set_temperature(95.0)
+    wires.world.clock.sleep(2.0)
+    assert servo.read_state().hardware_errors == ("overheating",)
+    with pytest.raises(DeviceFault, match="overheating"):
+        servo.torque_on()
+
+
+def test_one_transaction_reads_the_whole_state():
+    wires = servo_wires()
+    servo = open_servo(wires)
+    before = len(wires.instructions)
+    state = servo.read_state()
+    assert len(wires.instructions) == before + 1
+    assert state.voltage_v == pytest.approx(12.0, abs=1.0)
+    assert 15 < state.temperature_c < 60
+
+
+def test_a_tripped_watchdog_is_cleared_only_when_torque_is_asked_for():
+    wires = servo_wires()
+    servo = open_servo(wires)
+    servo.torque_on()
+    servo.arm_watchdog(0.1)
+    servo.move_to(servo.read_state().position_deg + 90)
+    wires.world.clock.sleep(2.0)  # the host is silent
+    assert wires.device.memory["Bus Watchdog"] == 0xFF
+    assert abs(wires.world.shaft()[1]) < 1e-9
+    servo.torque_on()
+    assert wires.device.memory["Bus Watchdog"] == 0
+
+
+def test_the_sdk_knows_the_model_tables_and_an_unknown_model_is_a_configuration_error():
+    assert model_numbers()[1060] == "xl430_w250"
+    assert control_table("xl430_w250")["Present Position"].address == 132
+    assert control_table("xl330_m288", 52)["Indirect Data 1"].address == 208
+    with pytest.raises(ConfigError) as caught:
+        control_table("xl999")
+    assert "xl430_w250" in caught.value.evidence["models"]
+
+
+@pytest.mark.parametrize("name", ["Goal Position", "Present Load", "Homing Offset", "Torque Enable"])
+def test_registers_round_trip(name):
+    register = control_table("xl430_w250")[name]
+    low = -(2 ** (8 * register.size - 1)) if register.signed else 0
+    high = low + 2 ** (8 * register.size) - 1
+    for value in (low, -1 if register.signed else 1, 0, high):
+        assert register.decode(register.encode(value)) == value
+    with pytest.raises(OverflowError):
+        register.encode(high + 1)
+
+
+def test_torque_that_comes_on_with_a_goal_is_switched_off():
+    """After a dip of the supply such a servo would obey the next goal, as fast as it can and perhaps a turn away."""
+    wires = servo_wires()
+    wires.device.memory["Drive Mode"] = 0b1000
+    servo = open_servo(wires)
+    assert wires.device.memory["Drive Mode"] == 0
+    wires.device.power_cycle()
+    wires.world.clock.sleep(0.5)
+    servo.move_to(servo.read_state().position_deg + 90)
+    wires.world.clock.sleep(1.0)
+    assert abs(wires.world.shaft()[0]) < 0.1

@@ -1,0 +1,464 @@
+"""The rig head's driver on the firmware itself: opening, outputs, faults, a broken line, another head."""
+
+import numpy as np
+import pytest
+import serial
+
+from rig.core.errors import (
+    ConfigError,
+    DeviceMismatch,
+    DeviceNotFound,
+    DeviceRefused,
+    DeviceSilent,
+    EmergencyStop,
+    FirmwareMismatch,
+    HeadRestarted,
+    HostWasSilent,
+)
+from rig.devices.head.head import RigHead
+from rig.devices.head.link import HeadLink
+from rig.devices.head.protocol import BAUD, PROTOCOL_VERSION, Fault, Light, Reset, State, Trigger, Triggered
+from sim.clock import VirtualClock
+from sim.head import build
+from sim.head.board import SimHead
+from sim.head.wire import HeadSerial
+from sim.imu.mpu6050 import SimMpu6050
+from sim.motion import to_velocity
+from sim.noise import NoiseModel
+from sim.world import World
+from tests.contract.heads import mpu6050, needs, opened_head, simulated_head
+
+MS = 1_000_000
+
+
+@pytest.fixture(params=["memory", "avr"])
+def opened(request):
+    """A driver on the core in memory, and on the AVR binary."""
+    with opened_head(request.param, NoiseModel.none()) as h:
+        yield h
+
+
+def switch_on(h):
+    h.imu.set_power(True)
+    h.imu.set_light(1.0)
+
+
+# -- opening -----------------------------------------------------------------------------------------------------
+
+
+def test_opening_tells_who_it_is_and_leaves_the_outputs_off(opened):
+    who = opened.imu.identity
+    assert (who.model, who.who_am_i, who.bus_address) == ("MPU-6050", 0x68, 0x68)
+    board = {"memory": "host", "avr": "atmega328p"}[opened.head.kind]
+    assert (who.board, who.protocol, who.serial) == (board, PROTOCOL_VERSION, 1)
+    assert not opened.head.relay_closed
+    assert opened.head.light == 0
+    assert opened.imu.fault is None
+
+
+@pytest.mark.parametrize(
+    ("version", "step"), [(PROTOCOL_VERSION - 1, "make -C firmware flash"), (PROTOCOL_VERSION + 1, "Update")]
+)
+def test_another_version_says_which_side_to_update(version, step):
+    needs("memory")
+    world = World()
+    head = SimHead(world, library=build.host_library(f"-DPROTOCOL_VERSION={version}"))
+    with pytest.raises(FirmwareMismatch) as caught:
+        RigHead(HeadSerial(head), world.clock, mpu6050())
+    assert step in caught.value.next_step
+    assert caught.value.evidence["head"] == version
+    head.close()
+
+
+def test_nobody_at_the_port(opened):
+    class Deaf:
+        baudrate, in_waiting = BAUD, 0
+
+        def __init__(self, clock):
+            self.clock = clock
+
+        def read(self, size=1):
+            self.clock.sleep(0.002)
+            return b""
+
+        def write(self, data):
+            return len(data)
+
+        def reset_input_buffer(self): ...
+        def close(self): ...
+
+    clock = VirtualClock()
+    with pytest.raises(DeviceNotFound) as caught:
+        RigHead(Deaf(clock), clock, mpu6050(), name="/dev/ttyUSB7")
+    assert "PORT=/dev/ttyUSB7" in caught.value.next_step
+    assert clock.now_ns() < 4e9
+
+
+def test_a_board_that_starts_slowly_is_waited_for():
+    with simulated_head(noise=NoiseModel.none()) as (head, world):
+        head.attach(0x68, SimMpu6050(head.world_then))
+        wire = HeadSerial(head)
+        starts_ns = world.clock.now_ns() + 1_700 * MS  # the boot loader of an Arduino whose port was opened
+        head.tampers.append(lambda _to_head, byte: byte if world.clock.now_ns() > starts_ns else None)
+        imu = RigHead(wire, world.clock, mpu6050())
+        assert world.clock.now_ns() > starts_ns
+        imu.close()
+
+
+def test_no_sensor_and_another_sensor():
+    with simulated_head() as (head, world):
+        with pytest.raises(DeviceSilent, match="does not answer") as caught:
+            RigHead(HeadSerial(head), world.clock, mpu6050())
+        assert caught.value.evidence["imu_status"] == "absent"
+        head.attach(0x68, SimMpu6050(head.world_then, who_am_i=0x70))
+        with pytest.raises(DeviceMismatch, match=r"0x70, expected 0x68.*MPU-6500"):
+            RigHead(HeadSerial(head), world.clock, mpu6050())
+
+
+def test_an_impossible_deadman(opened):
+    with pytest.raises(ConfigError, match="deadman"):
+        RigHead(HeadSerial(opened.head), opened.clock, mpu6050(), deadman_s=3.0)
+
+
+# -- outputs -----------------------------------------------------------------------------------------------------
+
+
+def test_light_and_power_follow_while_the_program_lives(opened):
+    switch_on(opened)
+    opened.imu.set_light(0.2)
+    assert opened.head.light == pytest.approx(0.2, abs=0.005)
+    assert opened.head.relay_closed
+    opened.clock.sleep(5.0)  # the heart beats beside the program
+    assert opened.head.relay_closed
+    assert opened.imu.status.state is State.ACTIVE
+    opened.imu.close()
+    assert not opened.head.relay_closed
+    assert opened.head.light == 0
+    opened.clock.sleep(1.0)
+    assert [value for _, value in opened.head.pulses("relay")] == [1, 0]
+    assert not opened.imu.status.faults  # it rests in peace
+
+
+def test_a_pulse_is_as_wide_as_asked_and_dated(opened):
+    opened.clock.sleep(1.0)
+    began_ns = opened.imu.trigger(0.002)
+    opened.clock.sleep(0.01)
+    (up_ns, up), (down_ns, down) = opened.head.pulses("trigger")
+    assert (up, down) == (1, 0)
+    assert began_ns == pytest.approx(up_ns, abs=2e3 * opened.imu.health()["time_uncertainty_us"])
+    assert down_ns - up_ns == pytest.approx(2 * MS, rel=0.003)  # by a clock that is 0.2 % off
+    with pytest.raises(DeviceRefused, match="range"):
+        opened.imu.trigger(0.04)
+
+
+def test_a_second_pulse_within_the_first_is_refused(opened):
+    opened.imu.trigger(0.03)
+    with pytest.raises(DeviceRefused, match="busy"):
+        opened.imu.trigger(0.001)
+
+
+# -- what makes the bench safe --------------------------------------------------------------------------------------
+
+
+def test_a_silent_host_leaves_the_bench_dark_and_unpowered(opened):
+    switch_on(opened)
+    opened.imu._cancel()  # the program is killed: nothing beats any more
+    last_ns = opened.clock.now_ns()
+    opened.clock.sleep(1.0)
+    for pin in ("relay", "light"):
+        time_ns, value = opened.head.pulses(pin)[-1]
+        assert value == 0
+        assert time_ns - last_ns <= 255 * MS
+    with pytest.raises(HostWasSilent) as caught:
+        opened.imu.check()
+    assert caught.value.exit_code == 5
+    assert "rig acknowledge" in caught.value.next_step
+    with pytest.raises(DeviceRefused, match="fault is latched"):
+        opened.imu.set_power(True)
+    opened.imu.acknowledge()
+    assert opened.imu.fault is None
+    assert not opened.head.relay_closed  # never by itself
+    opened.imu.set_power(True)
+    assert opened.head.relay_closed
+
+
+@pytest.mark.parametrize("deadman_s", [0.05, 0.25, 2.0])
+def test_the_deadman_is_as_long_as_set(deadman_s):
+    with opened_head(noise=NoiseModel.none(), deadman_s=deadman_s) as h:
+        h.imu.set_power(True)
+        h.imu._cancel()
+        last_ns = h.imu._beaten_ns
+        h.clock.sleep(3.0)
+        silent_s = (h.head.pulses("relay")[-1][0] - last_ns) * 1e-9
+        assert deadman_s * 0.99 - 0.002 <= silent_s <= deadman_s * 1.01 + 0.001
+
+
+def test_the_estop_acts_within_a_millisecond_and_without_the_host(opened):
+    switch_on(opened)
+    opened.clock.sleep(0.1)
+    opened.imu._cancel()
+    opened.head.estop_open = True
+    pressed_ns = opened.clock.now_ns()
+    opened.clock.sleep(0.05)
+    assert opened.head.pulses("relay")[-1][0] - pressed_ns <= 1.01 * MS
+    with pytest.raises(EmergencyStop, match="e-stop"):
+        opened.imu.check()
+    with pytest.raises(EmergencyStop):
+        opened.imu.acknowledge()
+    opened.head.estop_open = False
+    opened.clock.sleep(0.05)
+    with pytest.raises(EmergencyStop):
+        opened.imu.check()  # released, but nobody has acknowledged it
+    opened.imu.acknowledge()
+    opened.imu.check()
+    assert not opened.head.relay_closed
+
+
+def test_a_head_that_restarts_says_so_and_goes_on_measuring(opened):
+    switch_on(opened)
+    opened.clock.sleep(0.5)
+    opened.imu.read_samples()
+    opened.head.reset(Reset.BROWN_OUT)
+    assert not opened.head.relay_closed
+    opened.clock.sleep(1.0)
+    assert opened.imu.read_samples().lost > 0
+    with pytest.raises(HeadRestarted, match="brown-out"):
+        opened.imu.check()
+    opened.clock.sleep(0.5)
+    samples = opened.imu.read_samples()
+    assert samples.lost == 0
+    assert len(samples.time_ns) == pytest.approx(100, abs=5)
+    assert opened.imu.statistics.restarts == 1
+    assert opened.head.light == 0
+    opened.imu.acknowledge()
+    assert opened.imu.fault is None
+
+
+def test_a_program_that_hangs_on_the_head_is_restarted_by_its_watchdog(opened):
+    switch_on(opened)
+    opened.head.hang()
+    opened.clock.sleep(1.0)
+    assert opened.head.resets == [Reset.WATCHDOG]
+    assert not opened.head.relay_closed
+    with pytest.raises(HeadRestarted, match="hung"):
+        opened.imu.check()
+
+
+def test_outputs_and_faults_do_not_depend_on_the_sensor(opened):
+    opened.head.detach(0x68)
+    opened.clock.sleep(2.0)
+    with pytest.raises(DeviceSilent):
+        opened.imu.read_samples()
+    opened.imu.set_power(True)
+    opened.head.estop_open = True
+    opened.clock.sleep(0.1)
+    with pytest.raises(EmergencyStop):
+        opened.imu.check()
+    opened.head.estop_open = False
+    opened.clock.sleep(0.1)
+    opened.imu.acknowledge()
+
+
+# -- a bad line ---------------------------------------------------------------------------------------------------
+
+
+def test_corrupt_frames_are_counted_and_cost_samples_but_no_wrong_value(opened):
+    rng = np.random.default_rng(1)
+    opened.world.drive(to_velocity(opened.clock.now_ns() * 1e-9, 0.0, 60.0, 60.0, 1e3))
+    opened.clock.sleep(0.5)
+    opened.imu.read_samples()
+    start_ns = opened.clock.now_ns()
+    opened.head.tampers.append(lambda _to_head, byte: byte ^ 0x20 if rng.random() < 0.002 else byte)
+    rates, times, lost = [], [], 0
+    for _ in range(50):
+        opened.clock.sleep(0.1)
+        samples = opened.imu.read_samples()
+        rates.append(samples.gyro_dps)
+        times.append(samples.time_ns)
+        lost += samples.lost
+    health = opened.imu.health()
+    assert health["crc_errors"] > 0
+    assert health["missed"] > 0
+    assert lost > 0
+    assert np.concatenate(rates)[:, 2] == pytest.approx(60.0, abs=0.05)
+    elapsed_s = (opened.clock.now_ns() - start_ns) * 1e-9
+    assert lost + sum(map(len, rates)) == pytest.approx(200 * elapsed_s, abs=6)
+    assert all(np.diff(np.concatenate(times)) > 0)
+    assert opened.imu.status.state is State.ACTIVE  # a beat that is lost is beaten again in time
+
+
+def test_babble_in_both_directions_is_outlived(opened):
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        opened.head.send(rng.bytes(60))
+        opened.head.babble(rng.bytes(60))
+        opened.clock.sleep(0.05)
+        opened.imu.read_samples()
+    opened.clock.sleep(0.5)
+    opened.imu.read_samples()
+    opened.clock.sleep(0.5)
+    assert opened.imu.read_samples().lost == 0
+    counters = opened.imu.counters()
+    assert counters.malformed + counters.crc_errors > 0
+
+
+def test_an_answer_that_comes_too_late_answers_nothing_else():
+    with opened_head(noise=NoiseModel.none()) as h:
+        h.imu._cancel()
+        wire = HeadSerial(h.head)
+        link = HeadLink(wire, h.clock, lambda _event: None, "head")
+        link.start()
+        h.head.tampers.append(lambda to_head, byte: None if not to_head else byte)
+        with pytest.raises(DeviceSilent):
+            link.request(Trigger(500), Triggered, attempts=1)
+        h.head.tampers.clear()
+        h.clock.sleep(0.1)
+        link.poll()
+        assert link.request(Trigger(700), Triggered).width_us == 700
+
+
+def test_a_request_whose_answer_was_lost_is_repeated_but_not_done_twice(opened):
+    opened.imu._cancel()
+    deaf_until_ns = opened.clock.now_ns() + 30 * MS
+    opened.head.tampers.append(lambda to_head, byte: byte if to_head or opened.clock.now_ns() > deaf_until_ns else None)
+    opened.imu._link.request(Trigger(500), Triggered)
+    opened.clock.sleep(0.1)
+    assert len(opened.head.pulses("trigger")) == 2  # up and down, once
+    assert opened.imu.health()["retries"] == 1
+
+
+def test_a_message_of_an_unknown_kind_is_refused_in_words(opened):
+    class Future(Light):
+        ID = 0x55
+
+    with pytest.raises(DeviceRefused, match="does not know the request"):
+        opened.imu._link.request(Future(1), Triggered)
+
+
+# -- a pulled cable -------------------------------------------------------------------------------------------------
+
+
+def test_a_cable_that_is_put_in_again_is_taken_up_by_itself_with_everything_off():
+    with opened_head(noise=NoiseModel.none(), reopen=HeadSerial) as h:
+        switch_on(h)
+        h.clock.sleep(0.2)
+        h.imu.read_samples()
+        h.unplug()
+        with pytest.raises(DeviceSilent, match="gone"):
+            h.imu.read_samples()
+        h.clock.sleep(1.0)
+        with pytest.raises(DeviceSilent):
+            h.imu.read_samples()
+        h.head.unplugged = False
+        h.clock.sleep(0.1)
+        h.imu.read_samples()
+        h.clock.sleep(0.5)
+        samples = h.imu.read_samples()
+        assert len(samples.time_ns) > 50
+        assert h.imu.statistics.reconnects == 1
+        assert not h.head.relay_closed
+        assert isinstance(h.imu.fault, HostWasSilent)
+
+
+def test_another_head_in_its_place_is_not_taken_for_it():
+    with opened_head(noise=NoiseModel.none(), reopen=lambda _head: HeadSerial(other)) as h:
+        other = SimHead(h.world, serial=2)
+        other.attach(0x68, SimMpu6050(other.world_then))
+        h.unplug()
+        with pytest.raises(DeviceSilent):
+            h.imu.read_samples()
+        with pytest.raises(DeviceMismatch, match="another rig head") as caught:
+            h.imu.read_samples()
+        assert caught.value.evidence["serial"] == {"got": 2, "expected": 1}
+        other.close()
+
+
+def test_a_port_that_somebody_else_has_is_an_error_of_the_port():
+    class Taken:
+        baudrate = BAUD
+
+        def write(self, data):
+            raise serial.SerialException(5, "Input/output error")
+
+        def close(self): ...
+
+    clock = VirtualClock()
+    with pytest.raises(DeviceSilent, match="gone"):
+        RigHead(Taken(), clock, mpu6050())
+
+
+# -- the sensor ------------------------------------------------------------------------------------------------------
+
+
+def test_a_sensor_that_stops_answering_is_found_and_taken_back(opened):
+    opened.clock.sleep(0.2)
+    opened.imu.read_samples()
+    opened.head.detach(0x68)
+    opened.clock.sleep(0.2)
+    opened.imu.read_samples()  # the head tries to get it back
+    opened.clock.sleep(1.0)
+    with pytest.raises(DeviceSilent, match="does not answer"):
+        opened.imu.read_samples()
+    opened.sensor.power_cycle()
+    opened.head.attach(0x68, opened.sensor)
+    opened.clock.sleep(1.0)
+    assert opened.imu.read_samples().lost > 200
+    opened.clock.sleep(0.2)
+    assert opened.imu.read_samples().lost == 0
+
+
+def test_a_sensor_that_browned_out_is_set_up_anew_and_its_samples_count_as_lost(opened):
+    opened.clock.sleep(0.2)
+    opened.imu.read_samples()
+    opened.sensor.power_cycle()
+    opened.clock.sleep(0.6)
+    samples = opened.imu.read_samples()
+    assert samples.lost == pytest.approx(0.2 * 200, abs=30)  # 50 ms to notice, 150 ms to start
+    assert opened.imu.counters().restarts == 1
+
+
+@pytest.mark.parametrize("clocks", [1, 4, 9])
+def test_a_stuck_bus_is_clocked_free_without_losing_a_sample(opened, clocks):
+    opened.clock.sleep(0.2)
+    opened.imu.read_samples()
+    opened.head.stuck = clocks
+    opened.clock.sleep(0.5)
+    samples = opened.imu.read_samples()
+    assert samples.lost == 0
+    counters = opened.imu.counters()
+    assert (counters.timeouts, counters.recoveries) == (1, 1)
+
+
+def test_a_bus_that_stays_stuck_is_told(opened):
+    opened.head.stuck = True
+    opened.clock.sleep(1.0)
+    with pytest.raises(DeviceSilent, match="stuck"):
+        opened.imu.read_samples()
+
+
+def test_refused_addresses_cost_no_sample(opened):
+    opened.clock.sleep(0.2)
+    opened.imu.read_samples()
+    for _ in range(20):
+        opened.head.nack(2)  # two in a row: the third attempt goes through
+        opened.clock.sleep(0.05)
+    assert opened.imu.read_samples().lost == 0
+    assert opened.imu.counters().nacks == 40
+
+
+def test_samples_without_the_ready_line_come_just_the_same_but_dated_less_well(opened):
+    opened.sensor.next_edge_ns = lambda _after_ns: None  # INT is not wired
+    opened.clock.sleep(0.3)
+    opened.imu.read_samples()
+    opened.clock.sleep(1.0)
+    samples = opened.imu.read_samples()
+    assert samples.lost == 0
+    assert len(samples.time_ns) == pytest.approx(200, abs=4)
+    assert samples.time_uncertainty_ns > 1 * MS
+
+
+def test_faults_are_named_in_the_evidence(opened):
+    opened.head.estop_open = True
+    opened.clock.sleep(0.1)
+    assert opened.imu.status.faults == Fault.ESTOP
+    assert opened.imu.fault.evidence["faults"] == "ESTOP"

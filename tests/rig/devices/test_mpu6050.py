@@ -1,0 +1,431 @@
+"""The real driver over the real smbus2, against the simulated sensor."""
+
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.devices.imu import ImuSamples
+from rig.devices.mpu6050 import Mpu6050
+from sim.clock import VirtualClock
+from sim.i2c import SimI2cBus
+from sim.imu.mpu6050 import SimMpu6050
+from sim.motion import to_position, to_velocity
+from sim.noise import NoiseModel
+from sim.world import World
+
+AT = 0x68
+
+
+class Bench:
+    """A world, the sensor in it, and the driver once it is opened."""
+
+    def __init__(self, noise: NoiseModel | None = None, seed: int = 0, who_am_i: int = 0x68) -> None:
+        self.world = World(noise=noise or NoiseModel.none(), seed=seed)
+        self.clock = self.world.clock
+        self.sensor = SimMpu6050(self.world, who_am_i=who_am_i)
+        self.bus = SimI2cBus(self.clock)
+        self.bus.attach(AT, self.sensor)
+        self.imu: Mpu6050 | None = None
+
+    def open(self, **settings: Any) -> Mpu6050:
+        self.imu = Mpu6050(self.bus.path, clock=self.clock, **settings)
+        return self.imu
+
+    def __enter__(self) -> "Bench":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.imu:
+            self.imu.close()
+        self.bus.close()
+
+    def turn(self, dps: float) -> None:
+        now_ns = self.clock.now_ns()
+        self.world.drive(to_velocity(now_ns * 1e-9, self.world.table_deg(), dps, dps, 1.0))
+
+    def write(self, *data: int) -> None:
+        """Do behind the driver's back what another program on the bus might."""
+        self.sensor.start(reading=False)
+        self.sensor.write(bytes(data))
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with Bench() as b:
+        yield b
+
+
+# -- opening ------------------------------------------------------------------------------------------------------
+
+
+def test_opening_wakes_and_sets_the_sensor(bench: Bench) -> None:
+    imu = bench.open(range_dps=500, rate_hz=100, bandwidth_hz=20)
+    written = bytes(bench.sensor._registers)
+    assert written[0x19:0x1D] == bytes([9, 4, 0x08, 0x00])
+    assert written[0x23] == 0x70
+    assert written[0x6A:0x6C] == b"\x40\x01"
+    assert (imu.identity.model, imu.identity.who_am_i, imu.identity.bus_address) == ("MPU-6050", 0x68, AT)
+    assert imu.rate_hz == 100
+    assert imu.range_dps == pytest.approx(500, rel=0.002)
+
+
+def test_opening_forgets_what_the_sensor_did_before(bench: Bench) -> None:
+    bench.open(range_dps=2000, rate_hz=1000).close()
+    bench.turn(90.0)
+    bench.clock.sleep(2.0)
+    imu = bench.open()
+    assert len(imu.read_samples().time_ns) <= 1
+    bench.clock.sleep(0.1)
+    assert imu.read_samples().gyro_dps[:, 2] == pytest.approx(90.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("who_am_i", "likely"),
+    [(0x70, "MPU-6500"), (0x71, "MPU-9250"), (0x73, "MPU-9255"), (0x00, "SDA held low"), (0xFF, "not connected")],
+)
+def test_another_chip_is_named(who_am_i: int, likely: str) -> None:
+    with Bench(who_am_i=who_am_i) as bench:
+        with pytest.raises(DeviceMismatch, match=likely) as caught:
+            bench.open()
+        assert caught.value.evidence == {"got": who_am_i, "expected": 0x68}
+        assert f"{who_am_i:#04x}" in caught.value.what
+        assert bench.sensor._registers[0x6B] == 0x40  # nothing was written to the stranger
+
+
+def test_an_unknown_chip_may_be_a_clock() -> None:
+    with Bench(who_am_i=0x42) as bench, pytest.raises(DeviceMismatch, match="DS3231"):
+        bench.open()
+
+
+def test_nobody_there_says_where_and_what_to_do(bench: Bench) -> None:
+    bench.bus.detach(AT)
+    with pytest.raises(DeviceNotFound, match="0x68") as caught:
+        bench.open()
+    for hint in ("AD0", "i2cdetect -y", "SDA"):
+        assert hint in caught.value.next_step
+
+
+def test_a_missing_bus_says_how_to_get_one(tmp_path: Path) -> None:
+    with pytest.raises(DeviceNotFound, match=str(tmp_path)) as caught:
+        Mpu6050(str(tmp_path / "i2c-1"), clock=VirtualClock())
+    assert "raspi-config" in caught.value.next_step
+
+
+def test_a_bus_number_names_its_device_file() -> None:
+    with pytest.raises(DeviceNotFound, match="/dev/i2c-987"):
+        Mpu6050(987, clock=VirtualClock())
+
+
+def test_a_forbidden_bus_names_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "i2c-1"
+    path.touch(stat.S_IRUSR)
+
+    def denied(*_: object) -> int:  # root may open anything, so the kernel's answer is played
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("smbus2.smbus2.os.open", denied)
+    with pytest.raises(DeviceNotFound, match="Permission denied") as caught:
+        Mpu6050(str(path), clock=VirtualClock())
+    assert "group i2c" in caught.value.next_step
+
+
+def open_files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_a_file_that_is_no_bus_is_refused_and_closed(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.touch()
+    before = open_files()
+    with pytest.raises(DeviceNotFound, match="cannot be opened") as caught:
+        Mpu6050(str(path), clock=VirtualClock())
+    assert "i2cdetect -l" in caught.value.next_step
+    assert open_files() == before
+
+
+def test_all_wrong_settings_are_reported_at_once(bench: Bench) -> None:
+    with pytest.raises(ConfigError) as caught:
+        bench.open(range_dps=300, rate_hz=210, bandwidth_hz=44)
+    assert set(caught.value.evidence) == {"range_dps", "rate_hz", "bandwidth_hz"}
+
+
+@given(rate_hz=st.floats(allow_nan=True, allow_infinity=True) | st.integers(1, 1000).map(lambda n: 1000 / n))
+def test_a_rate_is_taken_exactly_or_refused(rate_hz: float) -> None:
+    with Bench() as bench:
+        divides = rate_hz in [1000 / n for n in range(1, 257)]
+        try:
+            assert bench.open(rate_hz=rate_hz).rate_hz == pytest.approx(rate_hz)
+        except ConfigError:
+            assert not divides
+        else:
+            assert any(rate_hz == pytest.approx(1000 / n) for n in range(1, 257))
+
+
+def test_a_sensor_that_keeps_no_settings_is_a_fault(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = bench.sensor.write
+    monkeypatch.setattr(bench.sensor, "write", lambda data: kept(data[:1]) + len(data) - 1)
+    with pytest.raises(DeviceFault) as caught:
+        bench.open()
+    assert caught.value.evidence["register_0x23"] == {"got": "00", "expected": "70"}
+
+
+# -- samples ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("range_dps", [250, 500, 1000, 2000])
+def test_rates_come_in_degrees_a_second_in_every_range(bench: Bench, range_dps: int) -> None:
+    imu = bench.open(range_dps=range_dps)
+    bench.turn(-123.4)
+    bench.clock.sleep(0.3)
+    gyro = imu.read_samples().gyro_dps
+    assert gyro[-1] == pytest.approx([0, 0, -123.4], abs=range_dps / 32000)
+
+
+@pytest.mark.parametrize("range_dps", [250, 500, 1000, 2000])
+def test_saturation_reaches_the_range(bench: Bench, range_dps: int) -> None:
+    imu = bench.open(range_dps=range_dps)
+    for sign in (1, -1):
+        bench.turn(sign * 2 * range_dps)
+        bench.clock.sleep(0.3)
+        assert abs(imu.read_samples().gyro_dps[-1, 2]) >= imu.range_dps
+
+
+@given(pauses_ms=st.lists(st.integers(0, 300), min_size=2, max_size=10), divider=st.integers(2, 40))
+@settings(max_examples=50)
+def test_sample_times_are_even_and_true(pauses_ms: list[int], divider: int) -> None:
+    """Times come out of the count and the rate alone; they must still be those at which the sensor sampled."""
+    period_ns = divider * 1_000_000
+    with Bench() as bench:
+        imu = bench.open(rate_hz=1000 / divider)
+        start_ns = bench.sensor._epoch_ns
+        parts, newest_ns = [], 0
+        for pause in pauses_ms:
+            bench.clock.sleep(min(pause, 100 * divider) * 1e-3)
+            latched_ns = bench.clock.now_ns() + 3 * 22_500  # the count, after address, register and address
+            samples = imu.read_samples()
+            assert samples.lost == 0
+            parts.append(samples.time_ns)
+            newest_ns = start_ns + (latched_ns - start_ns) // period_ns * period_ns
+            if samples.time_ns.size:
+                assert samples.time_ns[-1] == pytest.approx(newest_ns, abs=period_ns // 2 + 200_000)
+        time_ns = np.concatenate(parts)
+        assert all(np.diff(time_ns) > 0)
+        assert all(np.ptp(np.diff(part)) <= 1 for part in parts if part.size > 1)
+        due = (newest_ns - start_ns) // period_ns
+        assert due - 1 <= time_ns.size <= due + 1  # none lost, none invented
+
+
+@pytest.mark.parametrize("clock_error", [-0.03, -0.005, 0.005, 0.03])
+def test_times_follow_a_sensor_whose_clock_is_off(bench: Bench, clock_error: float) -> None:
+    bench.sensor.clock_error = clock_error
+    imu = bench.open()
+    last_ns = 0
+    for _ in range(100):
+        bench.clock.sleep(0.15)
+        before_ns = bench.clock.now_ns()
+        samples = imu.read_samples()
+        assert samples.lost == 0
+        assert before_ns - 5_000_000 <= samples.time_ns[-1] <= bench.clock.now_ns()
+        assert samples.time_ns[0] > last_ns
+        last_ns = samples.time_ns[-1]
+
+
+def test_samples_are_where_the_motion_was(bench: Bench) -> None:
+    """The order within the FIFO and the times: each sample shows the rate of its own moment (less the filter's lag)."""
+    imu = bench.open(bandwidth_hz=188)
+    now_s = bench.clock.now_ns() * 1e-9
+    imu.read_samples()
+    bench.world.drive(to_position(now_s, 0.0, 0.0, 60.0, 120.0, 400.0))
+    parts = []
+    for _ in range(8):
+        bench.clock.sleep(0.1)
+        parts.append(imu.read_samples())
+    time_ns = np.concatenate([p.time_ns for p in parts])
+    rate = np.concatenate([p.gyro_dps[:, 2] for p in parts])
+    assert rate.max() == pytest.approx(120, abs=1)
+    np.testing.assert_allclose(rate, bench.world.table_motion(time_ns)[1], atol=400 * 0.006)
+
+
+def test_one_drain_is_two_transactions(bench: Bench) -> None:
+    imu = bench.open()
+    bench.clock.sleep(0.5)
+    before = imu.statistics.transfers
+    samples = imu.read_samples()
+    assert imu.statistics.transfers - before == 2
+    assert bench.bus.wire[-1].data == b"".join(np.rint(samples.gyro_dps * 131).astype(">i2"))
+
+
+def test_gravity_and_temperature(bench: Bench) -> None:
+    imu = bench.open()
+    bench.sensor.temperature_c = 31.0
+    bench.clock.sleep(0.1)
+    assert imu.read_gravity_g() == pytest.approx([0, 0, 1], abs=1e-4)
+    assert imu.temperature_c() == pytest.approx(31.0, abs=0.01)
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    def run(seed: int) -> bytes:
+        with Bench(NoiseModel(), seed) as bench:
+            imu = bench.open()
+            bench.turn(45.0)
+            parts: list[ImuSamples] = []
+            for _ in range(5):
+                bench.clock.sleep(0.13)
+                parts.append(imu.read_samples())
+            return b"".join(p.time_ns.tobytes() + p.gyro_dps.tobytes() for p in parts)
+
+    assert run(1) == run(1) != run(2)
+
+
+# -- faults -------------------------------------------------------------------------------------------------------
+
+
+def test_a_single_nack_is_retried_and_counted(bench: Bench) -> None:
+    imu = bench.open()
+    bench.clock.sleep(0.1)
+    bench.bus.nack(1)
+    samples = imu.read_samples()
+    assert 20 <= len(samples.time_ns) <= 21
+    assert samples.lost == 0
+    assert imu.statistics.retries == 1
+
+
+@pytest.mark.parametrize("fault", ["unplugged", "stuck"])
+def test_a_sensor_that_went_away_is_silent_not_still(bench: Bench, fault: str) -> None:
+    imu = bench.open()
+    bench.clock.sleep(0.1)
+    if fault == "unplugged":
+        bench.bus.detach(AT)
+    else:
+        bench.bus.stuck = True
+    with pytest.raises(DeviceSilent, match="0x68") as caught:
+        imu.read_samples()
+    assert caught.value.evidence["attempts"] == 3
+
+
+def test_an_overflow_is_told_and_the_fifo_starts_afresh(bench: Bench) -> None:
+    imu = bench.open()
+    bench.turn(30.0)
+    bench.clock.sleep(1.5)
+    overflowed = imu.read_samples()
+    assert overflowed.time_ns.size == overflowed.gyro_dps.size == 0
+    assert 298 <= overflowed.lost <= 303
+    assert imu.statistics.overflows == 1
+    bench.clock.sleep(0.2)
+    after = imu.read_samples()
+    assert after.lost == 0
+    assert 38 <= after.time_ns.size <= 41
+    assert after.gyro_dps == pytest.approx(np.tile([0, 0, 30.0], (after.time_ns.size, 1)), abs=0.01)
+
+
+@given(frames=st.integers(168, 172), early_us=st.integers(-50, 250))
+@settings(max_examples=100)
+def test_around_a_full_fifo_no_sample_is_ever_garbled(frames: int, early_us: int) -> None:
+    """Another sample may arrive between the reading of the count and that of the data."""
+    with Bench() as bench:
+        imu = bench.open()
+        bench.turn(100.0)
+        imu.read_samples()
+        taken = (bench.clock.now_ns() - bench.sensor._epoch_ns) // 5_000_000
+        bench.clock.advance_to(bench.sensor._epoch_ns + (taken + frames) * 5_000_000 - early_us * 1000)
+        samples = imu.read_samples()
+        assert samples.lost or samples.time_ns.size
+        assert samples.gyro_dps[5:] == pytest.approx(
+            np.tile([0, 0, 100.0], (max(len(samples.time_ns) - 5, 0), 1)), abs=1
+        )
+
+
+@pytest.mark.parametrize("after_bytes", [2, 6, 12, 100])
+def test_a_transfer_that_broke_off_loses_its_samples_openly(bench: Bench, after_bytes: int) -> None:
+    imu = bench.open()
+    bench.turn(10.0)
+    bench.clock.sleep(0.2)
+    bench.bus.cut_read(after_bytes)  # the two bytes of the count still pass
+    samples = imu.read_samples()
+    assert samples.time_ns.size == 0
+    assert samples.lost == pytest.approx(40, abs=2)
+    assert imu.statistics.retries == 1
+    bench.clock.sleep(0.1)
+    after = imu.read_samples()
+    assert after.lost == 0
+    assert after.gyro_dps[:, 2] == pytest.approx(10.0, abs=0.01)
+
+
+def test_a_transfer_that_never_began_loses_nothing(bench: Bench) -> None:
+    imu = bench.open()
+    bench.clock.sleep(0.2)
+    bench.clock.call_at(
+        bench.clock.now_ns() + 100_000, bench.bus.nack
+    )  # while the count crosses: the data's start fails
+    samples = imu.read_samples()
+    assert samples.lost == 0
+    assert samples.time_ns.size == pytest.approx(40, abs=1)
+    assert imu.statistics.retries == 1
+
+
+@pytest.mark.parametrize("polled_ms", [5, 20, 100, 500])
+def test_a_power_cycle_is_noticed_not_read_as_standing_still(bench: Bench, polled_ms: int) -> None:
+    imu = bench.open()
+    bench.turn(45.0)
+    bench.clock.sleep(0.1)
+    imu.read_samples()
+    bench.sensor.power_cycle()
+
+    def poll() -> None:
+        for _ in range(20):
+            bench.clock.sleep(polled_ms * 1e-3)
+            assert imu.read_samples().time_ns.size == 0
+
+    with pytest.raises(DeviceFault, match="supply was interrupted"):
+        poll()
+    for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c):
+        with pytest.raises(DeviceFault):
+            reading()
+
+
+def test_a_sensor_put_to_sleep_is_noticed(bench: Bench) -> None:
+    imu = bench.open()
+    bench.write(0x6B, 0x41)
+    bench.clock.sleep(0.2)
+    with pytest.raises(DeviceFault, match="fell asleep"):
+        imu.read_samples()
+
+
+def test_settings_changed_by_another_program_are_noticed_where_they_show(bench: Bench) -> None:
+    imu = bench.open()
+    bench.write(0x19, 19)  # a quarter of the rate
+    bench.clock.sleep(0.4)
+    with pytest.raises(DeviceFault, match="another program") as caught:
+        imu.read_samples()
+    assert caught.value.evidence["register_0x19"] == {"got": "13030000", "expected": "04030000"}
+
+
+def test_samples_that_another_reader_took_are_counted_as_lost(bench: Bench) -> None:
+    imu = bench.open()
+    bench.clock.sleep(0.3)
+    bench.write(0x6A, 0x04)
+    bench.write(0x6A, 0x40)
+    bench.clock.sleep(0.1)
+    samples = imu.read_samples()
+    assert samples.time_ns.size == pytest.approx(20, abs=1)
+    assert samples.lost == pytest.approx(60, abs=1)
+
+
+def test_a_closed_driver_leaves_no_open_file(bench: Bench) -> None:
+    before = open_files()
+    imu = bench.open()
+    assert open_files() == before + 1
+    imu.close()
+    imu.close()
+    assert open_files() == before
+    bench.bus.detach(AT)
+    with pytest.raises(DeviceNotFound):
+        bench.open()
+    assert open_files() == before

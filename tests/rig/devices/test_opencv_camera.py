@@ -1,0 +1,409 @@
+"""The OpenCV camera driver: settings, choosing frames by their time, and what it says when a camera fails."""
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rig.catalog import Catalog
+from rig.core.clock import SystemClock
+from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase, open_capture
+from rig.events.events import Rejected
+from rig.plans.enroll import enroll
+from sim.camera import FPS, SimCapture
+from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
+from sim.world import World
+
+PERIOD_NS = 1_000_000_000 // FPS
+
+
+class ForeignStamps(SimCapture):
+    """The simulated camera behind a backend whose time stamps are not the bench's clock."""
+
+    def __init__(self, world: World, offset_ms: float, factor: float = 1.0) -> None:
+        super().__init__(world)
+        self._offset_ms, self._factor = offset_ms, factor
+
+    def get(self, prop: int) -> float:
+        value = super().get(prop)
+        return value * self._factor + self._offset_ms if prop == cv2.CAP_PROP_POS_MSEC else value
+
+
+@pytest.fixture
+def world() -> World:
+    world = World(noise=NoiseModel.none())
+    world.put(shelf()["teapot"])
+    world.clock.sleep(100.0)
+    return world
+
+
+# -- settings ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_settings_are_locked_and_read_back(world: World) -> None:
+    settings = CameraSettings(exposure_us=8000, gain=3, white_balance_k=4200, focus=100)
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings, name="desk camera")
+    assert camera.not_taken == ()
+    locks = camera.read_locks()
+    assert (locks.exposure_us, locks.gain, locks.white_balance_k) == (8000, 3, 4200)
+    assert (locks.auto_exposure, locks.auto_white_balance) == (False, False)
+    identity = camera.identity
+    assert (identity.name, identity.width, identity.height, identity.fps) == ("desk camera", 640, 480, 30)
+    world.clock.sleep(20)
+    assert camera.read_locks() == locks
+
+
+def test_what_is_left_to_the_camera_stays_automatic(world: World) -> None:
+    settings = CameraSettings(exposure_us=None, gain=None, white_balance_k=None)
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings)
+    before = camera.read_locks()
+    assert (before.auto_exposure, before.exposure_us is None) == (True, False)
+    world.put(shelf()["candle"])
+    world.clock.sleep(5)
+    assert camera.read_locks().exposure_us != before.exposure_us
+
+
+def test_a_setting_that_the_camera_does_not_take_is_reported(world: World) -> None:
+    settings = CameraSettings(width=1920, exposure_us=90_000, gain=99)
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings)
+    assert {(n.setting, n.asked, n.reported) for n in camera.not_taken} == {
+        ("width", 1920, 640),
+        ("exposure_100us", 900, 333),
+        ("gain", 99, 24),
+    }
+    assert camera.identity.width == 640
+    assert camera.read_locks().gain == 24
+
+
+def test_a_drifting_lock_shows(world: World) -> None:
+    capture = SimCapture(world)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 3)  # another program, a camera that was plugged in again
+    assert camera.read_locks().auto_exposure is True
+
+
+@pytest.mark.parametrize("field", ["width", "height", "fps", "exposure_us", "white_balance_k"])
+def test_impossible_settings_are_refused(field: str) -> None:
+    for value in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=field):
+            CameraSettings(**{field: value})
+
+
+# -- which frame ------------------------------------------------------------------------------------------------------
+
+
+def test_stale_frames_are_dropped_by_their_stamps(world: World) -> None:
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock)
+    assert camera.time_base is TimeBase.STAMPED
+    for pause_s in (0.0, 0.01, 0.1, 3.0):
+        world.clock.sleep(pause_s)
+        after_ns = world.clock.now_ns()
+        frame = camera.capture(after_ns)
+        assert after_ns <= frame.exposed_ns < after_ns + PERIOD_NS + 2000  # the first one, not just any new one
+
+
+def test_a_frame_of_the_future_is_waited_for(world: World) -> None:
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock)
+    after_ns = world.clock.now_ns() + 700_000_000
+    assert after_ns <= camera.capture(after_ns).exposed_ns < after_ns + PERIOD_NS + 2000
+
+
+@pytest.mark.parametrize(
+    ("offset_ms", "factor"),
+    [(1.7e12, 1.0), (-100_000.0, 1.0), (0.0, 0.0), (0.0, 1000.0)],
+    ids=["time of day", "since the stream began", "no stamps", "microseconds"],
+)
+def test_without_stamps_only_frames_that_had_to_be_waited_for_count(
+    world: World, offset_ms: float, factor: float
+) -> None:
+    capture = ForeignStamps(world, offset_ms, factor)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    assert camera.time_base is TimeBase.PACED
+    for pause_s in (0.0, 0.05, 5.0):
+        world.clock.sleep(pause_s)
+        after_ns = world.clock.now_ns()
+        frame = camera.capture(after_ns)
+        truly_ns = round((capture.get(cv2.CAP_PROP_POS_MSEC) - offset_ms) / factor * 1e6) if factor else None
+        assert after_ns <= frame.exposed_ns <= (truly_ns or world.clock.now_ns())
+        assert frame.exposed_ns < after_ns + 6 * PERIOD_NS
+
+
+def test_the_image_is_the_one_of_the_stamp(world: World) -> None:
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock)
+    teapot = camera.capture(world.clock.now_ns()).image_bgr
+    world.put(shelf()["dice"])
+    dice = camera.capture(world.clock.now_ns()).image_bgr
+    assert teapot.shape == dice.shape == (480, 640, 3)
+    assert (teapot != dice).mean() > 0.05
+
+
+# -- failures ---------------------------------------------------------------------------------------------------------
+
+
+def test_an_unplugged_camera_is_silent(world: World) -> None:
+    capture = SimCapture(world)
+    camera = OpenCvCamera(capture, clock=world.clock, name="desk camera")
+    capture.unplug()
+    with pytest.raises(DeviceSilent, match="desk camera") as error:
+        camera.capture(world.clock.now_ns())
+    assert "cable" in error.value.next_step
+    with pytest.raises(DeviceSilent):
+        OpenCvCamera(capture, clock=world.clock)
+
+
+class Lagging(SimCapture):
+    """Falls behind when told so: its frames keep coming, each hardly younger than the one before."""
+
+    stuck_at_ms: float | None = None
+
+    def get(self, prop: int) -> float:
+        if prop == cv2.CAP_PROP_POS_MSEC and self.stuck_at_ms is not None:
+            self.stuck_at_ms += 0.001
+            return self.stuck_at_ms
+        return super().get(prop)
+
+
+def test_a_camera_that_shows_only_the_past_times_out(world: World) -> None:
+    capture = Lagging(world)
+    camera = OpenCvCamera(capture, clock=world.clock, timeout_s=1.5)
+    capture.stuck_at_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+    asked_ns = world.clock.now_ns()
+    with pytest.raises(DeviceSilent, match=r"no new frame in 1\.5 s") as error:
+        camera.capture(asked_ns)
+    assert error.value.evidence["dropped_frames"] == pytest.approx(1.5 * FPS, abs=3)
+    assert world.clock.now_ns() - asked_ns == pytest.approx(1.5e9, abs=2 * PERIOD_NS)
+
+
+def test_stamps_that_fall_back_are_trusted_no_more(world: World) -> None:
+    capture = ForeignStamps(world, 0.0)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    assert camera.time_base is TimeBase.STAMPED
+    capture._offset_ms = -60_000.0
+    after_ns = world.clock.now_ns()
+    assert camera.capture(after_ns).exposed_ns >= after_ns
+    assert camera.time_base is TimeBase.PACED
+
+
+def test_a_picture_that_is_not_colour_is_refused(world: World) -> None:
+    class Raw(SimCapture):
+        def retrieve(self) -> tuple[bool, np.ndarray | None]:
+            ok, image = super().retrieve()
+            return ok, None if image is None else image[..., 0]
+
+    with pytest.raises(DeviceFault, match=r"\(480, 640\)"):
+        OpenCvCamera(Raw(world), clock=world.clock).capture(0)
+
+
+def test_a_frame_that_cannot_be_decoded_is_reported(world: World) -> None:
+    class Torn(SimCapture):
+        def retrieve(self) -> tuple[bool, None]:
+            return False, None
+
+    with pytest.raises(DeviceSilent, match="decoding"):
+        OpenCvCamera(Torn(world), clock=world.clock).capture(0)
+
+
+def test_opening_says_what_is_wrong(tmp_path: Path) -> None:
+    with pytest.raises(DeviceNotFound, match="no camera /dev/video97") as error:
+        open_capture(97)
+    assert "connect" in error.value.next_step
+    with pytest.raises(DeviceNotFound, match="missing"):
+        open_capture(tmp_path / "missing.avi")
+
+
+@pytest.mark.skipif(not Path("/dev/null").exists(), reason="no device files on this system")
+def test_a_device_that_is_no_camera_cannot_be_opened() -> None:
+    with pytest.raises(DeviceNotFound, match="cannot open /dev/null"):
+        open_capture("/dev/null")
+
+
+# -- recordings and streams -------------------------------------------------------------------------------------------
+
+
+def test_a_recording_is_read_frame_by_frame_to_its_end(tmp_path: Path, world: World) -> None:
+    levels = (10, 90, 170)
+    for k, level in enumerate(levels):
+        cv2.imwrite(str(tmp_path / f"img_{k:02d}.png"), np.full((48, 64, 3), level, np.uint8))
+    camera = OpenCvCamera(open_capture(tmp_path / "img_%02d.png"), clock=world.clock)
+    assert camera.time_base is TimeBase.RECORDED
+    assert "exposure_100us" in {n.setting for n in camera.not_taken}
+    assert camera.read_locks().exposure_us is None
+    for level in levels:
+        after_ns = world.clock.now_ns() + 1000
+        frame = camera.capture(after_ns)
+        assert frame.exposed_ns >= after_ns
+        assert (frame.image_bgr == level).all()
+    with pytest.raises(DeviceSilent) as error:
+        camera.capture(world.clock.now_ns())
+    assert "end" in error.value.next_step
+
+
+@pytest.fixture
+def stream() -> Iterator[tuple[str, list[float]]]:
+    """An MJPEG stream on the loopback whose brightness can be set: the one source here that runs in real time."""
+    level, stop = [40.0], threading.Event()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+            self.end_headers()
+            while not stop.wait(1 / 30):
+                ok, jpeg = cv2.imencode(".jpg", np.full((120, 160, 3), int(level[0]), np.uint8))
+                assert ok
+                try:
+                    self.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg.tobytes() + b"\r\n")
+                except OSError:
+                    return
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/video", level
+    stop.set()
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_network_stream_shows_the_present_after_a_pause(stream: tuple[str, list[float]]) -> None:
+    url, level = stream
+    clock = SystemClock()
+    settings = CameraSettings(None, None, None, None, None, None)
+    # The latency leaves a busy machine time to drain what piled up before a stall can pass for waiting.
+    camera = OpenCvCamera(open_capture(url), clock=clock, settings=settings, timeout_s=20.0, latency_s=0.4)
+    try:
+        assert camera.time_base is TimeBase.PACED
+        clock.sleep(0.5)  # frames pile up in the socket
+        level[0] = 200.0
+        frame = camera.capture(clock.now_ns())
+        assert frame.image_bgr.mean() == pytest.approx(200, abs=3)
+        assert frame.exposed_ns <= clock.now_ns()
+    finally:
+        camera.close()
+
+
+# -- focus, a pulled cable, and a slow camera --------------------------------------------------------------------------
+
+
+def test_focus_is_held_where_it_is_and_told(world: World) -> None:
+    """Autofocus would make another picture of the same thing at the next sitting; nobody has to ask for its end."""
+    capture = SimCapture(world)
+    capture.drift(autofocus=True)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    locks = camera.read_locks()
+    assert locks.autofocus is False
+    assert locks.focus is not None
+    assert not [n for n in camera.not_taken if "focus" in n.setting]
+    capture.drift(autofocus=True)
+    assert camera.read_locks() != locks
+
+
+def test_a_fixed_lens_has_no_focus_to_complain_about(world: World) -> None:
+    class Fixed(SimCapture):
+        def get(self, prop: int) -> float:
+            return 0.0 if prop in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) else super().get(prop)
+
+        def set(self, prop: int, value: float) -> bool:
+            return prop not in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) and super().set(prop, value)
+
+    camera = OpenCvCamera(Fixed(world), clock=world.clock)
+    assert (camera.read_locks().focus, camera.read_locks().autofocus) == (None, None)
+    assert camera.not_taken == ()
+
+
+def returning(world: World, capture: SimCapture, away_s: float) -> OpenCvCamera:
+    """Return a camera that is unplugged now, and plugged in again ``away_s`` later."""
+
+    def reopen() -> SimCapture:
+        if not capture.reopen():
+            raise DeviceNotFound("there is no camera", next_step="connect the camera")
+        return capture
+
+    camera = OpenCvCamera(capture, clock=world.clock, reopen=reopen)
+    capture.unplug()
+    world.clock.call_at(world.clock.now_ns() + round(away_s * 1e9), capture.replug)
+    return camera
+
+
+@pytest.mark.parametrize("away_s", [0.0, 0.5, 2.0])
+def test_a_camera_that_was_unplugged_goes_on_as_it_was(world: World, away_s: float) -> None:
+    capture = SimCapture(world)
+    camera = returning(world, capture, away_s)
+    locks, after_ns = OpenCvCamera.read_locks(camera), world.clock.now_ns()
+    capture.drift(exposure=33.0)  # as after power-up
+    frame = camera.capture(after_ns)
+    assert frame.exposed_ns >= after_ns + away_s * 1e9
+    assert camera.read_locks() == locks
+    assert camera.returns == 1
+
+
+def test_a_camera_that_stays_away_is_silent_in_bounded_time(world: World) -> None:
+    capture = SimCapture(world)
+    camera = returning(world, capture, 3600.0)
+    begun_ns = world.clock.now_ns()
+    with pytest.raises(DeviceSilent, match="did not come back") as caught:
+        camera.capture(begun_ns)
+    assert caught.value.next_step == "connect the camera"
+    assert world.clock.now_ns() - begun_ns < 4e9
+
+
+def test_another_camera_in_its_place_is_refused(world: World) -> None:
+    capture = SimCapture(world)
+
+    class Small(SimCapture):
+        def set(self, prop: int, value: float) -> bool:
+            return False
+
+        def get(self, prop: int) -> float:
+            return 320.0 if prop == cv2.CAP_PROP_FRAME_WIDTH else super().get(prop)
+
+    camera = OpenCvCamera(capture, clock=world.clock, reopen=lambda: Small(world))
+    capture.unplug()
+    with pytest.raises(DeviceMismatch, match="another camera") as caught:
+        camera.capture(world.clock.now_ns())
+    assert caught.value.evidence["got"][0] == 320
+
+
+@pytest.mark.parametrize("seconds_a_frame", [1.0, 1.5, 2.5])
+def test_while_a_slow_camera_is_waited_for_other_things_get_done(world: World, seconds_a_frame: float) -> None:
+    capture = SimCapture(world)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    capture.every = round(FPS * seconds_a_frame)
+    for _ in range(3):  # how slow it is shows in its first frames
+        camera.capture(world.clock.now_ns())
+    done_ns: list[int] = [world.clock.now_ns()]
+    for _ in range(3):
+        frame = camera.capture(world.clock.now_ns(), lambda: done_ns.append(world.clock.now_ns()))
+        assert frame.exposed_ns > done_ns[0]
+    gaps_s = np.diff([*done_ns, world.clock.now_ns()]) * 1e-9
+    assert gaps_s.max() < 0.8  # the gyro's FIFO lasts for 0.85 s
+
+
+def test_a_fast_camera_is_not_slowed_down_by_other_things(world: World) -> None:
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock)
+    calls: list[int] = []
+    begun_ns = world.clock.now_ns()
+    for _ in range(10):
+        camera.capture(world.clock.now_ns(), lambda: calls.append(1))
+    assert calls == []
+    assert world.clock.now_ns() - begun_ns < 10 * 2.1 * PERIOD_NS + 1e8
+
+
+def test_an_enrollment_with_a_slow_camera_loses_no_sample_of_the_gyro(simulated, tmp_path: Path) -> None:
+    s = simulated()
+    s.operator.parts.camera.every = round(1.2 * FPS)  # 1.2 s a frame; the FIFO lasts for 0.85 s
+    s.operator.next_object = "lamp"
+    with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
+        events = list(enroll(s.bench, catalog, "lamp", views=6))
+    rejected = [reason for event in events if isinstance(event, Rejected) for reason in event.reasons]
+    assert len(rejected) <= 2, rejected  # until the camera's pace is known
+    assert s.bench.imu.statistics.overflows <= 3

@@ -1,0 +1,91 @@
+"""Simulated computers with a bench's devices, for the tests of what looks at them."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rig.bench.computer import User
+from rig.config import load_config
+from rig.doctor.case import Case
+from rig.doctor.checks import CHECKS
+from rig.doctor.examination import examine
+from rig.doctor.finding import Finding, Level
+from sim.clock import VirtualClock
+from sim.host import Computer, SimHost
+from sim.noise import NoiseModel
+from sim.parts import SimParts
+from sim.servo import Frame, Source, XSeriesServo
+from sim.world import World
+
+
+@dataclass
+class Bench:
+    """A bench that nobody has opened: its computer's files, its devices, and what went over the servo's line."""
+
+    computer: Computer
+    parts: SimParts
+    case: Case
+    sent: list[Frame] = field(default_factory=list)
+
+    def add_servo(self, bus_id: int, baud: int, model: str = "xl430_w250") -> XSeriesServo:
+        """Plug one more servo into the line."""
+        servo = XSeriesServo(World(clock=self.parts.world.clock), model, bus_id=bus_id, baudrate=baud)
+        self.parts.servo_bus.attach(servo)
+        return servo
+
+    def findings(self, *topics: str) -> list[Finding]:
+        """Examine the bench, or some topics of it."""
+        return list(examine(self.case, [check for check in CHECKS if not topics or check.topic in topics]))
+
+    def troubles(self, *topics: str) -> dict[str, str]:
+        """Return what is not fine: the finding, and what mends it."""
+        return {f.text: f.mend for f in self.findings(*topics) if f.level is not Level.FINE}
+
+    @property
+    def instructions(self) -> set[int]:
+        """The instructions that the host has sent (Protocol 2.0)."""
+        return {frame.data[7] for frame in self.sent if frame.source is Source.HOST and len(frame.data) > 7}
+
+
+@contextmanager
+def unopened(
+    *settings: str,
+    noise: NoiseModel | None = None,
+    user: User | None = None,
+    plugged: bool = True,
+    servo_at: tuple[int, int] | None = None,
+) -> Iterator[Bench]:
+    """Yield a bench as from the factory on a computer of its own.
+
+    Parameters
+    ----------
+    settings
+        Of the configuration, as ``KEY=VALUE``.
+    plugged
+        Lay out the device files; a test that wants others does it itself.
+    servo_at
+        Id and baud rate of the servo where they are not the configured ones.
+    """
+    with TemporaryDirectory() as folder:
+        home = Path(folder, "home")
+        paths = [f"{key}={home / key}" for key in ("catalog.path", "state_dir", "calibration_dir")]
+        config = load_config(None, [*paths, *settings])
+        built = config
+        if servo_at is not None:
+            there = config.servo.model_copy(update={"id": servo_at[0], "baud": servo_at[1]})
+            built = config.model_copy(update={"servo": there})
+        world = World(noise=noise, clock=VirtualClock(start_utc=datetime(2026, 5, 1, tzinfo=UTC)))
+        with SimParts.connected(built, world) as parts:
+            computer = Computer(Path(folder))
+            if plugged:
+                computer.serial_port()
+                computer.i2c_bus()
+                computer.camera()
+                computer.keeps_time()
+            case = Case(SimHost(Path(folder), parts, config, user), config, "sim", ("--bench", "sim"))
+            bench = Bench(computer, parts, case)
+            parts.servo_bus.taps.append(bench.sent.append)
+            yield bench

@@ -1,0 +1,152 @@
+"""Id and baud rate are changed on a servo that is alone, with its torque off, and verified."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, DeviceRefused, SeveralServos, UsageError
+from rig.devices.dynamixel.registers import control_table, model_numbers
+from rig.doctor.lone_servo import lone_servo
+from rig.doctor.register_words import baud_codes, words
+from rig.safety.saved_state import Holder
+from tests.fuzzing import fuzz_settings
+from tests.rig.doctor.doctor_parts import unopened
+
+WRITE = 0x03
+
+
+@fuzz_settings(0.02)
+@given(
+    at=st.tuples(st.integers(0, 252), st.sampled_from([57_600, 1_000_000, 9_600])),
+    new_id=st.integers(0, 252),
+    new_baud=st.sampled_from([9_600, 57_600, 115_200, 4_500_000]),
+)
+def test_a_servo_found_anywhere_gets_another_id_and_rate(at, new_id, new_baud):
+    with unopened(servo_at=at) as bench:
+        memory = bench.parts.servo.memory
+        memory["Torque Enable"] = 1
+        with lone_servo(bench.case) as servo:
+            assert (servo.found.bus_id, servo.found.baud) == at
+            servo.set_id(new_id)
+        assert memory["ID"] == new_id
+        assert memory["Torque Enable"] == 0
+        with lone_servo(bench.case) as servo:
+            assert (servo.found.bus_id, servo.found.baud) == (new_id, at[1])
+            servo.set_baud(new_baud)
+        with lone_servo(bench.case) as servo:
+            assert (servo.found.bus_id, servo.found.baud) == (new_id, new_baud)
+
+
+@pytest.mark.parametrize("place", [(2, 57_600), (2, 1_000_000), (1, 57_600), (1, 115_200)])
+def test_a_second_servo_at_any_rate_forbids_it_and_nothing_is_written(place):
+    with unopened() as bench:
+        bench.add_servo(*place)
+        with pytest.raises(SeveralServos) as caught, lone_servo(bench.case):
+            pass
+        assert "Unplug" in caught.value.next_step
+        assert caught.value.exit_code == 4
+        assert WRITE not in bench.instructions
+
+
+def test_no_servo_an_unknown_one_and_a_bench_in_use(monkeypatch):
+    monkeypatch.setattr("rig.doctor.lone_servo.BAUD_RATES_1", (1_000_000,))
+    with unopened() as bench:
+        bench.parts.servo.memory["Model Number"] = 4711
+        with pytest.raises(DeviceMismatch, match="4711"), lone_servo(bench.case):
+            pass
+        bench.parts.servo_bus.detach(bench.parts.servo)
+        with pytest.raises(DeviceNotFound, match="at any baud rate"), lone_servo(bench.case):
+            pass
+        bench.sent.clear()
+        bench.case.holder = Holder(pid=7, command="rig enroll mug", since_utc="")
+        with pytest.raises(BenchBusy, match="rig enroll mug"), lone_servo(bench.case):
+            pass
+        assert not bench.sent
+
+
+def test_what_a_servo_cannot_be_set_to_is_refused_before_anything_is_written():
+    with unopened() as bench, lone_servo(bench.case) as servo:
+        with pytest.raises(UsageError, match="No servo has the id 253"):
+            servo.set_id(253)
+        with pytest.raises(UsageError) as caught:
+            servo.set_baud(250_000)
+        assert "4500000" in caught.value.next_step
+        assert WRITE not in bench.instructions
+
+
+def test_a_servo_that_keeps_its_old_id_is_not_believed(monkeypatch):
+    with unopened() as bench, lone_servo(bench.case) as servo:
+        monkeypatch.setattr(type(bench.parts.servo), "bus_id", property(lambda _: 1))
+        with pytest.raises(DeviceRefused, match="did not take the id 9"):
+            servo.set_id(9)
+
+
+def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
+    with unopened() as bench, lone_servo(bench.case) as servo:
+        monkeypatch.setattr(type(bench.parts.servo), "baudrate", property(lambda _: 57_600))
+        with pytest.raises(DeviceRefused, match="1000000 baud"):
+            servo.set_baud(1_000_000)
+        assert servo.read()["Baud Rate"] == 3  # what it was told; it answers at the rate that it has
+
+
+def test_a_servo_that_answers_reads_alone_can_be_renamed():
+    with unopened() as bench:
+        bench.parts.servo.memory["Status Return Level"] = 1
+        with lone_servo(bench.case) as servo:
+            servo.set_id(5)
+        assert bench.parts.servo.memory["ID"] == 5
+
+
+def test_an_ax_12a_is_renamed_by_its_own_protocol(monkeypatch):
+    monkeypatch.setattr("rig.doctor.lone_servo.BAUD_RATES_1", (1_000_000, 115_200))  # each asks 253 ids
+    with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(1, 1_000_000)) as bench:
+        with lone_servo(bench.case) as servo:
+            assert servo.found.model == "ax_12a"
+            servo.set_id(4)
+            servo.set_baud(115_200)
+        with lone_servo(bench.case) as servo:
+            assert (servo.found.bus_id, servo.found.baud) == (4, 115_200)
+            assert words(servo.table, "Baud Rate", servo.read()["Baud Rate"]).startswith("1176")  # 2 MBd by 17
+
+
+# -- words ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("Baud Rate", 3, "1000000 bit/s"),
+        ("Return Delay Time", 250, "500 µs"),
+        ("Drive Mode", 0b1101, "reversed direction, time-based profile, torque on by goal"),
+        ("Operating Mode", 4, "extended position, many turns"),
+        ("Secondary ID", 255, "off"),
+        ("Homing Offset", -1024, "-90.00°"),
+        ("Min Voltage Limit", 95, "9.5 V"),
+        ("PWM Limit", 885, "100.0 %"),
+        ("Current Limit", 1193, "3209 mA"),
+        ("Shutdown", 0b110100, "overheating, electrical shock, overload"),
+        ("Hardware Error Status", 0, "none"),
+        ("Bus Watchdog", 25, "500 ms"),
+        ("Bus Watchdog", 255, "tripped"),
+        ("Profile Acceleration", 11, "236.0 °/s²"),
+        ("Profile Velocity", 0, "as fast as it can"),
+        ("Present Velocity", -66, "-90.68 °/s"),
+        ("Present Position", 4096, "360.00°"),
+        ("Present Current", -100, "-269 mA"),
+        ("Present Temperature", 33, "33 °C"),
+        ("Torque Enable", 1, "on"),
+        ("Position P Gain", 640, ""),
+    ],
+)
+def test_registers_are_told_in_the_units_of_the_e_manual(name, value, said):
+    assert words(control_table("xm430_w350"), name, value) == said
+
+
+def test_every_register_of_every_model_has_words_for_every_value():
+    for model in model_numbers().values():
+        table = control_table(model)
+        assert baud_codes(table)
+        for register in table.values():
+            top = 256**register.size
+            for value in (0, 1, 2, top // 2 - 1, -top // 2 if register.signed else top - 1):
+                assert isinstance(words(table, register.name, value), str)

@@ -1,0 +1,209 @@
+"""Who answers on the buses: found wherever they are, never disturbed, and two with one id told apart from one."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.devices.dynamixel.registers import model_numbers
+from rig.doctor.scan import BAUD_RATES, CHIPS, Heard, scan_imus, scan_servos, without_echoes
+from sim.faults import Faults
+from sim.faults.schedule import read_faults
+from tests.fuzzing import fuzz_settings
+from tests.rig.doctor.doctor_parts import unopened
+
+PING, READ = 0x01, 0x02
+
+
+def heard(bench, *bauds: int, protocol: int = 2) -> list[Heard]:
+    return list(scan_servos(bench.parts.adapter, bench.case.host.clock, bauds or BAUD_RATES, protocol=protocol))
+
+
+places = st.tuples(
+    st.integers(0, 252), st.sampled_from(BAUD_RATES), st.sampled_from(["xl430_w250", "xm430_w350", "mx_28"])
+)
+
+
+@fuzz_settings(0.02)
+@given(st.dictionaries(places.map(lambda place: place[:2]), places.map(lambda place: place[2]), min_size=1, max_size=4))
+def test_every_servo_is_found_at_its_id_and_baud_rate(placed):
+    (first, _), *others = placed.items()
+    with unopened(servo_at=first) as bench:
+        for (bus_id, baud), model in others:
+            bench.add_servo(bus_id, baud, model)
+        before = bench.parts.adapter.baudrate
+        all_heard = heard(bench)
+        found = {(s.bus_id, s.baud): s.model for h in all_heard for s in h.servos}
+        assert found == {**placed, first: "xl430_w250"}
+        assert not any(h.doubtful or h.noise for h in all_heard)
+        assert bench.parts.adapter.baudrate == before
+        assert bench.instructions <= {PING, READ}
+
+
+@fuzz_settings(0.01)
+@given(st.integers(0, 252), st.sampled_from(BAUD_RATES))
+def test_two_servos_with_one_id_are_noticed_wherever_they_are(bus_id, baud):
+    with unopened(servo_at=(bus_id, baud)) as bench:
+        bench.add_servo(bus_id, baud, "xm430_w350")
+        (said,) = heard(bench, baud)
+        assert said.doubtful == (bus_id,)
+        assert bus_id not in {servo.bus_id for servo in said.servos}
+
+
+def test_twins_are_found_beside_a_third_one():
+    with unopened() as bench:
+        bench.add_servo(1, 57_600)
+        bench.add_servo(7, 57_600)
+        (said,) = heard(bench, 57_600)
+        assert said.doubtful == (1,)
+        assert [servo.bus_id for servo in said.servos] == [7]
+
+
+def test_a_line_that_babbles_is_noise_and_no_253_servos():
+    with unopened() as bench:
+        faults = Faults(bench.parts)
+        faults.schedule(*read_faults(["babble"]))
+        (said,) = heard(bench, 57_600)
+        faults.clear()
+        assert said.noise
+        assert not said.doubtful
+
+
+def test_a_servo_whose_answer_to_all_was_spoiled_is_asked_by_itself():
+    with unopened() as bench:
+        spoiled = []
+
+        def spoil(frame):
+            if spoiled:
+                return frame
+            spoiled.append(frame)
+            return replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
+
+        bench.parts.servo_bus.tampers.append(spoil)
+        (said,) = heard(bench, 57_600)
+        assert [servo.bus_id for servo in said.servos] == [1]
+        assert not said.doubtful
+
+
+def test_an_adapter_that_hears_itself_changes_nothing():
+    with unopened() as bench:
+        faults = Faults(bench.parts)
+        faults.schedule(*read_faults(["echo"]))
+        (said,) = heard(bench, 57_600)
+        faults.clear()
+        assert [servo.bus_id for servo in said.servos] == [1]
+        assert not said.doubtful
+
+
+def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
+    class Relay:
+        """A pseudo-terminal: whatever rate it is told, the bytes arrive."""
+
+        def __init__(self, wire):
+            self.wire, self.baudrate = wire, wire.baudrate
+
+        def __getattr__(self, name):
+            return getattr(self.wire, name)
+
+    with unopened() as bench:
+        said = list(scan_servos(Relay(bench.parts.adapter), bench.case.host.clock))
+        assert [len(each.servos) for each in said] == [1] * 8
+        (once,) = without_echoes(said, 115_200)
+        assert once.baud == 115_200
+        bench.add_servo(1, 1_000_000)
+        real = heard(bench)
+        assert without_echoes(real, 57_600) == real  # two servos of one kind, at two rates
+
+
+def test_rates_that_the_adapter_lacks_are_left_out():
+    class Slow:
+        """An adapter that stops at 1 MBd."""
+
+        def __init__(self, wire):
+            self.__dict__["wire"] = wire
+
+        def __getattr__(self, name):
+            return getattr(self.wire, name)
+
+        def __setattr__(self, name, value):
+            if name == "baudrate" and value > 1_000_000:
+                raise ValueError(value)
+            setattr(self.wire, name, value)
+
+    with unopened() as bench:
+        rates = [said.baud for said in scan_servos(Slow(bench.parts.adapter), bench.case.host.clock)]
+        assert rates == [57_600, 1_000_000, 115_200, 9_600]
+
+
+def test_an_ax_12a_is_found_by_its_own_protocol():
+    with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(9, 1_000_000)) as bench:
+        assert not any(said.anything for said in heard(bench, 1_000_000))
+        (said,) = heard(bench, 1_000_000, protocol=1)
+        (servo,) = said.servos
+        assert (servo.bus_id, servo.model, servo.protocol) == (9, "ax_12a", 1)
+        assert not said.doubtful
+
+
+def test_an_unknown_model_is_told_by_its_number():
+    with unopened() as bench:
+        bench.parts.servo.memory["Model Number"] = 4711
+        assert 4711 not in model_numbers()
+        ((servo,),) = (said.servos for said in heard(bench, 57_600))
+        assert servo.model is None
+        assert "unknown model 4711" in str(servo)
+
+
+# -- I2C --------------------------------------------------------------------------------------------------------------
+
+
+class RegisterFile:
+    """A device that answers with what its registers hold."""
+
+    def __init__(self, registers: dict[int, int]) -> None:
+        self.registers = registers
+        self.written: list[bytes] = []
+        self.pointer = 0
+
+    def start(self, reading: bool) -> None: ...
+
+    def write(self, data: bytes) -> int:
+        self.pointer = data[0]
+        self.written.append(data)
+        return len(data)
+
+    def read(self, count: int) -> bytes:
+        return bytes(self.registers.get(self.pointer + i, 0) for i in range(count))
+
+    def stop(self) -> None: ...
+
+
+@pytest.mark.parametrize("chip", CHIPS, ids=lambda chip: chip.name)
+def test_each_imu_is_known_by_its_own_register_at_each_of_its_addresses(chip):
+    for address in chip.addresses:
+        with unopened() as bench:
+            bench.parts.i2c.detach(0x68)
+            device = RegisterFile({chip.register: chip.value})
+            bench.parts.i2c.attach(address, device)
+            (found,) = scan_imus(bench.case.host, 1)
+            assert (found.name, found.driver, found.address) == (chip.name, chip.driver, address)
+            assert all(len(data) == 1 for data in device.written)  # a register's number, never a value
+
+
+def test_an_unknown_chip_is_told_with_what_it_says_and_foreign_addresses_are_left_alone():
+    with unopened() as bench:
+        bench.parts.i2c.detach(0x68)
+        clock, memory = RegisterFile({0x00: 0x37}), RegisterFile({})
+        bench.parts.i2c.attach(0x68, clock)
+        bench.parts.i2c.attach(0x50, memory)
+        (found,) = scan_imus(bench.case.host, 1)
+        assert found.driver is None
+        assert "register 0x00 is 0x37" in str(found)
+        assert not memory.written
+
+
+def test_a_bus_that_is_held_low_is_an_error_of_the_system():
+    with unopened() as bench:
+        bench.parts.i2c.stuck = True
+        with pytest.raises(TimeoutError):
+            scan_imus(bench.case.host, 1)

@@ -1,0 +1,140 @@
+"""docs/events.md is the schema of the events: as documented, so emitted."""
+
+import re
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+import hbr
+from rig.catalog import Catalog
+from rig.core.errors import ViewRejected
+from rig.devices.camera import CameraLocks
+from rig.events.events import (
+    SCHEMA,
+    Candidate,
+    Event,
+    Failed,
+    Resemblance,
+    Unwinding,
+    Waiting,
+    Warned,
+    Weighed,
+    event_dict,
+)
+from rig.plans.enroll import enroll
+from rig.plans.identify import identify
+from rig.plans.photograph_table import photograph_table
+from rig.plans.similar_objects import insight
+from rig.plans.tray import TrayItem, enroll_tray
+from rig.safety.gyro_rotation import Stillness
+from rig.search.model import load_model
+from rig.views.capture import ViewEvidence
+
+TEXT = (Path(__file__).parents[3] / "docs" / "events.md").read_text(encoding="utf-8")
+PLAIN = {"string": str, "integer": int, "number": (int, float), "boolean": bool, "object": dict}
+PARTS = {
+    "candidate": Candidate,
+    "resemblance": Resemblance,
+    "weighed": Weighed,
+    "evidence": ViewEvidence,
+    "locks": CameraLocks,
+    "stillness": Stillness,
+}
+
+
+def documented() -> dict[str, dict[str, str]]:
+    """Return the types of the fields, by section and field."""
+    tables: dict[str, dict[str, str]] = {}
+    for section in re.split(r"^##+ ", TEXT, flags=re.MULTILINE)[1:]:
+        rows = re.findall(r"^\| `(\w+)` \| ([^|]+) \| [^|]+ \|$", section, re.MULTILINE)
+        if rows:
+            tables[section.split("\n")[0].strip()] = dict(rows)
+    return tables
+
+
+SCHEMAS = documented()
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+
+
+def check(value: Any, kind: str, where: str) -> None:
+    if kind.endswith(" or null"):
+        if value is None:
+            return
+        kind = kind.removesuffix(" or null")
+    if kind.startswith("list of "):
+        assert isinstance(value, list), where
+        for item in value:
+            check(item, kind.removeprefix("list of "), where)
+    elif kind in PLAIN:
+        assert isinstance(value, PLAIN[kind]), f"{where}: {value!r} is no {kind}"
+        assert (kind == "boolean") == isinstance(value, bool), f"{where}: {value!r} is no {kind}"
+    else:
+        check_fields(value, kind, where)
+
+
+def check_fields(value: dict[str, Any], kind: str, where: str) -> None:
+    assert value.keys() == SCHEMAS[kind].keys(), where
+    for name, item in value.items():
+        check(item, SCHEMAS[kind][name], f"{where}.{name}")
+
+
+def check_event(event: Event) -> str:
+    """Hold an event against the document and return its kind."""
+    return check_values(event_dict(event))
+
+
+def check_values(told: dict[str, Any]) -> str:
+    kind = str(told["event"])
+    check_fields({name: value for name, value in told.items() if name != "event"}, kind, kind)
+    return kind
+
+
+def test_every_event_and_part_is_documented_with_exactly_its_fields():
+    kinds = {kind.__name__.lower(): kind for kind in get_args(Event)}
+    assert SCHEMAS.keys() == kinds.keys() | PARTS.keys()
+    for name, kind in (kinds | PARTS).items():
+        assert is_dataclass(kind)
+        assert [f.name for f in fields(kind) if f.metadata.get("json", True)] == list(SCHEMAS[name]), name
+    assert f"# Events, schema {SCHEMA}" in TEXT
+
+
+def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
+    s = simulated(*SMALL, "table.limits_deg=[-180, 185]", "identify.max_views=5", "identify.margin=1", seed=2)
+    seen = set()
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        for event in enroll(s.bench, catalog, "dice", views=20):
+            seen.add(check_event(event))
+        for event in photograph_table(s.bench):
+            seen.add(check_event(event))
+        items = [TrayItem(2, "dice"), TrayItem(3, "lamp", label="light")]
+        for event in enroll_tray(s.bench, catalog, items, views=6):
+            seen.add(check_event(event))
+        views = catalog.views().views
+        seen |= {check_event(insight(views, name)) for name in ("dice", "lamp")}
+        for event in identify(s.bench, hbr.ViewIndex(views), strategy="sweep"):
+            seen.add(check_event(event))
+        s.operator.next_object = "radio"  # nobody knows it: the dense search weighs its turns, and gives up
+        told = [event_dict(event) for event in identify(s.bench, load_model(catalog))]
+        assert {"decided", "identified"} <= {check_values(values) for values in told}
+        assert any(values["weighed"] for values in told if values["event"] == "decided")
+        s.world.change(light=(0.0, 0.0, 0.0))
+        with pytest.raises(ViewRejected) as caught:
+            for event in enroll(s.bench, catalog, "candle", views=4):
+                seen.add(check_event(event))
+    error = caught.value.as_dict()
+    seen |= {check_event(Failed(**error)), check_event(Waiting("the next object"))}
+    seen.add(check_event(Warned(3, "the table is another", "Take a new picture.")))
+    seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
+    assert seen == {kind.__name__.lower() for kind in get_args(Event)}
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"index": 1.5}, {"agrees": 1}, {"seconds": None}, {"commanded_deg": "90"}, {"rotation_imu_deg": True}]
+)
+def test_the_check_itself_fails_on_a_wrong_type(wrong):
+    values = dict.fromkeys(SCHEMAS["moved"], 0.5) | {"index": 1, "agrees": True}
+    check_fields(values, "moved", "moved")
+    with pytest.raises(AssertionError):
+        check_fields(values | wrong, "moved", "moved")

@@ -1,0 +1,85 @@
+"""A servo that takes the camera around the object, and one that pans over less than a turn, under both plans."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hbr import ViewIndex
+from rig.catalog import Catalog
+from rig.events.events import Accepted, Enrolled, Identified
+from rig.motion.turntable import Turntable
+from rig.plans.enroll import enroll
+from rig.plans.estimate import even_azimuths, table_angles
+from rig.plans.identify import identify
+
+AX = (
+    "servo.model=ax_12a",
+    "servo.baud=1000000",
+    "table.mode=pan",
+    "table.zero_deg=150",
+    "table.limits_deg=[-150, 150]",
+)
+ARM = ("table.carries=camera",)
+
+
+def enrolled(simulated, catalog: Catalog, name: str, *overrides: str, views: int = 24) -> list[Accepted]:
+    s = simulated(*overrides)
+    *_, done = events = list(enroll(s.bench, catalog, name, views=views))
+    assert isinstance(done, Enrolled)
+    return [event for event in events if isinstance(event, Accepted)]
+
+
+def test_orientations_mean_the_same_whether_object_or_camera_turns(simulated, tmp_path: Path) -> None:
+    """At one azimuth both kinds of bench see the same side of a mug, its handle to the same hand."""
+    views = []
+    for overrides in ((), ARM):
+        with Catalog.open(tmp_path / str(len(views)), clock=simulated().bench.clock, create=True) as catalog:
+            views.append(enrolled(simulated, catalog, "mug-star", *overrides, views=4))
+    turned, around = views
+    assert [view.azimuth_deg for view in turned[1:]] == pytest.approx([270, 180, 90], abs=0.5)
+    assert [view.azimuth_deg for view in around[1:]] == pytest.approx([90, 180, 270], abs=0.5)
+    sides = {round(view.azimuth_deg) % 360: view.image_bgr.astype(float) for view in turned}
+    for view in around:
+        azimuth = round(view.azimuth_deg) % 360
+        unlike = {side: np.abs(image - view.image_bgr).mean() for side, image in sides.items()}
+        assert min(unlike, key=lambda side: unlike[side]) == azimuth
+
+
+def test_an_ax12_enrolls_the_sides_that_it_reaches_and_finds_by_them(simulated, tmp_path: Path) -> None:
+    with Catalog.open(tmp_path, clock=simulated().bench.clock, create=True) as catalog:
+        assert len(enrolled(simulated, catalog, "toy-car", *AX, views=12)) == 11  # the 300° that it reaches
+        s = simulated(*AX)
+        s.operator.next_object, s.operator.yaw_deg = "toy-car", 30.0
+        *_, found = identify(s.bench, ViewIndex(catalog.views().views))
+    assert isinstance(found, Identified)
+    assert found.name == "toy-car"
+
+
+def test_a_pan_servo_goes_as_far_as_it_can(simulated) -> None:
+    with Turntable(simulated(*AX).bench) as table:
+        assert table.within_reach(200.0) == -150.0
+        assert table.within_reach(-170.0) == -150.0
+        assert table.within_reach(160.0) == 150.0
+        assert table.within_reach(250.0) == -110.0
+
+
+@given(
+    views=st.integers(4, 90),
+    low=st.floats(-200.0, 0.0),
+    high=st.floats(0.0, 200.0),
+    sign=st.sampled_from([1, -1]),
+)
+def test_planned_views_lie_within_the_limits_and_none_is_left_out(
+    views: int, low: float, high: float, sign: int
+) -> None:
+    azimuths = even_azimuths(views, (low, high), sign)
+    angles = table_angles(azimuths, (low, high), sign)
+    assert all(low - 1e-5 <= angle <= high + 1e-5 for angle in angles)
+    assert list(angles) == sorted(angles)
+    step = 360.0 / views
+    assert len(angles) == views or len(angles) >= (high - low) / step - 1
+    for azimuth, angle in zip(azimuths, angles, strict=True):
+        assert (sign * angle - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-6)

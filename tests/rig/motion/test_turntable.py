@@ -1,0 +1,297 @@
+"""The table with real drivers on simulated wires: where it stops, when it is at rest, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NotReady, Stalled
+from rig.devices.servo import MotionProfile
+from rig.motion.turntable import Turntable, motion_seconds
+from rig.safety.supervisor import State
+from sim.noise import NoiseModel
+from sim.servo import Frame
+from tests.rig.bench_parts import motion_bench
+
+
+def test_it_goes_where_it_is_told_and_the_platter_agrees():
+    with motion_bench(seed=1) as (bench, wires), Turntable(bench) as table:
+        for target in (5.0, 90.0, -45.0, 0.0, 180.0):
+            move = table.goto(target)
+            assert move.encoder_deg == pytest.approx(target, abs=0.3)
+            # The platter hangs behind by half the play, always on the same side.
+            lag = move.encoder_deg - wires.world.table_deg()
+            assert lag == pytest.approx(wires.world.noise.backlash_deg / 2, abs=0.1)
+            assert move.agrees
+
+
+def test_the_play_is_taken_up_on_the_same_side_from_above_and_below():
+    noise = NoiseModel(backlash_deg=2.0)
+    with motion_bench(noise=noise) as (bench, wires), Turntable(bench) as table:
+        table.goto(50.0)
+        from_below = wires.world.table_deg()
+        table.goto(100.0)
+        table.goto(50.0)
+        from_above = wires.world.table_deg()
+        assert from_above == pytest.approx(from_below, abs=0.15)
+
+
+def test_without_an_approach_the_play_shows():
+    """The test above proves something: the play is there."""
+    noise = NoiseModel(backlash_deg=2.0)
+    with (
+        motion_bench("table.approach_deg=0", "table.backlash_deg=3", noise=noise) as (bench, wires),
+        Turntable(bench) as table,
+    ):
+        table.goto(50.0)
+        from_below = wires.world.table_deg()
+        table.goto(100.0)
+        table.goto(50.0)
+        assert abs(wires.world.table_deg() - from_below) > 1.5
+
+
+def test_entering_moves_nothing_and_leaving_takes_the_torque_off():
+    with motion_bench() as (bench, wires):
+        with Turntable(bench):
+            assert wires.device.memory["Torque Enable"] == 1
+            assert abs(wires.world.shaft()[0]) < 0.2
+        assert wires.device.memory["Torque Enable"] == 0
+
+
+def test_torque_is_off_after_an_exception_in_the_middle_of_a_motion():
+    with motion_bench() as (bench, wires):
+
+        def shout(*_: object) -> None:
+            raise RuntimeError
+
+        with pytest.raises(RuntimeError), Turntable(bench) as table:
+            wires.world.clock.call_at(wires.world.clock.now_ns() + 700_000_000, shout)
+            table.goto(300.0)
+        assert wires.device.memory["Torque Enable"] == 0
+        wires.world.clock.sleep(1.0)
+        assert abs(wires.world.shaft()[0]) < 100.0
+        assert wires.world.shaft()[1] == 0.0
+
+
+def test_a_stop_runs_out_along_the_ramp_and_does_not_come_back():
+    with motion_bench() as (bench, wires):
+        speeds = []
+
+        def look() -> None:
+            speeds.append(wires.world.shaft()[1])
+            wires.world.clock.call_at(wires.world.clock.now_ns() + 10_000_000, look)
+
+        def interrupt() -> None:
+            raise KeyboardInterrupt
+
+        wires.world.clock.call_at(0, look)
+        wires.world.clock.call_at(wires.world.clock.now_ns() + 1_900_000_000, interrupt)
+        with pytest.raises(KeyboardInterrupt), Turntable(bench) as table:
+            table.goto(300.0)
+        assert max(speeds) == pytest.approx(bench.config.table.velocity_dps, abs=1)
+        assert min(speeds) > -5
+        slowing = -np.diff(speeds).min() / 0.01
+        assert slowing < 1.5 * bench.config.table.acceleration_dps2
+        assert speeds[-1] == 0
+        assert bench.safety.state is State.STOPPED
+
+
+def test_a_target_beyond_the_cable_is_refused_before_anything_moves():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        before = len(wires.instructions)
+        with pytest.raises(LimitExceeded) as caught:
+            table.goto(401.0)
+        assert len(wires.instructions) == before
+        assert caught.value.evidence == {"from_deg": 0.0, "to_deg": 401.0, "limits_deg": [-400.0, 400.0]}
+
+
+@settings(max_examples=60, deadline=None)
+@given(target=st.floats(-3000, 3000), low=st.floats(-800, 0), span=st.floats(360, 1500))
+def test_within_reach_is_the_same_view_inside_the_limits(target, low, span):
+    high = low + span
+    if high < 0:
+        return
+    with motion_bench(f"table.limits_deg=[{low!r}, {high!r}]") as (bench, _):
+        table = Turntable(bench)
+        found = table.within_reach(target)
+        assert low <= found <= high
+        turns = (found - target) / 360
+        assert turns == pytest.approx(round(turns), abs=1e-9)
+        if low <= target <= high:
+            assert found == target
+
+
+def test_motion_needs_torque():
+    with motion_bench() as (bench, _), pytest.raises(NotReady, match="torque"):
+        Turntable(bench).goto(5.0)
+
+
+def test_a_jammed_table_is_found_long_before_the_servo_shuts_down_and_is_left_without_torque():
+    with motion_bench() as (bench, wires):
+        with pytest.raises(Stalled) as caught, Turntable(bench) as table:
+            table.goto(10.0)
+            wires.device.jam()
+            jammed_ns = wires.world.clock.now_ns()
+            table.goto(60.0)
+        assert (wires.world.clock.now_ns() - jammed_ns) * 1e-9 < 1.5
+        assert caught.value.exit_code == 5
+        assert bench.safety.state is State.FAULT
+        assert bench.safety.fault.code == Stalled.code
+        assert wires.device.memory["Hardware Error Status"] == 0
+        assert wires.device.memory["Torque Enable"] == 0
+
+
+def test_a_platter_that_slips_is_seen_by_the_gyro():
+    with motion_bench(seed=2) as (bench, wires), Turntable(bench) as table:
+        table.goto(5.0)
+        wires.world.clock.call_at(wires.world.clock.now_ns() + 300_000_000, lambda: wires.world.slip(-3.0, seconds=0.1))
+        move = table.goto(10.0)
+        assert not move.agrees
+        assert move.rotation_deg == pytest.approx(move.gyro.angle_deg)
+        assert move.rotation_deg == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_pulled_cable_is_told_at_once_and_the_servos_watchdog_stops_the_motion():
+    with motion_bench() as (bench, wires):
+        with pytest.raises(DeviceSilent), Turntable(bench) as table:
+            wires.world.clock.call_at(wires.world.clock.now_ns() + 1_200_000_000, wires.serial.unplug)
+            table.goto(350.0)
+        watchdog_s = bench.config.table.watchdog_s
+        wires.world.clock.sleep(watchdog_s + 0.1)
+        assert wires.world.shaft()[1] == 0.0
+        assert wires.world.shaft()[0] < 300.0
+
+
+def test_a_shaking_bench_is_not_at_rest():
+    noise = NoiseModel(structure_hz=8.0, structure_damping=0.001)  # rings for minutes
+    with motion_bench(noise=noise) as (bench, _), pytest.raises(MotionTimeout) as caught, Turntable(bench) as table:
+        table.goto(30.0)
+    assert caught.value.evidence["peak_rate_dps"] > bench.config.table.quiet_dps
+
+
+def test_still_sees_a_push_after_settling():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        table.goto(20.0)
+        wires.world.clock.sleep(0.2)
+        assert table.check_still().still
+        servo = bench.servo
+        servo.move_to(servo.read_state().position_deg + 5)
+        wires.world.clock.sleep(0.15)
+        assert not table.check_still().still
+
+
+def test_direction_and_zero_are_the_tables_own():
+    with (
+        motion_bench("table.direction=-1", "imu.sign=-1", "table.zero_deg=170.0") as (bench, wires),
+        Turntable(bench) as table,
+    ):
+        move = table.goto(30.0)
+        assert move.agrees
+        assert wires.world.shaft()[0] == pytest.approx(-30.0 - 10.0, abs=0.3)
+
+
+@given(distance=st.floats(-400, 400), v=st.floats(1, 300), a=st.floats(10, 2000))
+def test_the_expected_duration_is_the_trapezoids(distance, v, a):
+    from sim.motion import to_position
+
+    expected = to_position(0.0, 0.0, 0.0, distance, v, a).end_s
+    assert motion_seconds(distance, MotionProfile(v, a)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_ctrl_c_while_the_torque_goes_on_takes_it_off_again():
+    with motion_bench() as (bench, wires):
+
+        def interrupt() -> None:
+            raise KeyboardInterrupt
+
+        def when_on(frame: Frame) -> Frame:
+            if wires.device.memory["Torque Enable"]:
+                wires.bus.tampers.clear()
+                wires.world.clock.call_at(wires.world.clock.now_ns(), interrupt)
+            return frame
+
+        wires.bus.tampers.append(when_on)
+        with pytest.raises(KeyboardInterrupt), Turntable(bench):
+            pass
+        assert not wires.bus.tampers
+        assert wires.device.memory["Torque Enable"] == 0
+
+
+def test_a_watchdog_that_a_killed_host_left_armed_does_not_stop_the_next_run():
+    with motion_bench() as (bench, wires):
+        bench.servo.torque_on()
+        bench.servo.arm_watchdog(0.2)  # and the host is killed: no torque off
+        wires.world.clock.sleep(0.1)
+        with Turntable(bench) as table:
+            assert wires.device.memory["Profile Velocity"] > 0  # 0 would be: as fast as it can
+            assert table.goto(20.0).encoder_deg == pytest.approx(20.0, abs=0.3)
+
+
+def test_somebody_who_walks_past_at_rest_costs_no_move():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        table.goto(20.0)
+        wires.world.slip(0.06, 0.05)
+        assert table.goto(40.0).agrees
+
+
+def test_a_platter_pushed_while_it_stands_shows_in_the_next_move():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        table.goto(20.0)
+        wires.world.slip(5.0, 0.2)
+        wires.world.clock.sleep(0.4)
+        move = table.goto(40.0)
+        assert not move.agrees
+        assert move.rotation_deg == pytest.approx(25.0, abs=0.6)
+
+
+def test_a_shake_in_the_beginning_of_a_long_exposure_is_seen():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        settled_ns = table.goto(20.0).settled_ns
+        wires.world.slip(0.06, 0.05)
+        wires.world.clock.sleep(0.6)
+        assert table.check_still().still  # it stands now
+        assert not table.check_still(settled_ns).still
+
+
+def test_a_push_of_the_platter_stays_visible_after_it_stands_again():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        table.goto(20.0)
+        wires.world.slip(2.0, 0.1)
+        wires.world.clock.sleep(0.5)
+        stillness = table.check_still()
+        assert not stillness.still
+        assert stillness.platter_change_deg == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_time_out_can_be_told_in_json_although_the_gyro_knows_nothing():
+    with motion_bench() as (bench, wires), pytest.raises(MotionTimeout) as caught:
+        wires.device.jam()
+        wires.device.memory["Shutdown"] = 0
+        with Turntable(bench) as table:
+            table._heading.bias = None
+            table._wait_for_rest(60.0, 0.1, 0.5)
+    told = json.loads(json.dumps(caught.value.as_dict(), allow_nan=False))
+    assert told["evidence"]["peak_rate_dps"] is None
+
+
+def test_no_motion_follows_one_that_was_broken_off_until_its_fault_is_acknowledged():
+    with motion_bench() as (bench, wires):
+        table = Turntable(bench)
+        with table:
+            table.goto(10.0)
+            wires.device.jam()
+            with pytest.raises(Stalled):
+                table.goto(60.0)
+            sent = len(wires.instructions)
+            with pytest.raises(FaultLatched, match="blocked"):
+                table.goto(10.0)
+            assert len(wires.instructions) == sent
+        with pytest.raises(FaultLatched), table:
+            pass
+        assert wires.device.memory["Torque Enable"] == 0
+        wires.device.free()
+        bench.safety.acknowledge()
+        with table:
+            assert table.goto(20.0).agrees

@@ -1,0 +1,85 @@
+"""The cable's budget in the plans: moves inside it, unwinding announced before it happens, and a table left unwound."""
+
+from itertools import pairwise
+
+import pytest
+
+import hbr
+from rig.catalog import Catalog
+from rig.core.errors import LimitExceeded, Stalled
+from rig.events.events import Accepted, Enrolled, Identified, Moved, Unwinding
+from rig.motion.turntable import Turntable
+from rig.plans.enroll import enroll
+from rig.plans.identify import identify
+
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+VIEWS = 6
+
+
+@pytest.fixture
+def catalog(tmp_path, simulated):
+    with Catalog.open(tmp_path / "catalog", clock=simulated(*SMALL).bench.clock) as catalog:
+        yield catalog
+
+
+@pytest.mark.parametrize("limits", ["[-400, 400]", "[-300, 60]", "[0, 360]"])
+def test_an_enrollment_stays_within_any_budget_and_ends_with_the_cable_unwound(simulated, catalog, limits):
+    s = simulated(*SMALL, f"table.limits_deg={limits}")
+    low, high = s.bench.config.table.limits_deg
+    events = list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
+    assert isinstance(events[-1], Enrolled)
+    moves = [e for e in events if isinstance(e, Moved)]
+    assert all(low <= move.commanded_deg <= high for move in moves)
+    assert sorted({round(e.azimuth_deg) % 360 for e in events if isinstance(e, Accepted)}) == list(range(0, 360, 60))
+    assert s.world.table_deg() == pytest.approx(0.0, abs=0.5)
+    for event, following in pairwise(events):
+        if isinstance(event, Unwinding):
+            assert abs(event.to_deg) < abs(event.from_deg)
+            assert event.turns == 1
+            assert event.limits_deg == (low, high)
+            if isinstance(following, Moved):
+                assert following.commanded_deg == event.to_deg
+
+
+@pytest.mark.parametrize(
+    ("start_deg", "step_deg", "turns_to"),
+    [(390.0, -90, [120.0]), (-395.0, 90, [-125.0]), (250.0, 5, [-115.0]), (30.0, 90, [])],
+)
+def test_a_search_unwinds_when_it_must_and_at_its_end_and_says_so(simulated, catalog, start_deg, step_deg, turns_to):
+    s = simulated(*SMALL, "identify.max_views=2", f"identify.first_step_deg={step_deg}", seed=3)
+    list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
+    with Turntable(s.bench) as table:
+        table.goto(start_deg)
+    s.operator.next_object = "toy-car"
+    events = list(identify(s.bench, hbr.ViewIndex(catalog.views().views)))
+    assert isinstance(events[-1], Identified)
+    assert [e.to_deg for e in events if isinstance(e, Unwinding)] == pytest.approx(turns_to, abs=0.3)
+    assert abs(s.world.table_deg()) <= 180
+    low, high = s.bench.config.table.limits_deg
+    assert all(low <= e.commanded_deg <= high for e in events if isinstance(e, Moved))
+
+
+def test_the_answer_is_given_although_the_cable_cannot_be_unwound(simulated, catalog):
+    s = simulated(*SMALL, "identify.max_views=2", seed=3)
+    list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
+    with Turntable(s.bench) as table:
+        table.goto(300.0)
+    s.operator.next_object = "toy-car"
+    events = []
+    with pytest.raises(Stalled):
+        for event in identify(s.bench, hbr.ViewIndex(catalog.views().views)):
+            events.append(event)
+            if isinstance(event, Unwinding):
+                s.operator.parts.servo.jam()
+    assert isinstance(events[-1], Identified)
+    assert events[-1].candidates[0].name == "toy-car"
+    assert s.bench.safety.fault.code == Stalled.code
+
+
+def test_a_target_beyond_the_budget_is_refused_with_from_to_and_limits(simulated):
+    s = simulated(*SMALL)
+    with Turntable(s.bench) as table:
+        table.goto(20.0)
+        with pytest.raises(LimitExceeded, match=r"from 20\.0° to 401\.0°.*-1\.11 to \+1\.11 turns"):
+            table.goto(401.0)
+        assert table.goto(25.0).agrees  # a refusal is no fault

@@ -1,0 +1,114 @@
+"""What is known before anything moves: angles within the cable's reach, and how long it takes."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hbr.core.angles import wrap180, wrap360
+from rig.catalog import Catalog
+from rig.config import load_config
+from rig.core.errors import LimitExceeded
+from rig.events.events import Accepted, Enrolled, Moved, Started
+from rig.motion.motion_model import MotionModel
+from rig.plans.enroll import enroll
+from rig.plans.estimate import TimeLeft, dry_run, even_azimuths, table_angles
+
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+LIMITS = st.floats(-2000, 0).flatmap(
+    lambda low: st.tuples(st.just(low), st.floats(max(0.0, low + 360.0), low + 4000.0))
+)
+
+
+@given(views=st.integers(4, 720), limits=LIMITS)
+def test_every_plan_fits_every_cable_that_holds_a_turn_and_climbs(views, limits):
+    azimuths = even_azimuths(views, limits)
+    angles = table_angles(azimuths, limits)
+    assert len(angles) == len(set(azimuths)) == views
+    assert limits[0] - 1e-6 <= angles[0]
+    assert angles[-1] <= limits[1] + 1e-6
+    for before, after in pairwise(angles):
+        assert after - before == pytest.approx(360.0 / views)
+    for azimuth, angle in zip(azimuths, angles, strict=True):
+        assert wrap180(azimuth + angle) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_free_cable_begins_at_zero():
+    assert table_angles(even_azimuths(4, (-400, 400)), (-400, 400)) == (0.0, 90.0, 180.0, 270.0)
+
+
+def test_a_plan_of_another_bench_is_turned_by_whole_turns_or_refused_before_anything_moves():
+    elsewhere = [float(wrap360(-angle)) for angle in range(-180, 180, 90)]
+    assert table_angles(elsewhere, (-400, 400)) == (-180.0, -90.0, 0.0, 90.0)
+    with pytest.raises(LimitExceeded) as caught:
+        table_angles(even_azimuths(72, (-400, 400)), (-180, 185))
+    assert "--replace" in caught.value.next_step
+
+
+def test_an_enrollment_on_a_short_cable_stays_within_it_and_sees_all_sides(simulated, tmp_path):
+    s = simulated(*SMALL, "table.limits_deg=[-180, 185]")
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        moves = [e for e in enroll(s.bench, catalog, "dice", views=6) if isinstance(e, Moved)]
+        assert [m.commanded_deg for m in moves] == [-120.0, -60.0, 0.0, 60.0, 120.0, 180.0]
+        assert sorted(round(v.record.azimuth_deg) % 360 for v in catalog.object("dice").views) == [
+            0, 60, 120, 180, 240, 300,
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize("views", [8, 36])
+def test_the_motion_model_tells_the_time_within_a_tenth(simulated, tmp_path, views):
+    s = simulated(*SMALL, seed=3)
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        (before,) = dry_run(s.bench, catalog, ["dice"], views=views)
+        left = TimeLeft(MotionModel(s.bench.config), before.angles_deg)
+        told = []
+        for event in enroll(s.bench, catalog, "dice", views=views):
+            left.add(event)
+            if isinstance(event, Started):
+                assert event.angles_deg == before.angles_deg
+                start_ns = s.bench.clock.now_ns()
+            if isinstance(event, Accepted):
+                told.append((s.bench.clock.now_ns(), left.seconds))
+    end_ns = s.bench.clock.now_ns()
+    took_s = (end_ns - start_ns) * 1e-9
+    assert isinstance(event, Enrolled)
+    assert before.seconds == pytest.approx(took_s, rel=0.1)
+    for now_ns, seconds in told:
+        assert seconds == pytest.approx((end_ns - now_ns) * 1e-9, rel=0.1, abs=1.5)
+
+
+def test_a_rehearsal_moves_and_stores_nothing_and_says_what_would_happen(simulated, tmp_path):
+    s = simulated(*SMALL)
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        list(enroll(s.bench, catalog, "dice", views=4))
+        plan = enroll(s.bench, catalog, "lamp", views=6)
+        for event in plan:
+            if isinstance(event, Accepted) and event.index == 1:
+                break
+        plan.close()
+        stands_deg = s.world.table_deg()
+
+        def actions(*names: str, **options: bool) -> list[tuple[str, str, int]]:
+            found = dry_run(s.bench, catalog, names, views=5, **options)
+            return [(one.name, one.action, one.views) for one in found]
+
+        assert actions("dice", "lamp", "clock") == [("dice", "skip", 0), ("lamp", "resume", 4), ("clock", "enroll", 5)]
+        assert actions("dice") == [("dice", "refuse", 0)]
+        assert actions("dice", replace=True) == [("dice", "replace", 5)]
+        assert actions("lamp") == [("lamp", "refuse", 0)]
+        assert actions("lamp", resume=True) == [("lamp", "resume", 4)]
+        assert actions("clock", resume=True) == [("clock", "refuse", 0)]
+        (resumed,) = dry_run(s.bench, catalog, ["lamp"], resume=True)
+        assert resumed.angles_deg == (120.0, 180.0, 240.0, 300.0)
+        assert resumed.table_deg == pytest.approx(60.0, abs=0.3)
+        assert resumed.travel_deg == pytest.approx(60 + 180 + 300, abs=1)
+        assert {o.name for o in catalog.objects()} == {"dice", "lamp"}
+    assert s.world.table_deg() == pytest.approx(stands_deg, abs=0.01)
+    assert dry_run(s.bench, None, ["new"], views=4)[0].action == "enroll"
+
+
+def test_the_model_knows_that_downward_moves_take_longer():
+    model = MotionModel(load_config())
+    assert model.move_s(-90) > model.move_s(90) > model.move_s(10)
+    assert model.enrollment_s(0.0, ()) == 0.0

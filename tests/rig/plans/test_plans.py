@@ -1,0 +1,418 @@
+"""The plans end to end: real drivers, simulated wires, a catalog on disk."""
+
+import json
+
+import numpy as np
+import pytest
+
+import hbr
+from hbr.core.angles import wrap180
+from rig.catalog import Catalog
+from rig.config import load_config
+from rig.core.errors import (
+    CatalogError,
+    DeviceFault,
+    DeviceSilent,
+    ObjectExists,
+    ObjectNotFound,
+    RigError,
+    RotationDisagreement,
+    ViewRejected,
+)
+from rig.events.events import Accepted, Decided, Enrolled, Identified, Moved, Ranked, Rejected, Started, event_dict
+from rig.plans.enroll import enroll
+from rig.plans.identify import identify
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.objects.shelf import shelf
+from sim.world import World
+
+VIEWS = 18
+
+
+@pytest.fixture
+def catalog(tmp_path, simulated):
+    clock = simulated().bench.clock
+    with Catalog.open(tmp_path / "catalog", clock=clock) as catalog:
+        yield catalog
+
+
+def torque(s) -> int:
+    """Return what the simulated servo's register says."""
+    return s.bench.servo._read("Torque Enable")
+
+
+def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catalog):
+    s = simulated(seed=4)
+    truth = []
+    events = []
+    for event in enroll(s.bench, catalog, "teapot", views=VIEWS, label="kitchen"):
+        events.append(event)
+        if isinstance(event, Accepted):
+            truth.append(s.world.table_deg(event.evidence.exposed_ns))
+    assert isinstance(events[0], Started)
+    assert isinstance(events[-1], Enrolled)
+    details = catalog.object("teapot")
+    assert details.summary.views == VIEWS
+    assert details.summary.label == "kitchen"
+    for view, true_deg in zip(details.views, truth, strict=True):
+        record = view.record
+        assert record.encoder_deg == pytest.approx(true_deg, abs=0.3)
+        assert record.imu_deg == pytest.approx(true_deg, abs=max(4 * record.imu_sigma_deg, 0.3))
+        assert wrap180(record.azimuth_deg + record.encoder_deg) == pytest.approx(0, abs=1e-6)
+        assert record.evidence["exposed_ns"] >= record.evidence["settled_ns"]
+        x, y, width, height = s.bench.config.view.roi
+        stored = catalog.read_image(view)[y : y + height, x : x + width]
+        assert (hbr.describe(stored) == record.descriptor).all()
+    assert torque(s) == 0
+
+
+def test_a_view_is_durable_before_the_table_turns_on(simulated, catalog):
+    s = simulated()
+    stored = 0
+    for event in enroll(s.bench, catalog, "dice", views=6):
+        if isinstance(event, Moved):
+            assert len(catalog.resumable("dice").present) == stored
+        if isinstance(event, Accepted):
+            stored += 1
+            assert len(catalog.resumable("dice").present) == stored
+
+
+def test_an_interrupted_enrollment_keeps_its_views_and_resumes_with_the_others(simulated, catalog):
+    s = simulated()
+    plan = enroll(s.bench, catalog, "lamp", views=6)
+    for event in plan:
+        if isinstance(event, Accepted) and event.index == 2:
+            break
+    plan.close()
+    assert torque(s) == 0
+    assert catalog.resumable("lamp").present == (0, 1, 2)
+    with pytest.raises(CatalogError, match="unfinished"):
+        next(enroll(s.bench, catalog, "lamp", views=6))
+    taken = [e.index for e in enroll(s.bench, catalog, "lamp", resume=True) if isinstance(e, Accepted)]
+    assert taken == [3, 4, 5]
+    assert catalog.object("lamp").summary.views == 6
+
+
+def test_an_enrolled_object_is_replaced_only_on_request(simulated, catalog):
+    s = simulated()
+    list(enroll(s.bench, catalog, "dice", views=4))
+    with pytest.raises(ObjectExists):
+        next(enroll(s.bench, catalog, "dice", views=4))
+    list(enroll(s.bench, catalog, "dice", views=5, replace=True))
+    assert catalog.object("dice").summary.views == 5
+
+
+def test_what_a_view_was_taken_under_is_kept_with_it(simulated, catalog):
+    """Also on a bench without a noise model: the calibration in force, the camera's settings, what opening it found."""
+    s = simulated("imu.scale=1.007")
+    list(enroll(s.bench, catalog, "dice", views=4))
+    provenance = catalog.object("dice").views[0].sitting.provenance
+    assert provenance.conditions["imu"]["scale"] == 1.007
+    assert provenance.conditions["table"]["zero_deg"] == s.bench.config.table.zero_deg
+    assert provenance.conditions["camera"]["exposure_us"] == s.bench.config.camera.exposure_us
+    assert "servo: Operating Mode was 3, is now 4" in provenance.conditions["findings"]
+    assert provenance.devices["servo"]["model"] == "xl430_w250"
+
+
+def test_a_dark_moment_costs_retakes_and_darkness_ends_the_enrollment_without_losing_views(simulated, catalog):
+    s = simulated()
+    events = []
+    with pytest.raises(ViewRejected, match="too dark") as caught:
+        for event in enroll(s.bench, catalog, "lamp", views=6):
+            events.append(event)
+            if isinstance(event, Accepted) and event.index == 1:
+                s.world.change(light=(0.0, 0.0, 0.0))
+    assert sum(isinstance(e, Rejected) for e in events) == 1 + s.bench.config.view.retakes
+    assert caught.value.exit_code == 6
+    assert catalog.resumable("lamp").present == (0, 1)
+    assert torque(s) == 0
+
+
+def test_a_slipping_platter_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
+    s = simulated()
+    with pytest.raises(RotationDisagreement) as caught:
+        for event in enroll(s.bench, catalog, "lamp", views=18):
+            if isinstance(event, Accepted) and event.index == 3:
+                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-6.0, 0.1))
+    assert caught.value.evidence["difference_deg"] == pytest.approx(6.0, abs=0.7)
+    assert catalog.resumable("lamp").present == (0, 1, 2, 3)
+
+
+def test_a_pulled_servo_cable_ends_the_plan_with_everything_kept(simulated, catalog):
+    s = simulated()
+    with pytest.raises(DeviceSilent):
+        for event in enroll(s.bench, catalog, "lamp", views=8):
+            if isinstance(event, Accepted) and event.index == 2:
+                s.bench.servo.bus.port.ser.unplug()
+    assert catalog.resumable("lamp").present == (0, 1, 2)
+    with pytest.raises(DeviceSilent):
+        s.bench.close()  # says that the torque could not be taken off, and lets go of the other devices
+
+
+def test_torque_that_could_not_be_taken_off_is_noted_on_the_first_error(simulated):
+    s = simulated()
+    with pytest.raises(KeyboardInterrupt) as caught, s.bench:
+        s.bench.servo.bus.port.ser.unplug()
+        raise KeyboardInterrupt
+    assert any("does not answer" in note for note in caught.value.__notes__)
+
+
+def servo_of(s):
+    """Return the simulated servo behind a bench."""
+    return s.bench.servo.bus.port.ser._bus._devices[0]
+
+
+def i2c_of(s):
+    return s.operator.parts.i2c
+
+
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize(
+    ("trouble", "error"),
+    [
+        pytest.param(lambda s: i2c_of(s).detach(0x68), DeviceSilent, id="unplugged"),
+        pytest.param(lambda s: i2c_of(s)._devices[0x68].power_cycle(), DeviceFault, id="power-cycled"),
+        pytest.param(lambda s: setattr(i2c_of(s), "stuck", True), DeviceSilent, id="bus stuck"),
+    ],
+)
+def test_a_gyro_that_fails_ends_the_plan_with_the_table_stopped_and_without_torque(
+    simulated, catalog, trouble, error, moving
+):
+    s = simulated()
+    with pytest.raises(error):
+        for event in enroll(s.bench, catalog, "lamp", views=8):
+            if moving and isinstance(event, Accepted) and event.index == 2:
+                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: trouble(s))
+            if not moving and isinstance(event, Moved) and event.index == 3:
+                trouble(s)
+    assert catalog.resumable("lamp").present == (0, 1, 2)
+    assert torque(s) == 0
+    s.world.clock.sleep(1.0)
+    assert s.world.shaft()[1] == 0
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_a_dip_of_the_servos_supply_ends_the_plan_and_nothing_moves_afterwards(simulated, catalog, moving):
+    s = simulated()
+    with pytest.raises(RigError) as caught:
+        for event in enroll(s.bench, catalog, "lamp", views=8):
+            if moving and isinstance(event, Accepted) and event.index == 5:
+                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, servo_of(s).power_cycle)
+            if not moving and isinstance(event, Moved) and event.index == 5:
+                servo_of(s).power_cycle()
+                s.world.clock.sleep(0.5)
+    assert caught.value.exit_code in (4, 5, 6)
+    assert set(catalog.resumable("lamp").present) <= {0, 1, 2, 3, 4, 5}
+    assert torque(s) == 0
+    before = s.world.shaft()[0]
+    s.world.clock.sleep(2.0)
+    assert s.world.shaft()[0] == before
+
+
+@pytest.mark.parametrize("kind", [Started, Moved, Rejected, Accepted])
+@pytest.mark.parametrize("end", ["closed", "forgotten"])
+def test_a_plan_that_is_left_at_any_event_leaves_no_torque(simulated, catalog, kind, end):
+    s = simulated()
+    if kind is Rejected:
+        s.world.change(light=(0.0, 0.0, 0.0))
+    plan = enroll(s.bench, catalog, "lamp", views=4)
+    assert any(isinstance(event, kind) for event in plan)
+    if end == "closed":
+        plan.close()
+    del plan
+    assert torque(s) == 0
+
+
+def test_a_plan_that_outlives_its_bench_ends_quietly(simulated, catalog):
+    s = simulated()
+    plan = enroll(s.bench, catalog, "lamp", views=4)
+    assert any(isinstance(event, Accepted) for event in plan)
+    s.bench.close()
+    assert servo_of(s).memory["Torque Enable"] == 0
+    plan.close()
+
+
+def test_a_blow_beyond_the_gyros_range_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
+    s = simulated()
+    with pytest.raises(RotationDisagreement, match="unknown"):
+        for event in enroll(s.bench, catalog, "dice", views=6):
+            if isinstance(event, Accepted) and event.index == 2:
+                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-10.0))
+    assert catalog.resumable("dice").present == (0, 1, 2)
+
+
+def test_events_can_be_told_in_json_although_the_gyro_knows_nothing(simulated, catalog):
+    s = simulated()
+    rejected = []
+    for event in enroll(s.bench, catalog, "dice", views=4):
+        json.dumps(event_dict(event), allow_nan=False)
+        if isinstance(event, Moved):
+            s.world.clock.sleep(10.0)  # longer than the gyro's memory
+        if isinstance(event, Rejected):
+            rejected.append(event_dict(event)["evidence"]["stillness"]["peak_rate_dps"])
+    assert None in rejected
+
+
+@pytest.fixture(scope="module")
+def three_enrolled(tmp_path_factory):
+    operator = ShelfOperator(World(seed=9), shelf())
+    with (
+        open_sim_bench(load_config(), operator) as bench,
+        Catalog.open(tmp_path_factory.mktemp("three"), clock=bench.clock) as catalog,
+    ):
+        for name in ("mug-dots", "lamp", "toy-car"):
+            list(enroll(bench, catalog, name, views=VIEWS))
+        return hbr.ViewIndex(catalog.views().views)
+
+
+@pytest.fixture
+def shelf_of_three(simulated, three_enrolled):
+    return simulated(seed=10), three_enrolled
+
+
+def test_an_unknown_yaw_is_found_with_the_right_pose_by_physical_rotations(shelf_of_three):
+    s, index = shelf_of_three
+    s.operator.next_object, s.operator.yaw_deg = "toy-car", 77.0  # the lamp looks alike all around
+    events = list(identify(s.bench, index))
+    answer = events[-1]
+    assert isinstance(answer, Identified)
+    assert answer.name == "toy-car"
+    assert abs(wrap180(answer.yaw_deg - 77.0)) < 2 * 360 / VIEWS
+    moves = [e for e in events if isinstance(e, Moved)]
+    decisions = [e for e in events if isinstance(e, Decided)]
+    assert len(moves) == answer.views == len(decisions) + 1
+    for decided, move in zip(decisions, moves[1:], strict=True):
+        assert move.commanded_deg == pytest.approx(decided.target_deg)
+        # The camera goes around the object as the table turns under it, backwards; whole turns are the cable's.
+        assert wrap180(move.rotation_encoder_deg + decided.rotation_deg) == pytest.approx(0, abs=0.5)
+        assert move.rotation_imu_deg == pytest.approx(move.rotation_encoder_deg, abs=4 * move.imu_sigma_deg + 0.3)
+    assert answer.travelled_deg == pytest.approx(sum(abs(m.rotation_encoder_deg) for m in moves))
+    assert torque(s) == 0
+
+
+def test_every_ranking_follows_from_the_frames_that_were_seen(shelf_of_three):
+    s, index = shelf_of_three
+    s.operator.next_object = "lamp"
+    x, y, width, height = s.bench.config.view.roi
+    queries, orientations = [], []
+    for event in identify(s.bench, index):
+        if isinstance(event, Accepted):
+            queries.append(hbr.describe(event.image_bgr[y : y + height, x : x + width]))
+            orientations.append(event.azimuth_deg)
+        if isinstance(event, Ranked):
+            again = hbr.retrieve(np.array(queries), np.array(orientations), index)
+            assert [c.name for c in event.candidates] == list(again.names)
+            assert [c.score for c in event.candidates] == pytest.approx(list(again.scores / len(queries)), abs=1e-3)
+            assert event.margin == pytest.approx(hbr.lead(again, np.array(queries)) / len(queries), abs=1e-3)
+
+
+def test_what_was_never_enrolled_is_unknown_and_only_after_all_views(shelf_of_three):
+    s, index = shelf_of_three
+    s.operator.next_object = "radio"
+    answer = list(identify(s.bench, index))[-1]
+    assert answer.name is None
+    assert answer.views == s.bench.config.identify.max_views
+    assert answer.candidates
+
+
+def test_the_cable_is_unwound_when_a_decision_would_leave_the_limits(simulated, shelf_of_three):
+    _, index = shelf_of_three
+    s = simulated("table.limits_deg=[-180, 185]", "identify.margin=1", "identify.max_views=6", seed=2)
+    s.operator.next_object = "lamp"
+    for event in identify(s.bench, index):
+        if isinstance(event, Decided):
+            assert -180 <= event.target_deg <= 185
+    assert -181 <= s.world.shaft()[0] <= 186
+
+
+def test_during_an_identification_the_gyro_is_believed_when_the_platter_slips_a_little(shelf_of_three):
+    s, index = shelf_of_three
+    s.operator.next_object, s.operator.yaw_deg = "toy-car", 10.0
+    moves = []
+    for event in identify(s.bench, index):
+        if isinstance(event, Decided) and not moves[1:]:
+            s.world.clock.call_at(s.world.clock.now_ns() + 500_000_000, lambda: s.world.slip(9.0, 0.2))
+        if isinstance(event, Moved):
+            moves.append(event)
+        if isinstance(event, Accepted) and event.index == 1:
+            off_deg = wrap180(event.azimuth_deg + s.world.table_deg())
+    assert not moves[1].agrees
+    assert off_deg == pytest.approx(0, abs=4 * moves[1].imu_sigma_deg)
+
+
+def test_a_loose_platter_ends_an_identification_in_the_middle_of_the_move(shelf_of_three):
+    s, index = shelf_of_three
+    s.operator.next_object = "toy-car"
+    with pytest.raises(RotationDisagreement, match="so far"):
+        for event in identify(s.bench, index):
+            if isinstance(event, Decided):
+                s.world.clock.call_at(s.world.clock.now_ns() + 500_000_000, lambda: s.world.slip(20.0, 0.2))
+    assert s.bench.safety.fault.code == RotationDisagreement.code
+    assert torque(s) == 0
+
+
+def test_an_empty_catalog_is_said_before_anything_moves(simulated):
+    s = simulated()
+    with pytest.raises(CatalogError, match="empty"):
+        next(identify(s.bench, hbr.ViewIndex(hbr.Views.empty())))
+
+
+def test_equal_seeds_give_equal_events_and_other_seeds_do_not(simulated, tmp_path):
+    def run(seed: int, folder: str) -> list[dict]:
+        s = simulated(seed=seed)
+        with Catalog.open(tmp_path / folder, clock=s.bench.clock) as catalog:
+            told = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=6)]
+            return told + [event_dict(e) for e in identify(s.bench, hbr.ViewIndex(catalog.views().views))]
+
+    assert run(5, "a") == run(5, "b")
+    assert run(5, "c") != run(6, "d")
+
+
+def test_a_mistyped_name_leaves_nothing_in_the_catalog(simulated, catalog):
+    s = simulated()
+    plan = enroll(s.bench, catalog, "nonsense", views=6)
+    with pytest.raises(ObjectNotFound):
+        list(plan)
+    assert catalog.objects() == []
+    list(enroll(s.bench, catalog, "dice", views=4))
+    with pytest.raises(ObjectNotFound):
+        list(enroll(s.bench, catalog, "nonsense", views=6, label="x"))
+    assert [o.name for o in catalog.objects()] == ["dice"]
+
+
+def test_the_cable_is_left_unwound(simulated, catalog):
+    s = simulated()
+    list(enroll(s.bench, catalog, "dice", views=6))
+    assert s.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
+
+
+def test_an_enrollment_killed_between_its_last_view_and_its_end_is_finished_by_resume(simulated, catalog):
+    s = simulated()
+    plan = enroll(s.bench, catalog, "dice", views=4)
+    for event in plan:
+        if isinstance(event, Accepted) and event.index == 3:
+            break
+    plan.close()
+    assert catalog.object("dice").summary.views == 0
+    events = list(enroll(s.bench, catalog, "dice", resume=True))
+    assert [type(event) for event in events] == [Started, Enrolled]
+    assert catalog.object("dice").summary.views == 4
+
+
+def test_the_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, catalog):
+    s = simulated()
+    list(enroll(s.bench, catalog, "dice", views=4))
+    old_ids = set(catalog.views().view_ids.tolist())
+    assert len(old_ids) == 4
+    again = enroll(s.bench, catalog, "dice", views=5, replace=True)
+    for event in again:
+        if isinstance(event, Enrolled):
+            break
+        assert set(catalog.views().view_ids.tolist()) == old_ids
+        if isinstance(event, Accepted) and event.index == 3:
+            again.close()  # a pulled plug changes nothing about that
+    assert set(catalog.views().view_ids.tolist()) == old_ids
+    list(enroll(s.bench, catalog, "dice", resume=True))
+    new_ids = set(catalog.views().view_ids.tolist())
+    assert len(new_ids) == 5
+    assert not new_ids & old_ids

@@ -1,0 +1,208 @@
+"""A tray of objects: its list, and who is asked what."""
+
+import csv
+import io
+import string
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.catalog import Catalog
+from rig.core.errors import ObjectNotFound, RotationDisagreement, UsageError, ViewRejected
+from rig.events.events import Accepted, Enrolled, Item
+from rig.plans.enroll import enroll
+from rig.plans.tray import AT_THE_OBJECT, Answer, TrayItem, enroll_tray, read_tray
+
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+TEXT = st.text(string.ascii_letters + string.digits + " äöü,;\"'-_", min_size=1, max_size=12).map(str.strip)
+
+
+def written(tmp_path, text, name="tray.csv", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+    return path
+
+
+def mistakes(tmp_path, text):
+    with pytest.raises(UsageError) as caught:
+        read_tray(written(tmp_path, text))
+    assert caught.value.next_step
+    return caught.value.evidence["mistakes"]
+
+
+def test_a_list_as_spreadsheets_write_it(tmp_path):
+    expected = (TrayItem(2, "mug", "kitchen", "white, chipped"), TrayItem(4, "lamp", "", "", 12))
+    comma = 'name,label,note,views\nmug,kitchen,"white, chipped",\n\nlamp,,,12\n'
+    assert read_tray(written(tmp_path, comma)) == expected
+    semicolon = '\ufeffName;Label;Note;Views\r\nmug;kitchen;"white, chipped";\r\n\r\nlamp;;;12\r\n'
+    assert read_tray(written(tmp_path, semicolon)) == expected
+    assert read_tray(written(tmp_path, "name\nmug")) == (TrayItem(2, "mug"),)
+
+
+@given(
+    names=st.lists(TEXT.filter(bool), min_size=1, max_size=8, unique=True),
+    texts=st.lists(st.tuples(TEXT, TEXT), min_size=8, max_size=8),
+    separator=st.sampled_from(",;"),
+)
+def test_whatever_a_csv_writer_wrote_is_read_back(tmp_path_factory, names, texts, separator):
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, delimiter=separator)
+    writer.writerow(["note", "name", "label"])
+    rows = [(note, name, label) for name, (note, label) in zip(names, texts, strict=False)]
+    writer.writerows(rows)
+    items = read_tray(written(tmp_path_factory.mktemp("tray"), buffer.getvalue()))
+    assert [(item.note, item.name, item.label) for item in items] == rows
+
+
+@given(
+    st.binary(max_size=200) | st.text(string.printable, max_size=200).map(lambda text: f"name,note\n{text}".encode())
+)
+def test_garbage_is_refused_in_words_or_read(tmp_path_factory, content):
+    refused = None
+    try:
+        items = read_tray(written(tmp_path_factory.mktemp("tray"), content))
+    except UsageError as error:
+        refused = error
+    if refused is None:
+        assert items
+        assert len({item.name for item in items}) == len(items)
+    else:
+        assert refused.evidence["mistakes"]
+
+
+def test_every_mistake_is_told_with_its_line(tmp_path):
+    found = mistakes(tmp_path, "name,label,views\nmug,a\n,b\nlamp,c,three\nmug,d\nx,y,4,z\nbo\x07ok,e\n")
+    assert [mistake.split(":")[0] for mistake in found] == ["line 3", "line 4", "line 6", "line 7", "line 2", "line 5"]
+    assert "'three'" in found[1]
+    assert "2 times" in found[4]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no column name"),
+        ("name,label\n", "no object"),
+        ("naem,label\nmug,a\n", "line 1: 'naem' is no column; did you mean name?"),
+        ("label,note\na,b\n", "no column name"),
+        ("name,name\na,b\n", "twice"),
+        ('name\n"mug\n', "no CSV"),
+        ("name\nmug\nname\xe4\n".encode("latin-1"), "line 3: byte 0xe4"),
+        ("name,views\nmug,3\n", "from 4 to 720"),
+    ],
+)
+def test_a_list_that_cannot_be_used(tmp_path, text, words):
+    assert words in " ".join(mistakes(tmp_path, text))
+
+
+def test_a_list_that_is_not_there(tmp_path):
+    with pytest.raises(UsageError, match="cannot be read"):
+        read_tray(tmp_path / "nothing.csv")
+
+
+class Scripted:
+    """An attendant with answers ready."""
+
+    def __init__(self, bring=(), trouble=()):
+        self._bring, self._trouble = list(bring), list(trouble)
+        self.brought = []
+        self.troubles = []
+
+    def bring(self, item, number, of, kept):
+        self.brought.append((item.name, number, of, kept.unfinished_views if kept else None))
+        return self._bring.pop(0) if self._bring else Answer.GO
+
+    def trouble(self, item, error):
+        self.troubles.append((item.name, type(error)))
+        return self._trouble.pop(0)
+
+
+@pytest.fixture
+def catalog(tmp_path, simulated):
+    with Catalog.open(tmp_path / "catalog", clock=simulated().bench.clock) as catalog:
+        yield catalog
+
+
+def items(*names):
+    return [TrayItem(line, name) for line, name in enumerate(names, 2)]
+
+
+def actions(events):
+    return [(e.name, e.action) for e in events if isinstance(e, Item)]
+
+
+def interrupted(s, catalog, name, views=4):
+    plan = enroll(s.bench, catalog, name, views=views)
+    for event in plan:
+        if isinstance(event, Accepted) and event.index == 1:
+            break
+    plan.close()
+
+
+def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, catalog):
+    s = simulated(*SMALL)
+    list(enroll(s.bench, catalog, "dice", views=4))
+    interrupted(s, catalog, "lamp")
+    person = Scripted()
+    events = list(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"), views=4, attendant=person))
+    assert actions(events) == [("dice", "skip"), ("lamp", "resume"), ("clock", "enroll")]
+    assert person.brought == [("lamp", 2, 3, 2), ("clock", 3, 3, None)]
+    assert [e.name for e in events if isinstance(e, Enrolled)] == ["lamp", "clock"]
+    assert actions(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"))) == [
+        ("dice", "skip"),
+        ("lamp", "skip"),
+        ("clock", "skip"),
+    ]
+
+
+def test_an_interrupted_object_that_was_moved_is_enrolled_anew(simulated, catalog):
+    s = simulated(*SMALL)
+    interrupted(s, catalog, "lamp")
+    events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, attendant=Scripted([Answer.ANEW])))
+    assert actions(events) == [("lamp", "anew")]
+    assert sum(isinstance(e, Accepted) for e in events) == 4
+    assert len({view.sitting.id for view in catalog.object("lamp").views}) == 1
+
+
+def test_somebody_may_leave_objects_out_or_stop(simulated, catalog):
+    s = simulated(*SMALL)
+    person = Scripted([Answer.SKIP, Answer.GO, Answer.STOP])
+    events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, attendant=person))
+    assert actions(events) == [("lamp", "skip"), ("dice", "enroll")]
+    assert [o.name for o in catalog.objects()] == ["dice"]
+
+
+def test_an_object_in_the_dark_is_tried_again_with_the_views_it_has(simulated, catalog):
+    s = simulated(*SMALL)
+    s.world.change(light=(0.0, 0.0, 0.0))
+
+    class Lights(Scripted):
+        def trouble(self, item, error):
+            s.world.change(light=(1.0, 1.0, 1.0))
+            return super().trouble(item, error)
+
+    person = Lights(trouble=[Answer.GO])
+    events = list(enroll_tray(s.bench, catalog, items("dice"), views=4, attendant=person))
+    assert person.troubles == [("dice", ViewRejected)]
+    assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
+    assert catalog.object("dice").summary.views == 4
+
+
+def test_an_object_that_fails_is_left_out_or_ends_the_tray(simulated, catalog):
+    s = simulated(*SMALL)
+    person = Scripted(trouble=[Answer.SKIP])
+    events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, attendant=person))
+    assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
+    with pytest.raises(ObjectNotFound):
+        list(enroll_tray(s.bench, catalog, items("nonsense"), views=4))
+    assert {ViewRejected, RotationDisagreement, ObjectNotFound} == set(AT_THE_OBJECT)
+
+
+def test_the_lists_views_label_and_note_win(simulated, catalog):
+    s = simulated(*SMALL)
+    tray = [TrayItem(2, "dice", "toys", "loaded", 5), TrayItem(3, "lamp")]
+    list(enroll_tray(s.bench, catalog, tray, views=4))
+    assert [(o.name, o.label, o.note, o.views) for o in catalog.objects()] == [
+        ("dice", "toys", "loaded", 5),
+        ("lamp", "", "", 4),
+    ]

@@ -1,0 +1,161 @@
+"""Event streams as the plans yield them, for the tests of the reports."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.angles import wrap180, wrap360
+from rig.devices.camera import CameraLocks
+from rig.events.events import (
+    Accepted,
+    Candidate,
+    Decided,
+    Enrolled,
+    Event,
+    Identified,
+    Moved,
+    Ranked,
+    Rejected,
+    Started,
+    Weighed,
+)
+from rig.events.wording import likeness_words, separation_words
+from rig.report import EnrollmentRecord, IdentificationRecord, Truth
+from rig.safety.gyro_rotation import Stillness
+from rig.views.capture import ViewEvidence
+
+NAMES = ("mug-white", "mug-star", "teapot", "vase-blue", "lamp")
+
+
+def evidence(sharpness: float = 100.0) -> ViewEvidence:
+    locks = CameraLocks(8000.0, None, 5000.0, False, False)
+    return ViewEvidence(10, 20, sharpness, 90.0, 0.0, 0.0, False, locks, True, Stillness(0.05, 0.0, 0.0, True))
+
+
+def moved(index: int, commanded_deg: float, rotation_deg: float) -> Moved:
+    return Moved(index, commanded_deg, commanded_deg + 0.04, rotation_deg, rotation_deg + 0.1, 0.1, 0.5, True, 1.0)
+
+
+def noise(rng: np.random.Generator, shape: tuple[int, int] = (48, 64)) -> NDArray[np.uint8]:
+    return rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+
+
+def enrolling(
+    name: str = "mug-white", views: int = 8, *, retaken: Sequence[int] = (), shape: tuple[int, int] = (48, 64)
+) -> Iterator[Event]:
+    rng = np.random.default_rng(views)
+    yield Started("enroll", name, views, {}, angles_deg=tuple(360.0 * k / views for k in range(views)))
+    for k in range(views):
+        yield moved(k, 360.0 * k / views, 360.0 / views if k else 0.0)
+        if k in retaken:
+            yield Rejected(k, 1, ("blurred (sharpness 2.0 < 3)",), evidence(2.0))
+        yield Accepted(k, float(wrap360(-360.0 * k / views)), evidence(100.0 + k), noise(rng, shape))
+    yield Enrolled(name, views, len(retaken), 12.0)
+
+
+def identifying(
+    answer: str | None = "mug-white",
+    rotations_deg: Sequence[float] = (90.0, 47.3, -120.5),
+    *,
+    yaw_deg: float = 30.0,
+    names: Sequence[str] = NAMES,
+    shape: tuple[int, int] = (48, 64),
+    min_score: float = 0.75,
+) -> Iterator[Event]:
+    """The camera turns by ``rotations_deg``; the scores of all candidates are (0.9 - 0.1 rank) + 0.01 a view."""
+    rng = np.random.default_rng(5)
+    yield Started("identify", None, 8, {})
+    orientation_deg = 0.0
+    for k in range(len(rotations_deg) + 1):
+        rotation_deg = rotations_deg[k - 1] if k else 0.0
+        orientation_deg += rotation_deg
+        yield moved(k, -orientation_deg, -rotation_deg)
+        yield Accepted(k, float(wrap360(orientation_deg)), evidence(), noise(rng, shape))
+        pose_deg = float(wrap360(orientation_deg - yaw_deg))
+        candidates = tuple(Candidate(n, 0.9 - 0.1 * i + 0.01 * k, pose_deg) for i, n in enumerate(names))
+        yield Ranked(k, candidates, 0.1)
+        if k < len(rotations_deg):
+            step_deg = rotations_deg[k]
+            s_left, s_right = (None, None) if k == 0 else (0.41, 0.66) if step_deg >= 0 else (0.66, 0.41)
+            side = "left" if step_deg >= 0 else "right"
+            why = "the first turn is fixed" if s_left is None else likeness_words(side, s_left, s_right, names)
+            yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names), why)
+    travelled_deg = sum(map(abs, rotations_deg))
+    yield Identified(
+        answer,
+        candidates,
+        candidates[0].score,
+        0.1,
+        min_score,
+        pose_deg,
+        yaw_deg,
+        k + 1,
+        travelled_deg,
+        9.5,
+        "the lead passes",
+    )
+
+
+def searching_densely(
+    answer: str | None = "mug-star", rotations_deg: Sequence[float] = (80.0, -115.0), *, pair: bool = True
+) -> Iterator[Event]:
+    """The dense search turns by ``rotations_deg``, the best of all, to tell the first two of `NAMES` apart."""
+    rng = np.random.default_rng(6)
+    yield Started("identify", None, 8, {}, strategy="dense", descriptor="edges+colours", notes=("rehearse them",))
+    turns_deg = tuple(float(turn) for turn in range(-175, 185, 5) if turn)
+    orientation_deg = 0.0
+    for k in range(len(rotations_deg) + 1):
+        rotation_deg = rotations_deg[k - 1] if k else 0.0
+        orientation_deg += rotation_deg
+        yield moved(k, -orientation_deg, -rotation_deg)
+        yield Accepted(k, float(wrap360(orientation_deg)), evidence(), noise(rng, (48, 64)), {"agreement": 0.9})
+        pose_deg = float(wrap360(orientation_deg - 30))
+        odds = (0.6 + 0.2 * k, 0.4 - 0.2 * k, 0.0005, 0.0, 0.0)
+        candidates = tuple(
+            Candidate(n, 0.9 - 0.1 * i, pose_deg, p) for i, (n, p) in enumerate(zip(NAMES, odds, strict=True))
+        )
+        yield Ranked(k, candidates, 0.1, "not sure yet: a probability of 60.0%, and 95.0% ends the search")
+        if k < len(rotations_deg):
+            step_deg = rotations_deg[k]
+            away = tuple(abs(float(wrap180(turn - step_deg))) for turn in turns_deg)
+            weighed = Weighed(
+                turns_deg,
+                tuple(-8.0 + a / 30 for a in away),
+                tuple(0.02 + abs(turn) / 4500 for turn in turns_deg),
+                tuple(0.5 + a / 400 for a in away) if pair else None,
+            )
+            rivals = NAMES[:2] if pair else ()
+            why = separation_words(rivals, weighed.alike, turns_deg.index(step_deg))
+            side = "left" if step_deg >= 0 else "right"
+            yield Decided(k, side, step_deg, -orientation_deg - step_deg, None, None, rivals, why, weighed)
+    yield Identified(
+        answer,
+        candidates,
+        candidates[0].score,
+        0.1,
+        0.75,
+        pose_deg,
+        30.0,
+        k + 1,
+        195.0,
+        7.5,
+        "a probability of 97.0% reaches 95.0%",
+        probability=odds[0],
+        familiarity=1.02,
+        min_familiarity=0.95,
+    )
+
+
+def enrolled(*args: object, **kwargs: object) -> EnrollmentRecord:
+    record = EnrollmentRecord()
+    for event in enrolling(*args, **kwargs):  # type: ignore[arg-type]
+        record.add(event)
+    return record
+
+
+def identified(*args: object, truth: Truth | None = None, **kwargs: object) -> IdentificationRecord:
+    record = IdentificationRecord(truth=truth)
+    for event in identifying(*args, **kwargs):  # type: ignore[arg-type]
+        record.add(event)
+    return record

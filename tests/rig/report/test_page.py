@@ -1,0 +1,274 @@
+"""The report is one file that needs nothing else, says what the records say, and trusts no name."""
+
+import re
+from base64 import b64decode
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rig.core.errors import UsageError
+from rig.events.events import Accepted
+from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
+from rig.report.contact_sheet import CAPTION_PX, GAP_PX
+from tests.rig.report.report_samples import NAMES, enrolled, enrolling, identified, identifying, searching_densely
+
+VOID = {"meta", "link", "img", "br", "path", "circle", "line"}
+META = Meta({"seed": 7, "noise": {"backlash_deg": 0.25, "camera": {"gain": None}}}, {"written": "2026-01-02 03:04"})
+
+
+class Page(HTMLParser):
+    """Collects what the tests ask of a page; fails on tags that do not nest."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.tables: list[list[list[str]]] = []
+        self.texts: list[str] = []
+        self._open: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {key: value or "" for key, value in attrs}))
+        if tag not in VOID:
+            self._open.append(tag)
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {key: value or "" for key, value in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" in self._open:
+            return
+        self.texts.append(data)
+        if {"td", "th"} & set(self._open):
+            self.tables[-1][-1][-1] += data
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.texts).split())
+
+
+def demo(title: str = "Demo", names: tuple[str, ...] = NAMES) -> str:
+    enrollments = [enrolled(name, retaken=(3,)) for name in names[:2]]
+    identifications = [
+        identified(names[0], truth=Truth(names[0], 32.0), names=names),
+        identified(names[0], (90.0,), truth=Truth(names[1], 10.0), names=names),
+        identified(None, (90.0,), truth=Truth(None, description="globe"), names=names),
+        identified(names[0], (90.0,), truth=Truth(names[0], 30.0, 0.0), names=names),
+    ]
+    return render_report(title, "Two objects.", enrollments, identifications, meta=META)
+
+
+def test_the_page_says_what_the_records_say() -> None:
+    page = Page(demo())
+    results = page.tables[0]
+    assert results[0] == [
+        "#", "on the table", "found as", "verdict", "views", "travelled", "pose error", "score", "margin"
+    ]  # fmt: skip
+    assert results[1:] == [
+        ["1", "mug-white", "mug-white", "✓ right", "4", "258°", "2.0°", "0.930", "+0.100"],
+        ["2", "mug-star", "mug-white", "✗ wrong", "2", "90°", "–", "0.910", "+0.100"],
+        ["3", "globe (never enrolled)", "unknown", "✓ right", "2", "90°", "–", "0.910", "+0.100"],
+        ["4", "mug-white", "mug-white", "✓ right", "2", "90°", "–", "0.910", "+0.100"],
+    ]
+    assert "found 2/3" in page.text
+    assert "unknown recognised 1/1" in page.text
+    assert "S_left 0.41 < S_right 0.66; turning 47.3°" in page.text
+    assert len([a for a in page.all("svg") if "Camera positions" in a["aria-label"]]) == 4
+    assert len([a for a in page.all("svg") if "Scores per view" in a["aria-label"]]) == 4
+    assert len([a for a in page.all("svg") if "Ring of 8 views" in a["aria-label"]]) == 2
+
+
+def test_azimuths_are_the_enrolled_ones_where_the_object_was_found() -> None:
+    found = Page(render_report("", "", [], [identified("mug-white", (90.0,), yaw_deg=30.0)], meta=Meta()))
+    unknown = Page(render_report("", "", [], [identified(None, (90.0,), yaw_deg=30.0)], meta=Meta()))
+    assert [a["alt"] for a in found.all("img") if a["alt"]] == [
+        "View 1 at azimuth 330.0°",
+        "View 2 at azimuth 60.0°",
+    ]
+    assert any("330.0°, 60.0°" in a["aria-label"] for a in found.all("svg"))
+    assert "azimuth as enrolled" in found.text
+    assert [a["alt"] for a in unknown.all("img") if a["alt"]] == ["View 1 at azimuth 0.0°", "View 2 at azimuth 90.0°"]
+    assert "azimuth on the table" in unknown.text
+
+
+def test_nothing_is_fetched_and_nothing_runs() -> None:
+    page = Page(demo())
+    for _, attributes in page.tags:
+        for key in ("src", "href", "xlink:href", "action", "srcset", "poster", "data"):
+            if key in attributes:
+                assert re.match(r"data:|#", attributes[key])
+        assert not any(key.startswith("on") for key in attributes)
+    assert not page.all("script")
+    style = re.findall(r"<style>(.*?)</style>", demo(), re.DOTALL)
+    assert len(style) == 1
+    assert "@import" not in style[0]
+    assert "url(" not in style[0]
+
+
+def test_pictures_are_pictures_and_have_words() -> None:
+    page = Page(demo())
+    images = page.all("img")
+    assert len(images) > 10
+    for attributes in images:
+        head, data = attributes["src"].split(",", 1)
+        assert head == "data:image/jpeg;base64"
+        assert cv2.imdecode(np.frombuffer(b64decode(data), np.uint8), cv2.IMREAD_COLOR) is not None
+        # a stamp repeats what stands beside it: no words for screen readers
+        assert bool(attributes["alt"]) != (attributes.get("class") == "stamp")
+    assert all(attributes["aria-label"] for attributes in page.all("svg"))
+    assert all(attributes.get("scope") for attributes in page.all("th"))
+
+
+def test_the_contact_sheet_holds_every_view() -> None:
+    page = Page(render_report("", "", [enrolled(views=26)], [], meta=Meta()))
+    (sheet,) = [a for a in page.all("img") if a["alt"].startswith("Contact sheet")]
+    pixels = cv2.imdecode(np.frombuffer(b64decode(sheet["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None
+    assert pixels.shape[0] == 3 * (96 + CAPTION_PX + GAP_PX) + GAP_PX
+
+
+def test_links_lead_to_their_retrievals() -> None:
+    page = Page(demo())
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    links = [attributes["href"] for attributes in page.all("a")]
+    assert links == [f"#retrieval-{k}" for k in (1, 2, 3, 4)]
+    assert {link[1:] for link in links} <= set(ids)
+
+
+@pytest.mark.parametrize(
+    "name", ["<script>alert(1)</script>", "\"'><img src=x onerror=alert(1)>", "{{ 7*7 }}", "&lt;b&gt;"]
+)
+def test_names_are_text(name: str) -> None:
+    page = Page(demo(title=name, names=(name, *NAMES[1:])))
+    assert not page.all("script")
+    assert not any("onerror" in attributes for _, attributes in page.tags)
+    assert page.text.startswith(name)
+    assert page.tables[0][1][1] == name
+    assert any(attributes["alt"].startswith(f"Contact sheet of {name}:") for attributes in page.all("img"))
+
+
+def test_conditions_are_text_too() -> None:
+    page = Page(render_report("", "", [], [], meta=Meta({"<i>": "<script>"}, {"host": "<script>"})))
+    assert page.tables == [[["<i>", "<script>"]], [["host", "<script>"]]]
+
+
+def test_conditions_come_as_grouped_rows_and_the_wall_clock_apart() -> None:
+    page = Page(demo())
+    assert page.tables[-2] == [
+        ["seed", "7"], ["noise"], ["backlash_deg", "0.25"], ["noise camera"], ["gain", "–"]
+    ]  # fmt: skip
+    assert page.tables[-1] == [["written", "2026-01-02 03:04"]]
+
+
+def test_equal_runs_give_equal_pages_apart_from_the_wall_clock() -> None:
+    assert demo() == demo()
+    records = [enrolled()], [identified()]
+    early = render_report("t", "s", *records, meta=Meta({"seed": 1}, {"written": "early"}))
+    late = render_report("t", "s", *records, meta=Meta({"seed": 1}, {"written": "late"}))
+    assert early != late
+    assert early.replace("early", "late") == late
+
+
+def test_one_enrollment_makes_a_page_of_its_own() -> None:
+    page = Page(render_report("Enrollment of lamp", "", [enrolled("lamp")], [], meta=Meta()))
+    assert {attributes.get("id") for attributes in page.all("h2")} == {"objects"}
+    assert len(page.all("details")) == 1
+    assert "open" in page.all("details")[0]
+    assert page.tables == []
+
+
+def test_one_identification_makes_a_page_of_its_own() -> None:
+    page = Page(render_report("Identification", "", [], [identified()], meta=Meta()))
+    assert {attributes.get("id") for attributes in page.all("h2")} == {"retrievals"}
+    assert "verdict" not in {attributes.get("class") for attributes in page.all("span")}
+    assert "answer mug-white" in page.text
+    assert "score 0.930 per view; leads by 0.100" in page.text
+
+
+def test_many_are_folded_but_those_that_went_wrong() -> None:
+    records = [identified("mug-white", (90.0,), truth=Truth("lamp" if k == 5 else "mug-white")) for k in range(7)]
+    page = Page(render_report("", "", [], records, meta=Meta()))
+    assert [k for k, attributes in enumerate(page.all("details")) if "open" in attributes] == [0, 5]
+
+
+def test_what_ended_early_is_still_reported() -> None:
+    page = Page(render_report("t", "", [EnrollmentRecord()], [IdentificationRecord()], meta=Meta()))
+    assert "The search ended before an answer." in page.text
+    assert "No view was accepted." in page.text
+
+
+def test_a_full_demo_stays_small() -> None:
+    """20 objects of 72 views and 20 retrievals of 4 views; textured frames with more noise than the camera's."""
+    rng = np.random.default_rng(1)
+    y, x = np.mgrid[:480, :640]
+    checks = 60.0 * ((x // 60 + y // 60) % 2)
+    scene = np.stack([checks + x / 4, checks + y / 3, checks + (x + y) / 8], axis=-1)
+    frame = np.clip(scene + rng.normal(0, 6, scene.shape), 0, 255).astype(np.uint8)
+    enrollment, identification = EnrollmentRecord(region=(80, 0, 480, 480)), IdentificationRecord()
+    for record, events in ((enrollment, enrolling(views=72)), (identification, identifying())):
+        for event in events:
+            record.add(replace(event, image_bgr=frame) if isinstance(event, Accepted) else event)
+    html = render_report("t", "s", [enrollment], [identification], meta=META)
+    assert 20 * len(html.encode()) < 8e6
+
+
+def test_writing_replaces_the_page_as_a_whole(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "report.html"
+    write_report(path, "first ✓")
+    write_report(path, "second ✓")
+    assert path.read_text(encoding="utf-8") == "second ✓"
+    assert [p.name for p in path.parent.iterdir()] == ["report.html"]
+
+
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match=r"cannot be written to .*report\.html") as caught:
+        write_report(tmp_path / "file" / "report.html", "x")
+    assert "--out" in caught.value.next_step
+    assert caught.value.evidence["reason"]
+
+
+def test_a_failed_write_leaves_the_old_page(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    path.mkdir()
+    (path / "kept").write_text("old")
+    with pytest.raises(UsageError):
+        write_report(path, "new")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    assert (path / "kept").read_text() == "old"
+
+
+@pytest.mark.parametrize("pair", [True, False])
+def test_a_dense_search_is_shown_with_all_that_was_weighed(pair: bool) -> None:
+    record = IdentificationRecord()
+    for event in searching_densely(pair=pair):
+        record.add(event)
+    page = Page(render_report("Search", "", [], [record], meta=META))
+    charts = [attrs["class"] for tag, attrs in page.tags if "confusion" in attrs.get("class", "").split()]
+    assert len(charts) == 2
+    text = " ".join(page.texts)
+    assert "Rehearse them." in text
+    assert "Not sure yet: a probability of 60.0%, and 95.0% ends the search." in text
+    assert "What was weighed before each turn" in text
+    assert ("mug-white or mug-star" in text) == pair
+    assert ["mug-white", "60.0%", "0.900"] in [row for table in page.tables for row in table]

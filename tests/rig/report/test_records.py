@@ -1,0 +1,213 @@
+"""Records keep of a stream what a report needs: pictures in small, evidence, and what was right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.events.events import Accepted, Decided, Identified, Moved, Rejected, Started
+from rig.events.wording import answer_words, decision_words, distinct, likeness_words, move_words
+from rig.report import EnrollmentRecord, IdentificationRecord, Truth
+from rig.report.records import FRAME, TILE
+from rig.report.summary import enrollment_facts, totals
+from tests.rig.report.report_samples import enrolled, enrolling, evidence, identified, identifying, moved
+
+
+def facts(pairs: list) -> dict[str, str]:
+    return {fact.label: fact.value for fact in pairs}
+
+
+class TestEnrollment:
+    def test_views_come_in_order_with_their_retakes(self) -> None:
+        record = enrolled("lamp", 8, retaken=(2, 5))
+        assert record.name == "lamp"
+        assert [view.index for view in record.views] == list(range(8))
+        assert [bool(view.refused) for view in record.views] == [k in (2, 5) for k in range(8)]
+        assert record.views[2].refused == ("blurred (sharpness 2.0 < 3)",)
+        assert record.views[3].move == moved(3, 135.0, 45.0)
+        assert record.retakes == 2
+        assert record.result is not None
+
+    def test_frames_are_not_kept(self) -> None:
+        record = enrolled(views=4, shape=(480, 640))
+        for view in record.views:
+            assert view.picture_bgr.shape == (TILE[1], TILE[0], 3)
+            assert view.picture_bgr.base is None
+
+    def test_the_region_is_shown(self) -> None:
+        image = np.zeros((480, 640, 3), dtype=np.uint8)
+        image[:, 80:560] = 200
+        record = EnrollmentRecord(region=(80, 0, 480, 480))
+        record.add(Accepted(0, 0.0, evidence(), image))
+        assert (record.views[0].picture_bgr == 200).all()
+
+    def test_an_interrupted_enrollment_is_no_result(self) -> None:
+        record = EnrollmentRecord()
+        for event in list(enrolling(views=8))[:-5]:
+            record.add(event)
+        assert record.result is None
+        assert 0 < len(record.views) < record.planned == 8
+        assert facts(totals([record, enrolled()], []))["objects enrolled"] == "1"
+
+    def test_the_facts_are_those_of_the_evidence(self) -> None:
+        record = enrolled(views=8, retaken=(1,))
+        found = {fact.label: (fact.value, fact.note) for fact in enrollment_facts(record)}
+        assert found["views"] == ("8", "of 8 planned")
+        assert found["retakes"] == ("1", "blurred (sharpness 2.0 < 3)")
+        assert found["sharpness"] == ("104", "median; 100 to 107")
+        assert found["off the angle asked"][0] == "0.04°"
+        assert found["encoder against gyro"] == ("0.10°", "largest difference; 8 of 8 moves agree")
+        assert found["bench time"][0] == "12 s"
+
+
+class TestIdentification:
+    def test_turns_are_those_of_the_table(self) -> None:
+        rotations = (90.0, 47.3, -120.5)
+        turns = identified(rotations_deg=rotations).turns
+        assert [turn.rotation_deg for turn in turns] == pytest.approx(list(rotations))
+        assert [(turn.s_left, turn.s_right) for turn in turns] == [(None, None), (0.41, 0.66), (0.66, 0.41)]
+
+    @pytest.mark.parametrize("rotation_deg", [-270.0, 250.0, 359.0])
+    def test_the_long_way_round_is_told_from_the_short_one(self, rotation_deg: float) -> None:
+        assert identified(rotations_deg=(rotation_deg,)).turns[0].rotation_deg == pytest.approx(rotation_deg)
+
+    def test_a_turn_ends_at_the_azimuth_even_where_the_encoder_is_not_believed(self) -> None:
+        record = IdentificationRecord()
+        for event in identifying(rotations_deg=(90.0,)):
+            if isinstance(event, Moved) and event.index == 1:
+                event = replace(event, rotation_encoder_deg=-120.0, rotation_imu_deg=-90.0, agrees=False)
+            record.add(event)
+        assert record.turns[0].rotation_deg == pytest.approx(90.0)
+
+    def test_frames_are_kept_small(self) -> None:
+        assert {view.picture_bgr.shape for view in identified(shape=(480, 640)).views} == {(FRAME[1], FRAME[0], 3)}
+
+    @pytest.mark.parametrize(
+        ("answer", "truth", "correct"),
+        [
+            ("mug-white", Truth("mug-white"), True),
+            ("mug-white", Truth("mug-star"), False),
+            ("mug-white", Truth(None), False),
+            (None, Truth("mug-white"), False),
+            (None, Truth(None), True),
+            ("mug-white", None, None),
+        ],
+    )
+    def test_right_is_what_the_truth_says(self, answer: str | None, truth: Truth | None, correct: bool | None) -> None:
+        assert identified(answer, truth=truth).correct is correct
+
+    def test_without_an_answer_nothing_is_right_or_wrong(self) -> None:
+        record = IdentificationRecord(truth=Truth("mug-white", 10.0))
+        record.add(Started("identify", None, 8, {}))
+        assert record.correct is None
+        assert record.pose_error_deg is None
+        assert record.turns == []
+
+    @given(yaw=st.floats(0, 360), error=st.floats(-179, 179))
+    def test_pose_errors_go_the_short_way_round(self, yaw: float, error: float) -> None:
+        record = identified(yaw_deg=yaw, truth=Truth("mug-white", yaw + error))
+        assert record.pose_error_deg == pytest.approx(abs(error), abs=1e-6)
+
+    @given(fold=st.integers(2, 12), turns=st.integers(-5, 5), error=st.floats(-0.49, 0.49))
+    def test_pose_errors_are_modulo_the_symmetry(self, fold: int, turns: int, error: float) -> None:
+        period = 360 / fold
+        record = identified(yaw_deg=100.0, truth=Truth("mug-white", 100 + (turns + error) * period, period))
+        assert record.pose_error_deg == pytest.approx(abs(error) * period, abs=1e-6)
+
+    @pytest.mark.parametrize(
+        ("answer", "truth"),
+        [
+            ("mug-white", Truth("mug-white")),
+            ("mug-white", Truth("mug-white", 10.0, 0.0)),
+            ("mug-star", Truth("mug-white", 10.0)),
+            (None, Truth(None, 10.0)),
+        ],
+    )
+    def test_no_pose_error_where_there_is_no_pose(self, answer: str | None, truth: Truth) -> None:
+        assert identified(answer, truth=truth).pose_error_deg is None
+
+    def test_totals_count_the_known_and_the_unknown_apart(self) -> None:
+        records = [
+            identified("mug-white", (90.0,), yaw_deg=10.0, truth=Truth("mug-white", 13.0)),
+            identified("mug-white", (90.0, 30.0), yaw_deg=10.0, truth=Truth("mug-white", 9.0)),
+            identified("mug-white", (90.0,), truth=Truth("teapot", 0.0)),
+            identified(None, (90.0,), truth=Truth(None)),
+            identified("lamp", (90.0,), truth=Truth(None)),
+        ]
+        found = facts(totals([enrolled(), enrolled()], records))
+        assert found == {
+            "objects enrolled": "2",
+            "found": "2/3",
+            "unknown recognised": "1/2",
+            "views to an answer": "2.2",
+            "travelled": "96°",
+            "pose error": "2.0°",
+        }
+
+    def test_a_single_answer_without_truth_speaks_for_itself(self) -> None:
+        found = facts(totals([], [identified(None)]))
+        assert found["answer"] == "unknown"
+        assert found["views"] == "4"
+
+
+def decided(side: str, rotation_deg: float, s_left: float, s_right: float, *rivals: str) -> Decided:
+    why = likeness_words(side, s_left, s_right, rivals)
+    return Decided(1, side, rotation_deg, -rotation_deg, s_left, s_right, rivals, why)
+
+
+class TestWords:
+    def test_decisions(self) -> None:
+        first = Decided(0, "left", 90.0, -90.0, None, None, (), "the first turn is fixed")
+        assert decision_words(first) == "left: the first turn is fixed; turning 90.0°."
+        assert decision_words(decided("left", 47.3, 0.41, 0.66, "a", "b")) == (
+            "left: the two leading candidates look less alike there: S_left 0.41 < S_right 0.66; turning 47.3°."
+        )
+        assert decision_words(decided("right", -137.3, 0.66, 0.41, "a", "b", "c")) == (
+            "right: the leading candidates look less alike there: S_right 0.41 < S_left 0.66; "
+            "turning 137.3° past what was seen already."
+        )
+        tie = decided("left", 90.0, 0.5, 0.5, "a", "b")
+        assert "as much alike on both sides: S_left 0.50 = S_right 0.50" in decision_words(tie)
+        drawn = Decided(1, "right", -170.0, 170.0, None, None, (), "a turn drawn at random")
+        assert decision_words(drawn) == "right: a turn drawn at random; turning 170.0°."
+
+    @given(a=st.floats(0, 45), b=st.floats(0, 45))
+    def test_numbers_that_differ_read_differently(self, a: float, b: float) -> None:
+        left, right = distinct(a, b)
+        assert (left != right) == (a != b) or abs(a - b) < 1e-5
+        assert float(left) == pytest.approx(a, abs=0.00501)
+
+    def test_moves(self) -> None:
+        move = Moved(1, -90.0, -90.1, -90.1, -89.99, 0.12, 0.6, True, 1.0)
+        assert move_words(move) == "table −90.10° by the encoder, −89.99 ± 0.12° by the gyro"
+        slipped = replace(move, agrees=False, rotation_imu_deg=-80.0)
+        assert move_words(slipped).endswith("they disagree by more than 0.60°, the gyro is believed")
+        assert move_words(replace(move, rotation_imu_deg=None)).endswith("the gyro has no answer")
+
+    def test_a_lone_candidate_is_not_compared(self) -> None:
+        alone = decided("left", 90.0, 0.0, 0.0, "mug")
+        assert decision_words(alone) == "left: no second candidate is in sight to be told apart; turning 90.0°."
+
+    def test_answers(self) -> None:
+        known, unknown = identified("mug-white").answer, identified(None).answer
+        assert isinstance(known, Identified)
+        assert isinstance(unknown, Identified)
+        assert answer_words(known) == (
+            "mug-white, standing 30.0° counter-clockwise of how it was enrolled. The lead passes."
+        )
+        assert "not sure, mug-star looks as likely" in answer_words(replace(known, margin=-0.01))
+        assert answer_words(unknown).startswith(
+            "Unknown: the nearest are mug-white 0.930, mug-star 0.830, teapot 0.730."
+        )
+
+
+def test_refused_frames_belong_to_the_view_that_follows() -> None:
+    record = IdentificationRecord()
+    record.add(Rejected(0, 1, ("too dark", "blurred"), evidence()))
+    record.add(Rejected(0, 2, ("blurred",), evidence()))
+    record.add(Accepted(0, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
+    record.add(Accepted(1, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
+    assert record.views[0].refused == ("too dark, blurred", "blurred")
+    assert record.views[1].refused == ()

@@ -1,0 +1,367 @@
+"""What one program leaves, the next one finds: killed, without supply, without its cable, with another servo."""
+
+from collections.abc import Generator
+from contextlib import suppress
+
+import pytest
+
+from rig.bench import Bench
+from rig.core.errors import (
+    DeviceFault,
+    DeviceMismatch,
+    DeviceNotFound,
+    DeviceSilent,
+    FaultLatched,
+    RigError,
+    Stalled,
+    SupplyLost,
+    Unreferenced,
+    WatchdogTripped,
+)
+from rig.motion.turntable import Turntable
+from rig.safety.saved_state import FileStore
+from rig.safety.supervisor import State
+from sim.servo import XSeriesServo
+from tests.rig.bench_parts import Wires, kill, program, sensor, servo_wires
+
+
+@pytest.fixture
+def bench_of(tmp_path):
+    """Return a function that starts a program on one and the same bench, whose cable hung free at first."""
+    with sensor(servo_wires()) as (wires, i2c):
+        store = FileStore(tmp_path / "state")
+        with program(wires, i2c, store) as bench:
+            assert bench.safety.state is State.UNREFERENCED
+            with pytest.raises(Unreferenced) as refused, Turntable(bench):
+                pass
+            assert "rig home --turns 0" in refused.value.next_step
+            bench.safety.declare_turns(0)
+        yield lambda: program(wires, i2c, FileStore(tmp_path / "state")), wires
+
+
+def after(wires: Wires, seconds: float, happens) -> None:
+    wires.world.clock.call_at(wires.world.clock.now_ns() + round(seconds * 1e9), happens)
+
+
+def killed_in_motion(bench: Bench, wires: Wires, target_deg: float, after_s: float) -> None:
+    """Start a move and have the program killed in the middle of it."""
+
+    class Killed(BaseException):
+        pass
+
+    def die() -> None:
+        raise Killed
+
+    def moving() -> Generator[None, None, None]:
+        table = Turntable(bench)
+        table.__enter__()
+        motion = bench.safety.motion((table.rest_deg, target_deg), lambda: True)
+        motion.__enter__()
+        yield
+        bench.servo.arm_watchdog(bench.config.table.watchdog_s)
+        bench.servo.move_to(bench.safety.reference.to_servo(target_deg))
+        after(wires, after_s, die)
+        with suppress(Killed):
+            while True:
+                wires.world.clock.sleep(bench.config.table.poll_s)
+                bench.servo.read_state()
+        yield motion, table
+
+    plan = moving()
+    next(plan)
+    next(plan)
+    kill(wires, plan)
+
+
+def test_after_sigkill_the_servo_stops_by_itself_and_the_next_program_says_so_before_anything_moves(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        killed_in_motion(bench, wires, 300.0, after_s=1.2)
+        watchdog_s = bench.config.table.watchdog_s
+    assert wires.world.shaft()[1] > 50  # it turns on, and nobody is there
+    wires.world.clock.sleep(watchdog_s + 0.15)  # the ramp of a stop as fast as it can
+    assert wires.world.shaft()[1] == 0
+    assert wires.device.memory["Torque Enable"] == 1
+    assert wires.device.memory["Bus Watchdog"] == 0xFF
+    stands_deg = wires.world.shaft()[0]
+    sent = len(wires.instructions)
+    with start() as bench:
+        told = " ".join(bench.findings)
+        assert "torque was on" in told
+        assert "watchdog had stopped it" in told
+        assert "cut off in the middle of a motion" in told
+        assert bench.safety.state is State.READY  # it kept its supply: it has counted its turns
+        assert all(frame[7] != 3 for frame in wires.instructions[sent:])  # no write, so nothing moved
+        with Turntable(bench) as table:
+            assert wires.world.shaft()[0] == pytest.approx(stands_deg, abs=0.1)
+            assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
+            assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+    assert wires.device.memory["Torque Enable"] == 0
+
+
+def test_after_sigkill_and_a_power_cut_the_turns_are_in_doubt_and_a_person_tells(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        killed_in_motion(bench, wires, 380.0, after_s=4.0)
+    wires.world.clock.sleep(1.0)
+    wires.device.power_cycle()
+    wires.world.clock.sleep(1.0)
+    stands_deg = wires.world.shaft()[0]
+    assert stands_deg > 200  # 200° read as 20° would wind the cable up by a turn
+    with start() as bench:
+        assert bench.safety.state is State.UNREFERENCED
+        assert "in the middle of a motion" in bench.safety.doubt
+        with pytest.raises(Unreferenced), Turntable(bench):
+            pass
+        assert wires.device.memory["Torque Enable"] == 0
+        bench.safety.declare_turns(1 if stands_deg > 180 else 0)
+        with Turntable(bench) as table:
+            assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
+            table.goto(0.0)
+        assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
+
+
+def test_a_power_cut_between_programs_costs_no_turn(bench_of):
+    start, wires = bench_of
+    with start() as bench, Turntable(bench) as table:
+        table.goto(-370.0)
+    wires.device.power_cycle()
+    wires.world.clock.sleep(1.0)
+    with start() as bench:
+        assert bench.servo.read_state().position_deg == pytest.approx(170.0, abs=0.3)
+        assert "forgot 1 of its turns" in bench.findings[0]
+        with Turntable(bench) as table:
+            assert table.rest_deg == pytest.approx(-370.0, abs=0.3)
+            table.goto(-360.0)
+        assert wires.world.shaft()[0] == pytest.approx(-360.0, abs=0.3)
+    with start() as bench:  # what was restored is written down
+        assert not bench.findings
+        assert bench.safety.state is State.READY
+
+
+def test_turns_that_were_restored_survive_a_program_that_is_killed_at_rest(bench_of):
+    start, wires = bench_of
+    with start() as bench, Turntable(bench) as table:
+        table.goto(-370.0)
+    wires.device.power_cycle()
+    wires.world.clock.sleep(1.0)
+    with start() as bench:
+        table = Turntable(bench)
+        table.__enter__()  # and it is killed, with the torque on
+        kill(wires)
+    with start() as bench:
+        assert bench.safety.state is State.READY
+        assert bench.safety.reference.to_table(bench.servo.read_state().position_deg) == pytest.approx(-370.0, abs=0.3)
+
+
+def test_a_table_that_was_turned_while_the_supply_was_off_is_in_doubt(bench_of):
+    start, wires = bench_of
+    with start() as bench, Turntable(bench) as table:
+        table.goto(90.0)
+    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
+    wires.device.power_cycle()
+    wires.world.clock.sleep(1.0)
+    with start() as bench, pytest.raises(Unreferenced, match="turned meanwhile"), Turntable(bench):
+        pass
+
+
+def test_a_table_that_was_turned_by_hand_with_the_supply_on_is_where_it_was_turned_to(bench_of):
+    start, wires = bench_of
+    with start() as bench, Turntable(bench) as table:
+        table.goto(90.0)
+    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
+    with start() as bench:
+        assert "by hand" in bench.findings[0]
+        with Turntable(bench) as table:
+            assert table.rest_deg == pytest.approx(60.0, abs=0.3)
+
+
+def test_a_supply_that_dips_in_the_middle_of_a_motion_ends_it_and_the_turns_are_in_doubt(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        with pytest.raises((SupplyLost, DeviceSilent)), Turntable(bench) as table:
+            table.goto(300.0)
+            after(wires, 1.0, wires.device.power_cycle)
+            table.goto(30.0)
+        wires.world.clock.sleep(1.0)
+        assert wires.device.memory["Torque Enable"] == 0
+        with pytest.raises(Unreferenced), Turntable(bench):
+            pass
+    with start() as bench:
+        assert bench.safety.state is State.UNREFERENCED
+
+
+def test_a_pulled_cable_ends_the_motion_and_on_its_return_nothing_moves_by_itself(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        with pytest.raises(DeviceSilent), Turntable(bench) as table:
+            after(wires, 1.2, lambda: wires.bus.detach(wires.device))
+            table.goto(300.0)
+        assert bench.safety.state is State.DISCONNECTED
+        wires.world.clock.sleep(1.0)
+        stands_deg, speed_dps = wires.world.shaft()
+        assert speed_dps == 0
+        with pytest.raises(DeviceSilent), Turntable(bench):
+            pass
+        wires.bus.attach(wires.device)
+        wires.world.clock.sleep(5.0)
+        assert wires.world.shaft() == (stands_deg, 0.0)
+        with Turntable(bench) as table:  # asked for, and after a look at who is there
+            assert wires.world.shaft() == (stands_deg, 0.0)
+            assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+
+
+@pytest.mark.parametrize("other", [{"model": "xm430_w350"}, {"firmware": 44}])
+def test_another_servo_on_the_cable_is_refused(bench_of, other):
+    start, wires = bench_of
+    with start() as bench:
+        with pytest.raises(DeviceSilent), Turntable(bench) as table:
+            after(wires, 0.7, lambda: wires.bus.detach(wires.device))
+            table.goto(90.0)
+        wires.bus.attach(XSeriesServo(wires.world, **other))
+        with pytest.raises(DeviceMismatch), Turntable(bench):
+            pass
+        assert bench.safety.state is State.DISCONNECTED
+
+
+def test_a_watchdog_that_trips_under_a_live_program_is_told_as_such_and_leaves_no_fault(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        with pytest.raises(WatchdogTripped) as caught, Turntable(bench) as table:
+            after(wires, 0.7, wires.device.trip_watchdog)
+            table.goto(300.0)
+        assert caught.value.exit_code == 5
+        assert bench.safety.fault is None
+        assert wires.device.memory["Torque Enable"] == 0
+        with Turntable(bench) as table:
+            assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+
+
+def test_a_fault_outlives_the_program_and_is_acknowledged_when_its_cause_is_gone(bench_of):
+    start, wires = bench_of
+    with start() as bench, pytest.raises(Stalled), Turntable(bench) as table:
+        table.goto(10.0)
+        wires.device.jam()
+        table.goto(60.0)
+    with start() as bench:
+        assert bench.safety.state is State.FAULT
+        with pytest.raises(FaultLatched, match="blocked") as refused, Turntable(bench):
+            pass
+        assert refused.value.evidence["code"] == Stalled.code
+        assert "rig acknowledge" in refused.value.next_step
+        wires.device.free()
+        assert bench.safety.acknowledge() is State.READY
+    with start() as bench, Turntable(bench) as table:
+        assert table.goto(60.0).agrees
+
+
+def test_a_hardware_error_needs_a_reboot_after_which_all_is_verified_and_no_turn_lost(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        with pytest.raises(DeviceFault), Turntable(bench) as table:
+            after(wires, 1.5, lambda: wires.device.fail(0x20))
+            table.goto(380.0)
+            table.goto(0.0)
+        wires.world.clock.sleep(1.0)
+        stands_deg = wires.world.shaft()[0]
+    with start() as bench:
+        with pytest.raises(DeviceFault) as still:
+            bench.safety.acknowledge()
+        assert "rig acknowledge --reboot" in still.value.next_step
+        assert bench.safety.state is State.FAULT
+        assert bench.safety.acknowledge(reboot=True) is State.READY
+        assert wires.world.shaft() == (stands_deg, 0.0)
+        with Turntable(bench) as table:
+            assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
+            table.goto(0.0)
+        assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
+
+
+def test_a_reboot_that_shows_other_settings_leaves_the_fault(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        with pytest.raises(Stalled), Turntable(bench) as table:
+            wires.device.jam()
+            table.goto(60.0)
+        wires.device.free()
+        wires.device.memory["Operating Mode"] = 3
+        with pytest.raises(DeviceMismatch, match="EEPROM"):
+            bench.safety.acknowledge(reboot=True)
+        assert bench.safety.state is State.FAULT
+
+
+def test_an_old_goal_does_not_go_on_when_the_torque_that_a_killed_program_left_is_taken_over(bench_of):
+    start, wires = bench_of
+    with start() as bench:
+        killed_in_motion(bench, wires, 300.0, after_s=1.0)
+    wires.world.clock.sleep(0.2)  # armed still, and turning
+    with start() as bench:
+        assert "still armed" in " ".join(bench.findings)
+        with Turntable(bench) as table:
+            assert wires.world.shaft()[1] == 0
+            assert table.rest_deg == pytest.approx(wires.world.shaft()[0], abs=0.3)
+            wires.world.clock.sleep(2.0)
+            assert wires.world.shaft()[1] == 0
+
+
+def test_a_bench_whose_state_was_damaged_says_so_and_is_in_doubt(bench_of, tmp_path):
+    start, _wires = bench_of
+    (tmp_path / "state" / "state.json").write_bytes(b'{"version": 1, "tab')
+    with start() as bench:
+        assert "is damaged" in bench.findings[0]
+        assert bench.safety.state is State.UNREFERENCED
+
+
+def test_a_stop_that_was_asked_for_ends_the_motion_with_torque_off(bench_of, tmp_path):
+    start, wires = bench_of
+    with start() as bench:
+        with pytest.raises(RigError, match="rig stop") as stopped, Turntable(bench) as table:
+            after(wires, 1.2, FileStore(tmp_path / "state").request_stop)
+            table.goto(300.0)
+        assert (stopped.value.code, stopped.value.exit_code) == (512, 5)
+        assert wires.device.memory["Torque Enable"] == 0
+        assert wires.world.shaft()[1] == 0
+        assert 20 < wires.world.shaft()[0] < 200
+        assert not FileStore(tmp_path / "state").stop_requested()
+        with Turntable(bench) as table:  # stopped, not broken
+            assert table.goto(0.0).agrees
+
+
+@pytest.mark.parametrize("when", ["in a motion", "between two"])
+def test_an_adapter_that_is_plugged_in_again_is_opened_anew_and_who_answers_is_looked_at(simulated, when):
+    s = simulated()
+    adapter = s.operator.parts.adapter
+    with pytest.raises(DeviceSilent) as caught, Turntable(s.bench) as table:
+        if when == "in a motion":
+            s.world.clock.call_at(s.world.clock.now_ns() + 1_200_000_000, adapter.unplug)
+            table.goto(300.0)
+        else:
+            table.goto(60.0)
+            adapter.unplug()
+            table.goto(90.0)
+    assert ("did not hear the stop" in "".join(getattr(caught.value, "__notes__", ()))) == (when == "in a motion")
+    s.world.clock.sleep(1.0)
+    stands = s.world.shaft()
+    assert stands[1] == 0
+    with pytest.raises(DeviceNotFound), Turntable(s.bench):
+        pass
+    adapter.replug()
+    s.world.clock.sleep(3.0)
+    assert s.world.shaft() == stands
+    with Turntable(s.bench) as table:
+        assert s.world.shaft() == stands
+        assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
+
+
+def test_another_servo_behind_the_adapter_that_came_back_is_refused(simulated):
+    s = simulated()
+    parts = s.operator.parts
+    with pytest.raises(DeviceSilent), Turntable(s.bench) as table:
+        parts.adapter.unplug()
+        table.goto(60.0)
+    parts.servo_bus.detach(parts.servo)
+    parts.servo_bus.attach(XSeriesServo(s.world, "xl330_m288"))
+    parts.adapter.replug()
+    with pytest.raises(DeviceMismatch) as caught, Turntable(s.bench):
+        pass
+    assert caught.value.evidence["got"].startswith("xl330_m288")

@@ -1,0 +1,339 @@
+"""The state machine: whatever happens, in whatever order, READY means that the cable's turns are right."""
+
+from contextlib import ExitStack, suppress
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from hbr.core.angles import wrap180
+from rig.config import RigConfig
+from rig.core.errors import (
+    DeviceFault,
+    DeviceMismatch,
+    DeviceSilent,
+    FaultLatched,
+    MotionStopped,
+    NotReady,
+    RigError,
+    Stalled,
+    StateNotKept,
+    Unreferenced,
+    UsageError,
+)
+from rig.devices.servo import ServoCondition, ServoIdentity, ServoLimits, ServoState
+from rig.safety.saved_state import BenchState, MemoryStore
+from rig.safety.state_machine import TRANSITIONS, Happening
+from rig.safety.supervisor import LATCHING, Safety, State
+from sim.clock import VirtualClock
+from tests.fuzzing import fuzz_settings
+
+
+class Shaft:
+    """A servo as far as the safety layer sees it, and the truth about the cable.
+
+    It can be asked, verified and restarted; that the safety layer wrote anything else to it would be an AttributeError.
+    """
+
+    identity = ServoIdentity("xl430_w250", 1060, 1, 46)
+    limits = ServoLimits(72.0, (6.0, 14.0))
+    turn_deg = 360.0
+
+    def __init__(self) -> None:
+        self.cable_deg = 0.0
+        self.count_deg = 180.0  # what the servo reads at cable angle 0
+        self.set_up = False
+        self.there = True
+        self.other = False
+        self.errors: tuple[str, ...] = ()
+
+    def power_cycle(self) -> None:
+        read_deg = self.cable_deg + self.count_deg
+        self.count_deg += read_deg % 360.0 - read_deg
+        self.set_up = False
+
+    def read_state(self) -> ServoState:
+        self._answer()
+        position_deg = self.cable_deg + self.count_deg
+        return ServoState(0, position_deg, 0.0, 0.0, 12.0, 30.0, False, True, self.errors)
+
+    def read_condition(self) -> ServoCondition:
+        self._answer()
+        return ServoCondition(False, False, False, not self.set_up, self.errors)
+
+    def verify(self) -> None:
+        self._answer()
+        if self.other:
+            raise DeviceMismatch("Another servo answers.", next_step="Connect the right one.")
+
+    def reboot(self) -> None:
+        self.verify()
+        self.power_cycle()
+        self.errors = ()
+
+    def _answer(self) -> None:
+        if not self.there:
+            raise DeviceSilent("The servo does not answer.", next_step="Check its cable.")
+
+
+ENDS = {
+    "arrives": None,
+    "stalls": Stalled("The table is blocked.", next_step="Free it."),
+    "is stopped": MotionStopped("Stopped.", next_step="Start again."),
+    "is interrupted": KeyboardInterrupt(),
+    "hits a bug": ZeroDivisionError(),
+}
+
+
+class Bench(RuleBasedStateMachine):
+    """A bench, its technician, its cable and everything that happens to them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shaft = Shaft()
+        self.store = MemoryStore()
+        self.safety = self.process()
+        self.connected = False
+        self.zombies: list[object] = []
+        self.latched = 0
+        self.everything_is_mended()
+
+    def process(self) -> Safety:
+        return Safety(self.shaft, RigConfig(), VirtualClock(), self.store)
+
+    def keeps_its_promise(self) -> None:
+        """What is READY knows its turns."""
+        if self.safety.state is State.READY:
+            told_deg = self.safety.reference.to_table(self.shaft.read_state().position_deg)
+            assert told_deg == pytest.approx(self.shaft.cable_deg, abs=1e-6)
+
+    # -- programs -----------------------------------------------------------------------------------------------------
+
+    @rule()
+    def a_program_starts(self) -> None:
+        self.safety, self.connected = self.process(), False
+        if self.shaft.there and not self.shaft.other:
+            self.safety.connect()
+            self.connected = True
+            self.keeps_its_promise()
+
+    @precondition(lambda self: self.connected)
+    @rule(
+        to_deg=st.floats(-400, 400) | st.sampled_from([-400.0, -200.0, 200.0, 400.0]),
+        share=st.floats(0, 1),
+        end=st.sampled_from([*ENDS, "cable pulled", "killed", "supply lost"]),
+    )
+    def a_move(self, to_deg: float, share: float, end: str) -> None:
+        safety, shaft = self.safety, self.shaft
+        with suppress(FaultLatched, Unreferenced, DeviceSilent, DeviceMismatch):
+            safety.prepare()
+        if safety.state is not State.READY:
+            with pytest.raises(NotReady), safety.motion((0.0, to_deg), lambda: True):
+                pytest.fail("it moves")
+            return
+        if not shaft.there:
+            return
+        self.keeps_its_promise()
+        shaft.set_up = True
+        start_deg = shaft.cable_deg
+        motion = safety.motion((start_deg, to_deg), lambda: shaft.there)
+        with suppress(KeyboardInterrupt, ZeroDivisionError, RigError):
+            with ExitStack() as block:
+                begun = block.enter_context(motion)
+                assert safety.state is State.MOVING
+                with pytest.raises(NotReady):
+                    safety.require_ready()
+                shaft.cable_deg = start_deg + (to_deg - start_deg) * (1.0 if end == "arrives" else share)
+                if end == "killed":  # a killed program runs none of its exits
+                    self.zombies.append(block.pop_all())
+                    self.safety, self.connected = self.process(), False
+                    return
+                self.what_ends_it(end)
+                begun.arrived(shaft.read_state().position_deg)
+            assert end == "arrives"
+        error = ENDS.get(end)
+        if error is None and end == "arrives":
+            assert safety.state is State.READY
+        elif isinstance(error, LATCHING) or end == "supply lost":
+            assert safety.state is State.FAULT
+        else:
+            assert safety.state is (State.STOPPED if shaft.there else State.DISCONNECTED)
+        safety.released()
+
+    def what_ends_it(self, end: str) -> None:
+        if end == "supply lost":
+            self.shaft.power_cycle()
+            raise DeviceFault("The servo restarted.", next_step="Check the supply.")
+        if end == "cable pulled":
+            self.shaft.there = False
+            self.shaft.read_state()
+        if error := ENDS[end]:
+            raise error
+
+    @precondition(lambda self: self.connected)
+    @rule(reboot=st.booleans())
+    def acknowledged(self, reboot: bool) -> None:
+        fault, errors = self.safety.fault, self.shaft.errors
+        well = self.shaft.there and not self.shaft.other and (reboot or not errors)
+        with suppress(RigError):
+            self.safety.acknowledge(reboot=reboot)
+            assert well
+            assert self.safety.fault is None
+            assert self.safety.state in (State.READY, State.UNREFERENCED)
+            return
+        assert self.safety.fault == fault
+        assert not well or fault is None
+
+    @precondition(lambda self: self.connected)
+    @rule()
+    def a_plan_finds_something_wrong(self) -> None:
+        self.safety.latch(Stalled(f"Fault {self.latched}.", next_step="Look."))
+        self.latched += 1
+        assert self.safety.state is State.FAULT
+
+    @rule()
+    def everything_is_mended(self) -> None:
+        """What a technician does in the morning; without it, most days would be spent in the first fault."""
+        self.shaft.there, self.shaft.other, self.shaft.errors = True, False, ()
+        self.a_program_starts()
+        if self.safety.fault:
+            self.acknowledged(reboot=False)
+        if self.safety.doubt:
+            self.somebody_looks_at_the_cable(zero_here=False)
+
+    # -- people -------------------------------------------------------------------------------------------------------
+
+    @precondition(lambda self: self.connected and self.shaft.there and not self.shaft.other)
+    @rule(zero_here=st.booleans())
+    def somebody_looks_at_the_cable(self, zero_here: bool) -> None:
+        with suppress(NotReady):
+            if zero_here:
+                self.safety.declare(0.0)
+                self.shaft.count_deg += self.shaft.cable_deg
+                self.shaft.cable_deg = 0.0
+            elif self.safety.doubt and "nobody" not in self.safety.doubt:
+                within_deg = float(wrap180(self.shaft.cable_deg))
+                self.safety.declare_turns(round((self.shaft.cable_deg - within_deg) / 360.0))
+            else:
+                self.safety.declare(self.shaft.cable_deg)
+            assert self.safety.state is State.READY
+            return
+        assert self.safety.state in (State.FAULT, State.STOPPED, State.DISCONNECTED)
+
+    @rule(by_deg=st.floats(-720, 720) | st.sampled_from([-360.0, -180.0, 0.0, 180.0, 360.0]))
+    def the_table_is_turned_by_hand(self, by_deg: float) -> None:
+        """By whole turns to a hair's breadth, with the supply off, is the one thing that no encoder can tell."""
+        table = self.store.state.table
+        written_deg = table.position_deg + table.shift_deg - 180.0 if table else 0.0
+        turned_deg = self.shaft.cable_deg + by_deg - written_deg
+        if abs(turned_deg) < 180 or abs(wrap180(turned_deg)) > 2.1:
+            self.shaft.cable_deg += by_deg
+
+    # -- devices ------------------------------------------------------------------------------------------------------
+
+    @rule()
+    def the_supply_goes_and_comes_back(self) -> None:
+        self.shaft.power_cycle()
+
+    @rule(
+        there=st.sampled_from([True, True, False]),
+        other=st.sampled_from([False, False, True]),
+        errors=st.sampled_from([(), (), ("overload",)]),
+    )
+    def a_device_fails_or_is_well_again(self, there: bool, other: bool, errors: tuple[str, ...]) -> None:
+        self.shaft.there, self.shaft.other, self.shaft.errors = there, other, errors
+
+    # -- promises -----------------------------------------------------------------------------------------------------
+
+    @invariant()
+    def a_fault_outlives_its_program(self) -> None:
+        if self.safety.fault:
+            assert self.safety.state is State.FAULT
+            again = self.process()
+            assert again.state is State.FAULT
+            assert again.fault == self.safety.fault
+            with pytest.raises(FaultLatched, match=self.safety.fault.what):
+                again.require_ready()
+
+
+TestBench = Bench.TestCase
+TestBench.settings = settings(fuzz_settings(0.2), stateful_step_count=30)
+
+
+def test_the_table_of_transitions_lets_nothing_out_of_a_fault_but_an_acknowledgement():
+    leaving = [(s, h, to) for s, ways in TRANSITIONS.items() for h, to in ways.items() if s is not to]
+    assert {h for s, h, _ in leaving if s is State.FAULT} == {Happening.ACKNOWLEDGE}
+    assert {(s, h) for s, h, to in leaving if to is State.MOVING} == {(State.READY, Happening.START)}
+    assert all(ways[Happening.LATCH] is State.FAULT for ways in TRANSITIONS.values())
+    assert {s for s, h, to in leaving if to is State.READY} == {State.CONNECTED, State.UNREFERENCED, State.MOVING}
+    with pytest.raises(TypeError):
+        TRANSITIONS[State.FAULT] = {}
+    with pytest.raises(AttributeError):
+        Safety(Shaft(), RigConfig(), VirtualClock()).state = State.READY
+
+
+def test_a_state_that_cannot_be_written_down_lets_nothing_move():
+    class Full(MemoryStore):
+        full = False
+
+        def save(self, state: BenchState) -> None:
+            if self.full:
+                raise StateNotKept("The disk is full.", next_step="Make room.")
+            super().save(state)
+
+    store = Full()
+    safety = Safety(Shaft(), RigConfig(), VirtualClock(), store)
+    safety.connect()
+    safety.declare(0.0)
+    store.full = True
+    with pytest.raises(StateNotKept), safety.motion((0.0, 90.0), lambda: True):
+        pytest.fail("it moves")
+    assert safety.state is State.READY
+    stalled = Stalled("Blocked.", next_step="Free it.")
+    safety.latch(stalled)  # a fault is a fault, whether the disk is full or not
+    assert safety.state is State.FAULT
+    assert "in this program alone" in stalled.__notes__[0]
+
+
+def test_a_motion_that_nobody_said_to_have_arrived_was_broken_off():
+    safety = Safety(Shaft(), RigConfig(), VirtualClock())
+    safety.connect()
+    safety.declare(0.0)
+    stops = []
+    with pytest.raises(MotionStopped), safety.motion((0.0, 90.0), lambda: bool(stops.append(1)) or True):
+        pass
+    assert stops == [1]
+    assert safety.state is State.STOPPED
+
+
+def test_evidence_that_json_does_not_know_is_kept_in_words():
+    safety = Safety(Shaft(), RigConfig(), VirtualClock())
+    safety.latch(Stalled("Blocked.", next_step="Free it.", evidence={"seen": {1, 2}, "at": 3.5, "rate": float("nan")}))
+    assert safety.fault.evidence["at"] == 3.5
+    assert isinstance(safety.fault.evidence["seen"], str)
+    assert BenchState.model_validate_json(BenchState(fault=safety.fault).model_dump_json()).fault.code == 505
+
+
+def test_the_first_fault_stays_until_it_is_acknowledged():
+    safety = Safety(Shaft(), RigConfig(), VirtualClock())
+    safety.connect()
+    safety.latch(Stalled("The first.", next_step="Free it."))
+    safety.latch(Stalled("The second.", next_step="Free it."))
+    assert safety.fault.what == "The first."
+
+
+def test_an_acknowledgement_asks_every_device_that_has_a_say():
+    safety = Safety(Shaft(), RigConfig(), VirtualClock())
+    safety.connect()
+    safety.latch(Stalled("Blocked.", next_step="Free it."))
+
+    def gyro() -> None:
+        raise UsageError("the gyro is not well", next_step="look at it")
+
+    safety.checks.append(gyro)
+    with pytest.raises(UsageError):
+        safety.acknowledge()
+    assert safety.state is State.FAULT
+    safety.checks.clear()
+    assert safety.acknowledge() is State.UNREFERENCED

@@ -1,0 +1,110 @@
+"""Waiting for the next object by camera, on a bench without hands."""
+
+import pytest
+
+import hbr
+from rig.catalog import Catalog
+from rig.core.errors import DeviceSilent
+from rig.events.events import Failed, Identified, Waiting
+from rig.plans.enroll import enroll
+from rig.plans.watch import watch
+from rig.views.object_presence import TableWatcher
+from sim.objects.shelf import shelf
+
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+
+
+def at(s, seconds, action):
+    s.world.clock.call_at(s.world.clock.now_ns() + round(seconds * 1e9), action)
+
+
+def put(s, name, yaw_deg=0.0):
+    return lambda: s.world.put(shelf()[name] if name else None, yaw_deg)
+
+
+def seconds(s, watcher):
+    """Return how long the watcher waits."""
+    start_ns = s.world.clock.now_ns()
+    watcher.place(None)
+    return (s.world.clock.now_ns() - start_ns) * 1e-9
+
+
+def test_it_waits_until_an_object_stands_still(simulated):
+    s = simulated(*SMALL)
+    watcher = TableWatcher(s.bench)
+    at(s, 5.0, put(s, "lamp"))
+    at(s, 6.0, put(s, "lamp", 40.0))  # a hand still pushes it
+    at(s, 7.0, put(s, "toy-car", 10.0))
+    assert 8.5 <= seconds(s, watcher) <= 10.5
+
+
+def test_an_object_that_stays_is_no_new_one_and_another_or_the_same_put_again_is(simulated):
+    s = simulated(*SMALL)
+    watcher = TableWatcher(s.bench)
+    at(s, 1.0, put(s, "toy-car"))
+    watcher.place(None)
+    at(s, 20.0, put(s, "clock"))
+    assert 21.0 <= seconds(s, watcher) <= 23.5
+    at(s, 10.0, put(s, None))
+    at(s, 15.0, put(s, "clock"))
+    assert 16.0 <= seconds(s, watcher) <= 18.5
+
+
+def test_neither_an_emptied_table_nor_other_light_is_an_object(simulated):
+    s = simulated(*SMALL)
+    watcher = TableWatcher(s.bench)
+    at(s, 1.0, put(s, "radio"))
+    watcher.place(None)
+    at(s, 5.0, put(s, None))
+    for k in range(10):
+        level = 1.0 - 0.02 * k
+        at(s, 10.0 + 3 * k, lambda level=level: s.world.change(light=(level, level, level)))
+    at(s, 60.0, put(s, "dice"))
+    assert 61.0 <= seconds(s, watcher) <= 63.5
+
+
+def test_the_smallest_object_is_seen(simulated):
+    for name in ("dice", "candle"):
+        s = simulated(*SMALL)
+        watcher = TableWatcher(s.bench)
+        at(s, 2.0, put(s, name))
+        assert seconds(s, watcher) <= 6.0
+
+
+def test_an_object_to_be_enrolled_is_not_waited_for(simulated):
+    s = simulated(*SMALL)
+    start_ns = s.world.clock.now_ns()
+    TableWatcher(s.bench).place("lamp")
+    assert s.world.clock.now_ns() == start_ns
+
+
+def test_a_camera_that_is_pulled_while_nobody_comes_ends_the_waiting(simulated):
+    s = simulated(*SMALL)
+    at(s, 5.0, s.operator.parts.camera.unplug)
+    with pytest.raises(DeviceSilent):
+        TableWatcher(s.bench).place(None)
+
+
+def test_one_object_after_the_other_is_identified_and_a_dark_one_does_not_end_it(simulated, tmp_path):
+    s = simulated(*SMALL, "identify.max_views=4", seed=4)
+    with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
+        for name in ("toy-car", "book-night"):
+            list(enroll(s.bench, catalog, name, views=12))
+        index = hbr.ViewIndex(catalog.views().views)
+    s.world.put(None)
+    s.bench.operator = TableWatcher(s.bench)
+    coming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]
+    told = []
+    for event in watch(s.bench, lambda: index):
+        if isinstance(event, Waiting):
+            assert s.world.shaft()[0] == pytest.approx(0.0, abs=1.0)  # where the empty table was seen, and unwound
+            name, yaw_deg = coming.pop(0)
+            s.world.change(light=(1.0, 1.0, 1.0))
+            at(s, 4.0, put(s, name, yaw_deg))
+            if name == "radio":  # and when it was seen, somebody puts the light out
+                at(s, 6.2, lambda: s.world.change(light=(0.0, 0.0, 0.0)))
+        if isinstance(event, Failed | Identified):
+            told.append(event.code if isinstance(event, Failed) else event.name)
+            if not coming:
+                break
+    assert told == ["toy-car", 600, "book-night"]
