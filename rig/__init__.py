@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
+from rig.core.moved import keep_old_paths
+
 if TYPE_CHECKING:
     from rig.bench import Bench, open_bench
     from rig.catalog import Catalog
@@ -21,6 +23,8 @@ _HOMES = {
     "open_bench": "rig.bench",
     "photograph_table": "rig.plans.photograph_table",
 }
+
+keep_old_paths()
 
 
 def __getattr__(name: str) -> Any:
