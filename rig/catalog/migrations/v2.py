@@ -39,7 +39,7 @@ CREATE TABLE new_views (
 	image_sha256 VARCHAR(64) NOT NULL,
 	image_bytes INTEGER NOT NULL,
 	evidence JSON NOT NULL,
-	segmentation JSON,
+	front_end JSON,
 	CONSTRAINT uq_views_enrollment_id_view_index UNIQUE (enrollment_id, view_index),
 	CONSTRAINT fk_views_enrollment_id FOREIGN KEY(enrollment_id) REFERENCES enrollments (id),
 	CONSTRAINT fk_views_sitting_id FOREIGN KEY(sitting_id) REFERENCES sittings (id)
