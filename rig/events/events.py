@@ -1,5 +1,6 @@
 """What a plan tells while it runs: small frozen events, the one stream that people, files and tests see."""
 
+import re
 from dataclasses import dataclass, field, fields, is_dataclass
 from math import isfinite
 from typing import Any
@@ -169,7 +170,7 @@ class Enrolled:
 class Item:
     """The next object of a tray, ``number`` (from 1) ``of`` so many.
 
-    ``action`` is "enroll", "resume" (the views that are missing), "anew" (an interrupted enrollment, of an object that
+    ``action`` is "enroll", "resume" (the views that are missing), "replace" (an interrupted enrollment, of an object that
     was moved since), or "skip", with the reason in ``why``.
     """
 
@@ -210,7 +211,7 @@ class Insight:
 
 
 @dataclass(frozen=True, slots=True)
-class TablePicture:
+class EmptyTableImage:
     """The empty table was photographed, and the picture is kept: objects are found by what differs from it.
 
     ``turning_share`` is how much of the picture changed as the table turned a little, ``agreement`` how much of its
@@ -294,16 +295,21 @@ Event = (
     | Identified
     | Item
     | Insight
-    | TablePicture
+    | EmptyTableImage
     | Warned
     | Waiting
     | Failed
 )
 
 
+def event_kind(kind: type) -> str:
+    """Return the name of a kind of event in JSON: ``"empty_table_image"`` of `EmptyTableImage`."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
+
+
 def event_dict(event: Event) -> dict[str, Any]:
     """Return an event as plain data for JSON, its kind under ``"event"``; pictures are left out."""
-    return {"event": type(event).__name__.lower(), **plain(event)}
+    return {"event": event_kind(type(event)), **plain(event)}
 
 
 def plain(value: Any) -> Any:

@@ -8,7 +8,7 @@ from hbr.segmentation import TRUSTED
 from rig.bench import Bench, TableClearer
 from rig.core.clock import seconds_between
 from rig.core.errors import TableNotEmpty, UsageError
-from rig.events.events import Event, TablePicture, Warned, plain
+from rig.events.events import EmptyTableImage, Event, Warned, plain
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture
 from rig.plans.enroll import SAME_LIKENESS
@@ -24,7 +24,7 @@ NOTICED_SHARE: Final = 0.004
 """Something stands on the table when this share of the picture changes with it: 2 cm on a picture of 24 cm."""
 
 
-def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, None, TablePicture]:
+def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, None, EmptyTableImage]:
     """Take the picture of the empty table and keep it beside the bench's state; yields events and returns the last.
 
     An operator who can empties the table; otherwise it is empty already. Two frames are taken, the table turned a
@@ -96,7 +96,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         evidence={**plain(evidence), "turning_share": share, "agreement": agreement},
     )
     EmptyTables.keep(bench, taken)
-    done = TablePicture(
+    done = EmptyTableImage(
         taken_utc=f"{taken.taken_utc:%Y-%m-%dT%H:%M:%SZ}",
         width=int(first.image_bgr.shape[1]),
         height=int(first.image_bgr.shape[0]),

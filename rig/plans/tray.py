@@ -34,35 +34,35 @@ class TrayItem:
     views: int | None = None
 
 
-class Answer(StrEnum):
+class TrayDecision(StrEnum):
     """What somebody says about an object."""
 
-    GO = "go"
-    ANEW = "anew"
+    PROCEED = "proceed"
+    RESTART = "restart"
     SKIP = "skip"
     STOP = "stop"
 
 
-class Attendant(Protocol):
+class TrayOperator(Protocol):
     """Whoever brings the objects, or somebody who answers for hands that bring them by themselves."""
 
-    def bring(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> Answer:
-        """Have the object on the table; GO, or ANEW where an interrupted one (``kept``) was moved since."""
+    def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:
+        """Ask for the object; PROCEED, or RESTART if an interrupted one (``kept``) was moved meanwhile."""
         ...
 
-    def trouble(self, item: TrayItem, error: RigError) -> Answer:
-        """Say whether an object that failed is tried again (GO), skipped, or the tray stopped."""
+    def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:
+        """Say whether an object that failed is tried again (PROCEED), skipped, or the tray stopped."""
         ...
 
 
-class Hands:
-    """Hands that put every object by the platter's mark, the same way each time, and ask nobody."""
+class AutomaticOperator:
+    """AutomaticOperator that put every object by the platter's mark, the same way each time, and ask nobody."""
 
-    def bring(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> Answer:  # noqa: ARG002
-        return Answer.GO
+    def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:  # noqa: ARG002
+        return TrayDecision.PROCEED
 
-    def trouble(self, item: TrayItem, error: RigError) -> Answer:  # noqa: ARG002
-        return Answer.STOP
+    def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:  # noqa: ARG002
+        return TrayDecision.STOP
 
 
 def read_tray(path: Path) -> tuple[TrayItem, ...]:
@@ -127,7 +127,7 @@ def enroll_tray(
     items: Sequence[TrayItem],
     *,
     views: int | None = None,
-    attendant: Attendant | None = None,
+    operator: TrayOperator | None = None,
 ) -> Generator[Event, None, None]:
     """Enroll the objects of a tray one after the other; yields an `Item` before the events of each.
 
@@ -142,15 +142,15 @@ def enroll_tray(
         From `read_tray`.
     views
         Views of objects for which the list says nothing; ``enroll.views`` otherwise.
-    attendant
+    operator
         Brings the objects; without one they are taken to stand there when their turn comes.
 
     Raises
     ------
     RigError
-        As `enroll`, where the attendant does not want to go on.
+        As `enroll`, where the operator does not want to go on.
     """
-    attendant = attendant or Hands()
+    operator = operator or AutomaticOperator()
     for number, item in enumerate(items, 1):
         while True:
             known = {summary.name: summary for summary in catalog.objects()}.get(item.name)
@@ -158,14 +158,14 @@ def enroll_tray(
             if known is not None and kept is None and known.views:
                 yield Item(number, len(items), item.name, "skip", "it is enrolled already")
                 break
-            answer = attendant.bring(item, number, len(items), kept)
-            if answer is Answer.STOP:
+            answer = operator.request(item, number, len(items), kept)
+            if answer is TrayDecision.STOP:
                 return
-            if answer is Answer.SKIP:
+            if answer is TrayDecision.SKIP:
                 yield Item(number, len(items), item.name, "skip", "as asked")
                 break
-            resume = kept is not None and answer is Answer.GO
-            action = "resume" if resume else "anew" if kept else "enroll"
+            resume = kept is not None and answer is TrayDecision.PROCEED
+            action = "resume" if resume else "replace" if kept else "enroll"
             yield Item(number, len(items), item.name, action)
             try:
                 yield from enroll(
@@ -179,10 +179,10 @@ def enroll_tray(
                     replace=kept is not None and not resume,
                 )
             except AT_THE_OBJECT as error:
-                answer = attendant.trouble(item, error)
-                if answer is Answer.STOP:
+                answer = operator.decide_after_error(item, error)
+                if answer is TrayDecision.STOP:
                     raise
-                if answer is Answer.SKIP:
+                if answer is TrayDecision.SKIP:
                     yield Item(number, len(items), item.name, "skip", error.what)
                     break
             else:

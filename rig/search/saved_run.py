@@ -25,7 +25,7 @@ from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError
 from rig.core.files import write
-from rig.events.events import Accepted, Event, Started, event_dict
+from rig.events.events import Accepted, Event, Started, event_dict, event_kind
 from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as RULES
 from rig.search.stopping_rules import read_rules, write_rules
@@ -36,7 +36,7 @@ VERSION: Final = 2
 """Raised when a program that knows less could not compute a run again; version 1 knew no dense search."""
 EMPTY_TABLE: Final = "empty_table.png"
 
-_KINDS: Final[dict[str, type]] = {kind.__name__.lower(): kind for kind in get_args(Event)}
+_KINDS: Final[dict[str, type]] = {event_kind(kind): kind for kind in get_args(Event)}
 
 
 class RunWriter:

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.ui.ask import agreed
 from rig.cli.ui.command import command
+from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def settings_(
         if not settings.json:
             print(servo.found)
             print("\n".join(f"  {difference}" for difference in differences) or "  as the rig needs it")
-        written = bool(differences) and write and (yes or settings.json or agreed("Write these settings?"))
+        written = bool(differences) and write and (yes or settings.json or ask_yes_no("Write these settings?"))
         if written:
             write_settings(servo.bus, servo.found.bus_id, servo.table, differences)
     if settings.json:
@@ -133,7 +133,7 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
         if not settings.json:
             print(servo.found)
         if old != new:
-            if not (yes or settings.json or agreed(f"Change its {what} from {old} to {new}, with its torque off?")):
+            if not (yes or settings.json or ask_yes_no(f"Change its {what} from {old} to {new}, with its torque off?")):
                 print("Nothing was changed.")
                 return
             if what == "id":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from rig.cli.ui import ask
+from rig.cli.ui import prompts
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
@@ -62,7 +62,7 @@ def setup(
         lines = [f"{'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
         if write and not dialogue.ask_nothing:
             print("\n".join(["", f"{path}{'' if there else ' (new)'}:", *(f"  {line}" for line in lines)]), file=out)
-            write = ask.agreed(f"Write {path}?", default=True)
+            write = prompts.ask_yes_no(f"Write {path}?", default=True)
     if write:
         save(path, new)
     done = f"Wrote {path}." if write else f"{path} is left as it is."
@@ -132,7 +132,7 @@ class Dialogue:
     def _again(self, what: str) -> bool:
         if self.ask_nothing:
             return False
-        return ask.agreed(f"{what} Look again, after you have checked cables and supply?", default=False)
+        return prompts.ask_yes_no(f"{what} Look again, after you have checked cables and supply?", default=False)
 
     def _pick(
         self, what: str, found: Sequence[T], shown: Sequence[str], node: "Callable[[T], Node] | None" = None
@@ -147,7 +147,9 @@ class Dialogue:
             return None
         nodes = [node(each) for each in found] if node else []
         several = len({each.path for each in nodes}) > 1
-        index = ask.chosen(f"Which is the table's {what}?", shown, other="find out by unplugging it" if several else "")
+        index = prompts.ask_choice(
+            f"Which is the table's {what}?", shown, other="find out by unplugging it" if several else ""
+        )
         if index is not None:
             return found[index]
         pulled = self._pulled(what, lambda: [*self.case.host.serial_ports(), *self.case.host.cameras()])
@@ -157,15 +159,15 @@ class Dialogue:
         """Find out which device file belongs to a device by having it unplugged and plugged in again."""
         before = there()
         while True:
-            ask.line(f"Unplug the {what}'s USB cable, then press Enter.")
+            prompts.ask_line(f"Unplug the {what}'s USB cable, then press Enter.")
             left = {node.path for node in there()}
             gone = [node for node in before if node.path not in left]
-            ask.line("Plug it in again, then press Enter.")
+            prompts.ask_line("Plug it in again, then press Enter.")
             if len(gone) == 1:
                 print(f"It is {gone[0].path} ({gone[0].name}).", file=self.out)
                 return gone[0]
             print(f"{len(gone) or 'No'} device{'s' if len(gone) != 1 else ''} went away.", file=self.out)
-            if not ask.agreed("Try again?", default=True):
+            if not prompts.ask_yes_no("Try again?", default=True):
                 return None
 
     def _which_port(self) -> None:
@@ -173,7 +175,7 @@ class Dialogue:
         ports = [port for port in self.case.host.serial_ports() if port.usb]
         port: Node | None = ports[0] if len(ports) == 1 else None
         if len(ports) > 1 and not self.ask_nothing:
-            index = ask.chosen(
+            index = prompts.ask_choice(
                 "Which is the servo's adapter?",
                 [f"{each.path}: {each.name}" for each in ports],
                 other="find out by unplugging it",
@@ -201,7 +203,7 @@ class Dialogue:
             print("\n".join(f"  {difference}" for difference in differences), file=self.out)
             if self.ask_nothing:
                 print(f"  left as they are; to write them: {case.rig('servo settings --write')}", file=self.out)
-            elif ask.agreed("Write them now, with the servo's torque off?", default=True):
+            elif prompts.ask_yes_no("Write them now, with the servo's torque off?", default=True):
                 write(servo.bus, servo.found.bus_id, servo.table, differences)
                 print("Written, and read back.", file=self.out)
 
@@ -210,7 +212,7 @@ class Dialogue:
         low, high = self.case.config.table.limits_deg
         if self.ask_nothing or self._configured("table", "limits_deg") or self.case.config.table.mode == "pan":
             return
-        reach = ask.entered(
+        reach = prompts.ask_value(
             "How far may the table turn either way, in degrees, before the IMU's cable is taut?",
             min(-low, high),
             _degrees,
@@ -222,9 +224,12 @@ class Dialogue:
 
 
 def _degrees(text: str) -> float:
-    value = float(text.removesuffix("°"))
+    try:
+        value = float(text.removesuffix("°"))
+    except ValueError:
+        raise ValueError(f"{text!r} is not a number.") from None
     if not SMALLEST_REACH_DEG <= value <= LARGEST_REACH_DEG:
-        raise ValueError(f"give {SMALLEST_REACH_DEG:.0f} to {LARGEST_REACH_DEG:.0f} degrees; one whole turn is needed")
+        raise ValueError(f"Enter {SMALLEST_REACH_DEG:.0f}–{LARGEST_REACH_DEG:.0f} degrees: one revolution or more.")
     return value
 
 

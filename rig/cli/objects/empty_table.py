@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.jobs import somebody_there
+from rig.cli.ui.jobs import is_interactive
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def empty_table(
         )
 
 
-def see_to_empty_table(settings: Settings, bench: "Bench", *, ask: bool, then: str | None = None) -> None:
+def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, then: str | None = None) -> None:
     """Have a picture of the empty table for today, before objects are put on it.
 
     An operator who can empties the table unasked. A person is asked, where ``ask`` allows it and somebody is there;
@@ -93,7 +93,7 @@ def see_to_empty_table(settings: Settings, bench: "Bench", *, ask: bool, then: s
         return
     consequence = WITHOUT if standing.table is None else STALE
     person = isinstance(bench.operator, ObjectStandsThere)
-    if person and ask and not settings.json and somebody_there():
+    if person and ask and not settings.json and is_interactive():
         if _asked(settings, bench, f"{sentence(standing.words)} Take everything off the table.", consequence) and then:
             _enter(f"Now put {then} on the table and take your hands away.\n  Enter goes on: ")
         return

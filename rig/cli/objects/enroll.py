@@ -84,13 +84,13 @@ def enroll(
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
         from rig.bench import ObjectStandsThere
         from rig.cli.catalog.catalog import tell_other_regions
-        from rig.cli.objects.empty_table import see_to_empty_table
-        from rig.cli.ui.operator_prompts import Person
+        from rig.cli.objects.empty_table import ensure_empty_table_image
+        from rig.cli.ui.operator_prompts import OperatorPrompts
         from rig.plans.enroll import enroll as enroll_one
-        from rig.plans.tray import Hands, enroll_tray
+        from rig.plans.tray import AutomaticOperator, enroll_tray
 
         tell_other_regions(settings, catalog, bench)
-        see_to_empty_table(settings, bench, ask=not yes, then=name)
+        ensure_empty_table_image(settings, bench, ask=not yes, then=name)
         job = _Job(settings, bench, catalog)
         if name is not None:
             events = enroll_one(
@@ -99,9 +99,9 @@ def enroll(
             job.run(events, lambda: again("Go on with:"), report)
         else:
             person = isinstance(bench.operator, ObjectStandsThere)
-            attendant = Person(job.quiet) if person else Hands()
+            operator = OperatorPrompts(job.quiet) if person else AutomaticOperator()
             job.run(
-                enroll_tray(bench, catalog, items, views=views, attendant=attendant),
+                enroll_tray(bench, catalog, items, views=views, operator=operator),
                 lambda: again("The same command goes on with the others:"),
                 report,
             )
@@ -261,7 +261,7 @@ def _dry_run(settings: Settings, names: list[str], views: int | None, *, resume:
     with settings.open_bench() as bench, settings.catalog_there() or nullcontext() as catalog:
         found = dry_run(bench, catalog, names, views=views, resume=resume, replace=replace)
     if settings.json:
-        settings.print_json({"rehearsal": plain(found)})
+        settings.print_json({"dry_run": plain(found)})
         return
     screen = console()
     for line in dry_run_lines(found):

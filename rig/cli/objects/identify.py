@@ -54,7 +54,7 @@ def identify(
     Example: rig identify --watch --bench sim --json
     """
     from rig.bench import TableClearer
-    from rig.cli.objects.empty_table import see_to_empty_table
+    from rig.cli.objects.empty_table import ensure_empty_table_image
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
     from rig.events.events import Identified, Waiting, event_dict
@@ -82,7 +82,7 @@ def identify(
             known = model()
             sees = known.descriptor != PAPER_DESCRIPTOR and known.pictured is not False
             if sees and isinstance(bench.operator, TableClearer):
-                see_to_empty_table(settings, bench, ask=False)
+                ensure_empty_table_image(settings, bench, ask=False)
             if watch:
                 events = watch_table(bench, model, strategy=chosen, seed=seed, top=top)
             else:

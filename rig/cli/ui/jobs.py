@@ -36,7 +36,7 @@ def run_job(title: str, job: "Generator[Progressed, None, _T]", *, interrupted: 
         job.close()
 
 
-def somebody_there() -> bool:
+def is_interactive() -> bool:
     """Tell whether a person can answer."""
     return sys.stdin.isatty()
 
@@ -47,7 +47,7 @@ def confirm(question: str, *, yes: bool, settings: Settings) -> None:
 
     if yes:
         return
-    if settings.json or not somebody_there():
+    if settings.json or not is_interactive():
         raise UsageError(f"{question} Nobody is there to answer.", next_step="give --yes if you mean it")
     if not typer.confirm(question, err=True):
         print("Nothing was changed.", file=sys.stderr)

@@ -6,12 +6,12 @@ from typing import TextIO
 
 from rig.catalog import ObjectSummary
 from rig.core.errors import RigError, UsageError
-from rig.plans.tray import Answer, TrayItem
+from rig.plans.tray import TrayDecision, TrayItem
 
 BELL = "\a"
 
 
-class Person:
+class OperatorPrompts:
     """Asks for the next object, with a beep, and reads the answer as a line.
 
     Parameters
@@ -33,27 +33,29 @@ class Person:
         self._questions = questions or sys.stderr
         self._answers = answers or sys.stdin
 
-    def bring(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> Answer:
+    def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:
         label = f" ({item.label})" if item.label else ""
         asked = f"{number} of {of}: put {item.name}{label} on the table and take your hands away."
         if kept is None:
-            return self._ask(asked, {"": Answer.GO, "s": Answer.SKIP, "q": Answer.STOP}, "Enter goes on")
+            return self._ask(
+                asked, {"": TrayDecision.PROCEED, "s": TrayDecision.SKIP, "q": TrayDecision.STOP}, "Enter goes on"
+            )
         views = kept.unfinished_views or 0
         return self._ask(
             f"{number} of {of}: {item.name} has {views} view{'' if views == 1 else 's'} from before. "
             "If nobody has moved it since, it can go on.",
-            {"": Answer.GO, "n": Answer.ANEW, "s": Answer.SKIP, "q": Answer.STOP},
+            {"": TrayDecision.PROCEED, "n": TrayDecision.RESTART, "s": TrayDecision.SKIP, "q": TrayDecision.STOP},
             "Enter goes on, n begins anew because it was moved",
         )
 
-    def trouble(self, item: TrayItem, error: RigError) -> Answer:
+    def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:
         return self._ask(
             f"{item.name}: {error.what}\n{error.next_step}",
-            {"": Answer.GO, "s": Answer.SKIP, "q": Answer.STOP},
+            {"": TrayDecision.PROCEED, "s": TrayDecision.SKIP, "q": TrayDecision.STOP},
             "Enter tries again",
         )
 
-    def _ask(self, question: str, answers: dict[str, Answer], hint: str) -> Answer:
+    def _ask(self, question: str, answers: dict[str, TrayDecision], hint: str) -> TrayDecision:
         self._before()
         bell = BELL if self._questions.isatty() else ""
         while True:
@@ -66,6 +68,6 @@ class Person:
                 ) from error
             if not said:
                 print(file=self._questions)
-                return Answer.STOP
+                return TrayDecision.STOP
             if (answer := answers.get(said.strip().lower())) is not None:
                 return answer

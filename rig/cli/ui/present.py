@@ -13,6 +13,7 @@ from rig.events.events import (
     Accepted,
     Candidate,
     Decided,
+    EmptyTableImage,
     Enrolled,
     Event,
     Failed,
@@ -23,7 +24,6 @@ from rig.events.events import (
     Ranked,
     Rejected,
     Started,
-    TablePicture,
     Unwinding,
     Waiting,
     Warned,
@@ -93,7 +93,7 @@ def line(event: Event) -> str:
             return ""
         case Insight():
             return "\n".join(f"  {words}" for words in insight_words(event))
-        case TablePicture():
+        case EmptyTableImage():
             turning = "" if event.turning_share is None else f", {event.turning_share:.1%} of it turns with the table"
             return f"Picture of the empty table: {event.width} x {event.height} pixels{turning}"
         case Warned():

@@ -139,7 +139,7 @@ def test_a_day_with_the_catalog(two: Rig) -> None:
 
 @pytest.mark.parametrize(("answer", "left"), [("n\n", ["mug", "tin"]), ("y\n", ["tin"])])
 def test_a_deletion_asks(two: Rig, monkeypatch: pytest.MonkeyPatch, answer: str, left: list[str]) -> None:
-    monkeypatch.setattr("rig.cli.ui.jobs.somebody_there", lambda: True)
+    monkeypatch.setattr("rig.cli.ui.jobs.is_interactive", lambda: True)
     done = CliRunner().invoke(app, ["catalog", "delete", "mug"], input=answer)
     assert "Delete mug with 4 views?" in done.output
     assert done.exit_code == (0 if answer == "y\n" else 1)

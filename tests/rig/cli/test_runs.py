@@ -156,7 +156,7 @@ def test_the_bench_searches_by_its_own_strategy_where_its_catalog_is_described_f
         return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
 
     events, _ = searched("--top", "1", "--save-run", "runs/own")
-    started, *_, answer = (event for event in events if event["event"] != "tablepicture")
+    started, *_, answer = (event for event in events if event["event"] != "empty_table_image")
     assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
     assert 0.9 < answer["probability"] <= 1
     assert answer["familiarity"] >= answer["min_familiarity"]
@@ -225,7 +225,7 @@ def test_a_dry_run_says_all_and_does_nothing(rig):
     assert "Table angles: 0.0, 60.0, 120.0, 180.0, 240.0, 300.0" in done.stdout
     assert "travel" in done.stdout
     assert "would be refused, it is enrolled already" in rig("enroll", "lamp", "--dry-run").stdout
-    (told,) = json.loads(rig("enroll", "lamp", "--replace", "--dry-run", "--json").stdout)["rehearsal"]
+    (told,) = json.loads(rig("enroll", "lamp", "--replace", "--dry-run", "--json").stdout)["dry_run"]
     assert (told["action"], told["views"]) == ("replace", 8)
     assert sorted(Path("catalog").rglob("*.png")) == before
 

@@ -165,7 +165,7 @@ def test_an_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch
         ("\n", lambda: None),
         ("y\n", lambda: None),
     )
-    monkeypatch.setattr("rig.cli.ui.ask.sys.stdin", hands)
+    monkeypatch.setattr("rig.cli.ui.prompts.sys.stdin", hands)
     with pytest.raises(typer.Exit) as ended:
         setup.__wrapped__(Settings(), yes=False)
     assert ended.value.exit_code == 4

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from rig.bench import ObjectStandsThere
 from rig.cli.main import app
-from rig.cli.objects.empty_table import see_to_empty_table
+from rig.cli.objects.empty_table import ensure_empty_table_image
 from rig.cli.ui.settings import Settings
 from rig.views.empty_table import EmptyTables
 
@@ -35,7 +35,7 @@ def test_it_is_taken_told_and_shown(rig: Callable[..., Any]) -> None:
     assert nothing.exit_code == 2
     assert "no picture of the empty table was taken yet" in nothing.stderr
     taken = json.loads(rig("empty-table", "--json").stdout)
-    assert (taken["event"], taken["width"], taken["height"]) == ("tablepicture", 640, 480)
+    assert (taken["event"], taken["width"], taken["height"]) == ("empty_table_image", 640, 480)
     shown = rig("empty-table", "--show", "empty.png", "--json")
     assert json.loads(shown.stdout)["doubts"] == []
     assert cv2.imread("empty.png").shape == (480, 640, 3)
@@ -88,7 +88,7 @@ def asked(
             times = iter(range(99))
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
         monkeypatch.setattr("sys.stdin", answers)
-        see_to_empty_table(Settings(json=as_json), s.bench, ask=ask, then="toy-car")
+        ensure_empty_table_image(Settings(json=as_json), s.bench, ask=ask, then="toy-car")
         return EmptyTables.standing(s.bench).table, capsys.readouterr().err
 
     return run

@@ -22,6 +22,7 @@ from rig.events.events import (
     Warned,
     Weighed,
     event_dict,
+    event_kind,
 )
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
@@ -92,7 +93,7 @@ def check_values(told: dict[str, Any]) -> str:
 
 
 def test_every_event_and_part_is_documented_with_exactly_its_fields():
-    kinds = {kind.__name__.lower(): kind for kind in get_args(Event)}
+    kinds = {event_kind(kind): kind for kind in get_args(Event)}
     assert SCHEMAS.keys() == kinds.keys() | PARTS.keys()
     for name, kind in (kinds | PARTS).items():
         assert is_dataclass(kind)
@@ -127,7 +128,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     seen |= {check_event(Failed(**error)), check_event(Waiting("the next object"))}
     seen.add(check_event(Warned(3, "the table is another", "Take a new picture.")))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
-    assert seen == {kind.__name__.lower() for kind in get_args(Event)}
+    assert seen == {event_kind(kind) for kind in get_args(Event)}
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from rig.catalog import Catalog
 from rig.core.errors import ObjectNotFound, RotationDisagreement, UsageError, ViewRejected
 from rig.events.events import Accepted, Enrolled, Item
 from rig.plans.enroll import enroll
-from rig.plans.tray import AT_THE_OBJECT, Answer, TrayItem, enroll_tray, read_tray
+from rig.plans.tray import AT_THE_OBJECT, TrayDecision, TrayItem, enroll_tray, read_tray
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 TEXT = st.text(string.ascii_letters + string.digits + " äöü,;\"'-_", min_size=1, max_size=12).map(str.strip)
@@ -101,18 +101,18 @@ def test_a_list_that_is_not_there(tmp_path):
 
 
 class Scripted:
-    """An attendant with answers ready."""
+    """An operator with answers ready."""
 
     def __init__(self, bring=(), trouble=()):
         self._bring, self._trouble = list(bring), list(trouble)
         self.brought = []
         self.troubles = []
 
-    def bring(self, item, number, of, kept):
+    def request(self, item, number, of, kept):
         self.brought.append((item.name, number, of, kept.unfinished_views if kept else None))
-        return self._bring.pop(0) if self._bring else Answer.GO
+        return self._bring.pop(0) if self._bring else TrayDecision.PROCEED
 
-    def trouble(self, item, error):
+    def decide_after_error(self, item, error):
         self.troubles.append((item.name, type(error)))
         return self._trouble.pop(0)
 
@@ -144,7 +144,7 @@ def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, ca
     list(enroll(s.bench, catalog, "dice", views=4))
     interrupted(s, catalog, "lamp")
     person = Scripted()
-    events = list(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"), views=4, attendant=person))
+    events = list(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"), views=4, operator=person))
     assert actions(events) == [("dice", "skip"), ("lamp", "resume"), ("clock", "enroll")]
     assert person.brought == [("lamp", 2, 3, 2), ("clock", 3, 3, None)]
     assert [e.name for e in events if isinstance(e, Enrolled)] == ["lamp", "clock"]
@@ -158,16 +158,16 @@ def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, ca
 def test_an_interrupted_object_that_was_moved_is_enrolled_anew(simulated, catalog):
     s = simulated(*SMALL)
     interrupted(s, catalog, "lamp")
-    events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, attendant=Scripted([Answer.ANEW])))
-    assert actions(events) == [("lamp", "anew")]
+    events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, operator=Scripted([TrayDecision.RESTART])))
+    assert actions(events) == [("lamp", "replace")]
     assert sum(isinstance(e, Accepted) for e in events) == 4
     assert len({view.sitting.id for view in catalog.object("lamp").views}) == 1
 
 
 def test_somebody_may_leave_objects_out_or_stop(simulated, catalog):
     s = simulated(*SMALL)
-    person = Scripted([Answer.SKIP, Answer.GO, Answer.STOP])
-    events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, attendant=person))
+    person = Scripted([TrayDecision.SKIP, TrayDecision.PROCEED, TrayDecision.STOP])
+    events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, operator=person))
     assert actions(events) == [("lamp", "skip"), ("dice", "enroll")]
     assert [o.name for o in catalog.objects()] == ["dice"]
 
@@ -177,12 +177,12 @@ def test_an_object_in_the_dark_is_tried_again_with_the_views_it_has(simulated, c
     s.world.change(light=(0.0, 0.0, 0.0))
 
     class Lights(Scripted):
-        def trouble(self, item, error):
+        def decide_after_error(self, item, error):
             s.world.change(light=(1.0, 1.0, 1.0))
-            return super().trouble(item, error)
+            return super().decide_after_error(item, error)
 
-    person = Lights(trouble=[Answer.GO])
-    events = list(enroll_tray(s.bench, catalog, items("dice"), views=4, attendant=person))
+    person = Lights(trouble=[TrayDecision.PROCEED])
+    events = list(enroll_tray(s.bench, catalog, items("dice"), views=4, operator=person))
     assert person.troubles == [("dice", ViewRejected)]
     assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
     assert catalog.object("dice").summary.views == 4
@@ -190,8 +190,8 @@ def test_an_object_in_the_dark_is_tried_again_with_the_views_it_has(simulated, c
 
 def test_an_object_that_fails_is_left_out_or_ends_the_tray(simulated, catalog):
     s = simulated(*SMALL)
-    person = Scripted(trouble=[Answer.SKIP])
-    events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, attendant=person))
+    person = Scripted(trouble=[TrayDecision.SKIP])
+    events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, operator=person))
     assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
     with pytest.raises(ObjectNotFound):
         list(enroll_tray(s.bench, catalog, items("nonsense"), views=4))

@@ -16,7 +16,7 @@ from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotKept, TableNotEmpty, UsageError, ViewRejected
-from rig.events.events import TablePicture, Warned
+from rig.events.events import EmptyTableImage, Warned
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
@@ -34,9 +34,9 @@ SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 Open = Callable[..., Any]
 
 
-def photographed(bench: Bench, **options: Any) -> TablePicture:
+def photographed(bench: Bench, **options: Any) -> EmptyTableImage:
     *_, taken = photograph_table(bench, **options)
-    assert isinstance(taken, TablePicture)
+    assert isinstance(taken, EmptyTableImage)
     return taken
 
 
@@ -85,7 +85,7 @@ def test_a_round_object_turns_unseen_and_is_told_by_the_picture_before(simulated
     s.operator.clear = lambda: True
     s.operator.place("vase-blue")
     events = list(photograph_table(s.bench))
-    assert [type(event) for event in events[-2:]] == [Warned, TablePicture]
+    assert [type(event) for event in events[-2:]] == [Warned, EmptyTableImage]
     assert "does not look as it did" in events[-2].what
 
 

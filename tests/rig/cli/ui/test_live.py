@@ -17,12 +17,12 @@ from rich.console import Console
 
 from rig.catalog import ObjectSummary
 from rig.cli.ui.live import EnrollView, IdentifyView, LiveView
-from rig.cli.ui.operator_prompts import Person
+from rig.cli.ui.operator_prompts import OperatorPrompts
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
 from rig.events.events import Event, Insight, Item, Moved, Resemblance, Waiting
-from rig.plans.tray import Answer, TrayItem
+from rig.plans.tray import TrayDecision, TrayItem
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
@@ -229,37 +229,37 @@ def test_sigtstp_stops_between_two_views_and_sigcont_goes_on(folder):
     assert "12 views enrolled" in rest
 
 
-def asked(answers: str, kept: ObjectSummary | None = None) -> tuple[Answer, str]:
+def asked(answers: str, kept: ObjectSummary | None = None) -> tuple[TrayDecision, str]:
     questions = io.StringIO()
-    person = Person(questions=questions, answers=io.StringIO(answers))
-    return person.bring(TrayItem(2, "mug", "kitchen"), 3, 25, kept), questions.getvalue()
+    person = OperatorPrompts(questions=questions, answers=io.StringIO(answers))
+    return person.request(TrayItem(2, "mug", "kitchen"), 3, 25, kept), questions.getvalue()
 
 
 def test_a_person_is_asked_for_the_next_object():
     answer, question = asked("\n")
-    assert answer is Answer.GO
+    assert answer is TrayDecision.PROCEED
     assert question.startswith("3 of 25: put mug (kitchen) on the table")
     assert "\a" not in question  # in a pipe nobody hears it
-    assert asked("s\n")[0] is Answer.SKIP
-    assert asked("what?\nn\nQ\n")[0] is Answer.STOP  # what is no answer is asked again
-    assert asked("")[0] is Answer.STOP
+    assert asked("s\n")[0] is TrayDecision.SKIP
+    assert asked("what?\nn\nQ\n")[0] is TrayDecision.STOP  # what is no answer is asked again
+    assert asked("")[0] is TrayDecision.STOP
 
 
 def test_a_person_is_asked_whether_an_interrupted_object_was_moved():
     clock = SystemClock()
     kept = ObjectSummary("mug", "", "", clock.utc(), None, 0, 31)
     answer, question = asked("n\n", kept)
-    assert answer is Answer.ANEW
+    assert answer is TrayDecision.RESTART
     assert "31 views from before" in question
-    assert asked("\n", kept)[0] is Answer.GO
+    assert asked("\n", kept)[0] is TrayDecision.PROCEED
 
 
 def test_a_person_decides_what_becomes_of_an_object_that_failed():
     error = ViewRejected("View 3 was not acceptable: too dark.", next_step="Look at the light.")
-    for said, expected in (("\n", Answer.GO), ("s\n", Answer.SKIP), ("q\n", Answer.STOP)):
+    for said, expected in (("\n", TrayDecision.PROCEED), ("s\n", TrayDecision.SKIP), ("q\n", TrayDecision.STOP)):
         questions = io.StringIO()
-        person = Person(questions=questions, answers=io.StringIO(said))
-        assert person.trouble(TrayItem(2, "mug"), error) is expected
+        person = OperatorPrompts(questions=questions, answers=io.StringIO(said))
+        assert person.decide_after_error(TrayItem(2, "mug"), error) is expected
         assert "too dark" in questions.getvalue()
         assert "Look at the light" in questions.getvalue()
 
@@ -270,7 +270,7 @@ def test_where_nobody_can_be_asked_that_is_said():
             raise OSError("no input")
 
     with pytest.raises(UsageError):
-        Person(questions=io.StringIO(), answers=Closed()).bring(TrayItem(2, "mug"), 1, 1, None)
+        OperatorPrompts(questions=io.StringIO(), answers=Closed()).request(TrayItem(2, "mug"), 1, 1, None)
 
 
 def test_items_that_are_skipped_are_told():
