@@ -170,8 +170,8 @@ class Enrolled:
 class Item:
     """The next object of a tray, ``number`` (from 1) ``of`` so many.
 
-    ``action`` is "enroll", "resume" (the views that are missing), "replace" (an interrupted enrollment, of an object that
-    was moved since), or "skip", with the reason in ``why``.
+    ``action`` is "enroll", "resume" (take the missing views), "replace" (repeat an interrupted enrollment, because
+    the object was moved), or "skip", with the reason in ``why``.
     """
 
     number: int

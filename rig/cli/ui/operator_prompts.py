@@ -1,25 +1,26 @@
-"""The person who brings the objects of a tray, asked on the terminal."""
+"""Prompts for the operator who puts the objects of a tray on the table."""
 
 import sys
 from collections.abc import Callable
-from typing import TextIO
+from typing import Final, TextIO
 
 from rig.catalog import ObjectSummary
 from rig.core.errors import RigError, UsageError
 from rig.plans.tray import TrayDecision, TrayItem
 
-BELL = "\a"
+BELL: Final = "\a"
+_KEYS: Final = {"": TrayDecision.PROCEED, "s": TrayDecision.SKIP, "q": TrayDecision.STOP}
 
 
 class OperatorPrompts:
-    """Asks for the next object, with a beep, and reads the answer as a line.
+    """Asks for each object of a tray on the terminal, with a beep.
 
     Parameters
     ----------
     before
-        Called before a question: takes what is live off the screen.
+        Called before each question: removes the live display.
     questions, answers
-        Standard error and standard input by default. The end of the answers means stop.
+        Standard error and standard input by default. The end of the input means stop.
     """
 
     def __init__(
@@ -35,39 +36,37 @@ class OperatorPrompts:
 
     def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:
         label = f" ({item.label})" if item.label else ""
-        asked = f"{number} of {of}: put {item.name}{label} on the table and take your hands away."
         if kept is None:
             return self._ask(
-                asked, {"": TrayDecision.PROCEED, "s": TrayDecision.SKIP, "q": TrayDecision.STOP}, "Enter goes on"
+                f"{number} of {of}: put {item.name}{label} on the table and take your hands away.",
+                _KEYS,
+                "Enter: continue",
             )
         views = kept.unfinished_views or 0
         return self._ask(
-            f"{number} of {of}: {item.name} has {views} view{'' if views == 1 else 's'} from before. "
-            "If nobody has moved it since, it can go on.",
-            {"": TrayDecision.PROCEED, "n": TrayDecision.RESTART, "s": TrayDecision.SKIP, "q": TrayDecision.STOP},
-            "Enter goes on, n begins anew because it was moved",
+            f"{number} of {of}: {item.name} has {views} view{'' if views == 1 else 's'} of an interrupted enrollment. "
+            "You can resume it if the object was not moved.",
+            {**_KEYS, "n": TrayDecision.RESTART},
+            "Enter: resume, n: enroll again because the object was moved",
         )
 
     def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:
-        return self._ask(
-            f"{item.name}: {error.what}\n{error.next_step}",
-            {"": TrayDecision.PROCEED, "s": TrayDecision.SKIP, "q": TrayDecision.STOP},
-            "Enter tries again",
-        )
+        return self._ask(f"{item.name}: {error.what}\n{error.next_step}", _KEYS, "Enter: try again")
 
-    def _ask(self, question: str, answers: dict[str, TrayDecision], hint: str) -> TrayDecision:
+    def _ask(self, question: str, keys: dict[str, TrayDecision], hint: str) -> TrayDecision:
         self._before()
         bell = BELL if self._questions.isatty() else ""
         while True:
-            print(f"{bell}{question}\n  {hint}, s leaves it out, q stops: ", end="", file=self._questions, flush=True)
+            print(f"{bell}{question}\n  {hint}, s: skip, q: stop ", end="", file=self._questions, flush=True)
             try:
-                said = self._answers.readline()
+                answer = self._answers.readline()
             except (OSError, UnicodeDecodeError) as error:
                 raise UsageError(
-                    "Nobody can be asked for the next object.", next_step="Run the command in a terminal."
+                    "The program cannot ask for the next object: standard input is not readable.",
+                    next_step="Run the command in a terminal.",
                 ) from error
-            if not said:
+            if not answer:
                 print(file=self._questions)
                 return TrayDecision.STOP
-            if (answer := answers.get(said.strip().lower())) is not None:
-                return answer
+            if (decision := keys.get(answer.strip().lower())) is not None:
+                return decision

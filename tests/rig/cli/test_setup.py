@@ -116,7 +116,8 @@ def test_nonsense_is_asked_again(home):
     done = rig("setup", "--bench", "sim", answers="far\n90\n720\nperhaps\ny\n")
     assert done.exit_code == 0
     assert load_config(home / "rig.toml").table.limits_deg == (-720, 720)
-    assert "one whole turn is needed" in done.stderr
+    assert "'far' is not a number." in done.stderr
+    assert "one revolution or more" in done.stderr
     assert "Answer y or n." in done.stderr
 
 

@@ -250,7 +250,7 @@ def test_a_person_is_asked_whether_an_interrupted_object_was_moved():
     kept = ObjectSummary("mug", "", "", clock.utc(), None, 0, 31)
     answer, question = asked("n\n", kept)
     assert answer is TrayDecision.RESTART
-    assert "31 views from before" in question
+    assert "31 views of an interrupted enrollment" in question
     assert asked("\n", kept)[0] is TrayDecision.PROCEED
 
 
