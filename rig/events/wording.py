@@ -76,37 +76,56 @@ def odds_words(probability: float) -> str:
 
 
 def move_words(moved: Moved) -> str:
-    """Return how far the table turned by encoder and gyro, and whether they agree."""
-    words = f"table {signed(moved.rotation_encoder_deg, 2)}° by the encoder"
+    """Return the table's rotation as encoder and gyro measured it, and whether they agree."""
+    words = f"rotation {signed(moved.rotation_encoder_deg, 2)}° (encoder)"
     if moved.rotation_imu_deg is None:
-        return f"{words}, the gyro has no answer"
+        return f"{words}, no gyro value"
     sigma = "" if moved.imu_sigma_deg is None else f" ± {moved.imu_sigma_deg:.2f}"
-    words += f", {signed(moved.rotation_imu_deg, 2)}{sigma}° by the gyro"
+    words += f", {signed(moved.rotation_imu_deg, 2)}{sigma}° (gyro)"
     if moved.agrees:
         return words
     bound = "" if moved.bound_deg is None else f" by more than {moved.bound_deg:.2f}°"
-    return f"{words}; they disagree{bound}, the gyro is believed"
+    return f"{words}; they differ{bound}, so the gyro value counts"
 
 
 def unwinding_words(unwinding: Unwinding) -> str:
-    """Return that the table goes the long way round, and why."""
-    low_deg, high_deg = unwinding.limits_deg
+    """Return that the table frees its cable by a long rotation, and why."""
+    low, high = (f"{angle:g}°".replace("-", "−") for angle in unwinding.limits_deg)
+    back = counted(unwinding.turns, "revolution")
     return (
-        f"unwinding the cable: the table goes the long way, from {unwinding.from_deg:.1f}° to {unwinding.to_deg:.1f}° "
-        f"({counted(unwinding.turns, 'turn')} back; the cable reaches from {low_deg:g}° to {high_deg:g}°)"
+        f"Unwinding the cable: the table rotates from {angle_words(unwinding.from_deg)} to "
+        f"{angle_words(unwinding.to_deg)} ({back} back; the cable allows {low} to {high})"
     )
 
 
-def answer_words(answer: Identified) -> str:
-    """Return the answer, how sure it is and why the search ended; an unknown object with its nearest three."""
+def result_words(answer: Identified) -> str:
+    """Return the result alone: "mug-white, rotated 70°, 99 % confident (2 views)".
+
+    An unknown object is given with its three most similar enrolled objects.
+    """
     if answer.name is None:
-        nearest = ", ".join(f"{c.name} {c.score:.3f}" for c in answer.candidates[:3])
-        found = f"Unknown: the nearest are {nearest}"
-    else:
-        found = f"{answer.name}, standing {answer.yaw_deg:.1f}° counter-clockwise of how it was enrolled"
-        if answer.margin <= 0 and len(answer.candidates) > 1:
-            found += f"; not sure, {answer.candidates[1].name} looks as likely"
-    return f"{found}. {sentence(answer.reason)}"
+        similar = [f"{candidate.name} (score {candidate.score:.3f})" for candidate in answer.candidates[:3]]
+        verb = "objects are" if len(similar) > 1 else "object is"
+        return f"Unknown object. The most similar enrolled {verb} {joined(similar)}."
+    words = f"{answer.name}, rotated {round(answer.yaw_deg) % 360}°"
+    if answer.probability is not None:
+        percent = ">99.9" if answer.probability > 0.999 else min(round(answer.probability * 100), 99)
+        words += f", {percent} % confident"
+    return f"{words} ({counted(answer.views, 'view')})"
+
+
+def answer_lines(answer: Identified) -> list[str]:
+    """Return the result, a doubt if there is one, and why the search ended."""
+    lines = [result_words(answer)]
+    if answer.name is not None and answer.margin <= 0 and len(answer.candidates) > 1:
+        lines.append(f"Not certain: {answer.candidates[1].name} is similarly likely.")
+    return [*lines, sentence(answer.reason)]
+
+
+def answer_words(answer: Identified) -> str:
+    """Return the answer in sentences: the result first, then why the search ended."""
+    result, *rest = answer_lines(answer)
+    return " ".join([f"{result.removesuffix('.')}.", *rest])
 
 
 def symmetry_words(insight: Insight) -> str:
@@ -160,6 +179,16 @@ def azimuth_words(azimuth_deg: float) -> str:
 def counted(n: int, noun: str) -> str:
     """Return "1 view", "2 views"."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def angle_words(angle_deg: float) -> str:
+    """Return an angle of the table to a tenth of a degree: "−12.5°"."""
+    return f"{angle_deg:.1f}°".replace("-", "−")
+
+
+def joined(items: Sequence[str]) -> str:
+    """Return items as an English list: "a, b and c"."""
+    return f"{', '.join(items[:-1])} and {items[-1]}" if len(items) > 1 else "".join(items)
 
 
 def short(words: str, letters: int) -> str:

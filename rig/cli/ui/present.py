@@ -29,7 +29,7 @@ from rig.events.events import (
     Warned,
 )
 from rig.events.wording import (
-    answer_words,
+    answer_lines,
     azimuth_words,
     counted,
     decision_words,
@@ -81,12 +81,12 @@ def line(event: Event) -> str:
             took = duration_words(event.seconds)
             return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
         case Identified():
-            return (
-                f"{answer_words(event)}\n  score {event.score:.3f} a view (unknown below {event.min_score:.3f}), "
-                + ("" if event.probability is None else f"probability {odds_words(event.probability)}, ")
-                + f"sure lead {signed(event.margin, 3)}, {counted(event.views, 'view')}, "
-                f"{event.travelled_deg:.0f}° travelled, {event.seconds:.1f} s"
+            numbers = (
+                f"Score {event.score:.3f} per view (unknown below {event.min_score:.3f}), "
+                f"margin {signed(event.margin, 3)}, {event.travelled_deg:.0f}° of rotation, "
+                f"{duration_words(event.seconds)}."
             )
+            return "\n  ".join([*answer_lines(event), numbers])
         case Item(action="skip"):
             return f"{event.number} of {event.of}  {event.name}: left out, {event.why}"
         case Item():

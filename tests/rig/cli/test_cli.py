@@ -83,7 +83,7 @@ def test_an_unknown_object_ends_with_exit_code_8(rig):
     rig("enroll", "mug-dots", "--views", "8")
     done = rig("identify", "--set", "bench.sim.object=clock", "--max-views", "3")
     assert done.exit_code == 8
-    assert "Unknown: the nearest are mug-dots" in done.stdout
+    assert "Unknown object. The most similar enrolled object is mug-dots" in done.stdout
 
 
 def test_identify_without_a_catalog_says_what_to_do(rig):

@@ -181,10 +181,10 @@ class TestWords:
 
     def test_moves(self) -> None:
         move = Moved(1, -90.0, -90.1, -90.1, -89.99, 0.12, 0.6, True, 1.0)
-        assert move_words(move) == "table −90.10° by the encoder, −89.99 ± 0.12° by the gyro"
+        assert move_words(move) == "rotation −90.10° (encoder), −89.99 ± 0.12° (gyro)"
         slipped = replace(move, agrees=False, rotation_imu_deg=-80.0)
-        assert move_words(slipped).endswith("they disagree by more than 0.60°, the gyro is believed")
-        assert move_words(replace(move, rotation_imu_deg=None)).endswith("the gyro has no answer")
+        assert move_words(slipped).endswith("they differ by more than 0.60°, so the gyro value counts")
+        assert move_words(replace(move, rotation_imu_deg=None)).endswith("no gyro value")
 
     def test_a_lone_candidate_is_not_compared(self) -> None:
         alone = decided("left", 90.0, 0.0, 0.0, "mug")
@@ -194,12 +194,14 @@ class TestWords:
         known, unknown = identified("mug-white").answer, identified(None).answer
         assert isinstance(known, Identified)
         assert isinstance(unknown, Identified)
-        assert answer_words(known) == (
-            "mug-white, standing 30.0° counter-clockwise of how it was enrolled. The lead passes."
-        )
-        assert "not sure, mug-star looks as likely" in answer_words(replace(known, margin=-0.01))
+        assert answer_words(known) == "mug-white, rotated 30° (4 views). The lead passes."
+        sure = replace(known, yaw_deg=359.7, probability=0.996, views=1)
+        assert answer_words(sure).startswith("mug-white, rotated 0°, 99 % confident (1 view). ")
+        assert ">99.9 % confident" in answer_words(replace(known, probability=0.9999))
+        assert "Not certain: mug-star is similarly likely." in answer_words(replace(known, margin=-0.01))
         assert answer_words(unknown).startswith(
-            "Unknown: the nearest are mug-white 0.930, mug-star 0.830, teapot 0.730."
+            "Unknown object. The most similar enrolled objects are mug-white (score 0.930), mug-star (score 0.830) and "
+            "teapot (score 0.730). "
         )
 
 
