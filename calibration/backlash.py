@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from calibration.charts import MODEL, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Moved, plain
 from rig.motion.turntable import Turntable
@@ -153,7 +152,7 @@ def plain_approach(bench: Bench) -> Generator[None, None, None]:
         bench.config = before
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return what each reversal lost beyond the fitted ratio: the play, whatever the length of the leg."""
     if "backlash" not in fact.estimates:
         return None
@@ -161,13 +160,20 @@ def plot(fact: CalibrationResult) -> Figure | None:
     legs = [(i + 1, leg) for i, leg in enumerate(fact.evidence["legs"]) if not leg["trouble"]]
     lost = [(leg["encoder_deg"] - ratio * leg["gyro_deg"]) * np.sign(leg["encoder_deg"]) for _, leg in legs]
     ends = [legs[0][0], legs[-1][0]]
-    return chart(
-        "Play of the gears",
+    return Chart(
+        "Backlash of the gears",
         Axis("reversal", whole=True),
         Axis("encoder beyond gyro, °", span=(0.0,)),
         [
             Series(
-                f"play {play}", ends, [play.value] * 2, MODEL, dots=False, curve=True, band=[2 * play.uncertainty] * 2
+                f"backlash {play}",
+                ends,
+                [play.value] * 2,
+                MODEL,
+                dots=False,
+                curve=True,
+                low=[play.value - 2 * play.uncertainty] * 2,
+                high=[play.value + 2 * play.uncertainty] * 2,
             ),
             Series("measured", [i for i, _ in legs], lost),
         ],

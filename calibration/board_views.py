@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import pictures
-from calibration.charts import LIMIT, MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult
-from rig.charts.drawing import Figure
+from rig.charts.xy import LIMIT, MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.events.events import Event
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
@@ -173,7 +172,7 @@ def by_stand(views: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[Ma
     ]
 
 
-def plot_views(fact: CalibrationResult, limit_px: float) -> Figure | None:
+def plot_views(fact: CalibrationResult, limit_px: float) -> Chart | None:
     """Return how far the corners of each view are off the fit (RMS); the title names the worst."""
     views, rms = fact.evidence["views"], fact.evidence.get("view_rms_px")
     if not rms:
@@ -184,7 +183,7 @@ def plot_views(fact: CalibrationResult, limit_px: float) -> Figure | None:
         f"{view['number']} (stand {view['stand'] + 1} at {view['table_deg']:.0f}°) {view['rms']:.2f} px"
         for view in worst
     )
-    return chart(
+    return Chart(
         f"Worst views: {named}",
         Axis("view", whole=True),
         Axis("corners off the fit, px (RMS)", span=(0.0, limit_px)),

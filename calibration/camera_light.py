@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import pictures
-from calibration.charts import MODEL, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.devices.camera import CameraLocks
 from rig.events.events import plain
 from rig.views.capture import looks
@@ -337,7 +336,7 @@ def drift(
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return what the fact of noise, sharpness, flat field or drift was fitted to."""
     evidence = fact.evidence
     if not fact.estimates:
@@ -348,7 +347,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
             gain = 255 / fact.estimates["full_well_e"].value
             floor = (gain * fact.estimates["read_noise_e"].value) ** 2 + 1 / 12
             ends = np.array([0.0, mean.max()])
-            return chart(
+            return Chart(
                 "Photon transfer",
                 Axis("mean, grey levels", span=(0.0,)),
                 Axis("variance, squared levels", span=(0.0,)),
@@ -364,7 +363,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
             at = np.unique(rings)
             means = np.array([share[rings == ring].mean() for ring in at])
             level = float((means + fact.estimates["vignetting"].value * at * means[0]).mean())
-            return chart(
+            return Chart(
                 "Light over the frame, by rings about its middle",
                 Axis("squared distance from the middle (corner: 1)"),
                 Axis("share of the light"),
@@ -384,7 +383,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
             grey = np.array(evidence["levels_bgr"]).mean(axis=1)
             minutes = np.array(evidence["seconds"]) / 60
             slope = fact.estimates["drift"].value
-            return chart(
+            return Chart(
                 "Brightness of the card",
                 Axis("minutes"),
                 Axis("off the mean, %"),
@@ -401,7 +400,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
                 ],
             )
         case _:
-            return chart(
+            return Chart(
                 "Sharpness of the board",
                 Axis("frame", whole=True),
                 Axis("squared levels", span=(0.0,)),

@@ -13,11 +13,10 @@ import numpy as np
 
 from calibration.board_views import STANDS, BoardView, as_json, by_stand, coverage, look, points, turned_otherwise
 from calibration.board_views import plot_views as plot_views_of
-from calibration.charts import Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import Axis, Chart, Series
 from rig.events.events import Event
 from rig.views.charuco_board import Board
 
@@ -150,7 +149,7 @@ def matrix_of(fact: CalibrationResult) -> tuple["np.ndarray[tuple[int, int], np.
     return matrix, [value[name] for name in ("k1", "k2", "p1", "p2")]
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return where in the frame corners were seen; every stand has its colour."""
     views = fact.evidence["views"]
     if not views:
@@ -161,7 +160,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
     for name, colour, of_stand in by_stand(views):
         x, y = np.concatenate([view["corners_px"] for view in of_stand]).T.tolist()
         seen.append(Series(name, x, y, colour))
-    return chart(
+    return Chart(
         f"Corners seen: {covered:.0%} of the frame{rms}",
         Axis("x, px"),
         Axis("y, px", falling=True),
@@ -170,7 +169,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
     )
 
 
-def plot_residuals(fact: CalibrationResult) -> Figure | None:
+def plot_residuals(fact: CalibrationResult) -> Chart | None:
     """Return by how much and where to each corner is off the fit, enlarged; every stand has its colour."""
     views = fact.evidence["views"]
     if not views or not fact.estimates:
@@ -187,7 +186,7 @@ def plot_residuals(fact: CalibrationResult) -> Figure | None:
             for x, y in np.stack([corners, ends], axis=2).tolist():
                 vectors.append(Series("", x, y, colour, dots=False, curve=True))
         vectors.append(Series(name, [], [], colour, dots=False, curve=True))
-    return chart(
+    return Chart(
         f"Corners less the fit, {ENLARGED} times enlarged: without a pattern they are noise",
         Axis("x, px"),
         Axis("y, px", falling=True),
@@ -196,7 +195,7 @@ def plot_residuals(fact: CalibrationResult) -> Figure | None:
     )
 
 
-def plot_views(fact: CalibrationResult) -> Figure | None:
+def plot_views(fact: CalibrationResult) -> Chart | None:
     """Return how far the corners of each view are off the fit; see `calibration.board_views.plot_views`."""
     return plot_views_of(fact, MAX_RMS_PX)
 

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.charts import MODEL, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Moved, plain
 from rig.motion.turntable import Turntable
@@ -189,7 +188,7 @@ def from_data(
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return the encoder's error over its turn, as fitted and as the steps show it."""
     if not fact.estimates:
         return None
@@ -207,19 +206,21 @@ def plot(fact: CalibrationResult) -> Figure | None:
     to = np.array([step["to_deg"] for step in steps])
     seen = sense * error
     seen += float(np.mean(_basis(to, turn_deg) @ values - seen))
-    return chart(
-        "Error of the encoder over its turn",
+    fit, band = basis @ values, 2 * np.sqrt(basis**2 @ sigma**2)
+    return Chart(
+        "Error of the encoder over its revolution",
         Axis("position of the encoder, °", span=(0.0, turn_deg)),
         Axis("reads too much, °"),
         [
             Series(
                 "two harmonics",
                 phi.tolist(),
-                (basis @ values).tolist(),
+                fit.tolist(),
                 MODEL,
                 dots=False,
                 curve=True,
-                band=(2 * np.sqrt(basis**2 @ sigma**2)).tolist(),
+                low=(fit - band).tolist(),
+                high=(fit + band).tolist(),
             ),
             Series("steps, summed up", np.mod(to, turn_deg).tolist(), seen.tolist()),
         ],

@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from calibration.charts import MODEL, Axis, Series, chart
 from calibration.events import Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.errors import UsageError
 
 NAME = "imu.noise"
@@ -211,10 +210,10 @@ def rotation_sigma_deg(fact: CalibrationResult, seconds: float) -> float:
     return sqrt(arw**2 * seconds + walk**2 * seconds**3 / 3)
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return the Allan deviation over the time that is averaged, measured and fitted."""
     taus = fact.evidence["tau_s"]
-    return chart(
+    return Chart(
         "Allan deviation of the gyro at rest",
         Axis("averaged over, s", log=True),
         Axis("°/s", log=True),

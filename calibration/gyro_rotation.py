@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from calibration.charts import LIMIT, MODEL, Axis, Series, chart
 from calibration.legs import Leg
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Moved, plain
 from rig.motion.turntable import Turntable
@@ -174,14 +173,14 @@ def from_data(
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return the scatter of repeated rotations over their duration, and what is stated for them."""
     rows = fact.evidence["by_duration"]
     if not rows:
         return None
     seconds = [row["seconds"] for row in rows]
     measured = [row["measured_deg"] for row in rows]
-    return chart(
+    return Chart(
         "Scatter of a measured rotation by its duration",
         Axis("duration, s", log=True),
         Axis("σ, °", span=(0.0,)),

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.legs import COVERAGE, Leg, fit
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Moved, plain
 from rig.motion.turntable import Turntable
@@ -166,7 +165,7 @@ def from_data(
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return encoder over gyro for each leg, and the scale."""
     legs = [(i + 1, leg) for i, leg in enumerate(fact.evidence["legs"]) if not leg["trouble"] and leg["gyro_deg"]]
     if not legs or not fact.estimates:
@@ -177,8 +176,8 @@ def plot(fact: CalibrationResult) -> Figure | None:
         return 100 * (ratio - 1)
 
     ends = [legs[0][0], legs[-1][0]]
-    return chart(
-        "Scale of the gyro, by whole turns",
+    return Chart(
+        "Scale of the gyro, from whole revolutions",
         Axis("leg", whole=True),
         Axis("encoder beyond gyro, %"),
         [
@@ -189,7 +188,8 @@ def plot(fact: CalibrationResult) -> Figure | None:
                 MODEL,
                 dots=False,
                 curve=True,
-                band=[200 * scale.uncertainty] * 2,
+                low=[percent(scale.value) - 200 * scale.uncertainty] * 2,
+                high=[percent(scale.value) + 200 * scale.uncertainty] * 2,
             ),
             *(
                 Series(

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.charts import MEASURED, MODEL, OTHER, Axis, Series, chart
 from calibration.recording import Recording, recording
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.core.errors import LimitExceeded
 from rig.events.events import Moved
 from rig.motion.turntable import Turntable
@@ -193,7 +192,7 @@ def from_data(
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return what the accelerometer reads across the axis over the turn: a tilt and an offset make a circle of it."""
     levels = fact.evidence["levels"]
     if not levels or not fact.estimates:
@@ -201,7 +200,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
     mean_g = np.array([level["mean_g"] for level in levels])
     angles = [level["table_deg"] for level in levels]
     across = [(i, colour) for i, colour in enumerate((MEASURED, OTHER, MODEL)) if np.abs(mean_g[:, i]).mean() < 0.5]
-    return chart(
+    return Chart(
         "Gravity across the table's axis",
         Axis("table, °"),
         Axis("accelerometer, g"),

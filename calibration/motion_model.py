@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from calibration.backlash import plain_approach
-from calibration.charts import MODEL, Axis, Series, chart
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.errors import LimitExceeded, UsageError
 from rig.devices.servo import MotionProfile
 from rig.events.events import Moved, plain
@@ -155,7 +154,7 @@ def from_data(
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return the time of each move over its length, and the model."""
     if not fact.estimates:
         return None
@@ -163,7 +162,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
     model = np.array([fact.estimates[name].value for name in ("pace", "wind_up", "delay")])
     lengths = [abs(move["distance_deg"]) for move in moves]
     distance = np.linspace(0.5, max(lengths), 121)
-    return chart(
+    return Chart(
         "Time until the table is at rest",
         Axis("length of the move, °", span=(0.0,)),
         Axis("seconds", span=(0.0,)),

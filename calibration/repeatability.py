@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 
 import hbr
 from calibration import pictures
-from calibration.charts import LIMIT, OTHER, Axis, Series, chart
 from calibration.events import Ask
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import LIMIT, OTHER, Axis, Chart, Series
 from rig.core.errors import UsageError
 from rig.events.events import Accepted, Event
 from rig.motion.turntable import Turntable
@@ -215,11 +214,11 @@ def from_data(
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return how alike views are that lie some degrees of the table apart."""
     steps = [step["step_deg"] for step in fact.evidence["by_step"]]
     threshold = fact.estimates["repeatability"].value
-    return chart(
+    return Chart(
         "Similarity of repeated views",
         Axis("apart, ° of the table"),
         Axis("Tanimoto similarity", span=(1.0,)),

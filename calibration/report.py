@@ -22,11 +22,11 @@ from calibration import (
     table_axis,
 )
 from rig.calibrations import CalibrationResult, Standing, State
-from rig.charts.drawing import Figure
+from rig.charts.xy import Chart
 from rig.core.errors import UsageError
 from rig.core.files import write
 
-PLOTS: Mapping[str, Callable[[CalibrationResult], Figure | None]] = {
+PLOTS: Mapping[str, Callable[[CalibrationResult], Chart | None]] = {
     **{
         module.NAME: module.plot
         for module in (
@@ -47,7 +47,7 @@ PLOTS: Mapping[str, Callable[[CalibrationResult], Figure | None]] = {
     ),
 }
 
-FURTHER: Mapping[str, Sequence[Callable[[CalibrationResult], Figure | None]]] = {
+FURTHER: Mapping[str, Sequence[Callable[[CalibrationResult], Chart | None]]] = {
     camera_model.NAME: (camera_model.plot_views, camera_model.plot_residuals),
     table_axis.NAME: (table_axis.plot_views,),
 }
@@ -64,7 +64,7 @@ class _Shown(NamedTuple):
     devices: Sequence[tuple[str, str]]
 
 
-def plots(fact: CalibrationResult) -> list[Figure]:
+def plots(fact: CalibrationResult) -> list[Chart]:
     """Return the plots of a fact, the main one first; none where its kind has none, or nothing could be estimated."""
     draw = [*([PLOTS[fact.name]] if fact.name in PLOTS else []), *FURTHER.get(fact.name, ())]
     return [figure for figure in (one(fact) for one in draw) if figure]
@@ -140,7 +140,7 @@ def _shown(standing: Standing, history: Sequence[CalibrationResult]) -> _Shown:
         standing.command,
         refused,
         # Markup of our own making: its words are escaped where it is made.
-        [Markup(figure.svg()) for figure in plots(fact)],
+        [Markup(figure.svg(themed=True)) for figure in plots(fact)],
         [(part, _words(identity)) for part, identity in fact.device.items() if part in ("servo", "imu", "camera")],
     )
 

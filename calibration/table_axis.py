@@ -26,11 +26,10 @@ from calibration.board_views import STANDS as ALL_STANDS
 from calibration.board_views import BoardView, as_json, look, points, turned_otherwise
 from calibration.board_views import plot_views as plot_views_of
 from calibration.camera_model import PARAMETERS, matrix_of
-from calibration.charts import LIMIT, MODEL, Axis, Series, chart
 from calibration.events import Ask, Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate
-from rig.charts.drawing import Figure
+from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
 from rig.events.events import Event
 from rig.views.charuco_board import Board
 
@@ -224,7 +223,7 @@ def _region(corners: Floats, size: Sequence[int], room: Room) -> tuple[list[int]
     )
 
 
-def plot(fact: CalibrationResult) -> Figure | None:
+def plot(fact: CalibrationResult) -> Chart | None:
     """Return the way of the board's middle about the axis, seen along it, and the circles that were fitted."""
     if not fact.estimates:
         return None
@@ -235,7 +234,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
     side /= np.linalg.norm(side)
     across, along = offset @ -side, offset @ np.cross(side, up)  # the camera is below
     around = np.linspace(0.0, 2 * np.pi, 97)
-    return chart(
+    return Chart(
         f"The board about the axis, seen from above; wobble {fact.estimates['wobble']}",
         Axis("mm"),
         Axis("mm from the axis"),
@@ -251,7 +250,7 @@ def plot(fact: CalibrationResult) -> Figure | None:
     )
 
 
-def plot_views(fact: CalibrationResult) -> Figure | None:
+def plot_views(fact: CalibrationResult) -> Chart | None:
     """Return how far the corners of each view are off the fit; see `calibration.board_views.plot_views`."""
     return plot_views_of(fact, MAX_RMS_PX)
 

@@ -9,8 +9,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from hbr.evaluation.protocol import CERTAINTY, Runs
-from rig.charts.drawing import Figure
 from rig.charts.evaluation_figures import figures
+from rig.charts.xy import Chart
 from rig.core.errors import UsageError
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
@@ -82,7 +82,7 @@ def write_results(
     return results
 
 
-def _page(results: dict[str, Any], drawn: Mapping[str, Figure]) -> str:
+def _page(results: dict[str, Any], drawn: Mapping[str, Chart]) -> str:
     loader = PackageLoader("rig.evaluation", ".")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -143,7 +143,7 @@ def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_p
     assert page.count("<svg") == sum(map(len, pictures))
     for fact, drawn in zip(facts, pictures, strict=True):
         assert f'id="{fact.name}"' in page
-        assert all(picture.svg() in page for picture in drawn)
+        assert all(picture.svg(themed=True) in page for picture in drawn)
     for fact in facts[-2:]:
         worst = int(np.argmax(fact.evidence["view_rms_px"]))
         assert f"Worst views: {worst + 1} (stand {fact.evidence['views'][worst]['stand'] + 1} at" in page
