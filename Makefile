@@ -6,12 +6,14 @@ READY  := .venv/.ready
 # With several threads small matrix products wait for each other; one is faster here.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench lock clean help
+.PHONY: demo test lint docs wheel bench lock clean help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
 	@echo "make test   run all tests"
 	@echo "make lint   formatting, lint, types, import contracts"
+	@echo "make docs   the documentation as a site in site/"
+	@echo "make wheel  build wheel and sdist in dist/, and try the wheel in an empty environment"
 	@echo "make bench  speed, as ratios against named peers"
 	@echo "make clean  remove what the others made"
 
@@ -27,6 +29,14 @@ lint: $(READY)
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
+# No network: the theme loads no fonts, and links to other sites are not followed.
+docs: $(READY)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --clean
+	@echo "Open site/index.html"
+
+wheel: $(READY)
+	@sh .ci/wheel
+
 bench: $(READY)
 	@for file in benchmarks/bench_*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
 
@@ -40,5 +50,5 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf .venv .tools rig-demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .tools rig-demo site dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""The simulated bench: byte-true devices below the real drivers, a rendered world, a virtual clock, and faults."""

@@ -1,0 +1,371 @@
+"""Generate the pages of the documentation site that come from the code.
+
+MkDocs loads this file as a hook (`mkdocs.yml`) when `make docs` builds the site. Nothing that it generates is stored in
+the repository, so a page cannot become outdated. Without MkDocs, `generated_pages` returns the same pages to the tests.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import posixpath
+import re
+import sys
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from types import UnionType
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # docs is no package of the wheel
+
+PACKAGES = ("hbr", "rig", "calibration", "sim")
+REPOSITORY_PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "examples/README.md": "how-to/examples.md",
+    "firmware/README.md": "how-to/rig-head.md",
+    "firmware/PROTOCOL.md": "reference/head-protocol.md",
+}
+"""Pages that stand in the repository outside `docs`, and where the site shows them."""
+
+EXIT_CODES = {
+    0: "The command succeeded.",
+    1: "The program itself failed. Report it as a bug.",
+    2: "The command line is wrong: an unknown option, an invalid value.",
+    3: "The configuration cannot be used.",
+    4: "A device is missing, silent or faulty.",
+    5: "A motion failed or is not allowed.",
+    6: "A view, a calibration or a replay is not good enough.",
+    7: "The catalog cannot do what was asked.",
+    8: "`rig identify` found an unknown object.",
+    9: "Another program uses the bench or the catalog.",
+    129: "The terminal was lost (SIGHUP). The torque is off.",
+    130: "Ctrl+C. The torque is off.",
+    141: "The program that read the output closed the pipe.",
+    143: "SIGTERM. The torque is off.",
+}
+NOTE = "*This page is generated from the code.*\n\n"
+
+
+# Pages
+
+
+def generated_pages() -> dict[str, str]:
+    """Return the Markdown of every generated page by its path below `docs`."""
+    return {
+        "reference/cli.md": cli_page(),
+        "reference/configuration.md": configuration_page(),
+        "reference/errors.md": errors_page(),
+        "reference/exit-codes.md": exit_codes_page(),
+        "reference/api/index.md": public_names_page(),
+        **dict(api_pages()),
+        **{site: (ROOT / page).read_text(encoding="utf-8") for page, site in REPOSITORY_PAGES.items()},
+    }
+
+
+def cli_page() -> str:
+    """Return a page with every command of `rig`, its arguments and its options."""
+    import typer.main
+
+    from rig.cli.main import app
+
+    group = typer.main.get_command(app)
+    shared = {name for option in group.params for name in option.opts}
+    lines = [f"# Commands\n\n{NOTE}{group.help}\n", "## Common options\n", "Every command accepts these.\n"]
+    lines += [*_parameter_table(group.params), ""]
+    for words, command in _commands("rig", group):
+        lines += [f"## {words}\n", _unwrapped(command.help or ""), ""]
+        own = [p for p in command.params if not shared.intersection(p.opts) and not getattr(p, "hidden", False)]
+        if own:
+            lines += [*_parameter_table(own), ""]
+    return "\n".join(lines)
+
+
+def _commands(prefix: str, group: Any) -> Iterator[tuple[str, Any]]:
+    for name, command in sorted(group.commands.items()):
+        if command.hidden:
+            continue
+        if hasattr(command, "commands"):
+            yield from _commands(f"{prefix} {name}", command)
+        else:
+            yield f"{prefix} {name}", command
+
+
+def _parameter_table(parameters: list[Any]) -> list[str]:
+    rows = []
+    for parameter in parameters:
+        if parameter.param_type_name == "argument":
+            name = f"`{parameter.metavar or parameter.name.upper()}`" + ("" if parameter.required else " (optional)")
+        else:
+            name = ", ".join(f"`{option}`" for option in [*parameter.opts, *parameter.secondary_opts])
+            if parameter.metavar and not parameter.is_flag:
+                name += f" `{parameter.metavar}`"
+        default = "" if parameter.default is None or callable(parameter.default) else parameter.default
+        default = "" if default in (False, (), []) else f"`{default}`"
+        rows.append(f"| {name} | {_cell(getattr(parameter, 'help', '') or '')} | {default} |")
+    return ["| name | meaning | default |", "|---|---|---|", *rows]
+
+
+def configuration_page() -> str:
+    """Return a page with every key of `rig.toml`."""
+    from rig.config import RigConfig
+    from sim.bench import SimOptions
+
+    lines = [
+        f"# Configuration keys\n\n{NOTE}`rig.toml` holds these keys. `rig config show` prints the values in use and where "
+        "each comes from; `rig config set KEY VALUE` changes one; `--set KEY=VALUE` overrides one for a single command.\n"
+    ]
+    plain = {name: field for name, field in RigConfig.model_fields.items() if not _section(field)}
+    plain.pop("bench")
+    lines += ["## Top level\n", *_key_table(plain)]
+    for name, field in RigConfig.model_fields.items():
+        if section := _section(field):
+            lines += [f"\n## [{name}]\n", _unwrapped(section.__doc__ or ""), "", *_key_table(section.model_fields)]
+    lines += ["\n## [bench.sim]\n", "The simulated bench.\n", *_key_table(SimOptions.model_fields), ""]
+    return "\n".join(lines)
+
+
+def _section(field: Any) -> Any:
+    from rig.config import Section
+
+    kind = field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, Section) else None
+
+
+def _key_table(fields: dict[str, Any]) -> list[str]:
+    lines = ["| key | type | default | range | meaning |", "|---|---|---|---|---|"]
+    for name, field in fields.items():
+        limits = []
+        for constraint in field.metadata:
+            for attribute, sign in (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<")):
+                if (bound := getattr(constraint, attribute, None)) is not None:
+                    limits.append(f"{sign} {bound:g}")
+        default = field.get_default(call_default_factory=True)
+        shown = "–" if default is None else f"`{_toml(default)}`"
+        cells = (f"`{name}`", _type_words(field.annotation), shown, ", ".join(limits), _cell(field.description or ""))
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _type_words(kind: Any) -> str:
+    arguments = typing.get_args(kind)
+    origin = typing.get_origin(kind)
+    if origin is typing.Literal:
+        return ", ".join(f"`{_toml(choice)}`" for choice in arguments)
+    if origin is typing.Annotated:
+        return _type_words(arguments[0])
+    if origin in (typing.Union, UnionType):
+        return " or ".join(_type_words(choice) for choice in arguments if choice is not type(None))
+    if origin in (tuple, list):
+        return f"list of {len(arguments) if origin is tuple else ''} {_type_words(arguments[0])}s".replace("  ", " ")
+    if origin is dict:
+        return "table"
+    names = {int: "integer", float: "number", str: "text", bool: "true or false", Path: "path"}
+    return names.get(kind, getattr(kind, "__name__", str(kind)))
+
+
+def errors_page() -> str:
+    """Return a page with every error of the registry."""
+    from rig.core.errors import RigError
+
+    lines = [
+        f"# Error codes\n\n{NOTE}Every error has a code, says what happened, shows the evidence, and gives the next step. "
+        "The hundreds of the code are the [exit code](exit-codes.md) of the command.\n",
+        "| code | title | meaning | Python class |",
+        "|---|---|---|---|",
+    ]
+    kinds: list[type[RigError]] = [RigError]
+    for kind in kinds:  # grows while it is read
+        kinds += [sub for sub in kind.__subclasses__() if sub.__module__ == RigError.__module__]
+    for kind in sorted(set(kinds) - {RigError}, key=lambda kind: kind.code):
+        summary = (kind.__doc__ or "").partition("\n\n")[0]
+        lines.append(f"| {kind.code} | {kind.title} | {_cell(summary)} | `{kind.__name__}` |")
+    return "\n".join([*lines, ""])
+
+
+def exit_codes_page() -> str:
+    """Return a page with the exit codes of `rig`."""
+    rows = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()]
+    more = "\nCodes 2 to 9 are the hundreds of an [error code](errors.md).\n"
+    return "\n".join([f"# Exit codes\n\n{NOTE}| code | meaning |", "|---|---|", *rows, more])
+
+
+def public_names_page() -> str:
+    """Return a page with the names that programs import from `hbr` and `rig`."""
+    lines = [f"# Python API\n\n{NOTE}These names are the public API. The other pages show what is behind them.\n"]
+    for package in ("rig", "hbr"):
+        lines += [f"## {package}\n", "| name | what it is or does |", "|---|---|"]
+        module = importlib.import_module(package)
+        for name in module.__all__:
+            thing = getattr(module, name)
+            home = getattr(thing, "__module__", None)
+            summary = _cell((thing.__doc__ or "").strip().partition("\n\n")[0]) if home else ""
+            linked = f"[`{package}.{name}`][{home}.{name}]" if home in modules() else f"`{package}.{name}`"
+            lines.append(f"| {linked} | {summary} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def modules() -> list[str]:
+    """Return the dotted names of all modules that have an API page."""
+    found = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            if "migrations" not in parts and parts[-1] != "__main__":
+                found.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
+    return found
+
+
+def api_pages() -> Iterator[tuple[str, str]]:
+    """Yield a page for each room: path and Markdown, one section for each module."""
+    rooms: dict[str, list[str]] = {}
+    for module in modules():
+        if module in ("hbr", "rig"):
+            continue  # their public names have a page of their own
+        room = ".".join(module.split(".")[:2])
+        is_room = (ROOT / Path(*room.split("."))).is_dir()
+        rooms.setdefault(room if is_room else module.partition(".")[0], []).append(module)
+    for room, held in sorted(rooms.items()):
+        lines = [f"# {room}\n"]
+        for module in held:
+            source = ROOT / Path(*module.split("."))
+            source = source / "__init__.py" if source.is_dir() else source.with_suffix(".py")
+            if _has_definitions(source):
+                lines.append(f"::: {module}\n")
+            elif summary := ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))):
+                lines.append(f"{summary}\n")
+        yield f"reference/api/{room}.md", "\n".join(lines)
+
+
+def _has_definitions(source: Path) -> bool:
+    body = ast.parse(source.read_text(encoding="utf-8")).body
+    kinds = (ast.FunctionDef, ast.ClassDef, ast.Assign, ast.AnnAssign)
+    return any(isinstance(node, kinds) for node in body)
+
+
+def _cell(text: str) -> str:
+    return _unwrapped(text).replace("|", "\\|").replace("\n", " ").replace("``", "`")
+
+
+def _unwrapped(text: str) -> str:
+    """Return a docstring as Markdown: paragraphs on one line each, Python prompts and indents as they are."""
+    paragraphs = [" ".join(line.strip() for line in part.splitlines()) for part in text.strip().split("\n\n")]
+    return "\n\n".join(re.sub(r"^Example: (.*)$", r"Example: `\1`", part) for part in paragraphs)
+
+
+# Links
+
+
+def site_path(repository_path: str) -> str | None:
+    """Return where the site shows a file of the repository; None if it does not show it as a page."""
+    if repository_path in REPOSITORY_PAGES:
+        return REPOSITORY_PAGES[repository_path]
+    if repository_path.startswith("docs/") and (ROOT / repository_path).is_file():
+        return repository_path.removeprefix("docs/")
+    return None
+
+
+def with_site_links(markdown: str, page: str) -> tuple[str, set[str]]:
+    """Rewrite the links of a repository page for the site.
+
+    Parameters
+    ----------
+    markdown
+        The text of the page.
+    page
+        Its path in the repository, such as ``docs/searching.md``.
+
+    Returns
+    -------
+    str
+        The text with links that work on the site. A link to a folder becomes plain text.
+    set of str
+        Files of the repository that are linked and are not pages: the site has to copy them to ``files/``.
+    """
+    copied: set[str] = set()
+    home = site_path(page) or page
+
+    def rewritten(match: re.Match[str]) -> str:
+        text, target, anchor = match["text"], match["target"], match["anchor"] or ""
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
+        if (ROOT / path).is_dir():
+            return text if not text.startswith("!") else match[0]
+        shown = site_path(path)
+        if shown is None:
+            if not (ROOT / path).is_file():
+                return match[0]  # generated, or broken: MkDocs reports it
+            copied.add(path)
+            shown = f"files/{path}"
+        link = posixpath.relpath(shown, posixpath.dirname(home) or ".")
+        return f"{'!' if match['image'] else ''}[{text}]({link}{anchor})"
+
+    link = r"(?P<image>!)?\[(?P<text>[^\]]*)\]\((?!https?:|#)(?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)"
+    return re.sub(link, rewritten, markdown), copied
+
+
+# Hooks of MkDocs
+
+
+def on_config(config: Any) -> Any:
+    """Expand ``folder/*`` in the navigation to the pages of that folder."""
+    config.nav = _expanded(config.nav)
+    return config
+
+
+def _expanded(entries: list[Any]) -> list[Any]:
+    found: list[Any] = []
+    for entry in entries:
+        if isinstance(entry, dict):
+            found += [{title: _expanded(e) if isinstance(e, list) else e} for title, e in entry.items()]
+        elif entry.endswith("/*"):
+            folder = entry.removesuffix("*")
+            stored = {f"{folder}{path.name}" for path in (ROOT / "docs" / folder).glob("[0-9]*.md")}
+            found += sorted(stored | {path for path, _ in api_pages() if path.startswith(folder)})
+        else:
+            found.append(entry)
+    return found
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the generated pages, and the files of the repository that pages link to."""
+    from mkdocs.structure.files import File
+
+    pages = {v: k for k, v in REPOSITORY_PAGES.items()}
+    copied: set[str] = set()
+    for path, markdown in generated_pages().items():
+        if path in pages:
+            markdown, more = with_site_links(markdown, pages[path])
+            copied |= more
+        files.append(File.generated(config, path, content=markdown))
+    for file in list(files.documentation_pages()):
+        if file.abs_src_path and not file.generated_by:
+            source = Path(file.abs_src_path).read_text(encoding="utf-8")
+            copied |= with_site_links(source, f"docs/{file.src_uri}")[1]
+    from docs.architecture import picture
+
+    files.append(File.generated(config, "images/architecture.svg", content=picture()))
+    for path in sorted(copied):
+        files.append(File.generated(config, f"files/{path}", abs_src_path=str(ROOT / path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Rewrite the links of the pages in `docs` that lead out of it."""
+    if page.file.generated_by:
+        return markdown
+    return with_site_links(markdown, f"docs/{page.file.src_uri}")[0]
