@@ -59,7 +59,9 @@ class Panel:
 
 def layers(package: str) -> list[list[str]]:
     """Return the rooms of a package from the top layer to the bottom one, as the import contract names them."""
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
     (contract,) = (c for c in contracts if c.get("containers") == [package])
     return [[f"{package}.{room.strip()}" for room in layer.split("|")] for layer in contract["layers"]]
 
