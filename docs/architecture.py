@@ -2,8 +2,8 @@
 
     python docs/architecture.py > architecture.svg
 
-Layers come from `pyproject.toml`, imports from the code, captions from the docstring of each room. An arrow that follows
-from other arrows is left out.
+Layers come from `pyproject.toml`, imports from the code, captions from the docstring of each room. An arrow that
+follows from other arrows is left out.
 """
 
 import ast

@@ -116,8 +116,9 @@ def configuration_page() -> str:
     from sim.bench import SimOptions
 
     lines = [
-        f"# Configuration keys\n\n{NOTE}`rig.toml` holds these keys. `rig config show` prints the values in use and where "
-        "each comes from; `rig config set KEY VALUE` changes one; `--set KEY=VALUE` overrides one for a single command.\n"
+        f"# Configuration keys\n\n{NOTE}`rig.toml` holds these keys. `rig config show` prints the values in use and "
+        "where each comes from; `rig config set KEY VALUE` changes one; `--set KEY=VALUE` overrides one for a single "
+        "command.\n"
     ]
     plain = {name: field for name, field in RigConfig.model_fields.items() if not _section(field)}
     plain.pop("bench")
@@ -183,8 +184,8 @@ def errors_page() -> str:
     from rig.core.errors import RigError
 
     lines = [
-        f"# Error codes\n\n{NOTE}Every error has a code, says what happened, shows the evidence, and gives the next step. "
-        "The hundreds of the code are the [exit code](exit-codes.md) of the command.\n",
+        f"# Error codes\n\n{NOTE}Every error has a code, says what happened, shows the evidence, and gives the next "
+        "step. The hundreds of the code are the [exit code](exit-codes.md) of the command.\n",
         "| code | title | meaning | Python class |",
         "|---|---|---|---|",
     ]
@@ -364,7 +365,7 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+def on_page_markdown(markdown: str, page: Any, **_others: Any) -> str:
     """Rewrite the links of the pages in `docs` that lead out of it."""
     if page.file.generated_by:
         return markdown
