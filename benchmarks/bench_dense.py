@@ -15,7 +15,18 @@ import cv2
 import numpy as np
 
 from benchmarks.bench_search import model, queries_of
-from hbr import Background, DenseIndex, ViewIndex, Views, believe, descriptor, next_look, next_view, retrieve, segment
+from hbr import (
+    Background,
+    DenseIndex,
+    ViewIndex,
+    Views,
+    descriptor,
+    next_best_view,
+    next_view,
+    retrieve,
+    segment,
+    update_belief,
+)
 from hbr.core.arrays import ImageArray, IndexArray
 from hbr.dense.filter import Belief
 from hbr.descriptors import names
@@ -77,9 +88,11 @@ def bench_step(objects: int) -> None:
 def _step_ms(views: Views, index: DenseIndex, rows: IndexArray) -> float:
     so_far: DenseIndex | Belief = index
     for i in rows[:-1].tolist():
-        so_far = believe(views.descriptors[i], float(views.azimuth_deg[i]), so_far)
+        so_far = update_belief(views.descriptors[i], float(views.azimuth_deg[i]), so_far)
     last, angle_deg = views.descriptors[rows[-1]], float(views.azimuth_deg[rows[-1]])
-    step = partial(lambda levels, deg, known: next_look(believe(levels, deg, known)), last, angle_deg, so_far)
+    step = partial(
+        lambda levels, deg, known: next_best_view(update_belief(levels, deg, known)), last, angle_deg, so_far
+    )
     return timeit.timeit(step, timer=process_time, number=1) * 1e3
 
 

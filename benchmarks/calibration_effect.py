@@ -50,7 +50,7 @@ LEVELS = {
         placement_mm=2.0,
     ),
 }
-OBJECTS, STRANGERS, TRIALS, VIEWS = 10, 5, 2, 24
+OBJECTS, UNKNOWN, TRIALS, VIEWS = 10, 5, 2, 24
 OTHER_BENCH = 1000
 """The seed of the bench on which objects are found is so much above that of the one on which they were enrolled."""
 
@@ -101,7 +101,7 @@ def angles_off(events: Iterator[Any], operator: ShelfOperator, orientation: str)
 def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder: Path) -> Told:
     """Return the figures of one bench and the other: right, unknown and confirmed answers, errors in degrees, views."""
     things = shelf()
-    names = np.random.default_rng(seed).permutation(sorted(things))[: OBJECTS + STRANGERS].tolist()
+    names = np.random.default_rng(seed).permutation(sorted(things))[: OBJECTS + UNKNOWN].tolist()
     config = load_config(None, (f"table.orientation={orientation}",))
     told: Told = defaultdict(list)
     for bench_seed in (seed, seed + OTHER_BENCH):
@@ -151,7 +151,7 @@ def main() -> None:
     arguments.add_argument("--orientation", choices=("encoder", "imu"), action="append")
     given = arguments.parse_args()
     print(
-        "| errors | angle by | bench | right | strangers unknown | known unknown | pose within 15° | RMSE "
+        "| errors | angle by | bench | right | unknown recognized | known unknown | pose within 15° | RMSE "
         "| table's angle, RMS | views |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")

@@ -343,7 +343,7 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
                     _print_json(settings, fact, path)
                 else:
                     then = ", in force from now on." if fact.passed else "; what was in force stays so."
-                    print(f"{verdict(fact)}\nKept in {path}{then}")
+                    print(f"{outcome_text(fact)}\nKept in {path}{then}")
                 if not fact.passed:
                     raise typer.Exit(EXIT_QUALITY)
             told, region = bench.out_of_force, bench.config.view.roi
@@ -408,7 +408,7 @@ def _print_json(settings: Settings, fact: "CalibrationResult", path: "Path") -> 
     settings.print_json({"event": "calibrated", "passed": fact.passed, "id": fact.id, "file": str(path), **plain(fact)})
 
 
-def verdict(fact: "CalibrationResult") -> str:
+def outcome_text(fact: "CalibrationResult") -> str:
     """Return in words what a calibration found, or why it was refused and what to do."""
     judged = ""
     if fact.residual is not None and fact.limit is not None:

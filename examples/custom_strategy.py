@@ -10,7 +10,7 @@ import tempfile
 
 from rig import Catalog, enroll, identify, load_model, open_bench
 from rig.events.events import Identified
-from rig.search.strategies import AnyStrategy, DenseLook, Look, Stop, Turn, descriptor_for, enough
+from rig.search.strategies import AnyStrategy, DenseSearchState, Finish, Rotate, SearchState, descriptor_for, enough
 from sim.bench import ShelfOperator
 
 OBJECTS = ("toy-house", "toy-car", "book-night")
@@ -21,8 +21,8 @@ class Golden:
 
     name = "golden"
 
-    def next(self, look: Look) -> Turn | Stop:
-        return enough(look) or Turn(137.508, "the golden angle leads far from all views so far")
+    def next(self, look: SearchState) -> Rotate | Finish:
+        return enough(look) or Rotate(137.508, "the golden angle leads far from all views so far")
 
 
 class FarSide:
@@ -31,10 +31,10 @@ class FarSide:
     name = "far-side"
     descriptor = "edges+colours"
 
-    def next(self, look: DenseLook) -> Turn | Stop:
+    def next(self, look: DenseSearchState) -> Rotate | Finish:
         if look.verdict.kind != "look":
-            return Stop(look.verdict.words)
-        return Turn(135.0, "nearly the far side")
+            return Finish(look.verdict.words)
+        return Rotate(135.0, "nearly the far side")
 
 
 def main() -> None:

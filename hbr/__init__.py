@@ -1,7 +1,7 @@
 """Retrieval: arrays in, decisions out."""
 
-from hbr.dense.filter import Belief, DenseIndex, believe
-from hbr.dense.next_view import Look, next_look
+from hbr.dense.filter import Belief, DenseIndex, update_belief
+from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.stopping import Rules, Verdict, judge, rehearse, rules
 from hbr.descriptors import Descriptor, descriptor
 from hbr.descriptors.cedd import cedd
@@ -11,9 +11,9 @@ from hbr.descriptors.tanimoto import tanimoto
 from hbr.model.views import Views
 from hbr.paper.hough import Extension, Ranking, retrieve
 from hbr.paper.index import ViewIndex
-from hbr.paper.margin import lead
+from hbr.paper.margin import score_margin
 from hbr.paper.next_view import Decision, Side, next_view
-from hbr.paper.open_set import familiar_score
+from hbr.paper.open_set import open_set_threshold
 from hbr.segmentation import Background, Segmentation, segment
 
 __all__ = [
@@ -23,7 +23,7 @@ __all__ = [
     "DenseIndex",
     "Descriptor",
     "Extension",
-    "Look",
+    "NextBestView",
     "Ranking",
     "Rules",
     "Segmentation",
@@ -31,21 +31,21 @@ __all__ = [
     "Verdict",
     "ViewIndex",
     "Views",
-    "believe",
     "cedd",
     "describe",
     "descriptor",
-    "familiar_score",
     "judge",
-    "lead",
-    "next_look",
+    "next_best_view",
     "next_view",
+    "open_set_threshold",
     "pack",
     "rehearse",
     "retrieve",
     "rules",
+    "score_margin",
     "segment",
     "tanimoto",
     "unpack",
     "unpack_rows",
+    "update_belief",
 ]

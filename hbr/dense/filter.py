@@ -251,7 +251,9 @@ class DenseRanking:
     pose_deg: FloatArray
 
 
-def believe(query: LevelArray, orientation_deg: float, so_far: DenseIndex | Belief, *, kept: int = KEPT) -> Belief:
+def update_belief(
+    query: LevelArray, orientation_deg: float, so_far: DenseIndex | Belief, *, kept: int = KEPT
+) -> Belief:
     """Add a query to what is believed.
 
     Parameters

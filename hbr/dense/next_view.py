@@ -18,7 +18,7 @@ _NEAR_DEG: Final = 15.0
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class NextBestView:
     """A turn, and what it was decided on.
 
     Attributes
@@ -46,7 +46,7 @@ class Look:
     alike: FloatArray | None
 
 
-def next_look(
+def next_best_view(
     belief: Belief,
     *,
     beta: float = BETA,
@@ -54,7 +54,7 @@ def next_look(
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
     second_costs: float = 1.0,
-) -> Look:
+) -> NextBestView:
     """Choose the turn with the lowest expected confusion, and what it costs.
 
     For hypotheses p, p' of different objects, a turn a leaves the confusion
@@ -115,11 +115,11 @@ def next_look(
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
         alike = similar[:, first, second]
     turn = float(turns_deg[chosen])
-    return Look(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike)
+    return NextBestView(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike)
 
 
-def most_informative_turn(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
-    """Choose the turn whose view is expected to leave the least entropy of the object: a baseline for `next_look`.
+def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
+    """Choose the turn whose view is expected to leave the least entropy of the object: a baseline for `next_best_view`.
 
     If hypothesis h is true, the view after a turn is the one that was enrolled there, and hypothesis h' is then as
     likely as exp(β T(view_h, view_h')^p) says.
@@ -127,7 +127,7 @@ def most_informative_turn(belief: Belief, *, beta: float = BETA, rotations_deg: 
     Parameters
     ----------
     belief, beta, rotations_deg
-        As for `next_look`.
+        As for `next_best_view`.
     """
     turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     probability, place, bin_of = _strongest(belief.posterior(beta))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import LevelArray
-from hbr.dense.filter import Belief, DenseIndex, believe
+from hbr.dense.filter import Belief, DenseIndex, update_belief
 from hbr.descriptors.describe import describe
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, read_photograph
@@ -108,7 +108,7 @@ def hits(
                     generator(protocol.seed, item.name, "photograph", i),
                 )
                 described[i] = describe(shot.image, descriptor=condition.descriptor, reference=shot.empty)
-            so_far = belief = believe(described[i], float(azimuth_deg[i] + error_deg[n]), so_far)
+            so_far = belief = update_belief(described[i], float(azimuth_deg[i] + error_deg[n]), so_far)
             found[t, n] = belief.ranking().object_index[0] == own
             away_deg = np.abs(wrap180(azimuth_deg[free] - azimuth_deg[i] - _STEP_DEG))
             away_deg[np.isin(free, seen)] = np.inf

@@ -22,7 +22,7 @@ class Method:
     walk : str
         How the next view is chosen. ``random``; ``sweep-45`` and ``sweep-90``: at fixed steps; ``ahbr``: by Eq. 5-7;
         ``coin``: by a coin with the step of Eq. 5-7. These two need two views: the second is a random one, or, of
-        ``ahbr-90``, 90 degrees to the left as on the rig. Of the dense filter alone: ``look``, by `hbr.next_look`;
+        ``ahbr-90``, 90 degrees to the left as on the rig. Of the dense filter alone: ``look``, by `hbr.next_best_view`;
         ``look-coin``: its turn to a side by a coin; ``mutual``: by mutual information; ``oracle``: the photograph after
         which the true object, which it is told, leads most.
     omega, list_length, extension

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.filter import Belief, DenseIndex, believe
-from hbr.dense.next_view import most_informative_turn, next_look
+from hbr.dense.filter import Belief, DenseIndex, update_belief
+from hbr.dense.next_view import most_informative_rotation, next_best_view
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
@@ -100,7 +100,7 @@ class Runs:
         Symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not symmetric;
         nan if it has too few views.
     lead : float64
-        `hbr.lead` of the best object, a view; by the dense filter, its score above the second's.
+        `hbr.score_margin` of the best object, a view; by the dense filter, its score above the second's.
     best : int32
         The best object, by its index in the views' names.
     score : float64
@@ -297,9 +297,9 @@ class _Trials:
             if len(gone):  # the views near to the newest query left the model for the queries before, too
                 so_far = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
-                    so_far = believe(self._queries[i], angle_deg, so_far)
+                    so_far = update_belief(self._queries[i], angle_deg, so_far)
             start_ns = self._now_ns()
-            so_far = belief = believe(self._queries[seen[-1]], measured_deg[-1], so_far)
+            so_far = belief = update_belief(self._queries[seen[-1]], measured_deg[-1], so_far)
             following = self._next_dense(method, draws, seen, belief) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = belief.ranking()
@@ -314,12 +314,12 @@ class _Trials:
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], belief: Belief) -> int:
         match method.walk:
             case "look":
-                return self._nearest(seen, next_look(belief).rotation_deg)
+                return self._nearest(seen, next_best_view(belief).rotation_deg)
             case "look-coin":
-                turn_deg = abs(next_look(belief).rotation_deg)
+                turn_deg = abs(next_best_view(belief).rotation_deg)
                 return self._nearest(seen, turn_deg if draws.coins[len(seen)] else -turn_deg)
             case "mutual":
-                return self._nearest(seen, most_informative_turn(belief))
+                return self._nearest(seen, most_informative_rotation(belief))
             case "oracle":
                 return self._told(seen, belief)
             case _:
@@ -332,7 +332,7 @@ class _Trials:
         left = np.setdiff1d(self._free, seen)[::3]
         leads = []
         for i in left.tolist():
-            scores = believe(self._queries[i], float(self._azimuth_deg[i]), belief).scores()
+            scores = update_belief(self._queries[i], float(self._azimuth_deg[i]), belief).scores()
             own = belief.index.object_index == self._object
             leads.append(scores[own].max(initial=-np.inf) - scores[~own].max(initial=-np.inf))
         return int(left[int(np.argmax(leads))])
@@ -401,7 +401,7 @@ class _Trials:
         at: tuple[int, int, int, int],
     ) -> None:
         runs.score[at] = ranking.scores[0] / len(seen)
-        # hbr.lead, of similarities computed once for all trials
+        # hbr.score_margin, of similarities computed once for all trials
         reach = self._reach[:, seen].sum(axis=1)
         reach[self._object] = self._own_similar[seen][:, keep].max(axis=1).sum()
         reach[ranking.object_index[0]] = -np.inf

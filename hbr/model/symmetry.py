@@ -44,7 +44,7 @@ class Symmetry:
 
 
 @dataclass(frozen=True, slots=True)
-class Lookalike:
+class SimilarObject:
     """Another object that cannot be told from one, seen from some sides.
 
     Attributes
@@ -88,9 +88,9 @@ def symmetry(views: Views, object_index: int, *, similarity: Similarity = tanimo
     count = len(descriptors)
     if count < _FEWEST:
         return None
-    likeness = similarity(descriptors, descriptors)
+    pairwise = similarity(descriptors, descriptors)
     step_deg = 360.0 / count
-    mean = np.array([_mean_at(likeness, azimuth_deg, k * step_deg) for k in range(1, count // 2 + 1)])
+    mean = np.array([_mean_at(pairwise, azimuth_deg, k * step_deg) for k in range(1, count // 2 + 1)])
     neighbours, floor = float(mean[0]), float(mean[0]) - SLACK
     if mean.min() >= floor:
         return Symmetry(0.0, neighbours, float(mean.min()))
@@ -109,7 +109,7 @@ def symmetry(views: Views, object_index: int, *, similarity: Similarity = tanimo
     return Symmetry(360.0, neighbours, float(mean[int(mean.argmin()) :].max()))
 
 
-def lookalikes(views: Views, object_index: int, *, similarity: Similarity = tanimoto) -> tuple[Lookalike, ...]:
+def similar_objects(views: Views, object_index: int, *, similarity: Similarity = tanimoto) -> tuple[SimilarObject, ...]:
     """Find the objects that an object can be taken for, and from which sides.
 
     A view looks like another object when one of that object's views is as similar to it as the better one of its own
@@ -117,7 +117,7 @@ def lookalikes(views: Views, object_index: int, *, similarity: Similarity = tani
 
     Returns
     -------
-    tuple of Lookalike
+    tuple of SimilarObject
         The one with the largest share of views first; empty of an object with fewer than three views.
     """
     descriptors, azimuth_deg = _ring(views, object_index)
@@ -132,7 +132,7 @@ def lookalikes(views: Views, object_index: int, *, similarity: Similarity = tani
     reach = np.stack([np.maximum.reduceat(similarity(view, model)[0], begin) for view in descriptors])
     alike = reach >= enough[:, None]
     found = [
-        Lookalike(
+        SimilarObject(
             object_index=int(other),
             arcs_deg=_arcs(azimuth_deg, alike[:, column]),
             share=float(alike[:, column].mean()),
@@ -151,11 +151,11 @@ def _ring(views: Views, object_index: int) -> tuple[LevelArray, FloatArray]:
     return views.descriptors[rows], views.azimuth_deg[rows]
 
 
-def _mean_at(likeness: FloatArray, azimuth_deg: FloatArray, shift_deg: float) -> float:
+def _mean_at(pairwise: FloatArray, azimuth_deg: FloatArray, shift_deg: float) -> float:
     """Mean similarity of each view to the one nearest to ``shift_deg`` further on."""
     away_deg = np.abs(wrap180(azimuth_deg[None, :] - azimuth_deg[:, None] - shift_deg))
     partner: IndexArray = away_deg.argmin(axis=1)
-    return float(likeness[np.arange(len(partner)), partner].mean())
+    return float(pairwise[np.arange(len(partner)), partner].mean())
 
 
 def _arcs(azimuth_deg: FloatArray, alike: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:

@@ -8,7 +8,7 @@ from hbr.descriptors.tanimoto import tanimoto
 from hbr.paper.hough import Ranking
 
 
-def lead(ranking: Ranking, queries: LevelArray | ArrayLike) -> float:
+def score_margin(ranking: Ranking, queries: LevelArray | ArrayLike) -> float:
     """Return by how much the best object's score exceeds whatever score any other enrolled object can have.
 
     A score is a sum of similarities less a penalty that is never negative (Eq. 3), so no path of an object j scores

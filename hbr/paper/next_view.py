@@ -73,7 +73,7 @@ def next_view(
         A turn that would end this close to a visited orientation, or closer, goes on for 90 degrees, and again until it
         is clear of all. If all four endings are visited, the first is taken.
     side : {"left", "right"}, optional
-        Turn to this side whatever the likenesses say, by the same step: the control that a decision is measured by.
+        Turn to this side whatever the similarities say, by the same step: the control that a decision is measured by.
 
     Returns
     -------
@@ -101,8 +101,8 @@ def next_view(
         candidates = np.sort(ranking.object_index[:_BEST])
     pose_of = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
     poses = np.array([pose_of[j] for j in candidates.tolist()])
-    s_left = _likeness(ranking.views, candidates, _next_sector(poses, +1)[0])
-    s_right = _likeness(ranking.views, candidates, _next_sector(poses, -1)[0])
+    s_left = _side_similarity(ranking.views, candidates, _next_sector(poses, +1)[0])
+    s_right = _side_similarity(ranking.views, candidates, _next_sector(poses, -1)[0])
 
     if side is None:
         side = "left" if s_left <= s_right else "right"
@@ -121,7 +121,7 @@ def _next_sector(pose_deg: FloatArray, sign: int) -> tuple[IndexArray, FloatArra
     return gap_deg.argmin(axis=1), gap_deg.min(axis=1)
 
 
-def _likeness(views: Views, candidates: IndexArray, sectors: IndexArray) -> float:
+def _side_similarity(views: Views, candidates: IndexArray, sectors: IndexArray) -> float:
     """Sum of the similarities of all pairs of candidates, each seen in its sector (Eq. 6)."""
     averages = np.stack([_average_view(views, int(j), int(s)) for j, s in zip(candidates, sectors, strict=True)])
     return float(np.triu(tanimoto(averages, averages), k=1).sum())

@@ -11,7 +11,7 @@ _QUERIES: Final = 4
 """Views that a typical retrieval takes, spread evenly around the object."""
 
 
-def familiar_score(views: Views, *, quantile: float = 0.05, repeatability: float = 0.97) -> float:
+def open_set_threshold(views: Views, *, quantile: float = 0.05, repeatability: float = 0.97) -> float:
     """Return the score a view below which an object is probably none of those enrolled.
 
     Every enrolled view is taken for a query and compared with its two neighbours in azimuth, as if it were not enrolled

@@ -7,7 +7,7 @@ from typing import Final
 from rig.charts import svg
 from rig.charts.compass import CENTRE, RIM, SIZE, polar, rim
 from rig.events.events import Weighed
-from rig.events.wording import azimuth_words, odds_words, short
+from rig.events.wording import azimuth_words, percent_words, short
 
 _INNER: Final = 34.0
 _OUTER: Final = 118.0
@@ -91,7 +91,7 @@ def _reasons(weighed: Weighed, chosen: int, rivals: Sequence[str]) -> list[tuple
         reason = [("no second object is likely:", "small"), ("what is new helps its pose", "small")]
         return [*reason, *_cost(weighed, chosen)]
     least, most = min(weighed.alike), max(weighed.alike)
-    left, worst = (odds_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
+    left, worst = (percent_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
     return [
         ("", "small"),
         ("to tell", "small"),

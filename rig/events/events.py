@@ -111,8 +111,8 @@ class Candidate:
 class Ranked:
     """What is thought after a view; ``margin`` is how far, in score per view, the first candidate surely leads.
 
-    It leads any other enrolled object by at least that (`hbr.lead`); it may be negative. ``verdict`` is what the rules
-    of the dense search say of it, in words.
+    It leads any other enrolled object by at least that (`hbr.score_margin`); it may be negative. ``verdict`` is the
+    stopping rule's decision, in words.
     """
 
     index: int
@@ -182,7 +182,7 @@ class Item:
 
 
 @dataclass(frozen=True, slots=True)
-class Resemblance:
+class SimilarObject:
     """An enrolled object that looks the same from some sides.
 
     ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise; ``share`` of the views; ``similarity`` is the
@@ -196,7 +196,7 @@ class Resemblance:
 
 
 @dataclass(frozen=True, slots=True)
-class Insight:
+class SimilarObjects:
     """What a new object will be taken for: itself, turned by ``period_deg``, and other objects.
 
     ``period_deg`` is 360 where no turn makes it look the same, 0 where it looks alike from everywhere, None where there
@@ -207,7 +207,7 @@ class Insight:
     period_deg: float | None
     neighbours: float | None
     alike: float | None
-    lookalikes: tuple[Resemblance, ...]
+    lookalikes: tuple[SimilarObject, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,7 +294,7 @@ Event = (
     | Enrolled
     | Identified
     | Item
-    | Insight
+    | SimilarObjects
     | EmptyTableImage
     | Warned
     | Waiting

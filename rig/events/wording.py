@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from math import isfinite
 
 from hbr import Verdict
-from rig.events.events import Decided, Identified, Insight, Moved, Resemblance, Unwinding
+from rig.events.events import Decided, Identified, Moved, SimilarObject, SimilarObjects, Unwinding
 
 
 def decision_words(decided: Decided) -> str:
@@ -16,7 +16,7 @@ def decision_words(decided: Decided) -> str:
     return f"{decided.side}: {decided.why}; {turning}{past}."
 
 
-def likeness_words(side: str, s_left: float, s_right: float, rivals: Sequence[str]) -> str:
+def side_words(side: str, s_left: float, s_right: float, rivals: Sequence[str]) -> str:
     """Return why a side was chosen: how alike the rivals look from the left and from the right (Eq. 6)."""
     if len(rivals) < 2:
         return "no second candidate is in sight to be told apart"
@@ -52,7 +52,7 @@ def verdict_words(verdict: Verdict, *, certainty: float, least: float, views: in
     views
         That were taken.
     """
-    probability, familiarity = odds_words(verdict.probability), f"{verdict.familiarity:.3f}"
+    probability, familiarity = percent_words(verdict.probability), f"{verdict.familiarity:.3f}"
     familiar = not isfinite(least) or verdict.familiarity >= least
     known = f" and a familiarity of {familiarity} the {least:.3f} of enrolled objects" if isfinite(least) else ""
     if verdict.kind == "unknown":
@@ -60,15 +60,14 @@ def verdict_words(verdict: Verdict, *, certainty: float, least: float, views: in
     if verdict.kind == "look" and not familiar:
         return f"not familiar yet: {familiarity}, and enrolled objects reach {least:.3f}"
     if verdict.kind == "look":
-        return f"not sure yet: a probability of {probability}, and {odds_words(certainty)} ends the search"
+        return f"not sure yet: a probability of {probability}, and {percent_words(certainty)} ends the search"
     if verdict.probability >= certainty:
-        return f"a probability of {probability} reaches {odds_words(certainty)}{known}"
-    return (
-        f"the best after {counted(views, 'view')}, with a probability of {probability}; {odds_words(certainty)} is sure"
-    )
+        return f"a probability of {probability} reaches {percent_words(certainty)}{known}"
+    views_words = counted(views, "view")
+    return f"the best after {views_words}, with a probability of {probability}; {percent_words(certainty)} is sure"
 
 
-def odds_words(probability: float) -> str:
+def percent_words(probability: float) -> str:
     """Return a probability in percent; what is nearly none or nearly all as such."""
     if probability > 0.999:
         return ">99.9%"
@@ -128,19 +127,19 @@ def answer_words(answer: Identified) -> str:
     return " ".join([f"{result.removesuffix('.')}.", *rest])
 
 
-def symmetry_words(insight: Insight) -> str:
+def symmetry_words(similar: SimilarObjects) -> str:
     """Return what an object's views say about its pose; nothing where they say nothing."""
-    if insight.period_deg is None or insight.neighbours is None or insight.alike is None:
+    if similar.period_deg is None or similar.neighbours is None or similar.alike is None:
         return ""
-    numbers = f"similarity {insight.alike:.3f}, of neighbouring views {insight.neighbours:.3f}"
-    if insight.period_deg == 0:
+    numbers = f"similarity {similar.alike:.3f}, of neighbouring views {similar.neighbours:.3f}"
+    if similar.period_deg == 0:
         return f"looks alike from everywhere (least {numbers}): its pose will not be known"
-    if insight.period_deg < 360:
-        return f"looks the same every {insight.period_deg:g}° ({numbers}): its pose will be known up to that"
+    if similar.period_deg < 360:
+        return f"looks the same every {similar.period_deg:g}° ({numbers}): its pose will be known up to that"
     return ""
 
 
-def resemblance_words(one: Resemblance) -> str:
+def similar_object_words(one: SimilarObject) -> str:
     """Return from which sides an object looks like another one: "looks like mug-03 from 120–200°"."""
     if one.arcs_deg == ((0.0, 360.0),):
         return f"looks like {one.name} from all sides"
@@ -149,11 +148,11 @@ def resemblance_words(one: Resemblance) -> str:
     return f"looks like {one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {several}"
 
 
-def insight_words(insight: Insight) -> list[str]:
+def similar_objects_words(similar: SimilarObjects) -> list[str]:
     """Return what an object will be taken for, a line for each finding."""
-    lines = [words] if (words := symmetry_words(insight)) else []
-    lines += [f"{resemblance_words(one)} (similarity up to {one.similarity:.3f})" for one in insight.lookalikes]
-    return lines if insight.lookalikes else [*lines, "looks like no other enrolled object"]
+    lines = [words] if (words := symmetry_words(similar)) else []
+    lines += [f"{similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.lookalikes]
+    return lines if similar.lookalikes else [*lines, "looks like no other enrolled object"]
 
 
 def duration_words(seconds: float) -> str:

@@ -14,11 +14,11 @@ from rig.events.events import Accepted, Enrolled, Event, Started, Warned, plain
 from rig.motion.turntable import Move, Turntable
 from rig.plans.capture import announced, capture, moved
 from rig.plans.estimate import even_azimuths, table_angles
-from rig.views.capture import Viewer, likeness
+from rig.views.capture import Viewer, image_similarity
 from rig.views.description import DESCRIPTORS, PAPER_DESCRIPTOR, Describer
 from rig.views.empty_table import COMMAND, Drift, EmptyTables
 
-SAME_LIKENESS = 0.97
+SAME_SIMILARITY = 0.97
 """Two frames of an object at one angle are more alike; one that was shifted by a centimetre, or taken away, is less."""
 
 
@@ -176,15 +176,15 @@ def _look_again(
     """
     move = yield from announced(index, table, angle_deg)
     again = yield from capture(index, viewer, table, move.settled_ns)
-    alike = likeness(image_bgr, again.image_bgr, bench.config.view)
-    if alike < SAME_LIKENESS:
+    alike = image_similarity(image_bgr, again.image_bgr, bench.config.view)
+    if alike < SAME_SIMILARITY:
         enrollment.abandon()
         raise ObjectMoved(
             f"{enrollment.object_name} does not stand as it stood for view {index}: it fell, was pushed, or creeps "
             "on the platter.",
             next_step="Put it back on its mark, with something that holds it, and enroll it anew with --replace; "
             "the views taken are abandoned.",
-            evidence={"likeness": round(alike, 3), "smallest_likeness": SAME_LIKENESS, "table_deg": angle_deg},
+            evidence={"similarity": round(alike, 3), "smallest_similarity": SAME_SIMILARITY, "table_deg": angle_deg},
         )
 
 

@@ -15,7 +15,7 @@ from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, moved, unwind
 from rig.search.model import Model, empty_table_for
 from rig.search.session import SHOWN, begin_search
-from rig.search.strategies import AnyStrategy, Stop, Turn
+from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import Describer
 from rig.views.empty_table import COMMAND, Drift, EmptyTables
@@ -38,7 +38,7 @@ def identify(
     views are a fixed step apart, every later one lies where the rivals look less alike (Eq. 5-7), until a known object
     leads all others by ``identify.margin`` a view, or ``identify.max_views`` were taken. Its object is unknown when its
     score a view stays below ``identify.min_score``; where that is not given, below what the enrolled views let expect
-    (`hbr.familiar_score`). Closing the generator takes the torque off.
+    (`hbr.open_set_threshold`). Closing the generator takes the torque off.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def identify(
                 yield Warned(number, drifted, f"The search goes on without it; then take a new one: {COMMAND}")
             ranked, step = search.look(seen.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
             yield ranked
-            if isinstance(step, Stop):
+            if isinstance(step, Finish):
                 break
             asked_deg = table.rest_deg + sign * step.rotation_deg
             decided = _decided(number, step, table.within_reach(asked_deg), top)
@@ -124,7 +124,7 @@ def identify(
     return answer
 
 
-def _decided(number: int, turn: Turn, target_deg: float, top: int) -> Decided:
+def _decided(number: int, turn: Rotate, target_deg: float, top: int) -> Decided:
     return Decided(
         index=number,
         side="left" if turn.rotation_deg >= 0 else "right",

@@ -11,8 +11,8 @@ from rig.core.errors import TableNotEmpty, UsageError
 from rig.events.events import EmptyTableImage, Event, Warned, plain
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture
-from rig.plans.enroll import SAME_LIKENESS
-from rig.views.capture import Viewer, likeness
+from rig.plans.enroll import SAME_SIMILARITY
+from rig.views.capture import Viewer, image_similarity
 from rig.views.description import within
 from rig.views.empty_table import COMMAND, EmptyTable, EmptyTables
 from rig.views.object_presence import GRID, changed_cells, picture
@@ -80,7 +80,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         if not anyway:
             _check(share, agreement)
     before = EmptyTables.standing(bench)
-    if before.table is not None and likeness(before.table.image_bgr, first.image_bgr, config) < SAME_LIKENESS:
+    if before.table is not None and image_similarity(before.table.image_bgr, first.image_bgr, config) < SAME_SIMILARITY:
         yield Warned(
             None,
             f"the table does not look as it did at {before.table.taken_utc:%Y-%m-%d %H:%M} UTC; what is round turns "

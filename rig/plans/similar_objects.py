@@ -1,15 +1,15 @@
 """What a freshly enrolled object may be taken for."""
 
-from hbr.model.symmetry import lookalikes, symmetry
+from hbr.model import symmetry
 from hbr.model.views import Views
 from rig.core.errors import ObjectNotFound
-from rig.events.events import Insight, Resemblance
+from rig.events.events import SimilarObject, SimilarObjects
 
 TOLD = 3
 """Objects that are named as confusable."""
 
 
-def insight(views: Views, name: str) -> Insight:
+def similar_objects(views: Views, name: str) -> SimilarObjects:
     """Judge how alike an enrolled object is to itself from other sides, and to the other objects.
 
     Raises
@@ -22,14 +22,14 @@ def insight(views: Views, name: str) -> Insight:
             f"{name!r} has no complete enrollment.", next_step="Enroll it, or finish its enrollment with --resume."
         )
     number = views.object_names.index(name)
-    own = symmetry(views, number)
-    return Insight(
+    own = symmetry.symmetry(views, number)
+    return SimilarObjects(
         name=name,
         period_deg=own.period_deg if own else None,
         neighbours=own.neighbours if own else None,
         alike=own.alike if own else None,
         lookalikes=tuple(
-            Resemblance(views.object_names[one.object_index], one.arcs_deg, one.share, one.similarity)
-            for one in lookalikes(views, number)[:TOLD]
+            SimilarObject(views.object_names[one.object_index], one.arcs_deg, one.share, one.similarity)
+            for one in symmetry.similar_objects(views, number)[:TOLD]
         ),
     )

@@ -26,7 +26,7 @@ from rig.events.wording import (
     decision_words,
     listed,
     move_words,
-    odds_words,
+    percent_words,
     sentence,
     signed,
 )
@@ -134,7 +134,7 @@ class _Frame(NamedTuple):
     refused: str
     leading: list[tuple[str, str, str]]
     margin: str
-    verdict: str
+    decided: str
     moved: str
     decision: str
 
@@ -227,7 +227,7 @@ def _as_drawn(record: IdentificationRecord, azimuth_deg: float) -> float:
 
 
 def _leading(one: Candidate) -> tuple[str, str, str]:
-    return one.name, f"{one.score:.3f}", "" if one.probability is None else odds_words(one.probability)
+    return one.name, f"{one.score:.3f}", "" if one.probability is None else percent_words(one.probability)
 
 
 def _decisions(record: IdentificationRecord) -> list[Markup]:
@@ -263,7 +263,7 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
                 where=f"{azimuth_words(_as_drawn(record, view.azimuth_deg))}°",
                 refused=listed(view.refused),
                 leading=[_leading(c) for c in thought.candidates[:3]] if thought else [],
-                verdict=sentence(thought.verdict) if thought and thought.verdict else "",
+                decided=sentence(thought.verdict) if thought and thought.verdict else "",
                 margin=signed(thought.margin, 3) if thought else "",
                 moved=sentence(move_words(view.move)) if view.move and view.index else "",
                 decision=decision_words(decision) if decision else "",

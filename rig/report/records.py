@@ -13,10 +13,10 @@ from rig.events.events import (
     Enrolled,
     Event,
     Identified,
-    Insight,
     Moved,
     Ranked,
     Rejected,
+    SimilarObjects,
     Started,
 )
 from rig.report.contact_sheet import Image, Region, thumbnail
@@ -91,7 +91,7 @@ class EnrollmentRecord:
         self.planned = 0
         self.conditions: Mapping[str, Any] = {}
         self.result: Enrolled | None = None
-        self.insight: Insight | None = None
+        self.similar: SimilarObjects | None = None
         self._looks = _Looks(TILE, region)
 
     @property
@@ -111,8 +111,8 @@ class EnrollmentRecord:
             self.name, self.planned, self.conditions = event.name or "", event.views, event.conditions
         elif isinstance(event, Enrolled):
             self.result = event
-        elif isinstance(event, Insight):
-            self.insight = event
+        elif isinstance(event, SimilarObjects):
+            self.similar = event
 
     def complete(self, stored: Iterable[tuple[ViewRecord, Image]]) -> None:
         """Add the stored views that were not taken under these eyes: those of the sittings before."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from statistics import fmean, median
 from typing import NamedTuple
 
-from rig.events.events import Insight
-from rig.events.wording import counted, listed, odds_words, resemblance_words
+from rig.events.events import SimilarObjects
+from rig.events.wording import counted, listed, percent_words, similar_object_words
 from rig.report.records import EnrollmentRecord, IdentificationRecord
 
 
@@ -90,23 +90,23 @@ def enrollment_facts(record: EnrollmentRecord) -> list[SummaryItem]:
                 "encoder against gyro", f"{max(gaps):.2f}°", f"largest difference; {agree} of {len(moves)} moves agree"
             )
         )
-    if record.insight:
-        facts.append(_symmetry(record.insight))
-        similar = [resemblance_words(one).removeprefix("looks like ") for one in record.insight.lookalikes]
+    if record.similar:
+        facts.append(_symmetry(record.similar))
+        similar = [similar_object_words(one).removeprefix("looks like ") for one in record.similar.lookalikes]
         facts.append(SummaryItem("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
     if record.result:
         facts.append(SummaryItem("bench time", f"{record.result.seconds:.0f} s"))
     return facts
 
 
-def _symmetry(insight: Insight) -> SummaryItem:
-    if insight.period_deg is None or insight.neighbours is None or insight.alike is None:
+def _symmetry(similar: SimilarObjects) -> SummaryItem:
+    if similar.period_deg is None or similar.neighbours is None or similar.alike is None:
         return SummaryItem("symmetry", "–", "too few views to tell")
-    note = f"similarity {insight.alike:.3f}, of neighbouring views {insight.neighbours:.3f}"
-    if insight.period_deg == 360:
+    note = f"similarity {similar.alike:.3f}, of neighbouring views {similar.neighbours:.3f}"
+    if similar.period_deg == 360:
         return SummaryItem("symmetry", "none", note)
     return SummaryItem(
-        "symmetry", f"every {insight.period_deg:g}°" if insight.period_deg else "alike from everywhere", note
+        "symmetry", f"every {similar.period_deg:g}°" if similar.period_deg else "alike from everywhere", note
     )
 
 
@@ -116,7 +116,7 @@ def _answer_facts(record: IdentificationRecord) -> list[SummaryItem]:
         return []
     return [
         SummaryItem("answer", answer.name or "unknown"),
-        *([SummaryItem("probability", odds_words(answer.probability))] if answer.probability is not None else []),
+        *([SummaryItem("probability", percent_words(answer.probability))] if answer.probability is not None else []),
         SummaryItem("score", f"{answer.score:.3f}", f"per view; leads by {answer.margin:.3f}"),
         SummaryItem("views", f"{answer.views}"),
         SummaryItem("travelled", f"{answer.travelled_deg:.0f}°"),

@@ -17,7 +17,7 @@ OVERSHOOT_DEG = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class SavedAngleCheck:
     """What is to be added to the servo's positions, or why that is in ``doubt``; ``findings`` for the operator."""
 
     shift_deg: float
@@ -67,13 +67,13 @@ class Reference:
         return float(wrap180(self.to_table(position_deg))) + 360.0 * turns
 
 
-def judge(
+def check_saved_angle(
     saved: SavedTable | None,
     identity: ServoIdentity,
     position_deg: float,
     condition: ServoCondition,
     turn_deg: float = 360.0,
-) -> Judgement:
+) -> SavedAngleCheck:
     """Compare what a servo says after a pause with what was written down before.
 
     ``turn_deg`` is the angle after which its encoder reads the same again.
@@ -83,39 +83,39 @@ def judge(
     turns. All else is in doubt, and only a person who looks at the cable can tell.
     """
     if saved is None:
-        return Judgement(0.0, "nobody has told yet how its cable lies")
+        return SavedAngleCheck(0.0, "nobody has told yet how its cable lies")
     shift_deg = saved.shift_deg
     found, written = f"{position_deg:.1f}°", f"{saved.position_deg:.1f}°"
     if (identity.model_number, identity.bus_id) != (saved.model_number, saved.bus_id):
-        return Judgement(shift_deg, "another servo is connected than the last time")
+        return SavedAngleCheck(shift_deg, "another servo is connected than the last time")
     if identity.firmware != saved.firmware:
-        return Judgement(shift_deg, f"the servo's firmware was {saved.firmware} and is {identity.firmware} now")
+        return SavedAngleCheck(shift_deg, f"the servo's firmware was {saved.firmware} and is {identity.firmware} now")
     turned_deg = position_deg - saved.position_deg
     turns = round(turned_deg / turn_deg)
     same_within_turn = abs(turned_deg - turn_deg * turns) <= TOLERANCE_DEG
     if saved.path_deg is not None:
         low_deg, high_deg = saved.path_deg
         if condition.power_lost:
-            return Judgement(shift_deg, "the servo lost its supply in the middle of a motion")
+            return SavedAngleCheck(shift_deg, "the servo lost its supply in the middle of a motion")
         if not low_deg - OVERSHOOT_DEG <= position_deg <= high_deg + OVERSHOOT_DEG:
-            return Judgement(
+            return SavedAngleCheck(
                 shift_deg, f"a motion was cut off, and the servo stands at {found}, which was not on its way"
             )
         finding = f"the last program was cut off in the middle of a motion; the servo kept its turns (at {found})"
-        return Judgement(shift_deg, findings=(finding,))
+        return SavedAngleCheck(shift_deg, findings=(finding,))
     if condition.power_lost:
         if not same_within_turn:
-            return Judgement(
+            return SavedAngleCheck(
                 shift_deg,
                 f"the servo was without supply and the table was turned meanwhile (at {found}, left at {written})",
             )
         if turns:
             finding = f"the servo was without supply and forgot {abs(turns)} of its turns; they were written down"
-            return Judgement(shift_deg - turn_deg * turns, findings=(finding,))
-        return Judgement(shift_deg)
+            return SavedAngleCheck(shift_deg - turn_deg * turns, findings=(finding,))
+        return SavedAngleCheck(shift_deg)
     if abs(turned_deg) > min(HAND_DEG, turn_deg / 2):
-        return Judgement(shift_deg, f"the servo stands at {found}, it was left at {written}")
+        return SavedAngleCheck(shift_deg, f"the servo stands at {found}, it was left at {written}")
     if abs(turned_deg) > TOLERANCE_DEG:
         finding = f"the table was turned by hand, with the servo counting (at {found}, left at {written})"
-        return Judgement(shift_deg, findings=(finding,))
-    return Judgement(shift_deg)
+        return SavedAngleCheck(shift_deg, findings=(finding,))
+    return SavedAngleCheck(shift_deg)

@@ -32,7 +32,7 @@ from rig.core.errors import (
     Unreferenced,
 )
 from rig.devices.servo import Servo, ServoState
-from rig.safety.angle_reference import Reference, judge
+from rig.safety.angle_reference import Reference, check_saved_angle
 from rig.safety.motion_checks import unfit
 from rig.safety.saved_state import BenchState, Fault, MemoryStore, SavedTable, StateStore
 from rig.safety.state_machine import Happening, Machine
@@ -368,11 +368,13 @@ class Safety:
     def _judged(self) -> bool:
         """Compare what the servo says with what was written down; return whether the turns are beyond doubt."""
         state, condition = self._servo.read_state(), self._servo.read_condition()
-        judgement = judge(self._kept.table, self._servo.identity, state.position_deg, condition, self._servo.turn_deg)
-        self.reference.shift_deg = judgement.shift_deg
-        self._findings += [finding for finding in judgement.findings if finding not in self._findings]
-        self._doubt = judgement.doubt
-        return not judgement.doubt
+        check = check_saved_angle(
+            self._kept.table, self._servo.identity, state.position_deg, condition, self._servo.turn_deg
+        )
+        self.reference.shift_deg = check.shift_deg
+        self._findings += [finding for finding in check.findings if finding not in self._findings]
+        self._doubt = check.doubt
+        return not check.doubt
 
     def _judge(self) -> None:
         """Go where the comparison leads; a fault stays."""

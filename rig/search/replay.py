@@ -8,7 +8,7 @@ from typing import Any, Final
 from rig.events.events import Accepted, Decided, Identified, Moved, Ranked, plain
 from rig.search.saved_run import SavedRun
 from rig.search.session import Search, begin_search
-from rig.search.strategies import AnyStrategy, Stop, Turn
+from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.description import Describer
 
 TOLERANCE = 1e-9
@@ -57,7 +57,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     search: Search | None = None
     describe = Describer(run.config.view, (run.views.descriptor,), run.empty_table)
     ranked: Ranked | None = None
-    step: Turn | Stop | None = None
+    step: Rotate | Finish | None = None
     table_deg = 0.0
     for event in run.events():
         match event:
@@ -110,8 +110,8 @@ def _saved_step(event: Decided) -> dict[str, Any]:
     }
 
 
-def _computed_step(step: Turn | Stop | None, saved: Decided) -> dict[str, Any]:
-    if not isinstance(step, Turn):
+def _computed_step(step: Rotate | Finish | None, saved: Decided) -> dict[str, Any]:
+    if not isinstance(step, Rotate):
         return {"what": "stop", "why": step.why if step else "no view was taken"}
     rivals = list(step.rivals[: len(saved.rivals)])
     return {"what": "turn", **plain(step), "rivals": rivals}
@@ -135,10 +135,10 @@ def _saved_answer(event: Identified) -> dict[str, Any]:
     return {"what": "stop", **{key: getattr(event, key) for key in _ANSWER}}
 
 
-def _computed_answer(search: Search, ranked: Ranked, step: Turn | Stop | None) -> dict[str, Any]:
+def _computed_answer(search: Search, ranked: Ranked, step: Rotate | Finish | None) -> dict[str, Any]:
     answer = search.answer(ranked, step.why if step else "")
     return {
-        "what": "stop" if isinstance(step, Stop) else "turn",
+        "what": "stop" if isinstance(step, Finish) else "turn",
         **{key: getattr(answer, key) for key in _ANSWER},
     }
 

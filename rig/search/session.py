@@ -17,12 +17,12 @@ from rig.events.events import Candidate, Identified, Ranked
 from rig.events.wording import verdict_words
 from rig.search.model import Model
 from rig.search.strategies import (
-    DenseLook,
+    DenseSearchState,
     DenseStrategy,
-    Look,
-    Stop,
+    Finish,
+    Rotate,
+    SearchState,
     Strategy,
-    Turn,
     descriptor_for,
     is_dense,
     reachable_turns,
@@ -57,7 +57,9 @@ class Search(ABC):
     def min_score(self) -> float:
         """Score a view below which the leading object counts as unknown; 0 where nothing does."""
 
-    def look(self, levels: NDArray[np.uint8], azimuth_deg: float, *, table_deg: float) -> tuple[Ranked, Turn | Stop]:
+    def look(
+        self, levels: NDArray[np.uint8], azimuth_deg: float, *, table_deg: float
+    ) -> tuple[Ranked, Rotate | Finish]:
         """Take the next view; return what is thought now, and what to do.
 
         Parameters
@@ -77,7 +79,7 @@ class Search(ABC):
     def _vote(self, levels: NDArray[np.uint8]) -> Ranked: ...
 
     @abstractmethod
-    def _next(self, ranked: Ranked, table_deg: float) -> Turn | Stop: ...
+    def _next(self, ranked: Ranked, table_deg: float) -> Rotate | Finish: ...
 
     def answer(self, ranked: Ranked, reason: str, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         """Return what is known when the search ends."""
@@ -104,7 +106,7 @@ class HoughSearch(Search):
         super().__init__(index.views, config, seed=seed, top=top)
         given = config.identify.min_score
         self._min_score = (
-            hbr.familiar_score(index.views, repeatability=config.identify.repeatability) if given is None else given
+            hbr.open_set_threshold(index.views, repeatability=config.identify.repeatability) if given is None else given
         )
         self._index = index
         self._strategy = strategy
@@ -131,10 +133,10 @@ class HoughSearch(Search):
             Candidate(name, float(score) / views, float(pose_deg))
             for name, score, pose_deg in zip(ranking.names[: self._top], ranking.scores, ranking.pose_deg, strict=False)
         )
-        return Ranked(views - 1, candidates, hbr.lead(ranking, queries) / views)
+        return Ranked(views - 1, candidates, hbr.score_margin(ranking, queries) / views)
 
-    def _next(self, ranked: Ranked, table_deg: float) -> Turn | Stop:
-        look = Look(
+    def _next(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:
+        look = SearchState(
             index=self._index,
             queries=self._queries,
             ranking=self._ranking,
@@ -150,7 +152,7 @@ class HoughSearch(Search):
 
 
 class DenseSearch(Search):
-    """The bench's own: every object from every azimuth has a probability (`hbr.believe`), rules say when to end."""
+    """The bench's own: every object from every azimuth has a probability (`hbr.update_belief`)."""
 
     def __init__(
         self,
@@ -183,7 +185,7 @@ class DenseSearch(Search):
         return self._rules.familiar[min(self._belief.queries, len(self._rules.familiar)) - 1]
 
     def _vote(self, levels: NDArray[np.uint8]) -> Ranked:
-        self._so_far = self._belief = belief = hbr.believe(
+        self._so_far = self._belief = belief = hbr.update_belief(
             levels, self._orientations[-1], self._so_far, kept=self._kept
         )
         verdict, least = judged(belief, self._rules, max_views=self._config.identify.max_views)
@@ -204,9 +206,9 @@ class DenseSearch(Search):
         others = float(scores[order[1:]].max()) if len(order) > 1 else 0.0
         return Ranked(belief.queries - 1, candidates, self._best_score - others, self._words)
 
-    def _next(self, ranked: Ranked, table_deg: float) -> Turn | Stop:  # noqa: ARG002
+    def _next(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
         rotations_deg, seconds = reachable_turns(self._config, table_deg)
-        look = DenseLook(
+        look = DenseSearchState(
             belief=self._belief,
             verdict=self._verdict,
             rules=self._rules,

@@ -211,7 +211,7 @@ def _alone(index: hbr.DenseIndex, error_rate: float, false_reject: float) -> Reh
     if len(index) == 1 and len(index.views) > 1:
         levels, azimuth_deg = index.views.descriptors, index.views.azimuth_deg
         scores = [
-            float(hbr.believe(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()[0])
+            float(hbr.update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()[0])
             for row in range(len(levels))
         ]
         # as `hbr.judge` has it, whose lead over no second is the whole score

@@ -2,8 +2,8 @@
 
 `identify` asks one strategy after every view. Five come with the rig; others plug in by an object of their own, or by
 name through the entry-point group `rig.strategies`. Which views a strategy is shown it says by its attribute
-``descriptor``: the paper's where it has none (`Strategy`, `Look`), the bench's own for the dense search
-(`DenseStrategy`, `DenseLook`).
+``descriptor``: the paper's where it has none (`Strategy`, `SearchState`), the bench's own for the dense search
+(`DenseStrategy`, `DenseSearchState`).
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from hbr.core.angles import wrap180
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import Weighed
-from rig.events.wording import likeness_words, separation_words
+from rig.events.wording import separation_words, side_words
 from rig.motion.motion_model import MotionModel
 from rig.motion.turntable import equivalent_within
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
@@ -35,7 +35,7 @@ _DRAWS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
+class SearchState:
     """What is known after a view.
 
     Attributes
@@ -47,7 +47,7 @@ class Look:
     ranking : hbr.Ranking
         What they say; `ranking.orientation_deg` is where each was taken.
     score, margin
-        Of the leading candidate, per view: its Hough score, and how far it surely leads (`hbr.lead`).
+        Of the leading candidate, per view: its Hough score, and how far it surely leads (`hbr.score_margin`).
     min_score
         Below this score a view the object counts as unknown.
     table_deg, limits_deg
@@ -76,7 +76,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DenseLook:
+class DenseSearchState:
     """What the dense search knows after a view.
 
     Attributes
@@ -113,7 +113,7 @@ class DenseLook:
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class Rotate:
     """Look again, ``rotation_deg`` further around the object, positive to the left; ``why`` in words.
 
     ``s_left`` and ``s_right`` say how alike the ``rivals`` (names) look from either side, where that was asked;
@@ -129,7 +129,7 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class Finish:
     """Look no further; ``why`` in words."""
 
     why: str
@@ -143,7 +143,7 @@ class Strategy(Protocol):
         """By which it is asked for, and which is kept with a run."""
         ...
 
-    def next(self, look: Look) -> Turn | Stop:
+    def next(self, look: SearchState) -> Rotate | Finish:
         """Return where to look next, or that it is enough. The same look and draws give the same answer."""
         ...
 
@@ -161,7 +161,7 @@ class DenseStrategy(Protocol):
         """By which views are described for it: ``edges+colours``, the bench's own."""
         ...
 
-    def next(self, look: DenseLook) -> Turn | Stop:
+    def next(self, look: DenseSearchState) -> Rotate | Finish:
         """Return where to look next, or that it is enough. The same look and draws give the same answer."""
         ...
 
@@ -200,7 +200,7 @@ def reachable_turns(config: RigConfig, table_deg: float) -> tuple[NDArray[np.flo
     return np.array(rotations_deg), np.array(seconds)
 
 
-def enough(look: Look) -> Stop | None:
+def enough(look: SearchState) -> Finish | None:
     """Return the reason to stop that most strategies share, or None.
 
     A search is over when a known object leads all others by ``identify.margin`` a view, or ``identify.max_views`` were
@@ -208,14 +208,14 @@ def enough(look: Look) -> Stop | None:
     """
     config = look.config
     if look.views >= config.min_views and look.score >= look.min_score and look.margin >= config.margin:
-        return Stop(f"the lead of {look.margin:.3f} a view passes {config.margin:g}")
+        return Finish(f"the lead of {look.margin:.3f} a view passes {config.margin:g}")
     return spent(look)
 
 
-def spent(look: Look) -> Stop | None:
+def spent(look: SearchState) -> Finish | None:
     """Return the reason to stop when all views that are allowed were taken, or None."""
     if look.views >= look.config.max_views:
-        return Stop(f"{look.config.max_views} views were taken")
+        return Finish(f"{look.config.max_views} views were taken")
     return None
 
 
@@ -224,16 +224,16 @@ class Active:
 
     name = "ahbr"
 
-    def next(self, look: Look) -> Turn | Stop:
+    def next(self, look: SearchState) -> Rotate | Finish:
         if stop := enough(look):
             return stop
         if look.views == 1:
-            return Turn(look.config.first_step_deg, "the first turn is fixed")
+            return Rotate(look.config.first_step_deg, "the first turn is fixed")
         decision = hbr.next_view(look.ranking)
         names = look.ranking.views.object_names
         rivals = tuple(names[i] for i in decision.candidates)
-        why = likeness_words(decision.side, decision.s_left, decision.s_right, rivals)
-        return Turn(decision.rotation_deg, why, decision.s_left, decision.s_right, rivals)
+        why = side_words(decision.side, decision.s_left, decision.s_right, rivals)
+        return Rotate(decision.rotation_deg, why, decision.s_left, decision.s_right, rivals)
 
 
 class Sweep:
@@ -241,9 +241,9 @@ class Sweep:
 
     name = "sweep"
 
-    def next(self, look: Look) -> Turn | Stop:
+    def next(self, look: SearchState) -> Rotate | Finish:
         views = look.config.max_views
-        return enough(look) or Turn(360.0 / views, f"the sweep goes around in {views} even steps")
+        return enough(look) or Rotate(360.0 / views, f"the sweep goes around in {views} even steps")
 
 
 class Random:
@@ -251,8 +251,8 @@ class Random:
 
     name = "random"
 
-    def next(self, look: Look) -> Turn | Stop:
-        return enough(look) or Turn(_draw(look), "a turn drawn at random")
+    def next(self, look: SearchState) -> Rotate | Finish:
+        return enough(look) or Rotate(_draw(look), "a turn drawn at random")
 
 
 class Passive:
@@ -260,8 +260,8 @@ class Passive:
 
     name = "hbr"
 
-    def next(self, look: Look) -> Turn | Stop:
-        return spent(look) or Turn(_draw(look), f"view {look.views + 1} of {look.config.max_views}, drawn at random")
+    def next(self, look: SearchState) -> Rotate | Finish:
+        return spent(look) or Rotate(_draw(look), f"view {look.views + 1} of {look.config.max_views}, drawn at random")
 
 
 class Dense:
@@ -270,12 +270,14 @@ class Dense:
     name = "dense"
     descriptor = BENCH_DESCRIPTOR
 
-    def next(self, look: DenseLook) -> Turn | Stop:
+    def next(self, look: DenseSearchState) -> Rotate | Finish:
         if look.verdict.kind != "look":
-            return Stop(look.verdict.words)
+            return Finish(look.verdict.words)
         if not len(look.rotations_deg):
-            return Stop("the cable leaves no other view")
-        ahead = hbr.next_look(look.belief, beta=look.rules.beta, rotations_deg=look.rotations_deg, seconds=look.seconds)
+            return Finish("the cable leaves no other view")
+        ahead = hbr.next_best_view(
+            look.belief, beta=look.rules.beta, rotations_deg=look.rotations_deg, seconds=look.seconds
+        )
         names = look.belief.index.views.object_names
         rivals = () if ahead.pair is None else tuple(names[i] for i in ahead.pair)
         alike = None if ahead.alike is None else tuple(ahead.alike.tolist())
@@ -283,7 +285,7 @@ class Dense:
         weighed = Weighed(
             tuple(ahead.rotations_deg.tolist()), tuple(ahead.confusion.tolist()), tuple(ahead.cost.tolist()), alike
         )
-        return Turn(ahead.rotation_deg, separation_words(rivals, alike, chosen), rivals=rivals, weighed=weighed)
+        return Rotate(ahead.rotation_deg, separation_words(rivals, alike, chosen), rivals=rivals, weighed=weighed)
 
 
 BUILT_IN: Final[dict[str, Callable[[], AnyStrategy]]] = {
@@ -325,7 +327,7 @@ def strategy(name: str) -> AnyStrategy:
     )
 
 
-def _draw(look: Look) -> float:
+def _draw(look: SearchState) -> float:
     """A rotation that leads to where no view was taken yet; the last one drawn where everything has been seen."""
     seen_deg = look.ranking.orientation_deg
     for _ in range(_DRAWS):

@@ -20,7 +20,7 @@ NOISE_GAIN = 20
 MAX_NOISE = 0.3
 """Largest share of such variance in a picture; half a frame of random bytes has more."""
 LIKENESS_PX = 4
-"""Side of the squares that `likeness` averages over."""
+"""Side of the squares that `image_similarity` averages over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ def looks(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Looks:
     )
 
 
-def likeness(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8], config: ViewConfig) -> float:
+def image_similarity(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8], config: ViewConfig) -> float:
     """Return how much two frames show the same in their region of interest: 1 for the same, whatever the light.
 
     It is the correlation of their grey levels, averaged over a few pixels: noise and a tenth of a degree cost less

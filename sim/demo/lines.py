@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from rig.cli.ui.present import line
 from rig.events.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
-from rig.events.wording import azimuth_words, distinct, odds_words, signed
+from rig.events.wording import azimuth_words, distinct, percent_words, signed
 
 
 class MoveLines:
@@ -56,18 +56,20 @@ class MoveLines:
             if move.rotation_imu_deg is not None and move.imu_sigma_deg is not None:
                 imu = f"{signed(move.rotation_imu_deg, 2)} ± {move.imu_sigma_deg:.2f}°"
             turned = f"{signed(self._asked_deg, 1):>7}°{signed(move.rotation_encoder_deg, 2):>10}°{imu:>18}"
-        likeness = f"{'–':>12}{'–':>9}  "
+        similarity = f"{'–':>12}{'–':>9}  "
         if decided and decided.s_left is not None and decided.s_right is not None:
             left, right = distinct(decided.s_left, decided.s_right, decimals=3)
-            likeness = f"{left:>12}{right:>9}  "
+            similarity = f"{left:>12}{right:>9}  "
         if decided and decided.weighed is not None and decided.weighed.alike is not None:
             alike = decided.weighed.alike
             there = alike[decided.weighed.rotations_deg.index(decided.rotation_deg)]
-            likeness = f"{there:>11.2f}{f'{min(alike):.2f}–{max(alike):.2f}':>11} "
+            similarity = f"{there:>11.2f}{f'{min(alike):.2f}–{max(alike):.2f}':>11} "
         goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
         leading = ", ".join(
-            f"{c.name} {f'{c.score:.3f}' if c.probability is None else odds_words(c.probability)}"
+            f"{c.name} {f'{c.score:.3f}' if c.probability is None else percent_words(c.probability)}"
             for c in self._leading
         )
         note = "" if move.agrees else "  ENCODER AND IMU DISAGREE"
-        return f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{turned}{likeness}{goes:<11} {leading}{note}"
+        return (
+            f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{turned}{similarity}{goes:<11} {leading}{note}"
+        )

@@ -62,7 +62,7 @@ ENROLLED = (
 )
 """What is enrolled first: two pairs of twins, a round vase, a bowl that looks the same at every eighth of a turn."""
 
-STRANGERS = ("radio", "clock")
+UNKNOWN_OBJECTS = ("radio", "clock")
 """What is shown to the bench without having been enrolled."""
 
 COUNT_OF_FOLDER = 20
@@ -93,7 +93,7 @@ class DemoResult:
     def as_dict(self) -> dict[str, Any]:
         """Return the totals and every trial as plain data."""
         known = [trial for trial in self.trials if trial.truth and trial.truth.name is not None]
-        strangers = [trial for trial in self.trials if trial.truth and trial.truth.name is None]
+        unknown = [trial for trial in self.trials if trial.truth and trial.truth.name is None]
         errors = [error for trial in self.trials if (error := trial.pose_error_deg) is not None]
         answers = [trial.answer for trial in self.trials if trial.answer]
         return {
@@ -103,8 +103,8 @@ class DemoResult:
             "views_enrolled": sum(len(record.views) for record in self.enrollments),
             "found": sum(bool(trial.correct) for trial in known),
             "of": len(known),
-            "unknown_recognised": sum(bool(trial.correct) for trial in strangers),
-            "of_unknown": len(strangers),
+            "unknown_recognised": sum(bool(trial.correct) for trial in unknown),
+            "of_unknown": len(unknown),
             "mean_views": statistics.fmean(answer.views for answer in answers),
             "travelled_deg": sum(answer.travelled_deg for answer in answers),
             "median_pose_error_deg": statistics.median(errors) if errors else None,
@@ -125,7 +125,7 @@ def run_demo(
     change: Change | None = None,
     faults: Sequence[Fault] = (),
 ) -> DemoResult:
-    """Enroll a shelf, find each object again and two strangers, print what happens, and write ``out/report.html``.
+    """Enroll a shelf, find each object again and two unknown ones, print what happens, and write ``out/report.html``.
 
     Objects are searched by ``strategy``, or as ``identify.strategy`` says. The ``change`` comes about when all are
     enrolled. The ``faults``, and those of the configuration, happen meanwhile.
@@ -148,10 +148,10 @@ def run_demo(
     asked = strategy or config.identify.strategy
     chosen = None if asked is None else strategy_named(asked)
     options = validate(SimOptions, config.bench.get("sim", {}), where="the configuration", prefix="bench.sim")
-    enrolled, strangers = _choose(objects or options.objects, count)
+    enrolled, unknown = _choose(objects or options.objects, count)
     seed = settings.seed or 0
     world = World(noise=NoiseModel(**options.noise), seed=seed)
-    operator = ShelfOperator(world, {**enrolled, **strangers})
+    operator = ShelfOperator(world, {**enrolled, **unknown})
     heard = None if settings.json else _say_fault
     with (
         _folder_within(out) as folder,
@@ -174,7 +174,7 @@ def run_demo(
                 enrolled=name in enrolled,
                 say=number == 0 and not settings.json,
             )
-            for number, (name, thing) in enumerate({**enrolled, **strangers}.items())
+            for number, (name, thing) in enumerate({**enrolled, **unknown}.items())
         ]
         searched_by = (chosen or strategy_for(model.descriptor)).name
         bench_s = bench.clock.now_ns() * 1e-9
@@ -196,7 +196,7 @@ def run_demo(
     totals = result.as_dict()
     summary = (
         f"{totals['enrolled']} objects enrolled, {totals['found']} of {totals['of']} found again, "
-        f"{totals['unknown_recognised']} of {totals['of_unknown']} strangers recognised as unknown, "
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognized, "
         "on the simulated bench."
     )
     write_report(result.report, render_report("The rig's demonstration", summary, enrollments, trials, meta=meta))
@@ -211,20 +211,20 @@ def _say_fault(occurrence: Occurrence) -> None:
 
 
 def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, Thing], Mapping[str, Thing]]:
-    """Return what is enrolled and what is not; a folder that is enrolled whole gets its strangers from the shelf."""
+    """Return the objects to enroll and the unknown ones; if a whole folder is enrolled, those come from the shelf."""
     built_in: dict[str, Thing] = dict(shelf())
-    known = dict(photographs(folder)) if folder else {k: v for k, v in built_in.items() if k not in STRANGERS}
+    known = dict(photographs(folder)) if folder else {k: v for k, v in built_in.items() if k not in UNKNOWN_OBJECTS}
     names = list(known) if folder else list(dict.fromkeys([*ENROLLED, *known]))
     wanted = count or min(COUNT_OF_FOLDER if folder else len(ENROLLED), len(names))
     if wanted > len(names):
         raise UsageError(
             f"There are {len(names)} objects to enroll, not {wanted}.", next_step=f"Give --count {len(names)} or less."
         )
-    left = names[wanted : wanted + len(STRANGERS)]
-    strangers = {name: known[name] for name in left} if folder and len(left) == len(STRANGERS) else None
+    left = names[wanted : wanted + len(UNKNOWN_OBJECTS)]
+    unknown = {name: known[name] for name in left} if folder and len(left) == len(UNKNOWN_OBJECTS) else None
     return (
         {name: known[name] for name in names[:wanted]},
-        strangers or {name: built_in[name] for name in STRANGERS},
+        unknown or {name: built_in[name] for name in UNKNOWN_OBJECTS},
     )
 
 
@@ -335,7 +335,7 @@ def _print_totals(result: DemoResult) -> None:
     print(
         f"\n{totals['enrolled']} objects enrolled with {totals['views_enrolled']} views; "
         f"{totals['found']} of {totals['of']} found again, "
-        f"{totals['unknown_recognised']} of {totals['of_unknown']} strangers recognised as unknown.\n"
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognized.\n"
         f"{totals['mean_views']:.1f} views an answer, {totals['travelled_deg']:.0f}° travelled, "
         f"median pose error {'–' if error is None else f'{error:.1f}°'}.\n"
         f"The bench worked {result.bench_s / 60:.0f} minutes of its own time in {result.wall_s:.0f} s.\n"

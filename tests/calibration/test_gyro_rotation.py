@@ -27,12 +27,12 @@ def moves(seed: int, *, true: float = 1.0, repeats: int = 10, play_deg: float = 
     return made
 
 
-def judged(some: list[Timed]) -> CalibrationResult:
+def fitted(some: list[Timed]) -> CalibrationResult:
     return from_data(some, resolution_deg=1e-6, when_utc=WHEN, device={})
 
 
 def test_a_true_sigma_passes_and_its_ratio_covers_one():
-    facts = [judged(moves(seed)) for seed in range(100)]
+    facts = [fitted(moves(seed)) for seed in range(100)]
     assert all(fact.passed for fact in facts)
     z = [
         (fact.estimates[f"ratio_{speed}"].value - 1) / fact.estimates[f"ratio_{speed}"].uncertainty
@@ -44,18 +44,18 @@ def test_a_true_sigma_passes_and_its_ratio_covers_one():
 
 def test_more_scatter_than_stated_is_refused_and_so_is_far_less():
     for seed in range(20):
-        assert "scatter by" in judged(moves(seed, true=2.5)).refusals[0]
-        assert "stated too large" in judged(moves(seed, true=0.1)).refusals[0]
+        assert "scatter by" in fitted(moves(seed, true=2.5)).refusals[0]
+        assert "stated too large" in fitted(moves(seed, true=0.1)).refusals[0]
 
 
 def test_one_speed_that_shakes_the_bench_is_named():
     some = [m if m.speed != "medium" else shaken for m, shaken in zip(moves(0), moves(0, true=4.0), strict=True)]
-    (refusal,) = judged(some).refusals
+    (refusal,) = fitted(some).refusals
     assert "Rotations of 5.1 s" in refusal
 
 
 def test_a_gyro_that_lost_its_rotations_is_refused():
-    fact = judged(moves(0, trouble="samples were lost"))
+    fact = fitted(moves(0, trouble="samples were lost"))
     assert "samples were lost" in fact.refusals[0]
     assert not fact.estimates
 

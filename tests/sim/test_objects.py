@@ -182,8 +182,8 @@ def test_confusable_things_differ_from_some_sides_only(one: str, other: str) -> 
 def test_things_that_are_not_confusable_differ() -> None:
     names = list(shelf())
     descriptors = np.stack([describe(render(shelf()[name], 20.0)) for name in names])
-    likeness = tanimoto(descriptors, descriptors)
-    close = {(names[i], names[j]) for i, j in np.argwhere(np.triu(likeness > 0.995, 1))}
+    similarity = tanimoto(descriptors, descriptors)
+    close = {(names[i], names[j]) for i, j in np.argwhere(np.triu(similarity > 0.995, 1))}
     assert close <= set(CONFUSABLE)
 
 

@@ -102,7 +102,9 @@ def bring_in(
     )
 
 
-def rehearse(plan: Plan, *, strict: bool = False, jobs: int | None = None) -> Generator[Progressed, None, Imported]:
+def preview_import(
+    plan: Plan, *, strict: bool = False, jobs: int | None = None
+) -> Generator[Progressed, None, Imported]:
     """Look at every image that `bring_in` would take, and return what it would; nothing is written.
 
     Raises

@@ -62,7 +62,7 @@ def calibrate(
 def _lines(found: "Rehearsed", objects: int, seconds: float) -> list[str]:
     from math import isfinite
 
-    from rig.events.wording import counted, odds_words, sentence
+    from rig.events.wording import counted, percent_words, sentence
 
     rules = found.rules
     lines = [
@@ -71,7 +71,7 @@ def _lines(found: "Rehearsed", objects: int, seconds: float) -> list[str]:
     ]
     if found.ended:
         lines.append(
-            f"  answers  a search ends at a probability of {odds_words(rules.certainty)}: {found.ended} did, after "
+            f"  answers  a search ends at a probability of {percent_words(rules.certainty)}: {found.ended} did, after "
             f"{found.mean_views:.2f} views, {found.wrong} of them with a wrong object ({found.wrong / found.ended:.1%})"
         )
     if isfinite(rules.familiar[-1]):

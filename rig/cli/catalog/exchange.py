@@ -89,10 +89,10 @@ def take_in(
     dry_run: bool,
     jobs: int | None,
 ) -> None:
-    """Import a package, or rehearse it, and report."""
+    """Import a package, or preview it, and report."""
     from contextlib import nullcontext
 
-    from rig.catalog.exchange import Conflict, bring_in, plan_import, rehearse
+    from rig.catalog.exchange import Conflict, bring_in, plan_import, preview_import
     from rig.core.clock import SystemClock, seconds_between
     from rig.core.errors import UsageError
 
@@ -108,7 +108,7 @@ def take_in(
     if dry_run:
         with settings.catalog_there() or nullcontext() as there:
             plan = plan_import(there, package, conflict)
-        done = run_job("looking", rehearse(plan, strict=strict, jobs=jobs), interrupted=nothing)
+        done = run_job("looking", preview_import(plan, strict=strict, jobs=jobs), interrupted=nothing)
     else:
         with settings.open_catalog(create=True) as catalog:
             plan = plan_import(catalog, package, conflict)

@@ -133,7 +133,7 @@ class _Job:
 
     def run(self, events: Any, how_on: Callable[[], list[str]], report: Path | None) -> None:
         from rig.events.events import Enrolled, Item
-        from rig.plans.similar_objects import insight
+        from rig.plans.similar_objects import similar_objects
 
         try:
             for event in events:
@@ -141,7 +141,7 @@ class _Job:
                     self.quiet()
                     self._heading = f"{event.number} of {event.of} "
                 if isinstance(event, Enrolled):  # it is in the catalog; that stays the last word about it
-                    self._tell(insight(self._catalog.views().views, event.name))
+                    self._tell(similar_objects(self._catalog.views().views, event.name))
                 self._tell(event)
                 if isinstance(event, Enrolled):
                     self._done += 1

@@ -21,10 +21,10 @@ from rig.events.events import (
     Enrolled,
     Event,
     Identified,
-    Insight,
     Moved,
     Ranked,
     Rejected,
+    SimilarObjects,
     Started,
 )
 from rig.events.wording import (
@@ -32,10 +32,10 @@ from rig.events.wording import (
     counted,
     decision_words,
     duration_words,
-    insight_words,
     move_words,
-    odds_words,
+    percent_words,
     signed,
+    similar_objects_words,
 )
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
@@ -173,8 +173,8 @@ class EnrollView(LiveView):
                 self.note(line(event))
                 for words in self._findings:
                     self.note(f"  {words}")
-            case Insight():
-                self._findings = insight_words(event)
+            case SimilarObjects():
+                self._findings = similar_objects_words(event)
             case _:
                 self.note(line(event))
         return isinstance(event, Accepted)
@@ -364,7 +364,7 @@ class IdentifyView(LiveView):
 
 
 def _odds(one: Candidate) -> str:
-    return "" if one.probability is None else odds_words(one.probability)
+    return "" if one.probability is None else percent_words(one.probability)
 
 
 def _angle(angle_deg: float | None) -> str:

@@ -18,11 +18,11 @@ from rig.events.events import (
     Event,
     Failed,
     Identified,
-    Insight,
     Item,
     Moved,
     Ranked,
     Rejected,
+    SimilarObjects,
     Started,
     Unwinding,
     Waiting,
@@ -34,10 +34,10 @@ from rig.events.wording import (
     counted,
     decision_words,
     duration_words,
-    insight_words,
     move_words,
-    odds_words,
+    percent_words,
     signed,
+    similar_objects_words,
     unwinding_words,
 )
 from rig.plans.estimate import DryRun
@@ -91,8 +91,8 @@ def line(event: Event) -> str:
             return f"{event.number} of {event.of}  {event.name}: left out, {event.why}"
         case Item():
             return ""
-        case Insight():
-            return "\n".join(f"  {words}" for words in insight_words(event))
+        case SimilarObjects():
+            return "\n".join(f"  {words}" for words in similar_objects_words(event))
         case EmptyTableImage():
             turning = "" if event.turning_share is None else f", {event.turning_share:.1%} of it turns with the table"
             return f"Picture of the empty table: {event.width} x {event.height} pixels{turning}"
@@ -105,7 +105,7 @@ def line(event: Event) -> str:
 
 
 def _leader(one: Candidate) -> str:
-    odds = "" if one.probability is None else f" ({odds_words(one.probability)})"
+    odds = "" if one.probability is None else f" ({percent_words(one.probability)})"
     return f"{one.name} {one.score:.3f}{odds} at {azimuth_words(one.pose_deg)}°"
 
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable
 
-from hbr import Belief, DenseIndex, believe
+from hbr import Belief, DenseIndex, update_belief
 
 
 def believe_all(queries: Iterable, orientation_deg: Iterable[float], index: DenseIndex) -> Belief:
     """Return what is believed after all these queries, in their order."""
     belief: DenseIndex | Belief = index
     for query, angle_deg in zip(queries, orientation_deg, strict=True):
-        belief = believe(query, float(angle_deg), belief)
+        belief = update_belief(query, float(angle_deg), belief)
     return belief

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hbr import DenseIndex, Views, believe, tanimoto
+from hbr import DenseIndex, Views, tanimoto, update_belief
 from hbr.dense.filter import BINS, Belief
 from tests.hbr.dense.searches import believe_all
 
@@ -68,12 +68,12 @@ def test_those_who_are_kept_are_the_strongest_and_score_as_if_all_were(seed: int
     views = catalog(seed, objects=6)
     index = DenseIndex(views)
     queries = catalog(seed + 1, ragged=False).descriptors[:2]
-    every = believe(queries[0], 0.0, index)
-    few = believe(queries[0], 0.0, index, kept=kept)
+    every = update_belief(queries[0], 0.0, index)
+    few = update_belief(queries[0], 0.0, index, kept=kept)
     strongest = np.sort(np.argsort(-every.support.max(axis=1), kind="stable")[:kept])
     np.testing.assert_array_equal(few.support.max(axis=1), every.support[strongest].max(axis=1))
     np.testing.assert_array_equal(few.index.object_index, strongest)
-    later, whole = believe(queries[1], 77.0, few), believe(queries[1], 77.0, every)
+    later, whole = update_belief(queries[1], 77.0, few), update_belief(queries[1], 77.0, every)
     np.testing.assert_array_equal(later.support, whole.support[strongest])
 
 
@@ -82,10 +82,10 @@ def test_a_view_that_is_left_out_counts_no_more() -> None:
     index = DenseIndex(views)
     query = views.descriptors[11]
     gone = np.array([11, 3])
-    fewer = believe(query, 0.0, index.without(gone))
+    fewer = update_belief(query, 0.0, index.without(gone))
     again = written_out(query[None], [0.0], views.select(np.setdiff1d(np.arange(len(views)), gone)), 2.0)
     np.testing.assert_allclose(fewer.support, again, atol=2e-5)
-    assert believe(query, 0.0, index).scores()[1] == pytest.approx(1)
+    assert update_belief(query, 0.0, index).scores()[1] == pytest.approx(1)
     with pytest.raises(ValueError, match="without any view"):
         index.without(views.of(2))
 
@@ -111,13 +111,13 @@ def test_turning_the_zero_of_the_orientations_changes_nothing() -> None:
 def test_what_is_no_query_is_refused() -> None:
     index = DenseIndex(catalog(1))
     query = np.zeros(144, np.uint8)
-    assert isinstance(believe(query, 0.0, index), Belief)
+    assert isinstance(update_belief(query, 0.0, index), Belief)
     with pytest.raises(ValueError, match="cedd has uint8 of"):
-        believe(query[:100], 0.0, index)
+        update_belief(query[:100], 0.0, index)
     with pytest.raises(ValueError, match="finite angle"):
-        believe(query, float("nan"), index)
+        update_belief(query, float("nan"), index)
     with pytest.raises(ValueError, match="kept is 0"):
-        believe(query, 0.0, index, kept=0)
+        update_belief(query, 0.0, index, kept=0)
     with pytest.raises(ValueError, match="enroll at least one object"):
         DenseIndex(Views.empty())
     with pytest.raises(ValueError, match=r"power is 0\.5"):

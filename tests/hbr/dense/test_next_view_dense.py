@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hbr import DenseIndex, Views, next_look
-from hbr.dense.filter import BINS, believe
-from hbr.dense.next_view import most_informative_turn
+from hbr import DenseIndex, Views, next_best_view
+from hbr.dense.filter import BINS, update_belief
+from hbr.dense.next_view import most_informative_rotation
 
 STEP = 15
 
@@ -38,34 +38,34 @@ def looked(azimuth: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("azimuth", "low", "high"), [(30.0, 145, 185), (300.0, -125, -85)])
 def test_twins_are_told_apart_where_they_differ(azimuth: float, low: float, high: float) -> None:
-    look = next_look(believe(looked(azimuth), 0.0, INDEX), beta=60.0)
+    look = next_best_view(update_belief(looked(azimuth), 0.0, INDEX), beta=60.0)
     assert low <= look.rotation_deg <= high
     assert look.pair in ((0, 1), (1, 0))
     assert look.orientation_deg == look.rotation_deg % 360
     # the baseline sees it, too
-    assert low <= most_informative_turn(believe(looked(azimuth), 0.0, INDEX), beta=60.0) <= high
+    assert low <= most_informative_rotation(update_belief(looked(azimuth), 0.0, INDEX), beta=60.0) <= high
 
 
 def test_only_turns_that_the_cable_allows_are_chosen() -> None:
-    belief = believe(looked(30.0), 0.0, INDEX)
+    belief = update_belief(looked(30.0), 0.0, INDEX)
     allowed = np.array([-90.0, -40.0, 20.0, 70.0])
-    look = next_look(belief, beta=60.0, rotations_deg=allowed)
+    look = next_best_view(belief, beta=60.0, rotations_deg=allowed)
     assert look.rotation_deg in allowed
     assert len(look.confusion) == len(look.cost) == 4
 
 
 def test_time_that_a_turn_takes_is_weighed_against_what_it_tells() -> None:
-    belief = believe(looked(30.0), 0.0, INDEX)
+    belief = update_belief(looked(30.0), 0.0, INDEX)
     turns = np.arange(-175.0, 181.0, 5)
-    quick = next_look(belief, beta=60.0, rotations_deg=turns, seconds=np.zeros(len(turns)))
-    slow = next_look(belief, beta=60.0, rotations_deg=turns, seconds=np.abs(turns) / 10, second_costs=5.0)
+    quick = next_best_view(belief, beta=60.0, rotations_deg=turns, seconds=np.zeros(len(turns)))
+    slow = next_best_view(belief, beta=60.0, rotations_deg=turns, seconds=np.abs(turns) / 10, second_costs=5.0)
     assert abs(slow.rotation_deg) < abs(quick.rotation_deg)
 
 
 def test_where_one_was_already_nothing_new_is_expected() -> None:
-    first = believe(looked(30.0), 0.0, INDEX)
-    second = believe(looked(180.0), 150.0, first)
-    look = next_look(second, beta=60.0, seconds=np.zeros(BINS - 1))
+    first = update_belief(looked(30.0), 0.0, INDEX)
+    second = update_belief(looked(180.0), 150.0, first)
+    look = next_best_view(second, beta=60.0, seconds=np.zeros(BINS - 1))
     landing = (150 + look.rotations_deg) % 360
     visited = np.isin(landing, [0.0, 150.0])
     assert look.confusion[visited].min() >= look.confusion.max() - 1e-9
@@ -77,9 +77,9 @@ def test_the_expected_confusion_is_that_of_the_formula(start: int, sharpness: fl
     """Once more from the posterior of single hypotheses that the decision keeps, written out."""
     from hbr.dense.next_view import _strongest
 
-    belief = believe(looked(start * STEP), 20.0, INDEX)
+    belief = update_belief(looked(start * STEP), 20.0, INDEX)
     turns = np.array([-120.0, 33.0, 90.0])
-    look = next_look(belief, beta=40.0, sharpness=sharpness, rotations_deg=turns)
+    look = next_best_view(belief, beta=40.0, sharpness=sharpness, rotations_deg=turns)
     probability, place, bins = _strongest(belief.posterior(40.0))
     for turn, confusion in zip(turns, look.confusion, strict=True):
         novelty = 1 - np.exp(-0.5 * (min(abs(turn), 360 - abs(turn)) / 15) ** 2)
@@ -99,17 +99,17 @@ def test_the_expected_confusion_is_that_of_the_formula(start: int, sharpness: fl
 
 def test_one_object_alone_is_looked_at_from_a_new_side() -> None:
     alone = DenseIndex(VIEWS.select(VIEWS.of(0)))
-    look = next_look(believe(looked(30.0), 0.0, alone), beta=60.0)
+    look = next_best_view(update_belief(looked(30.0), 0.0, alone), beta=60.0)
     assert look.pair is None
     assert abs(look.rotation_deg) >= 50
 
 
 def test_what_is_no_choice_is_refused() -> None:
-    belief = believe(looked(0.0), 0.0, INDEX)
+    belief = update_belief(looked(0.0), 0.0, INDEX)
     with pytest.raises(ValueError, match="the cable's limits"):
-        next_look(belief, beta=1.0, rotations_deg=[])
+        next_best_view(belief, beta=1.0, rotations_deg=[])
     with pytest.raises(ValueError, match="one finite time each"):
-        next_look(belief, beta=1.0, rotations_deg=[10.0, 20.0], seconds=[1.0])
+        next_best_view(belief, beta=1.0, rotations_deg=[10.0, 20.0], seconds=[1.0])
 
 
 def _tanimoto(a: np.ndarray, b: np.ndarray) -> float:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hbr import Belief, DenseIndex, Views, believe, tanimoto
+from hbr import Belief, DenseIndex, Views, tanimoto, update_belief
 from hbr.dense.stopping import (
     Leaders,
     Rules,
@@ -119,7 +119,7 @@ def test_rules_of_a_catalog_find_its_objects_and_not_others() -> None:
         rows = everything.of(j)
         so_far: DenseIndex | Belief = index
         for i in rows[[2, 7, 11, 16]]:
-            so_far = belief = believe(everything.descriptors[i], float(everything.azimuth_deg[i]), so_far)
+            so_far = belief = update_belief(everything.descriptors[i], float(everything.azimuth_deg[i]), so_far)
             verdict = judge(belief, made, max_views=4)
             if verdict.kind != "look":
                 break
@@ -136,7 +136,7 @@ def test_a_small_catalog_promises_nothing_and_says_how_much_it_takes() -> None:
     assert made.certainty == inf
     assert "49 are needed" in made.promises[0]
     assert "no search ends early" in made.promises[1]
-    belief = believe(catalog(2).descriptors[0], 0.0, DenseIndex(catalog(2)))
+    belief = update_belief(catalog(2).descriptors[0], 0.0, DenseIndex(catalog(2)))
     assert judge(belief, made, max_views=4).kind == "look"
     assert judge(belief, made, max_views=1).kind == "found"
 
@@ -145,9 +145,9 @@ def test_a_score_that_no_enrolled_object_has_ends_as_unknown_and_never_early() -
     by = Rules(BETA, 0.9, np.full((4, 2), 0.9), (1.4, 1.4), 0.01, 0.02, 0.0, 100)
     index = DenseIndex(catalog(4))
     stranger = catalog(1, seed=99).descriptors[0]
-    belief = believe(stranger, 0.0, index)
+    belief = update_belief(stranger, 0.0, index)
     assert judge(belief, by, max_views=2).kind == "look"
-    verdict = judge(believe(stranger, 90.0, belief), by, max_views=2)
+    verdict = judge(update_belief(stranger, 90.0, belief), by, max_views=2)
     assert verdict.kind == "unknown"
     assert "none of those enrolled" in verdict.words
 

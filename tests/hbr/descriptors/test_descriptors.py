@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hbr import DenseIndex, ViewIndex, Views, believe
+from hbr import DenseIndex, ViewIndex, Views, update_belief
 from hbr.descriptors import Descriptor, descriptor, names, unpack_rows
 
 
@@ -98,7 +98,7 @@ def test_a_network_s_embedding_is_a_descriptor_like_any_other(tmp_path: Path) ->
     assert similar[0, 1] < 0.5
     np.testing.assert_array_equal(own.unpack(own.pack(levels[0])), levels[0])
     index = DenseIndex(Views(levels, [0.0, 0.0], np.array([0, 1]), ("red", "blue"), own.name))  # type: ignore[arg-type]
-    assert believe(levels[1], 0.0, index).ranking().object_index[0] == 1
+    assert update_belief(levels[1], 0.0, index).ranking().object_index[0] == 1
 
 
 def test_a_model_that_cannot_be_used_is_refused_with_the_reason(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hbr import DenseIndex, believe, next_look
+from hbr import DenseIndex, next_best_view, update_belief
 from hbr.core.angles import wrap180
 from hbr.evaluation.methods import METHODS, choose_methods
 from hbr.evaluation.protocol import Protocol, Runs, _Trials, run_object
@@ -48,9 +48,9 @@ def test_a_trial_equals_the_protocol_written_out(name: str, protocol: Protocol) 
             assert runs.posterior[0, 0, t, n] == belief.posterior().sum(axis=1).max()
             match name:
                 case "dense":
-                    turn = next_look(belief).rotation_deg
+                    turn = next_best_view(belief).rotation_deg
                 case "dense-coin":
-                    turn = abs(next_look(belief).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
+                    turn = abs(next_best_view(belief).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
                 case "dense-90":
                     turn = 90.0
                 case _:
@@ -79,7 +79,7 @@ def test_strangers_are_looked_for_among_the_others() -> None:
     trials = _Trials(2, QUERIES[VIEWS.of(2)], VIEWS, protocol, lambda: 0)
     first = int(trials.draw(0).order[0])
     others = VIEWS.select(np.isin(VIEWS.object_index, [0, 1, 3, 5]) & (VIEWS.azimuth_deg % 45 == 0))
-    belief = believe(QUERIES[VIEWS.of(2)[first]], 0.0, DenseIndex(others, omega=METHODS["dense"].omega))
+    belief = update_belief(QUERIES[VIEWS.of(2)[first]], 0.0, DenseIndex(others, omega=METHODS["dense"].omega))
     assert stranger.score[0, 0, 0, 0] == pytest.approx(belief.scores().max())
     with pytest.raises(ValueError, match="dense filter"):
         run("hbr", 1, protocol)

@@ -68,7 +68,7 @@ def test_a_trial_equals_the_protocol_written_out(name: str, removal: Removal) ->
             )
             place = ranking.object_index.tolist().index(j) if j in ranking.object_index else -1
             assert runs.rank[0, 0, t, n] == place + 1
-            assert runs.lead[0, 0, t, n] == pytest.approx(hbr.lead(ranking, QUERIES[own[seen]]) / (n + 1))
+            assert runs.lead[0, 0, t, n] == pytest.approx(hbr.score_margin(ranking, QUERIES[own[seen]]) / (n + 1))
             assert runs.travelled_deg[0, 0, t, n] == travelled
             if place >= 0:
                 error = abs((ranking.pose_deg[place] - angles[-1] + 180) % 360 - 180)

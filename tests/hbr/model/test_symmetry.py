@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hbr
-from hbr.model.symmetry import _arcs, lookalikes, symmetry
+from hbr.model.symmetry import _arcs, similar_objects, symmetry
 
 COUNT = 36
 STEP_DEG = 360.0 / COUNT
@@ -63,7 +63,7 @@ def test_a_twin_that_differs_on_one_side_is_found_on_the_other_to_two_steps(star
     mine, other = ring(36), ring(36, seed=1)
     same = (start + np.arange(length)) % COUNT
     other[same] = mine[same]
-    (twin,) = lookalikes(views_of(mine, other), 0)
+    (twin,) = similar_objects(views_of(mine, other), 0)
     assert twin.object_index == 1
     assert twin.similarity == 1.0
     assert length / COUNT <= twin.share <= (length + 4) / COUNT
@@ -73,13 +73,13 @@ def test_a_twin_that_differs_on_one_side_is_found_on_the_other_to_two_steps(star
 
 
 def test_twins_come_before_others_and_strangers_not_at_all():
-    mine, half, stranger = ring(36), ring(36, seed=1), ring(36, seed=2)
+    mine, half, other_object = ring(36), ring(36, seed=1), ring(36, seed=2)
     half[:18] = mine[:18]
-    found = lookalikes(views_of(mine, stranger, half, mine), 0)
+    found = similar_objects(views_of(mine, other_object, half, mine), 0)
     assert [one.object_index for one in found] == [3, 2]
     assert found[0].arcs_deg == ((0.0, 360.0),)
-    assert lookalikes(views_of(mine), 0) == ()
-    assert lookalikes(views_of(mine[:2], mine), 0) == ()
+    assert similar_objects(views_of(mine), 0) == ()
+    assert similar_objects(views_of(mine[:2], mine), 0) == ()
 
 
 def test_one_view_that_differs_does_not_part_an_arc_but_two_do():

@@ -82,12 +82,12 @@ class Enumeration:
         ]
 
     def value(self, path: Sequence[int]) -> float:
-        likeness = sum(self.similar[i][v] for i, v in enumerate(path))
+        similarity = sum(self.similar[i][v] for i, v in enumerate(path))
         penalty = sum(
             turns(self.orientations[i] - self.orientations[i + 1], self.azimuth[path[i]] - self.azimuth[path[i + 1]])
             for i in range(len(path) - 1)
         )
-        return likeness - self.omega * penalty
+        return similarity - self.omega * penalty
 
 
 def next_view_reference(

@@ -32,8 +32,8 @@ def test_no_object_not_even_one_off_the_lists_comes_closer_than_the_lead(seed, o
     everything = hbr.retrieve(queries, orientation, index, list_length=len(views))
     best = ranking.object_index[0]
     rivals = everything.scores[everything.object_index != best]
-    assert hbr.lead(ranking, queries) <= ranking.scores[0] - rivals.max() + 1e-9
-    assert hbr.lead(ranking, queries) <= ranking.margin + 1e-9
+    assert hbr.score_margin(ranking, queries) <= ranking.scores[0] - rivals.max() + 1e-9
+    assert hbr.score_margin(ranking, queries) <= ranking.margin + 1e-9
 
 
 def test_a_twin_that_the_lists_do_not_hold_is_not_led():
@@ -45,13 +45,13 @@ def test_a_twin_that_the_lists_do_not_hold_is_not_led():
     ranking = hbr.retrieve(face[None], [0.0], index)
     assert ranking.names == ("round",)
     assert ranking.margin == 1.0
-    assert hbr.lead(ranking, face[None]) == 0.0
+    assert hbr.score_margin(ranking, face[None]) == 0.0
 
 
 def test_an_only_object_leads_by_its_score_and_wrong_queries_are_refused():
     rng = np.random.default_rng(2)
     views = random_views(rng, 1, 4)
     ranking = hbr.retrieve(views.descriptors[:2], [0.0, 10.0], hbr.ViewIndex(views))
-    assert hbr.lead(ranking, views.descriptors[:2]) == ranking.scores[0]
+    assert hbr.score_margin(ranking, views.descriptors[:2]) == ranking.scores[0]
     with pytest.raises(ValueError, match="3 queries for a ranking of 2"):
-        hbr.lead(ranking, views.descriptors[:3])
+        hbr.score_margin(ranking, views.descriptors[:3])

@@ -27,34 +27,34 @@ def by_hand(views: hbr.Views) -> list[float]:
 
 def test_it_is_the_quantile_of_what_neighbouring_views_score():
     views = ring(1, 24, 12)
-    assert hbr.familiar_score(views, quantile=0.0, repeatability=1.0) == pytest.approx(min(by_hand(views)))
-    assert hbr.familiar_score(views, quantile=0.5, repeatability=1.0) == pytest.approx(np.median(by_hand(views)))
+    assert hbr.open_set_threshold(views, quantile=0.0, repeatability=1.0) == pytest.approx(min(by_hand(views)))
+    assert hbr.open_set_threshold(views, quantile=0.5, repeatability=1.0) == pytest.approx(np.median(by_hand(views)))
 
 
 def test_the_order_of_the_views_does_not_matter_and_objects_are_kept_apart():
     both = hbr.Views.concatenate([ring(1, 24, 12), ring(2, 16, 30)])
     shuffled = both.select(np.random.default_rng(0).permutation(len(both)))
-    assert hbr.familiar_score(shuffled) == pytest.approx(hbr.familiar_score(both))
+    assert hbr.open_set_threshold(shuffled) == pytest.approx(hbr.open_set_threshold(both))
     expected = np.quantile(by_hand(ring(1, 24, 12)) + by_hand(ring(2, 16, 30)), 0.05)
-    assert hbr.familiar_score(both) == pytest.approx(expected)
+    assert hbr.open_set_threshold(both) == pytest.approx(expected)
 
 
 def test_coarser_enrollment_expects_less():
     fine = ring(3, 72, 8)
-    assert hbr.familiar_score(fine.select(np.arange(0, 72, 6))) < hbr.familiar_score(fine)
+    assert hbr.open_set_threshold(fine.select(np.arange(0, 72, 6))) < hbr.open_set_threshold(fine)
 
 
 def test_too_few_views_make_nothing_unknown_and_a_wrong_quantile_is_refused():
-    assert hbr.familiar_score(ring(4, 3, 5)) == 0.0
-    assert hbr.familiar_score(hbr.Views.empty()) == 0.0
+    assert hbr.open_set_threshold(ring(4, 3, 5)) == 0.0
+    assert hbr.open_set_threshold(hbr.Views.empty()) == 0.0
     with pytest.raises(ValueError, match="quantile is 5"):
-        hbr.familiar_score(ring(4, 8, 5), quantile=5)
+        hbr.open_set_threshold(ring(4, 8, 5), quantile=5)
 
 
 def test_no_more_is_asked_of_a_round_object_than_two_sittings_keep():
     face = np.random.default_rng(5).integers(0, 8, 144).astype(np.uint8)
     views = hbr.Views.of_object("vase", np.tile(face, (36, 1)), np.arange(36) * 10.0)
-    assert hbr.familiar_score(views) == 0.97
-    assert hbr.familiar_score(views, repeatability=0.9) == 0.9
+    assert hbr.open_set_threshold(views) == 0.97
+    assert hbr.open_set_threshold(views, repeatability=0.9) == 0.9
     with pytest.raises(ValueError, match="repeatability is 2"):
-        hbr.familiar_score(views, repeatability=2)
+        hbr.open_set_threshold(views, repeatability=2)

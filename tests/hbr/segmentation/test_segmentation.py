@@ -236,9 +236,9 @@ def test_another_light_and_place_hardly_change_the_bench_s_own_descriptor() -> N
     first = hbr.describe(with_thing(empty), descriptor=own, reference=empty)
     moved = with_thing(other, (150, 90, 54, 99))
     second = hbr.describe(lit(moved, (0.8, 1, 1.2)), descriptor=own, reference=lit(other, (0.8, 1, 1.2)))
-    stranger = empty.copy()
-    cv2.circle(stranger, (160, 130), 50, (40, 180, 40), -1)
-    third = hbr.describe(stranger, descriptor=own, reference=empty)
+    unknown = empty.copy()
+    cv2.circle(unknown, (160, 130), 50, (40, 180, 40), -1)
+    third = hbr.describe(unknown, descriptor=own, reference=empty)
     same, different = own.similarity(first[None], np.stack([second, third]))[0]
     assert same > 0.85 > different + 0.2
 

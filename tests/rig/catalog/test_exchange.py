@@ -31,9 +31,9 @@ from rig.catalog.exchange import (
     open_bundle,
     package_of,
     plan_import,
+    preview_import,
     read_folder,
     read_table,
-    rehearse,
     write_bundle,
     write_folder,
     write_parquet,
@@ -312,7 +312,7 @@ class TestFolders:
         (folder / "mug__47.png").mkdir()
         package = read_folder(folder, now=NOW)
         catalog = open_catalog("catalog")
-        rehearsed = finished(rehearse(plan_import(None, package)))
+        preview = finished(preview_import(plan_import(None, package)))
         done = come_in(catalog, package)
         assert {(Path(file.path).name, file.reason) for file in done.refused} == {
             ("mug__90.png", "cut off or damaged"),
@@ -322,8 +322,8 @@ class TestFolders:
             ("mug__46.png", "is no file"),
             ("mug__47.png", "is no file"),
         }
-        assert (done.objects, done.views) == (rehearsed.objects, rehearsed.views) == (1, 3)
-        assert rehearsed.refused == done.refused
+        assert (done.objects, done.views) == (preview.objects, preview.views) == (1, 3)
+        assert preview.refused == done.refused
         assert catalog.views().views.azimuth_deg.tolist() == [0.0, 180.0, 270.0]
         assert finished(verify(catalog)).findings == ()
 

@@ -15,7 +15,7 @@ from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.cli.objects.identify import _Model
 from rig.core.clock import SystemClock
-from rig.events.events import Insight
+from rig.events.events import SimilarObjects
 from rig.views.object_presence import TableWatcher
 from sim.bench import SimBenchKind
 from sim.objects.shelf import shelf
@@ -71,7 +71,7 @@ def test_enrollment_ends_with_what_the_object_may_be_taken_for_and_a_report(enro
     folder, outputs = enrolled
     assert "looks like no other enrolled object" in outputs["lamp"].stdout
     told = [json.loads(line) for line in outputs["dice"].stdout.splitlines()]
-    assert told[-2].keys() == {"event", *(Insight.__dataclass_fields__)}
+    assert told[-2].keys() == {"event", *(SimilarObjects.__dataclass_fields__)}
     assert told[-1]["event"] == "enrolled"
     page = (folder / "lamp.html").read_text(encoding="utf-8")
     assert "Contact sheet of lamp: 8 views" in page

@@ -80,7 +80,7 @@ def test_another_chip_is_named(chip_id: int, likely: str) -> None:
     with closing(bench.bus), pytest.raises(DeviceMismatch, match=likely) as caught:
         bench.open()
     assert caught.value.evidence == {"got": chip_id, "expected": 0xA0}
-    assert bench.sensor._registers[0x3D] == 0  # nothing was written to the stranger
+    assert bench.sensor._registers[0x3D] == 0  # nothing was written to the unknown device
 
 
 def test_nobody_there_says_where_and_what_to_do(bench: Bench) -> None:

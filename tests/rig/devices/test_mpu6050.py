@@ -96,7 +96,7 @@ def test_another_chip_is_named(who_am_i: int, likely: str) -> None:
             bench.open()
         assert caught.value.evidence == {"got": who_am_i, "expected": 0x68}
         assert f"{who_am_i:#04x}" in caught.value.what
-        assert bench.sensor._registers[0x6B] == 0x40  # nothing was written to the stranger
+        assert bench.sensor._registers[0x6B] == 0x40  # nothing was written to the unknown device
 
 
 def test_an_unknown_chip_may_be_a_clock() -> None:

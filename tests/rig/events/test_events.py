@@ -16,7 +16,7 @@ from rig.events.events import (
     Candidate,
     Event,
     Failed,
-    Resemblance,
+    SimilarObject,
     Unwinding,
     Waiting,
     Warned,
@@ -27,7 +27,7 @@ from rig.events.events import (
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
-from rig.plans.similar_objects import insight
+from rig.plans.similar_objects import similar_objects
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.gyro_rotation import Stillness
 from rig.search.model import load_model
@@ -37,7 +37,7 @@ TEXT = (Path(__file__).parents[3] / "docs" / "events.md").read_text(encoding="ut
 PLAIN = {"string": str, "integer": int, "number": (int, float), "boolean": bool, "object": dict}
 PARTS = {
     "candidate": Candidate,
-    "resemblance": Resemblance,
+    "similar_object": SimilarObject,
     "weighed": Weighed,
     "evidence": ViewEvidence,
     "locks": CameraLocks,
@@ -113,7 +113,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
         for event in enroll_tray(s.bench, catalog, items, views=6):
             seen.add(check_event(event))
         views = catalog.views().views
-        seen |= {check_event(insight(views, name)) for name in ("dice", "lamp")}
+        seen |= {check_event(similar_objects(views, name)) for name in ("dice", "lamp")}
         for event in identify(s.bench, hbr.ViewIndex(views), strategy="sweep"):
             seen.add(check_event(event))
         s.operator.next_object = "radio"  # nobody knows it: the dense search weighs its turns, and gives up

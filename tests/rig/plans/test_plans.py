@@ -303,7 +303,7 @@ def test_every_ranking_follows_from_the_frames_that_were_seen(shelf_of_three):
             again = hbr.retrieve(np.array(queries), np.array(orientations), index)
             assert [c.name for c in event.candidates] == list(again.names)
             assert [c.score for c in event.candidates] == pytest.approx(list(again.scores / len(queries)), abs=1e-3)
-            assert event.margin == pytest.approx(hbr.lead(again, np.array(queries)) / len(queries), abs=1e-3)
+            assert event.margin == pytest.approx(hbr.score_margin(again, np.array(queries)) / len(queries), abs=1e-3)
 
 
 def test_what_was_never_enrolled_is_unknown_and_only_after_all_views(shelf_of_three):

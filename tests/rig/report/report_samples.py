@@ -20,7 +20,7 @@ from rig.events.events import (
     Started,
     Weighed,
 )
-from rig.events.wording import likeness_words, separation_words
+from rig.events.wording import separation_words, side_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.safety.gyro_rotation import Stillness
 from rig.views.capture import ViewEvidence
@@ -79,7 +79,7 @@ def identifying(
             step_deg = rotations_deg[k]
             s_left, s_right = (None, None) if k == 0 else (0.41, 0.66) if step_deg >= 0 else (0.66, 0.41)
             side = "left" if step_deg >= 0 else "right"
-            why = "the first turn is fixed" if s_left is None else likeness_words(side, s_left, s_right, names)
+            why = "the first turn is fixed" if s_left is None else side_words(side, s_left, s_right, names)
             yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names), why)
     travelled_deg = sum(map(abs, rotations_deg))
     yield Identified(

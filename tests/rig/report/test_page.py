@@ -81,7 +81,7 @@ def test_the_page_says_what_the_records_say() -> None:
     page = Page(demo())
     results = page.tables[0]
     assert results[0] == [
-        "#", "on the table", "found as", "verdict", "views", "travelled", "pose error", "score", "margin"
+        "#", "on the table", "found as", "correct?", "views", "travelled", "pose error", "score", "margin"
     ]  # fmt: skip
     assert results[1:] == [
         ["1", "mug-white", "mug-white", "✓ right", "4", "258°", "2.0°", "0.930", "+0.100"],
@@ -200,7 +200,7 @@ def test_one_enrollment_makes_a_page_of_its_own() -> None:
 def test_one_identification_makes_a_page_of_its_own() -> None:
     page = Page(render_report("Identification", "", [], [identified()], meta=Meta()))
     assert {attributes.get("id") for attributes in page.all("h2")} == {"retrievals"}
-    assert "verdict" not in {attributes.get("class") for attributes in page.all("span")}
+    assert "outcome" not in {attributes.get("class") for attributes in page.all("span")}
     assert "answer mug-white" in page.text
     assert "score 0.930 per view; leads by 0.100" in page.text
 

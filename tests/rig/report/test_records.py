@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.events.events import Accepted, Decided, Identified, Moved, Rejected, Started
-from rig.events.wording import answer_words, decision_words, distinct, likeness_words, move_words
+from rig.events.wording import answer_words, decision_words, distinct, move_words, side_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
 from rig.report.summary import enrollment_facts, totals
@@ -153,7 +153,7 @@ class TestIdentification:
 
 
 def decided(side: str, rotation_deg: float, s_left: float, s_right: float, *rivals: str) -> Decided:
-    why = likeness_words(side, s_left, s_right, rivals)
+    why = side_words(side, s_left, s_right, rivals)
     return Decided(1, side, rotation_deg, -rotation_deg, s_left, s_right, rivals, why)
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hbr.core.angles import wrap180
 from rig.config import TableConfig
 from rig.devices.servo import ServoCondition, ServoIdentity
-from rig.safety.angle_reference import Reference, judge
+from rig.safety.angle_reference import Reference, check_saved_angle
 from rig.safety.saved_state import SavedTable
 
 IDENTITY = ServoIdentity("xl430_w250", 1060, 1, 46)
@@ -39,39 +39,42 @@ def test_what_a_person_declares_holds(direction, position_deg, table_deg, turns)
 @given(st.floats(-4000, 4000), st.floats(-720, 720), st.sampled_from([360.0, 120.0, 72.0]))
 def test_turns_that_were_lost_with_the_supply_are_restored_where_the_angle_fits(position_deg, shift_deg, turn_deg):
     found_deg = position_deg % turn_deg
-    judgement = judge(saved(position_deg, shift_deg), IDENTITY, found_deg, LOST, turn_deg)
-    assert not judgement.doubt
-    assert found_deg + judgement.shift_deg == pytest.approx(position_deg + shift_deg, abs=1e-6)
-    assert bool(judgement.findings) == (abs(position_deg - found_deg) > turn_deg / 2)
+    check = check_saved_angle(saved(position_deg, shift_deg), IDENTITY, found_deg, LOST, turn_deg)
+    assert not check.doubt
+    assert found_deg + check.shift_deg == pytest.approx(position_deg + shift_deg, abs=1e-6)
+    assert bool(check.findings) == (abs(position_deg - found_deg) > turn_deg / 2)
 
 
 @given(st.floats(-4000, 4000), st.floats(2.1, 357.9))
 def test_a_table_that_was_turned_without_supply_is_in_doubt(position_deg, turned_deg):
-    assert "turned meanwhile" in judge(saved(position_deg), IDENTITY, (position_deg + turned_deg) % 360, LOST).doubt
+    assert (
+        "turned meanwhile"
+        in check_saved_angle(saved(position_deg), IDENTITY, (position_deg + turned_deg) % 360, LOST).doubt
+    )
 
 
 @given(st.floats(-4000, 4000), st.floats(-175, 175))
 def test_a_servo_with_supply_counts_what_a_hand_does(position_deg, turned_deg):
-    judgement = judge(saved(position_deg, 7.0), IDENTITY, position_deg + turned_deg, KEPT)
-    assert (judgement.doubt, judgement.shift_deg) == ("", 7.0)
-    assert bool(judgement.findings) == (abs(turned_deg) > 2)
+    check = check_saved_angle(saved(position_deg, 7.0), IDENTITY, position_deg + turned_deg, KEPT)
+    assert (check.doubt, check.shift_deg) == ("", 7.0)
+    assert bool(check.findings) == (abs(turned_deg) > 2)
 
 
 @pytest.mark.parametrize("turns", [-2, -1, 1, 3])
 def test_whole_turns_that_nobody_wrote_down_are_in_doubt(turns):
-    assert judge(saved(200.0), IDENTITY, 200.0 + 360 * turns, KEPT).doubt
+    assert check_saved_angle(saved(200.0), IDENTITY, 200.0 + 360 * turns, KEPT).doubt
 
 
 def test_a_motion_that_was_cut_off_is_believed_on_its_way_and_with_its_supply_alone():
     cut = saved(180.0, path_deg=(180.0, 500.0))
-    on_its_way = judge(cut, IDENTITY, 430.0, KEPT)
+    on_its_way = check_saved_angle(cut, IDENTITY, 430.0, KEPT)
     assert not on_its_way.doubt
     assert "cut off" in on_its_way.findings[0]
-    assert not judge(cut, IDENTITY, 504.0, KEPT).doubt  # a stop takes a little room
-    assert "not on its way" in judge(cut, IDENTITY, 506.0, KEPT).doubt
-    assert "not on its way" in judge(cut, IDENTITY, 174.0, KEPT).doubt
+    assert not check_saved_angle(cut, IDENTITY, 504.0, KEPT).doubt  # a stop takes a little room
+    assert "not on its way" in check_saved_angle(cut, IDENTITY, 506.0, KEPT).doubt
+    assert "not on its way" in check_saved_angle(cut, IDENTITY, 174.0, KEPT).doubt
     # It would fit: 300° may be 300° or, a turn of them forgotten, no place on its way.
-    assert "supply" in judge(cut, IDENTITY, 300.0, LOST).doubt
+    assert "supply" in check_saved_angle(cut, IDENTITY, 300.0, LOST).doubt
 
 
 @pytest.mark.parametrize(
@@ -83,8 +86,8 @@ def test_a_motion_that_was_cut_off_is_believed_on_its_way_and_with_its_supply_al
     ],
 )
 def test_another_servo_is_in_doubt(values, words):
-    assert words in judge(saved(200.0, **values), IDENTITY, 200.0, KEPT).doubt
+    assert words in check_saved_angle(saved(200.0, **values), IDENTITY, 200.0, KEPT).doubt
 
 
 def test_a_bench_that_was_never_told_is_in_doubt():
-    assert "nobody has told" in judge(None, IDENTITY, 180.0, KEPT).doubt
+    assert "nobody has told" in check_saved_angle(None, IDENTITY, 180.0, KEPT).doubt

@@ -16,7 +16,7 @@ from rig.events.wording import verdict_words
 from rig.search.model import Model, load_model, model_of
 from rig.search.session import begin_search, judged
 from rig.search.stopping_rules import FILE, UNPROMISED, digest, read_rules, rehearse, rules_of, write_rules
-from rig.search.strategies import DenseLook, Stop, Turn, reachable_turns, strategy
+from rig.search.strategies import DenseSearchState, Finish, Rotate, reachable_turns, strategy
 
 KIND = hbr.descriptor("edges+colours")
 NOW = "2026-01-02T03:04:05Z"
@@ -53,7 +53,7 @@ def look_for(
         nearest = np.abs((other.azimuth_deg - here_deg + 180) % 360 - 180).argmin()
         ranked, step = search.look(other.descriptors[nearest], here_deg % 360, table_deg=-here_deg)
         taken += 1
-        if isinstance(step, Stop):
+        if isinstance(step, Finish):
             return search.answer(ranked, step.why).name, taken
         here_deg += step.rotation_deg
 
@@ -229,8 +229,8 @@ class Around:
     name = "around"
     descriptor = "edges+colours"
 
-    def next(self, look: DenseLook) -> Turn | Stop:
-        return Stop("enough") if look.views == 3 else Turn(180.0, f"the far side; {look.verdict.words}")
+    def next(self, look: DenseSearchState) -> Rotate | Finish:
+        return Finish("enough") if look.views == 3 else Rotate(180.0, f"the far side; {look.verdict.words}")
 
 
 def test_a_strategy_of_ones_own_decides_on_the_dense_search():
@@ -240,7 +240,7 @@ def test_a_strategy_of_ones_own_decides_on_the_dense_search():
     assert chosen.name == "around"
     for number in range(3):
         ranked, step = search.look(index.views.descriptors[6 * (number % 2)], 180.0 * number % 360, table_deg=0.0)
-    assert isinstance(step, Stop)
+    assert isinstance(step, Finish)
     assert search.answer(ranked, step.why).name == "object 0"
     assert sum(c.probability or nan for c in ranked.candidates) == pytest.approx(1)
 
@@ -270,7 +270,7 @@ def test_a_cable_that_leaves_no_turn_ends_the_search():
     search, _ = begin_search(Model(index, rehearse(index).rules), config)
     stranger = views_of("stranger", 8, seed=5)
     _, step = search.look(stranger.descriptors[0], 0.0, table_deg=0.0)
-    assert step == Stop("the cable leaves no other view")
+    assert step == Finish("the cable leaves no other view")
 
 
 def test_unknown_is_said_after_the_rehearsed_views_and_looking_goes_on_where_it_is_likely():
@@ -298,7 +298,7 @@ def test_a_first_glance_must_be_as_familiar_as_all_rehearsed_views(familiar, vie
     rules = replace(rehearse(index).rules, familiar=familiar, usual=np.zeros((3, len(familiar))))
     belief: hbr.Belief | hbr.DenseIndex = index
     for number in range(views):
-        belief = hbr.believe(index.views.descriptors[4 * number], 120.0 * number, belief)
+        belief = hbr.update_belief(index.views.descriptors[4 * number], 120.0 * number, belief)
     assert isinstance(belief, hbr.Belief)
     verdict, _ = judged(belief, rules, max_views=max_views)
     assert verdict.kind == kind

@@ -13,7 +13,7 @@ from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.search import strategies
 from rig.search.session import Search, begin_search
-from rig.search.strategies import Look, Stop, Strategy, Turn, enough, strategy
+from rig.search.strategies import Finish, Rotate, SearchState, Strategy, enough, strategy
 
 PAPERS = ["ahbr", "hbr", "sweep", "random"]
 
@@ -33,7 +33,7 @@ def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, top: i
     return begin_search(hbr.ViewIndex(known), settings, chosen, seed=seed, top=top)[0]
 
 
-def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list[Turn], Stop, list[float]]:
+def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list[Rotate], Finish, list[float]]:
     """Search with queries that fit nothing; return the turns, the stop, and where the views were taken."""
     search = searching(model(), chosen, seed=seed, **config)
     rng = np.random.default_rng(2)
@@ -42,7 +42,7 @@ def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list
         taken_deg.append(here_deg)
         levels = rng.integers(0, 8, 144, np.uint8)
         _, step = search.look(levels, here_deg % 360, table_deg=-here_deg)
-        if isinstance(step, Stop):
+        if isinstance(step, Finish):
             return turns, step, taken_deg
         turns.append(step)
         here_deg += step.rotation_deg
@@ -70,7 +70,7 @@ def test_what_each_strategy_does():
         assert apart.min() > 10
         assert run(name, max_views=8, margin=1.0, seed=1)[0] != turns
     active, _, _ = run("ahbr", max_views=4, margin=1.0, first_step_deg=70.0)
-    assert active[0] == Turn(70.0, "the first turn is fixed")
+    assert active[0] == Rotate(70.0, "the first turn is fixed")
     assert all(turn.s_left is not None and turn.rivals for turn in active[1:])
 
 
@@ -80,7 +80,7 @@ def test_a_clear_answer_ends_all_but_the_passive_search(name, views):
     search = searching(known, name, max_views=5)
     for number in range(views):
         ranked, step = search.look(known.descriptors[0], 0.0, table_deg=0.0)
-        assert isinstance(step, Stop) == (number == views - 1)
+        assert isinstance(step, Finish) == (number == views - 1)
     assert ranked.candidates[0].name == "o0"
 
 
@@ -89,7 +89,7 @@ def test_an_unknown_object_is_not_clear_however_far_it_leads():
     search = searching(known, "sweep", max_views=5, min_score=1.0, margin=0.0)
     other = np.roll(known.descriptors[0], 1)
     steps = [search.look(other, 0.0, table_deg=0.0)[1] for _ in range(5)]
-    assert [isinstance(step, Stop) for step in steps] == [False] * 4 + [True]
+    assert [isinstance(step, Finish) for step in steps] == [False] * 4 + [True]
 
 
 def test_only_so_many_candidates_are_named_as_asked():
@@ -113,8 +113,8 @@ class Once:
 
     name = "once"
 
-    def next(self, look: Look) -> Turn | Stop:
-        return enough(look) or Stop(f"one view says it: {look.ranking.names[0]}, {look.table_deg:g}")
+    def next(self, look: SearchState) -> Rotate | Finish:
+        return enough(look) or Finish(f"one view says it: {look.ranking.names[0]}, {look.table_deg:g}")
 
 
 def test_others_plug_in_by_an_entry_point(monkeypatch):

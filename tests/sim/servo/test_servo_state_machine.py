@@ -45,7 +45,7 @@ class ServoMachine(RuleBasedStateMachine):
         assert bool(error & ALERT) is self.shut_down
         return error & ~ALERT
 
-    def verdict(self, name: str, value: int) -> StatusError:
+    def expected_error(self, name: str, value: int) -> StatusError:
         if not 0 <= value <= LARGEST[name]:
             return StatusError.DATA_RANGE
         return StatusError.ACCESS if name in EEPROM and self.torque else StatusError.NONE
@@ -57,7 +57,7 @@ class ServoMachine(RuleBasedStateMachine):
     def write_setting(self, name: str, data: st.DataObject) -> None:
         size = self.line.table(1)[name].size
         value = data.draw(st.integers(0, min(LARGEST[name] + 2, 256**size - 1)))
-        expected = self.verdict(name, value)
+        expected = self.expected_error(name, value)
         assert self.write(name, value) == expected
         if expected is StatusError.NONE:
             self.keep(name, value)

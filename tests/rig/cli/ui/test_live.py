@@ -21,13 +21,13 @@ from rig.cli.ui.operator_prompts import OperatorPrompts
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
-from rig.events.events import Event, Insight, Item, Moved, Resemblance, Waiting
+from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, Waiting
 from rig.plans.tray import TrayDecision, TrayItem
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-INSIGHT = Insight("mug-white", 180.0, 0.95, 0.96, (Resemblance("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
+INSIGHT = SimilarObjects("mug-white", 180.0, 0.95, 0.96, (SimilarObject("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
 
 
 def enrolled_with_insight() -> list[Event]:
