@@ -35,7 +35,7 @@ def live(bench: Bench) -> Generator[Ask | CalibrationResult, None, CalibrationRe
     ends_deg = []
     for direction, picture in (("counter-clockwise", pictures.TURN_LEFT), ("clockwise", pictures.TURN_RIGHT)):
         yield Ask(f"Turn the table by hand {direction}, seen from above, until its cable is just not taut.", picture)
-        ends_deg.append(bench.safety.reference.to_table(bench.servo.read_state().position_deg))
+        ends_deg.append(bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg))
     yield Ask("Turn the table back by hand until its cable hangs free.", pictures.CABLE_FREE)
     fact = from_data(
         ends_deg[0],

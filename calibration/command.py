@@ -346,9 +346,9 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
                     print(f"{outcome_text(fact)}\nKept in {path}{then}")
                 if not fact.passed:
                     raise typer.Exit(EXIT_QUALITY)
-            told, region = bench.out_of_force, bench.config.view.roi
+            told, region = bench.calibration_findings, bench.config.view.roi
             calibrate(bench, store)
-            for finding in bench.out_of_force:
+            for finding in bench.calibration_findings:
                 if finding not in told:  # what a person wrote into the configuration wins
                     print(f"Note: {finding}.", file=sys.stderr)
             if bench.config.view.roi != region and (catalog := settings.catalog_there()):

@@ -78,7 +78,7 @@ def live(bench: Bench, *, turns: int = 2) -> Generator[Moved | CalibrationResult
     step_deg = bench.servo.turn_deg / STEPS_PER_TURN if bench.servo.turn_deg < 360.0 else 360.0 / STEPS_PER_TURN
     steps: list[Step] = []
     with Turntable(bench) as table:
-        reference = bench.safety.reference
+        reference = bench.safety.angle_reference
         start_deg = table.rest_deg
         may_return = True
         try:

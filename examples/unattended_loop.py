@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from rig import Catalog, load_model, open_bench, photograph_table
-from rig.bench import ObjectStandsThere, TableClearer
+from rig.bench import ObjectAlreadyPlaced, TableClearer
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
@@ -27,7 +27,7 @@ def main() -> int:
             Catalog.open(arguments.catalog, clock=SystemClock(), read_only=True) as catalog,
             open_bench(arguments.bench, load_config()) as bench,
         ):
-            if isinstance(bench.operator, ObjectStandsThere):  # nobody presses a key: the camera sees what comes
+            if isinstance(bench.operator, ObjectAlreadyPlaced):  # nobody presses a key: the camera sees what comes
                 bench.operator = TableWatcher(bench)
             if isinstance(bench.operator, TableClearer):
                 for taken in photograph_table(bench):  # begin with an empty table

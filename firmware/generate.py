@@ -30,7 +30,9 @@ def check(table: Table) -> None:
     for message in table["message"]:
         assert size(message) <= table["max_body"], f"{message['name']} is longer than max_body"
         assert message["from"] != "host" or names[message["reply"]]["from"] == "head", f"{message['name']}: no reply"
-    assert size(names["beat"]) == size(names["pulse"]), "beat and pulse must take the same time on the line"
+    assert size(names["heartbeat"]) == size(names["heartbeat_reply"]), (
+        "heartbeat and heartbeat_reply must take the same time on the bus"
+    )
 
 
 def header(table: Table) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, field_validator
 
 from rig.bench import Bench, BenchKind
-from rig.bench.computer import Host
+from rig.bench.computer import Computer
 from rig.bench.hardware import assemble
 from rig.config import RigConfig, Section
 from rig.core.clock import SystemClock
@@ -19,10 +19,10 @@ from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.calibration_board import utensils
 from sim.change import Change
 from sim.clock import VirtualClock
+from sim.computer import simulated_computer
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
-from sim.host import simulated_host
 from sim.noise import NoiseModel
 from sim.objects.photographs import Photographed, photographs
 from sim.objects.shelf import shelf
@@ -194,7 +194,7 @@ def open_sim_bench(
             config,
             world.clock,
             wire=parts.adapter,
-            reopen_wire=parts.reopen_adapter,
+            reopen_serial=parts.reopen_adapter,
             i2c_bus=parts.i2c.path,
             capture=parts.camera,
             reopen_camera=parts.reopen_camera,
@@ -203,10 +203,10 @@ def open_sim_bench(
         )
         if operator.state.load().table is None and bench.safety.fault is None:
             if bench.servo.turn_deg < 360.0:  # behind a gear somebody has to look at the table
-                bench.safety.declare(world.table_deg())
+                bench.safety.set_angle(world.table_deg())
             else:
-                bench.safety.declare_turns(0)
-        bench.wires = wires.pop_all()
+                bench.safety.set_revolutions(0)
+        bench.connections = wires.pop_all()
     bench.operator = operator
     bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
     return bench
@@ -228,18 +228,18 @@ class SimBenchKind:
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
             bench = open_sim_bench(config, operator, faults=read_faults(options.faults))
-            bench.wires.enter_context(held.pop_all())
+            bench.connections.enter_context(held.pop_all())
         return bench
 
     @contextmanager
-    def host(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Host]:
+    def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:
         """Yield the simulated computer; the devices' faults that need no motion happen there, too."""
         assert isinstance(options, SimOptions)
-        with SimParts.connected(config, _world(options, seed)) as parts, simulated_host(config, parts) as host:
+        with SimParts.connected(config, _world(options, seed)) as parts, simulated_computer(config, parts) as computer:
             faults = Faults(parts)
             faults.schedule(*read_faults(options.faults))
             try:
-                yield host
+                yield computer
             finally:
                 faults.clear()
 

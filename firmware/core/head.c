@@ -29,18 +29,18 @@ void head_tick(struct head *head) {
         head->inputs ^= INPUT_ESTOP_OPEN;
         head->changed = true;
     }
-    if (pressed && !(head->faults & FAULT_ESTOP)) {
-        latch(head, FAULT_ESTOP);
+    if (pressed && !(head->faults & HEAD_FAULT_ESTOP)) {
+        latch(head, HEAD_FAULT_ESTOP);
     }
-    if (head->state == STATE_ACTIVE && ++head->silence > head->deadman) {
-        latch(head, FAULT_DEADMAN);
+    if (head->state == HEAD_STATE_ACTIVE && ++head->silence > head->deadman) {
+        latch(head, HEAD_FAULT_DEADMAN);
     }
 }
 
 static void latch(struct head *head, uint8_t fault) {
     outputs_off(head);
     head->faults |= fault;
-    head->state = STATE_FAULT;
+    head->state = HEAD_STATE_FAULT;
     head->changed = true;
 }
 
@@ -66,7 +66,7 @@ static void tell_change(struct head *head) {
     uint8_t frame[FRAME_MAX];
     uint8_t before = hal_lock();
     head->changed = false;
-    struct changed m = {
+    struct status_changed m = {
         .time_us = hal_micros(),
         .state = head->state,
         .faults = head->faults,
@@ -76,7 +76,7 @@ static void tell_change(struct head *head) {
         .reset_cause = head->reset_cause,
     };
     hal_unlock(before);
-    if (transmit(frame, MESSAGE_CHANGED, head->sequence, put_changed(frame + FRAME_HEADER, &m))) {
+    if (transmit(frame, MESSAGE_STATUS_CHANGED, head->sequence, put_status_changed(frame + FRAME_HEADER, &m))) {
         head->sequence++;
     } else {
         head->changed = true; /* again as soon as there is room */
@@ -108,54 +108,54 @@ static void tell_sample(struct head *head, const struct imu_sample *sample) {
 /* -- what comes in ----------------------------------------------------------------------------------------------- */
 
 static uint8_t set_light(struct head *head, uint8_t level) {
-    uint8_t refusal = REFUSAL_NONE;
+    uint8_t rejection = REJECTION_NONE;
     uint8_t before = hal_lock();
-    if (level && head->state != STATE_ACTIVE) {
-        refusal = head->state == STATE_FAULT ? REFUSAL_FAULT_LATCHED : REFUSAL_NOT_ACTIVE;
+    if (level && head->state != HEAD_STATE_ACTIVE) {
+        rejection = head->state == HEAD_STATE_FAULT ? REJECTION_FAULT_LATCHED : REJECTION_NOT_ACTIVE;
     } else {
         hal_light(level);
         head->light = level;
     }
     hal_unlock(before);
-    return refusal;
+    return rejection;
 }
 
 static uint8_t set_relay(struct head *head, uint8_t closed) {
-    uint8_t refusal = REFUSAL_NONE;
+    uint8_t rejection = REJECTION_NONE;
     uint8_t before = hal_lock();
     if (closed > 1) {
-        refusal = REFUSAL_OUT_OF_RANGE;
-    } else if (closed && head->state != STATE_ACTIVE) {
-        refusal = head->state == STATE_FAULT ? REFUSAL_FAULT_LATCHED : REFUSAL_NOT_ACTIVE;
+        rejection = REJECTION_OUT_OF_RANGE;
+    } else if (closed && head->state != HEAD_STATE_ACTIVE) {
+        rejection = head->state == HEAD_STATE_FAULT ? REJECTION_FAULT_LATCHED : REJECTION_NOT_ACTIVE;
     } else {
         hal_relay(closed);
         head->inputs = (uint8_t)((head->inputs & ~INPUT_RELAY_CLOSED) | (closed ? INPUT_RELAY_CLOSED : 0));
     }
     hal_unlock(before);
-    return refusal;
+    return rejection;
 }
 
 static uint8_t acknowledge(struct head *head, uint8_t seen) {
-    uint8_t refusal = REFUSAL_NONE;
+    uint8_t rejection = REJECTION_NONE;
     uint8_t before = hal_lock();
-    if (head->inputs & INPUT_ESTOP_OPEN && seen & FAULT_ESTOP) {
-        refusal = REFUSAL_CAUSE_PERSISTS;
-    } else if (head->state == STATE_FAULT) {
+    if (head->inputs & INPUT_ESTOP_OPEN && seen & HEAD_FAULT_ESTOP) {
+        rejection = REJECTION_CAUSE_PERSISTS;
+    } else if (head->state == HEAD_STATE_FAULT) {
         head->faults &= (uint8_t)~seen;
         if (!head->faults) {
-            head->state = STATE_IDLE; /* outputs stay off until the host asks anew */
+            head->state = HEAD_STATE_IDLE; /* outputs stay off until the host asks anew */
         }
         head->changed = true;
     }
     hal_unlock(before);
-    return refusal;
+    return rejection;
 }
 
 static void rest(struct head *head) {
     uint8_t before = hal_lock();
     outputs_off(head);
-    if (head->state == STATE_ACTIVE) {
-        head->state = STATE_IDLE;
+    if (head->state == HEAD_STATE_ACTIVE) {
+        head->state = HEAD_STATE_IDLE;
         head->changed = true;
     }
     hal_unlock(before);
@@ -164,20 +164,20 @@ static void rest(struct head *head) {
 
 static uint8_t beat(struct head *head, uint16_t deadman_ms) {
     if (deadman_ms < DEADMAN_MIN_MS || deadman_ms > DEADMAN_MAX_MS) {
-        return REFUSAL_OUT_OF_RANGE;
+        return REJECTION_OUT_OF_RANGE;
     }
     uint8_t before = hal_lock();
     head->silence = 0;
     head->deadman = (uint16_t)(deadman_ms * TICKS_PER_MS);
-    if (head->state == STATE_IDLE) {
-        head->state = STATE_ACTIVE;
+    if (head->state == HEAD_STATE_IDLE) {
+        head->state = HEAD_STATE_ACTIVE;
     }
     hal_unlock(before);
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
-static uint8_t put_own_pulse(struct head *head, uint8_t *body) {
-    struct pulse m = {
+static uint8_t answer_heartbeat(struct head *head, uint8_t *body) {
+    struct heartbeat_reply m = {
         .received_us = hal_uart_frame_us(),
         .sent_us = hal_micros() + hal_uart_backlog_us(),
         .state = head->state,
@@ -187,7 +187,7 @@ static uint8_t put_own_pulse(struct head *head, uint8_t *body) {
         .who_am_i = head->imu.who_am_i,
         .light = head->light,
     };
-    return put_pulse(body, &m);
+    return put_heartbeat_reply(body, &m);
 }
 
 static uint8_t put_own_identity(struct head *head, uint8_t *body) {
@@ -207,27 +207,27 @@ static uint8_t put_own_identity(struct head *head, uint8_t *body) {
 
 static uint8_t trigger(struct head *head, uint16_t width_us, uint8_t *body) {
     struct triggered m = {.width_us = width_us};
-    uint8_t refusal = REFUSAL_NONE;
+    uint8_t rejection = REJECTION_NONE;
     if (width_us < TRIGGER_MIN_US || width_us > TRIGGER_MAX_US) {
-        return REFUSAL_OUT_OF_RANGE;
+        return REJECTION_OUT_OF_RANGE;
     }
     uint8_t before = hal_lock();
-    if (head->state == STATE_FAULT) {
-        refusal = REFUSAL_FAULT_LATCHED;
+    if (head->state == HEAD_STATE_FAULT) {
+        rejection = REJECTION_FAULT_LATCHED;
     } else if (!hal_trigger(width_us, &m.time_us)) {
-        refusal = REFUSAL_BUSY;
+        rejection = REJECTION_BUSY;
     }
     hal_unlock(before);
     put_triggered(body, &m);
-    return refusal;
+    return rejection;
 }
 
 /* The length of each request's body by its id; 0xFF where there is no such request. */
 static uint8_t length_of(uint8_t id) {
     static const uint8_t sizes[] = {
-        [MESSAGE_HELLO] = SIZE_HELLO, [MESSAGE_BEAT] = SIZE_BEAT,   [MESSAGE_REST] = SIZE_REST,
+        [MESSAGE_HELLO] = SIZE_HELLO, [MESSAGE_HEARTBEAT] = SIZE_HEARTBEAT,   [MESSAGE_SHUTDOWN] = SIZE_SHUTDOWN,
         [MESSAGE_LIGHT] = SIZE_LIGHT, [MESSAGE_RELAY] = SIZE_RELAY, [MESSAGE_TRIGGER] = SIZE_TRIGGER,
-        [MESSAGE_IMU] = SIZE_IMU,     [MESSAGE_COUNT] = SIZE_COUNT, [MESSAGE_ACKNOWLEDGE] = SIZE_ACKNOWLEDGE,
+        [MESSAGE_IMU] = SIZE_IMU,     [MESSAGE_READ_COUNTERS] = SIZE_READ_COUNTERS, [MESSAGE_ACKNOWLEDGE] = SIZE_ACKNOWLEDGE,
         [MESSAGE_STREAM] = SIZE_STREAM,
     };
     return id >= MESSAGE_HELLO && id < sizeof sizes ? sizes[id] : UINT8_MAX;
@@ -235,50 +235,50 @@ static uint8_t length_of(uint8_t id) {
 
 /* Do what is asked; the reply's body goes to `out`, its id to `*reply`. Returns the length of the reply's body. */
 static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8_t length, uint8_t *out, uint8_t *reply) {
-    uint8_t refusal = REFUSAL_NONE;
+    uint8_t rejection = REJECTION_NONE;
     uint8_t answer = 0;
     uint8_t expected = length_of(id);
     if (expected == UINT8_MAX) {
-        refusal = REFUSAL_UNKNOWN_REQUEST;
+        rejection = REJECTION_UNKNOWN_REQUEST;
     } else if (expected != length) {
-        refusal = REFUSAL_MALFORMED;
+        rejection = REJECTION_MALFORMED;
     } else {
         switch (id) {
         case MESSAGE_HELLO:
             *reply = MESSAGE_IDENTITY; /* whatever the host speaks: it must learn what we speak */
             answer = put_own_identity(head, out);
             break;
-        case MESSAGE_BEAT:
-            refusal = beat(head, get_u16(body + BEAT_DEADMAN_MS));
-            *reply = MESSAGE_PULSE;
-            answer = put_own_pulse(head, out);
+        case MESSAGE_HEARTBEAT:
+            rejection = beat(head, get_u16(body + HEARTBEAT_DEADMAN_MS));
+            *reply = MESSAGE_HEARTBEAT_REPLY;
+            answer = answer_heartbeat(head, out);
             break;
-        case MESSAGE_REST:
+        case MESSAGE_SHUTDOWN:
             rest(head);
             break;
         case MESSAGE_ACKNOWLEDGE:
-            refusal = acknowledge(head, body[ACKNOWLEDGE_FAULTS]);
+            rejection = acknowledge(head, body[ACKNOWLEDGE_FAULTS]);
             break;
         case MESSAGE_LIGHT:
-            refusal = set_light(head, body[LIGHT_LEVEL]);
+            rejection = set_light(head, body[LIGHT_LEVEL]);
             break;
         case MESSAGE_RELAY:
-            refusal = set_relay(head, body[RELAY_CLOSED]);
+            rejection = set_relay(head, body[RELAY_CLOSED]);
             break;
         case MESSAGE_TRIGGER:
-            refusal = trigger(head, get_u16(body + TRIGGER_WIDTH_US), out);
+            rejection = trigger(head, get_u16(body + TRIGGER_WIDTH_US), out);
             *reply = MESSAGE_TRIGGERED;
             answer = SIZE_TRIGGERED;
             break;
         case MESSAGE_IMU:
-            refusal = imu_setup(&head->imu, body[IMU_MODEL], body[IMU_ADDRESS], body[IMU_DIVIDER], body[IMU_FILTER],
+            rejection = imu_setup(&head->imu, body[IMU_MODEL], body[IMU_ADDRESS], body[IMU_DIVIDER], body[IMU_FILTER],
                                 body[IMU_RANGE]);
             break;
         case MESSAGE_STREAM:
-            refusal = body[STREAM_ON] > 1 ? REFUSAL_OUT_OF_RANGE : REFUSAL_NONE;
+            rejection = body[STREAM_ON] > 1 ? REJECTION_OUT_OF_RANGE : REJECTION_NONE;
             head->streaming = body[STREAM_ON] == 1;
             break;
-        case MESSAGE_COUNT:
+        case MESSAGE_READ_COUNTERS:
             *reply = MESSAGE_COUNTERS;
             answer = put_counters(out, &head->counters);
             break;
@@ -286,8 +286,8 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
             break;
         }
     }
-    if (refusal || answer == 0) {
-        struct done m = {.request = id, .refusal = refusal};
+    if (rejection || answer == 0) {
+        struct done m = {.request = id, .rejection = rejection};
         *reply = MESSAGE_DONE;
         return put_done(out, &m);
     }
@@ -342,9 +342,9 @@ void head_init(struct head *head) {
     head->reset_cause = hal_reset_cause();
     imu_init(&head->imu);
     if (head->reset_cause == RESET_WATCHDOG) {
-        latch(head, FAULT_WATCHDOG);
+        latch(head, HEAD_FAULT_WATCHDOG);
     } else if (head->reset_cause == RESET_BROWN_OUT) {
-        latch(head, FAULT_BROWN_OUT);
+        latch(head, HEAD_FAULT_BROWN_OUT);
     }
     uint8_t end = 0;
     hal_uart_write(&end, 1); /* of a frame that was broken off by the reset */

@@ -167,14 +167,14 @@ void imu_init(struct imu *imu) {
 
 uint8_t imu_setup(struct imu *imu, uint8_t model, uint8_t address, uint8_t divider, uint8_t filter, uint8_t range) {
     if (model > IMU_MODEL_BNO055 || address < 0x08 || address > 0x77 || filter < 1 || filter > 6 || range > 3) {
-        return REFUSAL_OUT_OF_RANGE;
+        return REJECTION_OUT_OF_RANGE;
     }
     if (hal_i2c_result() == HAL_I2C_BUSY) {
         hal_i2c_free();
     }
     imu_init(imu);
     if (model == IMU_MODEL_NONE) {
-        return REFUSAL_NONE;
+        return REJECTION_NONE;
     }
     imu->status = IMU_STATUS_STARTING;
     imu->phase = IDENTIFY;
@@ -184,7 +184,7 @@ uint8_t imu_setup(struct imu *imu, uint8_t model, uint8_t address, uint8_t divid
     imu->filter = filter;
     imu->range = range;
     imu->period_us = is_mpu(imu) ? (uint32_t)1000 * (divider + 1U) : BNO_PERIOD_US;
-    return REFUSAL_NONE;
+    return REJECTION_NONE;
 }
 
 /* Put the bytes of step `at` into `sent`; returns their number. */

@@ -42,7 +42,7 @@ struct imu {
 
 void imu_init(struct imu *imu);
 
-/* Begin to set the sensor up; returns a refusal. */
+/* Begin to set the sensor up; returns a rejection. */
 uint8_t imu_setup(struct imu *imu, uint8_t model, uint8_t address, uint8_t divider, uint8_t filter, uint8_t range);
 
 /* Go on; true where `*sample` has a new one. */

@@ -41,15 +41,15 @@
 #define RESET_WATCHDOG 4
 
 /* Outputs are off in `idle` and in `fault`; beats keep it `active`. */
-#define STATE_IDLE 0
-#define STATE_ACTIVE 1
-#define STATE_FAULT 2
+#define HEAD_STATE_IDLE 0
+#define HEAD_STATE_ACTIVE 1
+#define HEAD_STATE_FAULT 2
 
 /* Bits of the latched reasons. */
-#define FAULT_DEADMAN 1
-#define FAULT_ESTOP 2
-#define FAULT_WATCHDOG 4
-#define FAULT_BROWN_OUT 8
+#define HEAD_FAULT_DEADMAN 1
+#define HEAD_FAULT_ESTOP 2
+#define HEAD_FAULT_WATCHDOG 4
+#define HEAD_FAULT_BROWN_OUT 8
 
 /* Bits of the inputs as they are now. */
 #define INPUT_ESTOP_OPEN 1
@@ -70,15 +70,15 @@
 #define IMU_STATUS_SETTINGS_LOST 6
 
 /* Why a request was not done. */
-#define REFUSAL_NONE 0
-#define REFUSAL_UNKNOWN_REQUEST 1
-#define REFUSAL_MALFORMED 2
-#define REFUSAL_OUT_OF_RANGE 3
-#define REFUSAL_FAULT_LATCHED 4
-#define REFUSAL_NOT_ACTIVE 5
-#define REFUSAL_CAUSE_PERSISTS 6
-#define REFUSAL_BUSY 7
-#define REFUSAL_OTHER_VERSION 8
+#define REJECTION_NONE 0
+#define REJECTION_UNKNOWN_REQUEST 1
+#define REJECTION_MALFORMED 2
+#define REJECTION_OUT_OF_RANGE 3
+#define REJECTION_FAULT_LATCHED 4
+#define REJECTION_NOT_ACTIVE 5
+#define REJECTION_CAUSE_PERSISTS 6
+#define REJECTION_BUSY 7
+#define REJECTION_OTHER_VERSION 8
 
 /* Bits of `sample.flags`. */
 #define SAMPLE_FLAG_EDGE 1
@@ -86,10 +86,10 @@
 /* Message ids, and the length of each message's body. */
 #define MESSAGE_HELLO 0x01
 #define SIZE_HELLO 1
-#define MESSAGE_BEAT 0x02
-#define SIZE_BEAT 14
-#define MESSAGE_REST 0x03
-#define SIZE_REST 0
+#define MESSAGE_HEARTBEAT 0x02
+#define SIZE_HEARTBEAT 14
+#define MESSAGE_SHUTDOWN 0x03
+#define SIZE_SHUTDOWN 0
 #define MESSAGE_ACKNOWLEDGE 0x04
 #define SIZE_ACKNOWLEDGE 1
 #define MESSAGE_LIGHT 0x05
@@ -102,22 +102,22 @@
 #define SIZE_IMU 5
 #define MESSAGE_STREAM 0x09
 #define SIZE_STREAM 1
-#define MESSAGE_COUNT 0x0A
-#define SIZE_COUNT 0
+#define MESSAGE_READ_COUNTERS 0x0A
+#define SIZE_READ_COUNTERS 0
 #define MESSAGE_DONE 0x80
 #define SIZE_DONE 2
 #define MESSAGE_IDENTITY 0x81
 #define SIZE_IDENTITY 15
-#define MESSAGE_PULSE 0x82
-#define SIZE_PULSE 14
+#define MESSAGE_HEARTBEAT_REPLY 0x82
+#define SIZE_HEARTBEAT_REPLY 14
 #define MESSAGE_TRIGGERED 0x87
 #define SIZE_TRIGGERED 6
 #define MESSAGE_COUNTERS 0x8A
 #define SIZE_COUNTERS 20
 #define MESSAGE_SAMPLE 0xC0
 #define SIZE_SAMPLE 22
-#define MESSAGE_CHANGED 0xC1
-#define SIZE_CHANGED 10
+#define MESSAGE_STATUS_CHANGED 0xC1
+#define SIZE_STATUS_CHANGED 10
 
 static inline uint8_t *put_u8(uint8_t *out, uint8_t value) {
     *out = value;
@@ -142,12 +142,12 @@ static inline uint16_t get_u16(const uint8_t *from) {
 
 struct done {
     uint8_t request;
-    uint8_t refusal;
+    uint8_t rejection;
 };
 
 static inline uint8_t put_done(uint8_t *out, const struct done *m) {
     out = put_u8(out, m->request);
-    out = put_u8(out, m->refusal);
+    out = put_u8(out, m->rejection);
     return SIZE_DONE;
 }
 
@@ -176,7 +176,7 @@ static inline uint8_t put_identity(uint8_t *out, const struct identity *m) {
     return SIZE_IDENTITY;
 }
 
-struct pulse {
+struct heartbeat_reply {
     uint32_t received_us;
     uint32_t sent_us;
     uint8_t state;
@@ -187,7 +187,7 @@ struct pulse {
     uint8_t light;
 };
 
-static inline uint8_t put_pulse(uint8_t *out, const struct pulse *m) {
+static inline uint8_t put_heartbeat_reply(uint8_t *out, const struct heartbeat_reply *m) {
     out = put_u32(out, m->received_us);
     out = put_u32(out, m->sent_us);
     out = put_u8(out, m->state);
@@ -196,7 +196,7 @@ static inline uint8_t put_pulse(uint8_t *out, const struct pulse *m) {
     out = put_u8(out, m->imu_status);
     out = put_u8(out, m->who_am_i);
     out = put_u8(out, m->light);
-    return SIZE_PULSE;
+    return SIZE_HEARTBEAT_REPLY;
 }
 
 struct triggered {
@@ -266,7 +266,7 @@ static inline uint8_t put_sample(uint8_t *out, const struct sample *m) {
     return SIZE_SAMPLE;
 }
 
-struct changed {
+struct status_changed {
     uint32_t time_us;
     uint8_t state;
     uint8_t faults;
@@ -276,7 +276,7 @@ struct changed {
     uint8_t reset_cause;
 };
 
-static inline uint8_t put_changed(uint8_t *out, const struct changed *m) {
+static inline uint8_t put_status_changed(uint8_t *out, const struct status_changed *m) {
     out = put_u32(out, m->time_us);
     out = put_u8(out, m->state);
     out = put_u8(out, m->faults);
@@ -284,15 +284,15 @@ static inline uint8_t put_changed(uint8_t *out, const struct changed *m) {
     out = put_u8(out, m->imu_status);
     out = put_u8(out, m->who_am_i);
     out = put_u8(out, m->reset_cause);
-    return SIZE_CHANGED;
+    return SIZE_STATUS_CHANGED;
 }
 
 /* Where a request's fields are in its body. */
 #define HELLO_PROTOCOL 0
-#define BEAT_DEADMAN_MS 0
-#define BEAT_PAD_0 2
-#define BEAT_PAD_1 6
-#define BEAT_PAD_2 10
+#define HEARTBEAT_DEADMAN_MS 0
+#define HEARTBEAT_PAD_0 2
+#define HEARTBEAT_PAD_1 6
+#define HEARTBEAT_PAD_2 10
 #define ACKNOWLEDGE_FAULTS 0
 #define LIGHT_LEVEL 0
 #define RELAY_CLOSED 0

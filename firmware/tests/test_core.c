@@ -130,16 +130,16 @@ static void send(uint8_t id, const void *body, uint8_t length, uint8_t number) {
     run_ms(4);
 }
 
-/* Returns the refusal. */
+/* Returns the rejection. */
 static uint8_t ask(uint8_t id, const void *body, uint8_t length) {
     send(id, body, length, ++sequence);
     CHECK(answer[1] == sequence);
-    return answer[0] == MESSAGE_DONE ? answer[FRAME_HEADER + 1] : REFUSAL_NONE;
+    return answer[0] == MESSAGE_DONE ? answer[FRAME_HEADER + 1] : REJECTION_NONE;
 }
 
 static uint8_t beat(uint16_t deadman_ms) {
-    uint8_t body[SIZE_BEAT] = {(uint8_t)deadman_ms, (uint8_t)(deadman_ms >> 8)};
-    return ask(MESSAGE_BEAT, body, sizeof body);
+    uint8_t body[SIZE_HEARTBEAT] = {(uint8_t)deadman_ms, (uint8_t)(deadman_ms >> 8)};
+    return ask(MESSAGE_HEARTBEAT, body, sizeof body);
 }
 
 static uint8_t ask_u8(uint8_t id, uint8_t value) {
@@ -151,25 +151,25 @@ static void power_up(void) {
     relay = light = trigger = 0;
     board = board_open((struct board_outside){nobody, never}, NULL, 0, 7);
     run_ms(5);
-    CHECK(event[0] == MESSAGE_CHANGED && event[FRAME_HEADER + 9] == RESET_POWER_ON);
+    CHECK(event[0] == MESSAGE_STATUS_CHANGED && event[FRAME_HEADER + 9] == RESET_POWER_ON);
 }
 
 static void test_outputs_need_a_heartbeat(void) {
     power_up();
-    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NOT_ACTIVE);
-    CHECK(ask_u8(MESSAGE_LIGHT, 9) == REFUSAL_NOT_ACTIVE);
-    CHECK(beat(250) == REFUSAL_NONE);
-    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NONE && relay == 1);
-    CHECK(ask_u8(MESSAGE_LIGHT, 9) == REFUSAL_NONE && light == 9);
-    CHECK(ask_u8(MESSAGE_RELAY, 2) == REFUSAL_OUT_OF_RANGE);
-    CHECK(ask(MESSAGE_REST, "", 0) == REFUSAL_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NOT_ACTIVE);
+    CHECK(ask_u8(MESSAGE_LIGHT, 9) == REJECTION_NOT_ACTIVE);
+    CHECK(beat(250) == REJECTION_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NONE && relay == 1);
+    CHECK(ask_u8(MESSAGE_LIGHT, 9) == REJECTION_NONE && light == 9);
+    CHECK(ask_u8(MESSAGE_RELAY, 2) == REJECTION_OUT_OF_RANGE);
+    CHECK(ask(MESSAGE_SHUTDOWN, "", 0) == REJECTION_NONE);
     CHECK(relay == 0 && light == 0);
     board_close(board);
 }
 
 static void test_silence_makes_the_bench_safe(void) {
     power_up();
-    CHECK(beat(49) == REFUSAL_OUT_OF_RANGE && beat(2001) == REFUSAL_OUT_OF_RANGE);
+    CHECK(beat(49) == REJECTION_OUT_OF_RANGE && beat(2001) == REJECTION_OUT_OF_RANGE);
     beat(250);
     uint64_t beaten_ns = now_ns;
     ask_u8(MESSAGE_RELAY, 1);
@@ -179,12 +179,12 @@ static void test_silence_makes_the_bench_safe(void) {
     run_ms(20);
     CHECK(relay == 0 && light == 0);
     CHECK(relay_ns - beaten_ns <= 250000000 + TICK_US * 1000 && relay_ns == light_ns);
-    CHECK(beat(250) == REFUSAL_NONE);
-    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_FAULT_LATCHED);
-    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, FAULT_DEADMAN) == REFUSAL_NONE);
-    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NOT_ACTIVE); /* not by itself: a beat first */
+    CHECK(beat(250) == REJECTION_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_FAULT_LATCHED);
+    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, HEAD_FAULT_DEADMAN) == REJECTION_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NOT_ACTIVE); /* not by itself: a beat first */
     beat(250);
-    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NONE && relay == 1);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NONE && relay == 1);
     board_close(board);
 }
 
@@ -196,11 +196,11 @@ static void test_estop_acts_within_a_millisecond(void) {
     uint64_t opened_ns = now_ns;
     run_ms(2);
     CHECK(relay == 0 && relay_ns - opened_ns <= 1000000);
-    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, 0xFF) == REFUSAL_CAUSE_PERSISTS);
+    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, 0xFF) == REJECTION_CAUSE_PERSISTS);
     board_set_estop(board, false);
     run_ms(2);
     CHECK(relay == 0);
-    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, 0xFF) == REFUSAL_NONE);
+    CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, 0xFF) == REJECTION_NONE);
     for (int i = 0; i < 50; i++) { /* bouncing contacts: never open for a whole millisecond */
         board_set_estop(board, true);
         board_run(board, now_ns += 700000);
@@ -208,7 +208,7 @@ static void test_estop_acts_within_a_millisecond(void) {
         board_run(board, now_ns += 300000);
     }
     beat(2000);
-    CHECK(ask_u8(MESSAGE_RELAY, 1) == REFUSAL_NONE);
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NONE);
     board_close(board);
 }
 
@@ -227,9 +227,9 @@ static void test_a_repeated_request_is_answered_but_not_done_twice(void) {
 
 static void test_unknown_and_malformed_requests_are_refused(void) {
     power_up();
-    CHECK(ask(0x00, "", 0) == REFUSAL_UNKNOWN_REQUEST);
-    CHECK(ask(0x7F, "", 0) == REFUSAL_UNKNOWN_REQUEST);
-    CHECK(ask(MESSAGE_LIGHT, "ab", 2) == REFUSAL_MALFORMED);
+    CHECK(ask(0x00, "", 0) == REJECTION_UNKNOWN_REQUEST);
+    CHECK(ask(0x7F, "", 0) == REJECTION_UNKNOWN_REQUEST);
+    CHECK(ask(MESSAGE_LIGHT, "ab", 2) == REJECTION_MALFORMED);
     board_close(board);
 }
 
@@ -240,8 +240,8 @@ static void test_a_program_that_hangs_is_restarted(void) {
     board_hang(board, true);
     run_ms(130);
     CHECK(relay == 0);
-    CHECK(event[0] == MESSAGE_CHANGED && event[FRAME_HEADER + 9] == RESET_WATCHDOG);
-    CHECK(event[FRAME_HEADER + 5] == FAULT_WATCHDOG);
+    CHECK(event[0] == MESSAGE_STATUS_CHANGED && event[FRAME_HEADER + 9] == RESET_WATCHDOG);
+    CHECK(event[FRAME_HEADER + 5] == HEAD_FAULT_WATCHDOG);
     board_close(board);
 }
 

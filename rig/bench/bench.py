@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from rig.calibrations import CalibrationStore, State, apparatus, put_in_force
 from rig.calibrations.store import CALIBRATIONS
 from rig.config import RigConfig
-from rig.config.values import Values, mistaken, validate
+from rig.config.values import Values, config_mistakes, validate
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError
 from rig.devices.camera import Camera
@@ -46,7 +46,7 @@ class TableClearer(Protocol):
         ...
 
 
-class ObjectStandsThere:
+class ObjectAlreadyPlaced:
     """The operator of a bench where the object is on the table before the command is given."""
 
     def place(self, name: str | None) -> None:
@@ -57,11 +57,20 @@ class ObjectStandsThere:
 class Bench(AbstractContextManager["Bench"]):
     """The open devices of one bench, on one clock.
 
-    ``conditions`` says under which noise model or calibration the bench works, ``findings`` what opening it revealed
-    that a person should know; both are kept with every enrollment. ``out_of_force`` are the findings about calibrations
-    that do not hold, or not as they were kept. ``state`` is where the table's turns and faults
-    outlive the program, ``head`` the rig head that ``imu`` is on, if it is on one, ``wires`` what must be closed after
-    the devices.
+    Attributes
+    ----------
+    conditions
+        The noise model or the calibrations that the bench works under; stored with every enrollment.
+    findings
+        What opening the bench revealed that the operator should know; stored with every enrollment.
+    calibration_findings
+        The findings about calibrations that are not in force, or only in part.
+    state
+        Stores the table's revolutions and faults beyond the end of the program.
+    head
+        The rig head that `imu` is connected to; None if `imu` is on the computer's own I2C bus.
+    connections
+        What must be closed after the devices.
     """
 
     name: str
@@ -70,13 +79,13 @@ class Bench(AbstractContextManager["Bench"]):
     servo: Servo
     imu: Imu
     camera: Camera
-    operator: Operator = field(default_factory=ObjectStandsThere)
+    operator: Operator = field(default_factory=ObjectAlreadyPlaced)
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
-    out_of_force: tuple[str, ...] = field(default=(), init=False)
+    calibration_findings: tuple[str, ...] = field(default=(), init=False)
     state: StateStore = field(default_factory=MemoryStore, repr=False)
     head: RigHead | None = None
-    wires: ExitStack = field(default_factory=ExitStack, repr=False)
+    connections: ExitStack = field(default_factory=ExitStack, repr=False)
     safety: Safety = field(init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)
     _as_opened: tuple[RigConfig, tuple[str, ...]] | None = field(default=None, init=False, repr=False)
@@ -106,7 +115,13 @@ class Bench(AbstractContextManager["Bench"]):
             return
         self._open = False
         failures: list[Exception] = []
-        for step in (self.servo.torque_off, self.servo.close, self.imu.close, self.camera.close, self.wires.close):
+        for step in (
+            self.servo.torque_off,
+            self.servo.close,
+            self.imu.close,
+            self.camera.close,
+            self.connections.close,
+        ):
             try:
                 step()
             except (RigError, OSError) as failure:
@@ -224,9 +239,9 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
     standings = store.standings(bench.apparatus(), bench.clock.utc())
     facts = [standing.fact for standing in standings if standing.state is State.IN_FORCE]
     bench.config, told = put_in_force(config, facts)
-    bench.safety.reference.calibrate(bench.config.table)
+    bench.safety.angle_reference.calibrate(bench.config.table)
     bench.conditions = {**bench.conditions, CALIBRATIONS: [fact.id for fact in facts]}
-    bench.out_of_force = (
+    bench.calibration_findings = (
         *told,
         *(error.what for error in store.unreadable),
         *(
@@ -235,7 +250,7 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
             if standing.state is not State.IN_FORCE
         ),
     )
-    bench.findings = (*findings, *bench.out_of_force)
+    bench.findings = (*findings, *bench.calibration_findings)
 
 
 def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:
@@ -294,7 +309,7 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
         except ConfigError as error:
             found += error.evidence.get("mistakes") or [f"bench.{name}: {error.what} {error.next_step}"]
     if found:
-        raise mistaken(found, where)
+        raise config_mistakes(found, where)
     return config, options
 
 

@@ -19,7 +19,7 @@ from rig.config import RigConfig
 from rig.core.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
-    from rig.devices.dynamixel.port import Wire
+    from rig.devices.dynamixel.port import SerialConnection
     from rig.devices.opencv_camera import Capture
 
 SERIAL_NAMES = re.compile(r"tty(USB|ACM|AMA|S)\d+")
@@ -38,7 +38,7 @@ class Process:
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class DeviceFile:
     """A device file and what is known of it without opening it.
 
     ``stable`` is a name of it that outlives replugging, ``group`` whom it belongs to; ``usable`` says whether this user
@@ -54,7 +54,7 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
-class SerialPort(Node):
+class SerialPort(DeviceFile):
     """A serial port; ``latency_ms`` is the adapter's latency timer, None where it has none (`latency_file`)."""
 
     latency_ms: int | None
@@ -89,7 +89,7 @@ class Disk:
     writable: bool = True
 
 
-class Host(Protocol):
+class Computer(Protocol):
     """Where devices are looked for, and how they are opened."""
 
     @property
@@ -109,8 +109,8 @@ class Host(Protocol):
         """Return the port of that name, whatever is behind it (a pseudo-terminal, too); None where there is none."""
         ...
 
-    def i2c_buses(self) -> list[Node]: ...
-    def cameras(self) -> list[Node]: ...
+    def i2c_buses(self) -> list[DeviceFile]: ...
+    def cameras(self) -> list[DeviceFile]: ...
 
     def same_file(self, one: str, other: str) -> bool:
         """Return whether two paths, one of which may be a link, are one device."""
@@ -128,7 +128,7 @@ class Host(Protocol):
         """Return the disk on which ``path`` is, or would be."""
         ...
 
-    def open_wire(self, path: str, baud: int) -> "Wire": ...
+    def open_serial(self, path: str, baud: int) -> "SerialConnection": ...
     def i2c_name(self, bus: int | str) -> str:
         """Return what people call a bus: its device file."""
         ...
@@ -141,14 +141,14 @@ class Host(Protocol):
 
 
 @runtime_checkable
-class Hosted(Protocol):
+class ComputerProvider(Protocol):
     """A kind of bench whose computer can be looked at while the bench is not open."""
 
-    def host(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Host]: ...
+    def computer(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Computer]: ...
 
 
 @dataclass
-class LinuxHost:
+class LinuxComputer:
     """A computer with Linux, as far as its files below ``root`` tell; the one that the program runs on by default."""
 
     root: Path = Path("/")
@@ -190,10 +190,10 @@ class LinuxHost:
         node["holders"] = ()  # a pseudo-terminal is always held, by the program that is its other end
         return SerialPort(**node, latency_ms=None, latency_file="", usb={})
 
-    def i2c_buses(self) -> list[Node]:
+    def i2c_buses(self) -> list[DeviceFile]:
         return self._nodes("sys/class/i2c-dev", "")
 
-    def cameras(self) -> list[Node]:
+    def cameras(self) -> list[DeviceFile]:
         """Return the cameras; a device's further nodes, which carry no images, are left out."""
         nodes = self._nodes("sys/class/video4linux", "dev/v4l/by-id")
         return [n for n in nodes if self._text(f"/sys/class/video4linux/{Path(n.path).name}/index") in ("", "0")]
@@ -225,7 +225,7 @@ class LinuxHost:
 
     # -- opening ----------------------------------------------------------------------------------------------------
 
-    def open_wire(self, path: str, baud: int) -> "Wire":
+    def open_serial(self, path: str, baud: int) -> "SerialConnection":
         from rig.devices.dynamixel.port import open_serial
 
         return open_serial(path, baud)
@@ -259,9 +259,9 @@ class LinuxHost:
         except OSError:
             return []
 
-    def _nodes(self, folder: str, links: str) -> list[Node]:
+    def _nodes(self, folder: str, links: str) -> list[DeviceFile]:
         return [
-            Node(**self._node(f"/dev/{entry.name}", self._text(f"/{folder}/{entry.name}/name"), links))
+            DeviceFile(**self._node(f"/dev/{entry.name}", self._text(f"/{folder}/{entry.name}/name"), links))
             for entry in self._entries(folder)
         ]
 

@@ -9,9 +9,9 @@ from pydantic import BaseModel
 from rig.bench import Bench, BenchKind
 from rig.config import RigConfig, Section
 from rig.core.clock import Clock, SystemClock
-from rig.core.errors import ConfigError, RigError, StateNotKept
+from rig.core.errors import ConfigError, RigError, StateNotStored
 from rig.devices.dynamixel.opening import open_servo
-from rig.devices.dynamixel.port import Wire, open_serial
+from rig.devices.dynamixel.port import SerialConnection, open_serial
 from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.head.head import RigHead
 from rig.devices.head.opening import open_head, powered, switch_on
@@ -46,14 +46,14 @@ class HardwareBench:
                 config,
                 clock,
                 wire=wire,
-                reopen_wire=lambda: open_serial(config.servo.port, config.servo.baud),
+                reopen_serial=lambda: open_serial(config.servo.port, config.servo.baud),
                 i2c_bus=config.imu.bus,
                 capture=capture,
                 reopen_camera=lambda: open_capture(config.camera.source),
                 state=FileStore(state_path),
                 head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
-            bench.wires = wires.pop_all()
+            bench.connections = wires.pop_all()
             return bench
 
     @contextmanager
@@ -61,7 +61,7 @@ class HardwareBench:
         """Open the servo alone; to stop it, it must be reached although nothing can be written to the disk."""
         clock = SystemClock()
         with ExitStack() as wires:
-            with suppress(StateNotKept):
+            with suppress(StateNotStored):
                 wires.callback(BenchLock(config.state_path("hardware"), clock).close)
             wires.enter_context(powered(config, lambda: open_serial(config.head.port, BAUD, "head"), clock))
             wire = open_serial(config.servo.port, config.servo.baud)
@@ -74,13 +74,13 @@ def assemble(
     config: RigConfig,
     clock: Clock,
     *,
-    wire: Wire,
-    reopen_wire: Callable[[], Wire] | None = None,
+    wire: SerialConnection,
+    reopen_serial: Callable[[], SerialConnection] | None = None,
     i2c_bus: int | str,
     capture: Capture,
     reopen_camera: Callable[[], Capture] | None = None,
     state: StateStore,
-    head_port: Callable[[], Wire] | None = None,
+    head_port: Callable[[], SerialConnection] | None = None,
 ) -> Bench:
     """Put the drivers on their wires; a simulated bench is assembled by the same lines as a real one.
 
@@ -100,7 +100,7 @@ def assemble(
             head = open_head(config, head_port, clock)
             opened.callback(head.close)
             fault = switch_on(head, config.head, clock)  # first: the servo's supply may go through it
-        servo = open_servo(wire, config.servo, clock, config.table.mode, reopen_wire)
+        servo = open_servo(wire, config.servo, clock, config.table.mode, reopen_serial)
         findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
         _check_reach(config, servo)
         imu: Imu = head or open_imu(config.imu, i2c_bus, clock)
@@ -114,17 +114,17 @@ def assemble(
         )
         findings += tuple(
             f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}"
-            for n in camera.not_taken
+            for n in camera.rejected_settings
         )
         bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
         bench.safety.connect()
         if head is not None:
             watched = head
-            bench.safety.watches.append(watched.check)
-            bench.safety.restores.append(lambda: switch_on(watched, config.head, clock))
+            bench.safety.monitors.append(watched.check)
+            bench.safety.restore_actions.append(lambda: switch_on(watched, config.head, clock))
         if fault is not None:
             bench.safety.latch(fault)
-        bench.safety.checks.append(imu.read_samples)
+        bench.safety.acknowledge_checks.append(imu.read_samples)
         bench.findings += bench.safety.findings
         opened.pop_all()
     return bench

@@ -15,7 +15,7 @@ from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
 from rig.core.errors import CatalogError, UsageError
-from rig.core.processes import over_processes
+from rig.core.processes import map_in_processes
 from rig.views import image_files as images
 
 
@@ -91,7 +91,7 @@ def redescribe(
     done = 0
     yield Progressed(0, len(items))
     work = partial(_describe, catalog.path, kind.name)
-    for portion, found in over_processes(work, portions(items), processes(jobs, len(items))):
+    for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
         rows, sightings = [], []
         for item, one in zip(portion, found, strict=True):
             if one.packed is None:

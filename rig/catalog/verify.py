@@ -22,7 +22,7 @@ from rig.catalog.schema import descriptors, enrollments, objects, sittings, view
 from rig.catalog.upkeep import LOST
 from rig.core.errors import CatalogError, UsageError
 from rig.core.files import make_folder, write
-from rig.core.processes import over_processes
+from rig.core.processes import map_in_processes
 from rig.views import image_files as images
 
 ROUNDED: Final = 0.02
@@ -134,7 +134,7 @@ def verify(
     looked: dict[_Item, _Looked] = {}
     done = 0
     work = partial(_look, catalog.path, quick)
-    for portion, found in over_processes(work, portions(items), processes(jobs, len(items))):
+    for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
         looked.update(zip(portion, found, strict=True))
         done += len(portion)
         yield Progressed(done, len(items))

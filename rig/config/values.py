@@ -95,10 +95,10 @@ def validate(
     except ValidationError as error:
         above = tuple(prefix.split(".")) if prefix else ()
         found = mistakes(model, values, error.errors(include_url=False), above, places or {})
-    raise mistaken(found, where)
+    raise config_mistakes(found, where)
 
 
-def mistaken(found: list[str], where: str) -> ConfigError:
+def config_mistakes(found: list[str], where: str) -> ConfigError:
     """Return the error of a configuration with the mistakes that were found."""
     return ConfigError(
         f"{len(found)} mistake{'s' if len(found) > 1 else ''} in {where}.",

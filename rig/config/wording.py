@@ -39,7 +39,7 @@ _KINDS: Mapping[Any, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class KeyResults:
+class KeyInfo:
     """A key of the configuration: what it may be, in which unit (empty where there is none), and what it is for."""
 
     key: Key
@@ -53,21 +53,21 @@ class KeyResults:
         return ".".join(self.key)
 
 
-def key_facts(model: type[BaseModel], above: Key = ()) -> Iterator[KeyResults]:
+def key_info(model: type[BaseModel], above: Key = ()) -> Iterator[KeyInfo]:
     """Yield the keys of a model and of the sections in it, in their order."""
     for name, field in model.model_fields.items():
         if (inner := _section(field)) is not None:
-            yield from key_facts(inner, (*above, name))
+            yield from key_info(inner, (*above, name))
         else:
             default = field.get_default(call_default_factory=True, validated_data={})
-            yield KeyResults((*above, name), default, allowed(field), unit(name), field.description or "")
+            yield KeyInfo((*above, name), default, allowed(field), unit(name), field.description or "")
 
 
 def blank_file(model: type[BaseModel]) -> str:
     """Return a configuration file that sets nothing: every key that has a default as a comment, with its meaning."""
     lines = ["# Configuration of the rig. A line without its first # is in force; `rig config check` judges the file."]
     section: Key = ()
-    for facts in key_facts(model):
+    for facts in key_info(model):
         if isinstance(facts.default, dict):
             continue  # the benches' own sections
         if facts.key[:-1] != section:
@@ -79,14 +79,14 @@ def blank_file(model: type[BaseModel]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def setting_line(facts: KeyResults, value: Any, origin: str) -> str:
+def setting_line(facts: KeyInfo, value: Any, origin: str) -> str:
     """Return a key in force as a line of TOML (one that is not set as a comment): value, unit, origin and meaning."""
     stated = f"{'#' * (value is None)}{facts.key[-1]} = {_shown(facts, value)}".rstrip()
     note = "; ".join(part for part in (facts.unit, origin, facts.description) if part)
     return f"{stated:30s} # {note}"
 
 
-def _shown(facts: KeyResults, value: Any) -> str:
+def _shown(facts: KeyInfo, value: Any) -> str:
     return "" if value is None else stated(facts.key, value)
 
 

@@ -82,7 +82,7 @@ class DeviceSilent(RigError):
     title = "device silent"
 
 
-class DeviceRefused(RigError):
+class RequestRejected(RigError):
     """A device answered with an error status."""
 
     code = 403
@@ -222,7 +222,7 @@ class FaultLatched(NotReady):
     title = "fault latched"
 
 
-class StateNotKept(RigError):
+class StateNotStored(RigError):
     """What the next program must know about the bench (its turns, its faults) cannot be written to the disk."""
 
     code = 515
@@ -236,7 +236,7 @@ class EmergencyStop(RigError):
     title = "e-stop"
 
 
-class HostWasSilent(RigError):
+class HeartbeatLost(RigError):
     """The rig head heard nothing from this computer for too long, and made the bench safe by itself."""
 
     code = 521
@@ -313,7 +313,7 @@ class CatalogOutdated(CatalogError):
     title = "catalog outdated"
 
 
-class ImportRefused(CatalogError):
+class ImportRejected(CatalogError):
     """What was to be imported cannot be used; nothing of it is in the catalog."""
 
     code = 705

@@ -20,7 +20,7 @@ _work: Callable[[Any], object]
 _AHEAD: Final = 4
 
 
-def over_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: int) -> Iterator[tuple[_Item, _T]]:
+def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: int) -> Iterator[tuple[_Item, _T]]:
     """Yield each item with its result, as they come; closing the generator ends the processes.
 
     Parameters

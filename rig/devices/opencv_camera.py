@@ -87,7 +87,7 @@ class CameraSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class NotTaken:
+class RejectedSetting:
     """A setting that the camera did not take: what it was asked for, and what it reports."""
 
     setting: str
@@ -105,7 +105,7 @@ class OpenCvCamera:
     clock
         The bench's clock.
     settings
-        What to ask of the camera. What it does not take is in `not_taken`, and `read_locks` tells what it does instead.
+        What to ask of the camera. `rejected_settings` lists what it does not take; `read_locks` returns its settings.
     name
         Its name in records.
     timeout_s
@@ -140,7 +140,7 @@ class OpenCvCamera:
         self._clock = clock
         self._timeout_s = timeout_s
         self._supported: set[int] = set()
-        self.not_taken: tuple[NotTaken, ...] = self._configure(self._settings)
+        self.rejected_settings: tuple[RejectedSetting, ...] = self._configure(self._settings)
         self._identity = CameraIdentity(
             name,
             round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
@@ -209,7 +209,7 @@ class OpenCvCamera:
 
     # -- settings -----------------------------------------------------------------------------------------------------
 
-    def _configure(self, settings: CameraSettings) -> tuple[NotTaken, ...]:
+    def _configure(self, settings: CameraSettings) -> tuple[RejectedSetting, ...]:
         """Ask for every setting; an automatic is switched off before its value is set, as UVC needs it."""
         asked: list[tuple[str, int, float]] = []
 
@@ -236,7 +236,7 @@ class OpenCvCamera:
         ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
         read_back = [(name, prop, value, self._capture.get(prop)) for name, prop, value in asked]
         return tuple(
-            NotTaken(name, value, reported)
+            RejectedSetting(name, value, reported)
             for name, prop, value, reported in read_back
             if prop not in self._supported or abs(reported - value) > 0.01 * abs(value)
         )
@@ -296,16 +296,20 @@ class OpenCvCamera:
                     ) from missing
                 self._clock.sleep(_REPLUG_PAUSE_S)
         self._last_stamp_ns = -1
-        not_taken, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        rejected_settings, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
         got, expected = (
             tuple(round(self._capture.get(prop)) for prop in mode),
             (self._identity.width, self._identity.height),
         )
-        if got != expected or not_taken != self.not_taken:
+        if got != expected or rejected_settings != self.rejected_settings:
             raise DeviceMismatch(
                 f"{self._identity.name} came back as another camera, or with other settings",
                 next_step="Connect the camera that was there, or start again with this one.",
-                evidence={"expected": list(expected), "got": list(got), "not_taken": [n.setting for n in not_taken]},
+                evidence={
+                    "expected": list(expected),
+                    "got": list(got),
+                    "rejected_settings": [n.setting for n in rejected_settings],
+                },
             )
         self.returns += 1
 

@@ -95,7 +95,7 @@ class Servo(Protocol):
         ...
 
     @property
-    def line(self) -> Mapping[str, int]:
+    def bus_statistics(self) -> Mapping[str, int]:
         """What the line was like since it was opened: transactions, retries and what they were for."""
         ...
 

@@ -29,14 +29,14 @@ def camera(case: Case) -> Iterator[Finding]:
         return
     config = case.config.camera
     try:
-        capture = case.host.open_capture(config.source)
+        capture = case.computer.open_capture(config.source)
     except DeviceNotFound as error:
         yield of_error("camera", error)
         return
     with ExitStack() as opened:
         opened.callback(capture.release)
         settings = CameraSettings(**config.model_dump(exclude={"source"}))
-        source = OpenCvCamera(capture, clock=case.host.clock, settings=settings, name=f"camera {config.source}")
+        source = OpenCvCamera(capture, clock=case.computer.clock, settings=settings, name=f"camera {config.source}")
         identity = source.identity
         case.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         text = f"{identity.name}: {identity.width}x{identity.height} at {identity.fps:.3g} frames/s"
@@ -48,7 +48,7 @@ def camera(case: Case) -> Iterator[Finding]:
 def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
     locks = source.read_locks()
     device = f" -d {case.config.camera.source}"
-    for refused in source.not_taken:
+    for refused in source.rejected_settings:
         yield warning(
             "camera",
             f"{refused.setting}: asked for {refused.asked:g}, the camera reports {refused.reported:g}",
@@ -65,14 +65,14 @@ def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
     if automatic:
         text = f"{' and '.join(automatic)} not locked: views of one object may differ from each other"
         yield warning("camera", text, "v4l2-ctl --list-ctrls-menus" + device)
-    elif not source.not_taken:
+    elif not source.rejected_settings:
         exposure = "?" if locks.exposure_us is None else f"{locks.exposure_us / 1e3:.3g} ms"
         balance = "?" if locks.white_balance_k is None else f"{locks.white_balance_k:.0f} K"
         yield fine("camera", f"locked and read back: exposure {exposure}, white balance {balance}")
 
 
 def _frames(case: Case, source: Camera) -> Iterator[Finding]:
-    clock = case.host.clock
+    clock = case.computer.clock
     again = "Unplug the camera, plug it in again, then: " + case.rig("doctor")
     frames = []
     ages = []

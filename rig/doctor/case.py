@@ -8,7 +8,7 @@ from shlex import quote
 from typing import Any
 
 from rig.bench import bench_kind
-from rig.bench.computer import Host, Hosted, LinuxHost
+from rig.bench.computer import Computer, ComputerProvider, LinuxComputer
 from rig.config import RigConfig
 from rig.config.values import validate
 from rig.safety.saved_state import Holder, busy, holder
@@ -30,7 +30,7 @@ class Case:
         The devices that were met, put here by the checks for those that come after them.
     """
 
-    host: Host
+    computer: Computer
     config: RigConfig
     bench: str
     options: tuple[str, ...] = ()
@@ -78,8 +78,8 @@ def open_case(
         who = holder(config.state_path(bench))
     except OSError:  # the folder may not be read: the check of the bench's state tells
         who = None
-    if isinstance(kind, Hosted):
-        with kind.host(config, chosen, seed) as host:
-            yield Case(host, config, bench, options, file_options, who)
+    if isinstance(kind, ComputerProvider):
+        with kind.computer(config, chosen, seed) as computer:
+            yield Case(computer, config, bench, options, file_options, who)
     else:
-        yield Case(LinuxHost(), config, bench, options, file_options, who)
+        yield Case(LinuxComputer(), config, bench, options, file_options, who)

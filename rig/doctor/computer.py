@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 
-from rig.bench.computer import Node, SerialPort
+from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.clock import seconds_between
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, warning
@@ -51,9 +51,9 @@ def ports(case: Case) -> Iterator[Finding]:
     """The servo's serial port, the IMU's bus and the camera's device file: there, permitted, free, fast."""
     head = case.config.imu.connection == "head"
     for key, wanted in (("servo.port", case.config.servo.port), ("head.port", case.config.head.port))[: 1 + head]:
-        port = case.host.serial_port(wanted)
+        port = case.computer.serial_port(wanted)
         if port is None:
-            yield _missing(case, key, wanted, case.host.serial_ports())
+            yield _missing(case, key, wanted, case.computer.serial_ports())
             continue
         yield from access(case, "port", port, "dialout")
         if port.latency_ms is not None:
@@ -64,9 +64,9 @@ def ports(case: Case) -> Iterator[Finding]:
 
 
 def _i2c(case: Case) -> Iterator[Finding]:
-    bus = case.host.i2c_name(case.config.imu.bus)
-    buses = case.host.i2c_buses()
-    node = next((n for n in buses if case.host.same_file(n.path, bus)), None)
+    bus = case.computer.i2c_name(case.config.imu.bus)
+    buses = case.computer.i2c_buses()
+    node = next((n for n in buses if case.computer.same_file(n.path, bus)), None)
     if node is not None:
         yield from access(case, "port", node, "i2c")
     elif buses:
@@ -81,8 +81,8 @@ def _video(case: Case) -> Iterator[Finding]:
     if isinstance(source, str) and not source.isdigit() and not source.startswith("/dev/"):
         return  # a file or a stream
     camera = f"/dev/video{source}" if str(source).isdigit() else str(source)
-    cameras = case.host.cameras()
-    node = next((n for n in cameras if case.host.same_file(n.path, camera)), None)
+    cameras = case.computer.cameras()
+    node = next((n for n in cameras if case.computer.same_file(n.path, camera)), None)
     if node is not None:
         yield from access(case, "port", node, "video")
     elif cameras:
@@ -100,7 +100,7 @@ def _video(case: Case) -> Iterator[Finding]:
 def disk(case: Case) -> Iterator[Finding]:
     """Room for views, and a disk that is this computer's own."""
     path = case.catalog_path
-    there = case.host.disk(path)
+    there = case.computer.disk(path)
     views = there.free_bytes // VIEW_BYTES
     text = f"{there.free_bytes / 1e9:.1f} GB free for {path}: about {views // case.config.enroll.views} more objects"
     if there.free_bytes < TOO_LITTLE_ROOM:
@@ -110,8 +110,10 @@ def disk(case: Case) -> Iterator[Finding]:
     else:
         yield fine("disk", text, free_bytes=there.free_bytes)
     if not there.writable:
-        mend = f"sudo chown -R {case.host.user.name} {path}" if path.exists() else case.set("catalog.path", "FOLDER")
-        yield bad("disk", f"{case.host.user.name} may not write to {path}", mend, exit_code=7)
+        mend = (
+            f"sudo chown -R {case.computer.user.name} {path}" if path.exists() else case.set("catalog.path", "FOLDER")
+        )
+        yield bad("disk", f"{case.computer.user.name} may not write to {path}", mend, exit_code=7)
     if there.network:
         mend = case.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
         yield warning("disk", f"{path} is on a network file system, where locks may not hold", mend)
@@ -119,7 +121,7 @@ def disk(case: Case) -> Iterator[Finding]:
 
 def clock(case: Case) -> Iterator[Finding]:
     """Monotonic time that runs at the right pace, and a civil time that may be written into records."""
-    time = case.host.clock
+    time = case.computer.clock
     start_ns, start_utc = time.now_ns(), time.utc()
     time.sleep(_PAUSE_S)
     passed_s = seconds_between(start_ns, time.now_ns())
@@ -132,7 +134,7 @@ def clock(case: Case) -> Iterator[Finding]:
     else:
         yield fine("clock", f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.1f} ms", pause_s=passed_s)
     now = time.utc()
-    synchronised = case.host.time_synchronised()
+    synchronised = case.computer.time_synchronised()
     mend = "sudo timedatectl set-ntp true"
     if abs(civil_s - passed_s) > _STEP_S:
         yield warning("clock", f"the civil time jumped by {civil_s - passed_s:+.1f} s while it was watched", mend)
@@ -178,7 +180,7 @@ def udev_command(case: Case) -> str:
 
 def i2c_command(case: Case) -> str:
     """Return the command that makes a computer's I2C buses appear."""
-    return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in case.host.model else "sudo modprobe i2c-dev"
+    return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in case.computer.model else "sudo modprobe i2c-dev"
 
 
 def _missing(case: Case, key: str, wanted: str, found: list[SerialPort]) -> Finding:
@@ -190,7 +192,7 @@ def _missing(case: Case, key: str, wanted: str, found: list[SerialPort]) -> Find
     return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", mend)
 
 
-def access(case: Case, topic: str, node: Node, usual_group: str) -> Iterator[Finding]:
+def access(case: Case, topic: str, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
     """Say whether a device file can be opened: nobody else has it open, and the user may."""
     if node.holders:
         who = " and ".join(map(str, node.holders))
@@ -203,13 +205,13 @@ def access(case: Case, topic: str, node: Node, usual_group: str) -> Iterator[Fin
         yield fine(topic, f"{node.path}: {node.name}" + (f" ({node.stable})" if node.stable else ""))
         return
     group = node.group or usual_group
-    text = f"{case.host.user.name} may not use {node.path} ({node.name})"
+    text = f"{case.computer.user.name} may not use {node.path} ({node.name})"
     if group == "root":
         yield bad(topic, f"{text}: it belongs to root alone", udev_command(case))
-    elif case.host.joined(group):
+    elif case.computer.joined(group):
         yield bad(topic, f"{text} yet: the group {group} counts from the next login on", f"newgrp {group}")
     else:
-        mend = f"sudo usermod -aG {group} {case.host.user.name}"
+        mend = f"sudo usermod -aG {group} {case.computer.user.name}"
         yield bad(topic, f"{text}: the group {group} may; log in again after this", mend, group=group)
 
 
@@ -225,5 +227,5 @@ def _latency(case: Case, port: SerialPort) -> Finding:
     )
 
 
-def _names(nodes: list[Node] | list[SerialPort]) -> str:
+def _names(nodes: list[DeviceFile] | list[SerialPort]) -> str:
     return ", ".join(f"{node.path} ({node.name})" for node in nodes)

@@ -30,9 +30,9 @@ def imu(case: Case) -> Iterator[Finding]:
     if case.holder is not None:
         yield warning("imu", "not asked: opening it would spoil the measurement that is running", case.rig("stop"))
         return
-    config, clock = case.config, case.host.clock
+    config, clock = case.config, case.computer.clock
     if config.imu.connection == "head":
-        head = open_head(config, lambda: case.host.open_wire(config.head.port, BAUD), clock)
+        head = open_head(config, lambda: case.computer.open_serial(config.head.port, BAUD), clock)
         with closing(head):
             who = head.identity
             text = f"{who.model} on a rig head ({who.board}, firmware {who.firmware}) at {config.head.port}"
@@ -42,7 +42,7 @@ def imu(case: Case) -> Iterator[Finding]:
             yield from _at_rest(case, head)
         return
     try:
-        there = scan_imus(case.host, config.imu.bus)
+        there = scan_imus(case.computer, config.imu.bus)
     except OSError as error:
         yield _bus_failed(case, error)
         return
@@ -50,8 +50,8 @@ def imu(case: Case) -> Iterator[Finding]:
     if here is None or here.driver is None:
         yield _wrong(case, config.imu, here, there)
         return
-    with closing(open_imu(config.imu, case.host.i2c_path(config.imu.bus), clock)) as sensor:
-        bus, identity = case.host.i2c_name(config.imu.bus), sensor.identity
+    with closing(open_imu(config.imu, case.computer.i2c_path(config.imu.bus), clock)) as sensor:
+        bus, identity = case.computer.i2c_name(config.imu.bus), sensor.identity
         text = f"{identity.model} at {identity.bus_address:#04x} of {bus} (identity {identity.who_am_i:#04x})"
         yield fine("imu", text)
         yield from _at_rest(case, sensor)
@@ -69,7 +69,7 @@ def _samples(case: Case, sensor: Imu) -> ImuSamples:
     sensor.read_samples()
     taken = []
     for _ in range(round(SECONDS / DRAIN_S)):
-        case.host.clock.sleep(DRAIN_S)
+        case.computer.clock.sleep(DRAIN_S)
         taken.append(sensor.read_samples())
     return ImuSamples(
         np.concatenate([part.time_ns for part in taken]),
@@ -128,7 +128,7 @@ def _gravity(case: Case, sensor: Imu) -> Iterator[Finding]:
 
 
 def _wrong(case: Case, config: ImuConfig, here: FoundImu | None, there: list[FoundImu]) -> Finding:
-    bus = case.host.i2c_name(config.bus)
+    bus = case.computer.i2c_name(config.bus)
     if here is not None:
         mend = "Check its wiring; the rig drives MPU-6050 and BNO055"
         return bad("imu", f"{here}: the rig has no driver for it", mend, address=here.address)
@@ -141,7 +141,7 @@ def _wrong(case: Case, config: ImuConfig, here: FoundImu | None, there: list[Fou
 
 
 def _bus_failed(case: Case, error: OSError) -> Finding:
-    bus = case.host.i2c_name(case.config.imu.bus)
+    bus = case.computer.i2c_name(case.config.imu.bus)
     if isinstance(error, FileNotFoundError | PermissionError):
         return bad("imu", f"{bus} cannot be opened: {error.strerror}", case.rig("find"))
     mend = "Take the sensor's supply off and on; check SDA and SCL for a short"

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import serial
 
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceRefused, DeviceSilent, SeveralServos, UsageError
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RequestRejected, SeveralServos, UsageError
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.port import ClockedPort, Wire
+from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import ControlTable, control_table
 from rig.doctor.case import Case
 from rig.doctor.register_words import baud_codes
@@ -32,9 +32,9 @@ class LoneServo:
         It is of a model that has no control table.
     """
 
-    def __init__(self, case: Case, wire: Wire, say: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(self, case: Case, wire: SerialConnection, say: Callable[[str], None] = lambda _: None) -> None:
         self._wire = wire
-        self._clock = case.host.clock
+        self._clock = case.computer.clock
         self.found = _the_only_one(case, wire, say)
         if self.found.model is None:
             raise DeviceMismatch(
@@ -61,7 +61,7 @@ class LoneServo:
         ------
         UsageError
             There is no such id.
-        DeviceRefused
+        RequestRejected
             It did not take the id; it answers to the old one.
         """
         if not 0 <= new <= MAX_ID:
@@ -79,7 +79,7 @@ class LoneServo:
         ------
         UsageError
             The model, or the adapter, has no such rate.
-        DeviceRefused
+        RequestRejected
             It did not take the rate; it answers at the old one.
         """
         codes = baud_codes(self.table)
@@ -102,7 +102,7 @@ class LoneServo:
         self._clock.sleep(_SETTLE_S)
         try:
             self._verify(self.found.bus_id, "Baud Rate", codes[rate], f"{rate} baud")
-        except DeviceRefused:
+        except RequestRejected:
             self.bus.port.setBaudRate(old)
             raise
         self.found = replace(self.found, baud=rate)
@@ -110,7 +110,7 @@ class LoneServo:
     def _torque_off(self) -> None:
         self.bus.write(self.found.bus_id, self.table["Torque Enable"], 0, answered=self._answered())
         if self.bus.read(self.found.bus_id, self.table["Torque Enable"]):
-            raise DeviceRefused(
+            raise RequestRejected(
                 f"Servo {self.found.bus_id} keeps its torque on.",
                 next_step="Switch its supply off and on, then try again.",
             )
@@ -126,7 +126,7 @@ class LoneServo:
         except DeviceSilent:
             kept = False
         if not kept:
-            raise DeviceRefused(
+            raise RequestRejected(
                 f"The servo did not take {words}.",
                 next_step="Switch its supply off and on, then look with `rig find`.",
                 evidence={"register": name, "wrote": value, "id": bus_id},
@@ -137,14 +137,14 @@ class LoneServo:
 def lone_servo(case: Case, say: Callable[[str], None] = lambda _: None) -> Iterator[LoneServo]:
     """Yield the one servo on the configured port, its port open for this program alone; see `LoneServo`."""
     case.require_free()
-    wire = case.host.open_wire(case.config.servo.port, case.config.servo.baud)
+    wire = case.computer.open_serial(case.config.servo.port, case.config.servo.baud)
     try:
         yield LoneServo(case, wire, say)
     finally:
         wire.close()
 
 
-def _the_only_one(case: Case, wire: Wire, say: Callable[[str], None]) -> FoundServo:
+def _the_only_one(case: Case, wire: SerialConnection, say: Callable[[str], None]) -> FoundServo:
     """Look at all baud rates: a second servo at another one would answer as soon as their rates are the same."""
     found: list[FoundServo] = []
     for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
@@ -153,7 +153,7 @@ def _the_only_one(case: Case, wire: Wire, say: Callable[[str], None]) -> FoundSe
         there: list[Heard] = []
         for rate in rates:
             say(f"{case.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
-            for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
+            for heard in scan_servos(wire, case.computer.clock, [rate], protocol=protocol):
                 there.append(heard)
                 if heard.doubtful:
                     raise SeveralServos(

@@ -9,11 +9,11 @@ import serial
 from dynamixel_sdk import Protocol2PacketHandler
 from smbus2 import SMBus
 
-from rig.bench.computer import Host
+from rig.bench.computer import Computer
 from rig.core.clock import Clock
-from rig.core.errors import DeviceRefused, DeviceSilent
+from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.port import ClockedPort, LineBabble, Wire
+from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import model_numbers
 
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
@@ -65,7 +65,9 @@ class Heard:
         return bool(self.servos or self.doubtful)
 
 
-def scan_servos(wire: Wire, clock: Clock, bauds: Sequence[int] = BAUD_RATES, *, protocol: int = 2) -> Iterator[Heard]:
+def scan_servos(
+    wire: SerialConnection, clock: Clock, bauds: Sequence[int] = BAUD_RATES, *, protocol: int = 2
+) -> Iterator[Heard]:
     """Ask at each baud rate who is there, and yield what was heard; at last the wire has the baud rate it had.
 
     Takes about a second a baud rate, four at 9,600; with Protocol 1.0, where each id is asked, five.
@@ -107,7 +109,7 @@ def spoiled_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) ->
     for _ in range(reads):
         try:
             bus.read_block(bus_id, address, size)
-        except DeviceRefused:
+        except RequestRejected:
             continue
         except DeviceSilent:
             spoiled += 1
@@ -118,7 +120,7 @@ def _heard_2(port: ClockedPort, baud: int) -> Heard:
     listening = _Recording(port)
     try:
         answers, _ = Protocol2PacketHandler().broadcastPing(listening)
-    except LineBabble:
+    except BusBabble:
         return Heard(baud, 2, noise=True)
     port.drain()
     if _unasked(port):
@@ -132,7 +134,7 @@ def _heard_2(port: ClockedPort, baud: int) -> Heard:
     for bus_id in (bus_id for bus_id in range(253) if rest and bus_id not in answers):
         try:
             head = bus.read_block(bus_id, 0, 7)
-        except (DeviceRefused, DeviceSilent):
+        except (RequestRejected, DeviceSilent):
             doubtful += [bus_id] if _spoils(bus, bus_id) else []
         else:  # its answer to all was spoiled, that to the question of its own is not
             servos.append(_servo(bus_id, baud, 2, int.from_bytes(head[:2], "little"), head[6]))
@@ -172,7 +174,7 @@ def _heard_1(port: ClockedPort, baud: int) -> Heard:
         corrupt = bus.statistics.corrupt
         try:
             head = bus.read_block(bus_id, 0, 3)
-        except DeviceRefused:
+        except RequestRejected:
             continue
         except DeviceSilent:
             if bus.statistics.corrupt > corrupt and _spoils(bus, bus_id):
@@ -211,7 +213,7 @@ def _spoils(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
         corrupt = bus.statistics.corrupt
         try:
             bus.ping(bus_id)
-        except DeviceRefused:
+        except RequestRejected:
             return False
         except DeviceSilent:
             if bus.statistics.corrupt == corrupt:
@@ -263,7 +265,7 @@ class FoundImu:
         return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.trouble}" if self.trouble else "")
 
 
-def scan_imus(host: Host, bus: int | str) -> list[FoundImu]:
+def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
     """Return who answers at the addresses that IMUs have; no other address is asked, and nothing is written.
 
     Raises
@@ -271,9 +273,9 @@ def scan_imus(host: Host, bus: int | str) -> list[FoundImu]:
     OSError
         The bus cannot be opened, or does not move.
     """
-    name = host.i2c_name(bus)
+    name = computer.i2c_name(bus)
     found = []
-    with SMBus(host.i2c_path(bus)) as wire:
+    with SMBus(computer.i2c_path(bus)) as wire:
         for address in sorted({address for chip in CHIPS for address in chip.addresses}):
             said: dict[int, int] = {}
             try:

@@ -7,7 +7,7 @@ from rig.config import ServoConfig
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.dynamixel.opening import open_servo
-from rig.devices.dynamixel.port import Wire
+from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.doctor.case import Case
@@ -35,13 +35,13 @@ def servo(case: Case) -> Iterator[Finding | str]:
         return
     with ExitStack() as opened:
         try:
-            wire = case.host.open_wire(config.port, config.baud)
+            wire = case.computer.open_serial(config.port, config.baud)
         except DeviceNotFound as error:
             yield of_error("servo", error)
             return
         opened.callback(wire.close)
         try:
-            found = open_servo(wire, config, case.host.clock, case.config.table.mode)
+            found = open_servo(wire, config, case.computer.clock, case.config.table.mode)
         except DeviceNotFound:
             yield from _elsewhere(case, wire)
             return
@@ -66,7 +66,7 @@ def servo(case: Case) -> Iterator[Finding | str]:
         yield from _line(case, found)
 
 
-def _elsewhere(case: Case, wire: Wire) -> Iterator[Finding | str]:
+def _elsewhere(case: Case, wire: SerialConnection) -> Iterator[Finding | str]:
     """Nobody answers where the configuration says: look at the other baud rates, and say who is there instead."""
     config = case.config.servo
     protocol = protocol_of(config.model)
@@ -74,7 +74,7 @@ def _elsewhere(case: Case, wire: Wire) -> Iterator[Finding | str]:
     answered: list[Heard] = []
     for rate in [config.baud, *(rate for rate in rates if rate != config.baud)]:
         yield f"{config.port}: nobody at id {config.id}; asking at {rate} baud ..."
-        for heard in scan_servos(wire, case.host.clock, [rate], protocol=protocol):
+        for heard in scan_servos(wire, case.computer.clock, [rate], protocol=protocol):
             if heard.doubtful:
                 yield _duplicate(case, heard)
                 return
@@ -102,12 +102,12 @@ def _follow(case: Case, config: ServoConfig, there: FoundServo) -> str:
     return changes[0] if len(changes) == 1 else case.rig("setup")
 
 
-def _alone(case: Case, wire: Wire) -> Iterator[Finding]:
+def _alone(case: Case, wire: SerialConnection) -> Iterator[Finding]:
     """Say who else answers at this baud rate, and whether two answer at once."""
     config = case.config.servo
     if protocol_of(config.model) == 1:
         return  # has no broadcast ping: `rig find` asks each id
-    for heard in scan_servos(wire, case.host.clock, [config.baud]):
+    for heard in scan_servos(wire, case.computer.clock, [config.baud]):
         others = [servo for servo in heard.servos if servo.bus_id != config.id]
         if heard.doubtful:
             yield _duplicate(case, heard)
@@ -184,14 +184,14 @@ def _condition(case: Case, found: RegisterServo) -> Iterator[Finding]:
 
 
 def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
-    clock = case.host.clock
-    before = found.line
+    clock = case.computer.clock
+    before = found.bus_statistics
     ticks = _ticks(found)
     start_ns = clock.now_ns()
     for _ in range(READS):
         found.read_state()
     each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
-    after = found.line
+    after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
         text = f"frozen: its own clock stood at {ticks} ms during {READS} readings, so no reading of it can be believed"
         yield bad("servo", text, "Switch the servo's supply off and on, then: " + case.rig("doctor"), tick_ms=ticks)
@@ -201,7 +201,9 @@ def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
     if again > REPEATED:
         yield warning("servo", text, "Check the plugs of the servo's cable", retries=again, reading_ms=each_ms)
     elif each_ms > SLOW * 1e3 * case.config.table.poll_s:
-        port = next((p for p in case.host.serial_ports() if case.host.same_file(p.path, case.config.servo.port)), None)
+        port = next(
+            (p for p in case.computer.serial_ports() if case.computer.same_file(p.path, case.config.servo.port)), None
+        )
         mend = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
         mend = mend or case.rig("servo set-baud 1000000")
         yield warning("servo", text + ": slow", mend, retries=again, reading_ms=each_ms)

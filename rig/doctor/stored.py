@@ -21,7 +21,7 @@ def catalog(case: Case) -> Iterator[Finding]:
     if not (path / "catalog.sqlite").exists():
         yield fine("catalog", f"none yet in {path}; the first enrollment makes it")
         return
-    with Catalog.open(path, clock=case.host.clock, read_only=True) as opened:
+    with Catalog.open(path, clock=case.computer.clock, read_only=True) as opened:
         with opened.database.in_words(), opened.database.read() as connection:
             said = connection.exec_driver_sql("PRAGMA quick_check(5)").scalars().all()
             orphans = len(connection.exec_driver_sql("PRAGMA foreign_key_check").all())
@@ -53,7 +53,7 @@ def calibrations(case: Case) -> Iterator[Finding]:
     """Calibrations are there, of this bench's devices, and not too old."""
     store = CalibrationStore(case.config.calibration_path(case.bench))
     device = apparatus(case.bench, case.identities, case.config, {})
-    standings = store.standings(device, case.host.clock.utc())
+    standings = store.standings(device, case.computer.clock.utc())
     for error in store.unreadable:
         yield of_error("calibration", error)
     for standing in standings:

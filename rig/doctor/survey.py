@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import serial
 
-from rig.bench.computer import Node, SerialPort
+from rig.bench.computer import DeviceFile, SerialPort
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
@@ -38,7 +38,7 @@ _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi
 class FoundCamera:
     """A camera that opened, and the mode it came up in."""
 
-    node: Node
+    node: DeviceFile
     width: int
     height: int
     fps: float
@@ -73,13 +73,13 @@ class Survey:
         )
 
     def look_for_servos(self, case: Case) -> Iterator[Finding | str]:
-        known = case.host.serial_ports()
-        configured = case.host.serial_port(case.config.servo.port)
-        if configured is not None and not any(case.host.same_file(port.path, configured.path) for port in known):
+        known = case.computer.serial_ports()
+        configured = case.computer.serial_port(case.config.servo.port)
+        if configured is not None and not any(case.computer.same_file(port.path, configured.path) for port in known):
             known.append(configured)
         if self.ports is not None:
             known = [port for port in known if port.path in self.ports]
-        asked = [p for p in known if p.usb or case.host.same_file(p.path, case.config.servo.port)]
+        asked = [p for p in known if p.usb or case.computer.same_file(p.path, case.config.servo.port)]
         if not asked:
             text = f"no serial port on USB{'; there is ' + ', '.join(p.path for p in known) if known else ''}"
             yield bad("servo", text, "Plug the U2D2 in, then: " + case.rig("find"))
@@ -92,7 +92,7 @@ class Survey:
         if troubles:
             yield from troubles
             return
-        known_head = case.config.imu.connection == "head" and case.host.same_file(port.path, case.config.head.port)
+        known_head = case.config.imu.connection == "head" and case.computer.same_file(port.path, case.config.head.port)
         try:
             servos = False if known_head else (yield from self._servos(case, port, 2, BAUD_RATES))
             head = False if servos else (yield from self._head(case, port))
@@ -112,10 +112,10 @@ class Survey:
         self, case: Case, port: SerialPort, protocol: int, rates: Sequence[int]
     ) -> Generator[Finding | str, None, bool]:
         answered: list[Heard] = []
-        with closing(case.host.open_wire(port.path, rates[0])) as wire:
+        with closing(case.computer.open_serial(port.path, rates[0])) as wire:
             for rate in rates:
                 yield f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ..."
-                answered += scan_servos(wire, case.host.clock, [rate], protocol=protocol)
+                answered += scan_servos(wire, case.computer.clock, [rate], protocol=protocol)
         for heard in without_echoes(answered, case.config.servo.baud):
             yield from self._heard(case, port, heard)
         return any(heard.anything for heard in answered)
@@ -124,7 +124,9 @@ class Survey:
         yield f"{port.path}: asking for a rig head ..."
         config = case.config.model_copy(update={"head": case.config.head.model_copy(update={"port": port.path})})
         try:
-            with closing(open_head(config, lambda: case.host.open_wire(port.path, BAUD), case.host.clock)) as head:
+            with closing(
+                open_head(config, lambda: case.computer.open_serial(port.path, BAUD), case.computer.clock)
+            ) as head:
                 who = head.identity
         except DeviceNotFound:
             return False
@@ -150,11 +152,11 @@ class Survey:
             yield warning("servo", text, "Take everything but servos off the bus, then: " + case.rig("find"))
 
     def look_for_imus(self, case: Case) -> Iterator[Finding | str]:
-        configured = case.host.i2c_name(case.config.imu.bus)
+        configured = case.computer.i2c_name(case.config.imu.bus)
         asked = 0
         before = len(self.imus)
-        for node in case.host.i2c_buses():
-            if _COMPUTERS_OWN.search(node.name) and not case.host.same_file(node.path, configured):
+        for node in case.computer.i2c_buses():
+            if _COMPUTERS_OWN.search(node.name) and not case.computer.same_file(node.path, configured):
                 continue
             asked += 1
             troubles = [finding for finding in access(case, "imu", node, "i2c") if finding.mend]
@@ -163,7 +165,7 @@ class Survey:
                 continue
             yield f"{node.path}: asking for IMUs ..."
             try:
-                there = scan_imus(case.host, node.path)
+                there = scan_imus(case.computer, node.path)
             except OSError as error:
                 mend = "Take the sensor's supply off and on; check SDA and SCL for a short"
                 yield bad("imu", f"{node.path} does not move: {error.strerror}", mend)
@@ -181,7 +183,7 @@ class Survey:
             yield warning("imu", "no IMU answers on any I2C bus", mend)
 
     def look_for_cameras(self, case: Case) -> Iterator[Finding | str]:
-        nodes = case.host.cameras()
+        nodes = case.computer.cameras()
         if not nodes:
             yield warning("camera", "no camera", "Connect the camera, then: " + case.rig("find"))
         for node in nodes:
@@ -191,7 +193,7 @@ class Survey:
                 continue
             yield f"{node.path}: opening ..."
             try:
-                capture = case.host.open_capture(node.path)
+                capture = case.computer.open_capture(node.path)
             except DeviceNotFound as error:
                 yield of_error("camera", error)
                 continue

@@ -12,7 +12,7 @@ from hbr.dense.filter import DenseIndex
 from hbr.evaluation.matrix import Cell, cells, enrolled_few, hits
 from hbr.evaluation.statistics import wilson
 from hbr.model.views import Views
-from rig.core.processes import over_processes
+from rig.core.processes import map_in_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import Rows
 
@@ -32,14 +32,14 @@ def run_matrix(plan: Plan, jobs: int, advance: Callable[[str], None]) -> dict[st
     matrix = cells(plan.condition)
     names = [item.name for item in plan.dataset.objects]
     enrolled: dict[int, _Enrolled] = {}
-    for j, own in over_processes(partial(_enroll, plan, matrix), range(len(names)), jobs):
+    for j, own in map_in_processes(partial(_enroll, plan, matrix), range(len(names)), jobs):
         enrolled[j] = own
         advance(names[j])
     models = {
         on_bench: Views.concatenate([enrolled[j][on_bench] for j in range(len(names))]) for on_bench in enrolled[0]
     }
     found: dict[int, NDArray[np.bool_]] = {}
-    for j, own_hits in over_processes(partial(_search, plan, matrix, models), range(len(names)), jobs):
+    for j, own_hits in map_in_processes(partial(_search, plan, matrix, models), range(len(names)), jobs):
         found[j] = own_hits
         advance(names[j])
     together = np.stack([found[j] for j in range(len(names))])  # objects, cells, trials, views

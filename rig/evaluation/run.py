@@ -8,7 +8,7 @@ from hbr.evaluation.descriptors import enrolled_levels, query_levels
 from hbr.evaluation.protocol import Runs, run_object
 from hbr.model.views import Views
 from rig.core.clock import SystemClock
-from rig.core.processes import over_processes
+from rig.core.processes import map_in_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.store import Store
 
@@ -23,7 +23,7 @@ def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Vie
     """
     objects = plan.dataset.objects
     levels: dict[int, LevelArray] = {}
-    for j, found in over_processes(partial(_enroll, plan), range(len(objects)), jobs):
+    for j, found in map_in_processes(partial(_enroll, plan), range(len(objects)), jobs):
         levels[j] = found
         advance(objects[j].name)
     return Views.concatenate(
@@ -52,7 +52,7 @@ def run_plan(plan: Plan, views: Views, store: Store, jobs: int, advance: Callabl
             done[j] = runs
             advance(name)
     missing = [j for j in range(len(names)) if j not in done]
-    for j, runs in over_processes(partial(_search, plan, views), missing, jobs):
+    for j, runs in map_in_processes(partial(_search, plan, views), missing, jobs):
         store.save(names[j], runs)
         done[j] = runs
         advance(names[j])

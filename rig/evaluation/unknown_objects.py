@@ -15,7 +15,7 @@ from hbr.evaluation.protocol import Protocol, Runs, run_object, views_of_trial
 from hbr.evaluation.statistics import wilson
 from hbr.evaluation.unknown_objects import left_out, strangers
 from hbr.model.views import Views
-from rig.core.processes import over_processes
+from rig.core.processes import map_in_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import Rows
 
@@ -36,7 +36,7 @@ def run_strangers(
     names = tuple(item.name for item in plan.dataset.objects)
     protocols = left_out(plan.protocol, names, count, draws)
     found: dict[int, list[Runs]] = {}
-    for j, runs in over_processes(partial(_search, plan, views, protocols), range(len(names)), jobs):
+    for j, runs in map_in_processes(partial(_search, plan, views, protocols), range(len(names)), jobs):
         found[j] = runs
         advance(names[j])
     parts = [

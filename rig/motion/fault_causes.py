@@ -6,10 +6,10 @@ from rig.config import SafetyConfig
 from rig.core.errors import DeviceFault, MotionTimeout, RigError, SupplyLost, WatchdogTripped
 from rig.devices.servo import Servo, ServoState
 from rig.safety.gyro_rotation import finite
-from rig.safety.motion_checks import unfit
+from rig.safety.motion_checks import find_servo_fault
 
 
-def cause_of(symptom: RigError, servo: Servo, config: SafetyConfig) -> RigError:
+def find_cause(symptom: RigError, servo: Servo, config: SafetyConfig) -> RigError:
     """Return why the servo does not do what it was told, where it knows; else ``symptom`` itself."""
     try:
         condition = servo.read_condition()
@@ -26,13 +26,13 @@ def cause_of(symptom: RigError, servo: Servo, config: SafetyConfig) -> RigError:
                 evidence=symptom.evidence,
             )
         if condition.hardware_errors:
-            return unfit(servo.read_state(), config, servo.limits) or symptom
+            return find_servo_fault(servo.read_state(), config, servo.limits) or symptom
     except RigError:
         return symptom
     return symptom
 
 
-def unsettled(
+def explain_unsettled(
     goal_deg: float,
     angle_deg: float,
     allowed_s: float,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rig.bench import open_servo
 from rig.config import RigConfig
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import BenchBusy, StateNotKept
+from rig.core.errors import BenchBusy, StateNotStored
 from rig.safety.saved_state import FileStore, Holder, holder
 
 HEED_S = 2.0
@@ -48,7 +48,7 @@ def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None)
     who, signalled = holder(path), False
     if who is not None:
         store = FileStore(path)
-        with suppress(StateNotKept):  # a full disk: the signal is left
+        with suppress(StateNotStored):  # a full disk: the signal is left
             store.request_stop()
         if not store.stop_requested() or not _wait(
             clock, HEED_S, lambda: not store.stop_requested() or holder(path) is None

@@ -10,20 +10,20 @@ from typing import Self
 from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import (
-    DeviceRefused,
     DeviceSilent,
     FollowingError,
     LimitExceeded,
     MotionTimeout,
     NoProgress,
     NotReady,
+    RequestRejected,
     RigError,
     RotationDisagreement,
 )
 from rig.devices.servo import MotionProfile
-from rig.motion.fault_causes import cause_of, unsettled
-from rig.safety.gyro_rotation import Agreement, GyroHeading, Rotation, Stillness, compare
-from rig.safety.motion_checks import SlipWatch, Watch, incredible
+from rig.motion.fault_causes import explain_unsettled, find_cause
+from rig.safety.gyro_rotation import Agreement, GyroRotationMeter, Rotation, Stillness, compare
+from rig.safety.motion_checks import MotionMonitor, SlipMonitor, implausible_readings
 
 QUIET_COUNTS = 3
 """Encoder counts that readings at rest may differ by: one of quantisation, the rest of its noise."""
@@ -114,7 +114,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._safety = bench.safety
         self._trust_gyro = trust_gyro
         imu = bench.config.imu
-        self._heading = GyroHeading(
+        self._heading = GyroRotationMeter(
             bench.imu,
             bench.clock,
             axis=imu.axis,
@@ -164,7 +164,7 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def angle_deg(self) -> float:
         """Return the table's angle by the encoder, now."""
-        return self._safety.reference.to_table(self._servo.read_state().position_deg)
+        return self._safety.angle_reference.to_table(self._servo.read_state().position_deg)
 
     def check_target(self, target_deg: float) -> None:
         """Raise `LimitExceeded` where the cable does not reach."""
@@ -189,7 +189,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             return min((low, high), key=lambda limit: abs(remainder(limit - target_deg, 360.0)))
         return reached_deg
 
-    def turns_back(self, target_deg: float) -> int:
+    def unwound_revolutions(self, target_deg: float) -> int:
         """Return by how many whole turns the cable is unwound on the way to ``target_deg``, which could be shorter."""
         if abs(target_deg) >= abs(self._rest_deg):
             return 0
@@ -236,10 +236,10 @@ class Turntable(AbstractContextManager["Turntable"]):
         The rate is looked at from ``since_ns`` on, but never for less than ``table.quiet_s``; the angles of shaft and
         platter are compared with those of the rest, however long ago.
         """
-        self._safety.heed_stop()
+        self._safety.check_stop_request()
         state = self._servo.read_state()
-        self._safety.refuse_unfit(state)
-        change = abs(self._safety.reference.to_table(state.position_deg) - self._rest_deg)
+        self._safety.check_servo(state)
+        change = abs(self._safety.angle_reference.to_table(state.position_deg) - self._rest_deg)
         now_ns = self._clock.now_ns()
         window_s = max(self._config.quiet_s, seconds_between(now_ns if since_ns is None else since_ns, now_ns))
         peak = self._heading.peak_dps(window_s)
@@ -285,12 +285,12 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
         else:
             with self._safety.motion((start_deg, *waypoints), self._stop) as motion:
-                slip = SlipWatch(self._limits, start_deg) if self._trust_gyro else None
+                slip = SlipMonitor(self._limits, start_deg) if self._trust_gyro else None
                 for waypoint in waypoints:
                     # Only the last stop must be a rest; on the way it is enough to have arrived.
                     self._approach(waypoint, self._config.quiet_s if waypoint is waypoints[-1] else 0.0, slip)
                 self._servo.disarm_watchdog()
-                motion.arrived(self._safety.reference.to_servo(self._rest_deg))
+                motion.arrived(self._safety.angle_reference.to_servo(self._rest_deg))
         self._play_taken_up = self._play_taken_up or bool(waypoints)
         gyro = self._heading.end()
         rotation_deg = self._rest_deg - start_deg
@@ -310,10 +310,10 @@ class Turntable(AbstractContextManager["Turntable"]):
             target_deg, self._rest_deg, rotation_deg, gyro, agreement, started_ns, self._clock.now_ns(), by_gyro
         )
 
-    def _approach(self, goal_deg: float, quiet_s: float, slip: SlipWatch | None) -> None:
+    def _approach(self, goal_deg: float, quiet_s: float, slip: SlipMonitor | None) -> None:
         """Go to ``goal_deg`` under watch, and return when the table has arrived there and been quiet for so long."""
         assert self._profile is not None
-        watch = Watch(
+        watch = MotionMonitor(
             self._limits,
             self._servo.limits,
             start_deg=self._rest_deg,
@@ -324,29 +324,29 @@ class Turntable(AbstractContextManager["Turntable"]):
         allowed_s = 1.5 * motion_seconds(goal_deg - self._rest_deg, self._profile) + SETTLE_ALLOWANCE_S
         try:
             self._servo.arm_watchdog(self._config.watchdog_s)
-            self._servo.move_to(self._safety.reference.to_servo(goal_deg))
+            self._servo.move_to(self._safety.angle_reference.to_servo(goal_deg))
             self._wait_for_rest(goal_deg, quiet_s, allowed_s, watch, slip)
-        except (DeviceRefused, FollowingError, MotionTimeout, NoProgress) as symptom:
-            raise cause_of(symptom, self._servo, self._limits) from None
+        except (RequestRejected, FollowingError, MotionTimeout, NoProgress) as symptom:
+            raise find_cause(symptom, self._servo, self._limits) from None
 
     def _wait_for_rest(
         self,
         goal_deg: float,
         quiet_s: float,
         allowed_s: float,
-        watch: Watch | None = None,
-        slip: SlipWatch | None = None,
+        watch: MotionMonitor | None = None,
+        slip: SlipMonitor | None = None,
     ) -> None:
         """Poll until the servo is in position and encoder and gyro have been quiet for ``quiet_s``.
 
         The polling feeds the servo's watchdog.
         """
-        config, to_table = self._config, self._safety.reference.to_table
+        config, to_table = self._config, self._safety.angle_reference.to_table
         start_ns = self._clock.now_ns()
         readings: deque[tuple[int, float]] = deque()
         while True:
             self._clock.sleep(config.poll_s)
-            self._safety.heed_stop()
+            self._safety.check_stop_request()
             state = self._servo.read_state()
             self._heading.update()
             angle_deg = to_table(state.position_deg)
@@ -354,7 +354,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 lag_deg = None if state.trajectory_deg is None else state.trajectory_deg - state.position_deg
                 watch.look(state, angle_deg, lag_deg)
             else:
-                self._safety.refuse_unfit(state)
+                self._safety.check_servo(state)
             if slip:
                 self._look_for_slip(slip, state.time_ns, angle_deg)
             arrived = state.in_position and not state.moving and abs(angle_deg - goal_deg) <= config.tolerance_deg
@@ -367,9 +367,9 @@ class Turntable(AbstractContextManager["Turntable"]):
             elapsed_s = seconds_between(start_ns, self._clock.now_ns())
             if elapsed_s > allowed_s:
                 peak_dps = self._heading.peak_dps(config.quiet_s)
-                raise unsettled(goal_deg, angle_deg, allowed_s, state, arrived, peak_dps, config.velocity_dps)
+                raise explain_unsettled(goal_deg, angle_deg, allowed_s, state, arrived, peak_dps, config.velocity_dps)
 
-    def _look_for_slip(self, slip: SlipWatch, time_ns: int, angle_deg: float) -> None:
+    def _look_for_slip(self, slip: SlipMonitor, time_ns: int, angle_deg: float) -> None:
         slip.note(time_ns, angle_deg)
         if encoder := slip.encoder_deg(self._heading.newest_ns):
             at_ns, rotation_deg = encoder
@@ -395,7 +395,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         """
         try:
             state = self._servo.read_state()
-            if incredible(state):  # where the table is, nobody knows: it runs out
+            if implausible_readings(state):  # where the table is, nobody knows: it runs out
                 self._servo.torque_off()
                 return True
             self._clock.sleep(STANDS_S)

@@ -37,7 +37,7 @@ def announced(
     LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `Turntable.goto`.
     """
-    if target_deg != asked_deg and (turns := table.turns_back(target_deg)):
+    if target_deg != asked_deg and (turns := table.unwound_revolutions(target_deg)):
         yield Unwinding(index, table.rest_deg, target_deg, turns, table.limits_deg)
     return table.goto(target_deg)
 
@@ -45,7 +45,7 @@ def announced(
 def unwind(index: int, table: Turntable) -> Generator[Event, None, None]:
     """Leave the table with the same view before the camera and its cable unwound, whoever comes next."""
     target_deg = table.unwound_deg()
-    if table.turns_back(target_deg):
+    if table.unwound_revolutions(target_deg):
         yield from announced(index, table, target_deg)
 
 

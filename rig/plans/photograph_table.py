@@ -44,7 +44,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         Something turns with the table, or the surroundings are not still; the picture before this one stays.
     UsageError
         The camera goes around the object: its background is another in every view.
-    StateNotKept
+    StateNotStored
         The picture cannot be kept.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.views.capture` and `rig.motion.turntable`.

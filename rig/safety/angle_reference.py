@@ -25,7 +25,7 @@ class SavedAngleCheck:
     findings: tuple[str, ...] = ()
 
 
-class Reference:
+class AngleReference:
     """Converts between the servo's positions and the table's angles.
 
     The table's angle is ``direction · (position − error + shift − zero)``, degrees, unwrapped; the error is what the

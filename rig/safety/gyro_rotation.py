@@ -106,7 +106,7 @@ def finite(value: float) -> float | None:
     return round(value, 3) if isfinite(value) else None
 
 
-class GyroHeading:
+class GyroRotationMeter:
     """Rotations of the table by its gyro.
 
     Use: `rest` while the table stands, `begin`, move and call `update` every few hundredths of a second, and when

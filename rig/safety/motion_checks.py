@@ -29,7 +29,7 @@ COOLER_C = 5.0
 """How much cooler than its limit a servo must be before it may work again."""
 
 
-def incredible(state: ServoState) -> list[str]:
+def implausible_readings(state: ServoState) -> list[str]:
     """Return the readings that no servo can have; such a reading is no ground for any command."""
     ranges = {
         "position": (state.position_deg, "°", MAX_LIMIT_DEG),
@@ -41,13 +41,15 @@ def incredible(state: ServoState) -> list[str]:
     return [f"{name} {value:.0f} {unit}" for name, (value, unit, most) in ranges.items() if abs(value) > most]
 
 
-def unfit(state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again: bool = False) -> RigError | None:
+def find_servo_fault(
+    state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again: bool = False
+) -> RigError | None:
     """Return why a servo must not work, whether it turns or not: hardware errors, heat, supply; None if it may.
 
     Parameters
     ----------
     again
-        It was found unfit before: it must have cooled down, not just ceased to be too hot.
+        It was found find_servo_fault before: it must have cooled down, not just ceased to be too hot.
     """
     evidence = {
         "temperature_c": state.temperature_c,
@@ -56,7 +58,7 @@ def unfit(state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again
         "voltage_limits_v": [round(v, 1) for v in limits.voltage_v],
         "load_percent": round(state.load_percent, 1),
     }
-    if nonsense := incredible(state):
+    if nonsense := implausible_readings(state):
         return DeviceFault(
             f"The servo's readings cannot be true: {nonsense[0]}.",
             next_step="Check its cable, then `rig acknowledge --reboot`; a servo that goes on like this is broken.",
@@ -85,7 +87,7 @@ def unfit(state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again
     return None
 
 
-class Watch:
+class MotionMonitor:
     """Judges the readings of one motion, the latest after all others.
 
     Parameters
@@ -186,7 +188,7 @@ class Watch:
             )
 
     def _stay_fit(self, state: ServoState) -> None:
-        cause = unfit(state, self._config, self._limits)
+        cause = find_servo_fault(state, self._config, self._limits)
         dip = isinstance(cause, SupplyOutOfRange)
         if cause is not None and (not dip or self._lasts("supply", True, state.time_ns, VOLTAGE_S)):
             raise cause
@@ -209,7 +211,7 @@ class Watch:
         return seconds_between(stood[0][0], time_ns) >= self._config.no_progress_s
 
 
-class SlipWatch:
+class SlipMonitor:
     """Compares the platter's rotation, by the gyro, with the shaft's, by the encoder, while the table turns.
 
     The gyro's samples come in lots and late; so its rotation is compared with the encoder's of the same moment.

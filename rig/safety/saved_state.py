@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.core import files
 from rig.core.clock import Clock
-from rig.core.errors import BenchBusy, RigError, StateNotKept
+from rig.core.errors import BenchBusy, RigError, StateNotStored
 
 VERSION = 1
 LOCK_ATTEMPTS = 3
@@ -39,7 +39,7 @@ class SavedTable(_Saved):
     path_deg: tuple[float, float] | None = None
 
 
-class Fault(_Saved):
+class LatchedFault(_Saved):
     """A latched fault: what `rig.core.errors` said, and when."""
 
     code: int
@@ -50,7 +50,7 @@ class Fault(_Saved):
     utc: str
 
     @classmethod
-    def of(cls, error: RigError, utc: str) -> "Fault":
+    def of(cls, error: RigError, utc: str) -> "LatchedFault":
         """Return the fault that ``error`` tells of, as it can be kept in a file."""
         evidence = json.loads(json.dumps(error.evidence, default=str))
         return cls(
@@ -63,7 +63,7 @@ class BenchState(_Saved):
 
     version: int = VERSION
     table: SavedTable | None = None
-    fault: Fault | None = None
+    fault: LatchedFault | None = None
     damage: str = ""
 
 
@@ -86,7 +86,7 @@ class StateStore(Protocol):
 
         Raises
         ------
-        StateNotKept
+        StateNotStored
             The disk is full, or may not be written to.
         """
         ...
@@ -104,17 +104,17 @@ class StateStore(Protocol):
 
         Raises
         ------
-        StateNotKept
+        StateNotStored
             It is there and cannot be read.
         """
         ...
 
-    def keep_file(self, name: str, content: bytes) -> None:
+    def store_file(self, name: str, content: bytes) -> None:
         """Keep something beside the state; on return it outlives a power cut.
 
         Raises
         ------
-        StateNotKept
+        StateNotStored
             The disk is full, or may not be written to.
         """
         ...
@@ -147,7 +147,7 @@ class MemoryStore:
     def read_file(self, name: str) -> bytes | None:
         return self.files.get(name)
 
-    def keep_file(self, name: str, content: bytes) -> None:
+    def store_file(self, name: str, content: bytes) -> None:
         self.files[name] = content
 
     def remove_file(self, name: str) -> None:
@@ -205,18 +205,18 @@ class FileStore:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise StateNotKept(
+            raise StateNotStored(
                 f"{self.path / name} cannot be read.",
                 next_step="Give yourself the right to read it, or remove it.",
                 evidence={"reason": error.strerror or str(error)},
             ) from error
 
-    def keep_file(self, name: str, content: bytes) -> None:
+    def store_file(self, name: str, content: bytes) -> None:
         try:
             _make_folder(self.path)
             files.write(self.path / name, content)
         except OSError as error:
-            raise StateNotKept(
+            raise StateNotStored(
                 f"{name} cannot be kept in {self.path}.",
                 next_step="Make room on the disk, or set state_dir to a folder that you may write to.",
                 evidence={"reason": error.strerror or str(error)},
@@ -234,7 +234,7 @@ class BenchLock:
     ------
     BenchBusy
         Another process holds it; the evidence says which.
-    StateNotKept
+    StateNotStored
         The folder cannot be made.
     """
 
@@ -314,8 +314,8 @@ def _make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
-def _not_kept(path: Path, error: OSError) -> StateNotKept:
-    return StateNotKept(
+def _not_kept(path: Path, error: OSError) -> StateNotStored:
+    return StateNotStored(
         f"The bench's state cannot be written to {path}, so nothing may move.",
         next_step="Make room on the disk, or set state_dir to a folder that you may write to.",
         evidence={"reason": error.strerror or str(error)},

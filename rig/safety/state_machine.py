@@ -1,4 +1,4 @@
-"""The states of a bench's table, and what takes it from one to another.
+"""The states of a bench's table, and what accepts it from one to another.
 
     DISCONNECTED ──connect──▶ CONNECTED ──refer──▶ READY ──start──▶ MOVING ──arrive──▶ READY
                                   │                  ▲                 └──────stop───▶ STOPPED ──recheck──▶ CONNECTED
@@ -14,7 +14,7 @@ from enum import Enum, StrEnum, auto
 from types import MappingProxyType
 
 
-class State(StrEnum):
+class TableState(StrEnum):
     """Of a bench's table."""
 
     DISCONNECTED = "disconnected"
@@ -26,8 +26,8 @@ class State(StrEnum):
     FAULT = "fault"
 
 
-class Happening(Enum):
-    """What takes the machine from one state to another."""
+class StateEvent(Enum):
+    """What accepts the machine from one state to another."""
 
     CONNECT = auto()
     REFER = auto()
@@ -41,10 +41,10 @@ class Happening(Enum):
     LOSE = auto()
 
 
-_S, _H = State, Happening
+_S, _H = TableState, StateEvent
 _ALWAYS = {_H.LATCH: _S.FAULT, _H.LOSE: _S.DISCONNECTED}
 _JUDGED = {_H.REFER: _S.READY, _H.DOUBT: _S.UNREFERENCED}
-TRANSITIONS: Mapping[State, Mapping[Happening, State]] = MappingProxyType(
+TRANSITIONS: Mapping[TableState, Mapping[StateEvent, TableState]] = MappingProxyType(
     {
         _S.DISCONNECTED: {**_ALWAYS, _H.CONNECT: _S.CONNECTED},
         _S.CONNECTED: {**_ALWAYS, **_JUDGED},
@@ -58,20 +58,20 @@ TRANSITIONS: Mapping[State, Mapping[Happening, State]] = MappingProxyType(
 )
 
 
-class Machine:
+class StateMachine:
     """One table's state."""
 
     def __init__(self, *, faulty: bool) -> None:
-        self._state = State.FAULT if faulty else State.DISCONNECTED
+        self._state = TableState.FAULT if faulty else TableState.DISCONNECTED
 
     @property
-    def state(self) -> State:
+    def state(self) -> TableState:
         return self._state
 
-    def takes(self, happening: Happening) -> bool:
-        """Return whether ``happening`` can happen in this state."""
-        return happening in TRANSITIONS[self._state]
+    def accepts(self, event: StateEvent) -> bool:
+        """Return whether ``event`` can happen in this state."""
+        return event in TRANSITIONS[self._state]
 
-    def go(self, happening: Happening) -> None:
+    def apply(self, event: StateEvent) -> None:
         """Take note of what happened; KeyError where it cannot happen in this state."""
-        self._state = TRANSITIONS[self._state][happening]
+        self._state = TRANSITIONS[self._state][event]

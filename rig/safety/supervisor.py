@@ -17,7 +17,7 @@ from rig.core.errors import (
     FaultLatched,
     FollowingError,
     HeadRestarted,
-    HostWasSilent,
+    HeartbeatLost,
     MotionStopped,
     MotionTimeout,
     NoProgress,
@@ -27,16 +27,16 @@ from rig.core.errors import (
     RigError,
     RotationDisagreement,
     Stalled,
-    StateNotKept,
+    StateNotStored,
     SupplyOutOfRange,
     Unreferenced,
 )
 from rig.devices.servo import Servo, ServoState
-from rig.safety.angle_reference import Reference, check_saved_angle
-from rig.safety.motion_checks import unfit
-from rig.safety.saved_state import BenchState, Fault, MemoryStore, SavedTable, StateStore
-from rig.safety.state_machine import Happening, Machine
-from rig.safety.state_machine import State as State
+from rig.safety.angle_reference import AngleReference, check_saved_angle
+from rig.safety.motion_checks import find_servo_fault
+from rig.safety.saved_state import BenchState, LatchedFault, MemoryStore, SavedTable, StateStore
+from rig.safety.state_machine import StateEvent, StateMachine
+from rig.safety.state_machine import TableState as TableState
 
 LATCHING = (
     DeviceFault,
@@ -49,7 +49,7 @@ LATCHING = (
     SupplyOutOfRange,
     NoProgress,
     EmergencyStop,
-    HostWasSilent,
+    HeartbeatLost,
     HeadRestarted,
 )
 """Errors that, when they end a motion, leave a fault: something is wrong with the bench and a person must look."""
@@ -67,7 +67,7 @@ class Motion:
 
 
 class Safety:
-    """State, latched fault and reference of one bench's table.
+    """TableState, latched fault and reference of one bench's table.
 
     Parameters
     ----------
@@ -87,33 +87,33 @@ class Safety:
         self._clock = clock
         self._store: StateStore = store or MemoryStore()
         self._kept = self._store.load()
-        self._machine = Machine(faulty=self._kept.fault is not None)
+        self._machine = StateMachine(faulty=self._kept.fault is not None)
         self._doubt = ""
         self._findings: list[str] = []
-        self.reference = Reference(
+        self.angle_reference = AngleReference(
             config.table, self._kept.table.shift_deg if self._kept.table else 0.0, servo.turn_deg
         )
-        self.checks: list[Callable[[], object]] = []
+        self.acknowledge_checks: list[Callable[[], object]] = []
         """Called before a fault is acknowledged; each raises a `RigError` where its device is not well."""
-        self.watches: list[Callable[[], object]] = []
+        self.monitors: list[Callable[[], object]] = []
         """Called in every round of the control loop; each raises a `RigError` where its device has made us stop."""
-        self.restores: list[Callable[[], object]] = []
+        self.restore_actions: list[Callable[[], object]] = []
         """Called first of all when a fault is acknowledged: give back what a device has switched off."""
 
     # -- what is ------------------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> State:
+    def state(self) -> TableState:
         return self._machine.state
 
     @property
-    def fault(self) -> Fault | None:
+    def fault(self) -> LatchedFault | None:
         """The latched fault, perhaps of a program that ended long ago."""
         return self._kept.fault
 
     @property
     def doubt(self) -> str:
-        """Why the table is `State.UNREFERENCED`; empty where it is not."""
+        """Why the table is `TableState.UNREFERENCED`; empty where it is not."""
         return self._doubt
 
     @property
@@ -123,7 +123,7 @@ class Safety:
 
     # -- what happens -------------------------------------------------------------------------------------------------
 
-    def connect(self) -> State:
+    def connect(self) -> TableState:
         """Look at the servo that was opened, and judge where the table stands; nothing moves.
 
         Raises
@@ -141,7 +141,7 @@ class Safety:
             self._findings.append("the servo's watchdog was still armed: the last program died while the table moved")
         if condition.hardware_errors:
             self._findings.append(f"the servo reports: {', '.join(condition.hardware_errors)}")
-        self._go(Happening.CONNECT)
+        self._go(StateEvent.CONNECT)
         self._judge()
         return self.state
 
@@ -164,23 +164,23 @@ class Safety:
         if self._store.stop_requested():
             self._store.clear_stop()
             raise _stopped()
-        if self.state in (State.CONNECTED, State.UNREFERENCED, State.READY):
+        if self.state in (TableState.CONNECTED, TableState.UNREFERENCED, TableState.READY):
             try:
                 self._judge()
             except DeviceSilent:
-                self._go(Happening.LOSE)
-        if self.state in (State.DISCONNECTED, State.STOPPED):
+                self._go(StateEvent.LOSE)
+        if self.state in (TableState.DISCONNECTED, TableState.STOPPED):
             self._servo.verify()
-            self._go(Happening.CONNECT if self.state is State.DISCONNECTED else Happening.RECHECK)
+            self._go(StateEvent.CONNECT if self.state is TableState.DISCONNECTED else StateEvent.RECHECK)
             self._judge()
         self.require_ready()
         state = self._servo.read_state()
-        self.refuse_unfit(state)
+        self.check_servo(state)
         self._save(table=self._table(state.position_deg))
 
-    def refuse_unfit(self, state: ServoState) -> None:
+    def check_servo(self, state: ServoState) -> None:
         """Latch, and raise, what a reading at rest shows: a hardware error, heat, a supply out of range."""
-        if cause := unfit(state, self._config.safety, self._servo.limits):
+        if cause := find_servo_fault(state, self._config.safety, self._servo.limits):
             self.latch(cause)
             raise cause
 
@@ -189,13 +189,13 @@ class Safety:
 
         Also what a device that guards the bench has stopped it for meanwhile; that is latched.
         """
-        if self.state is not State.READY:
+        if self.state is not TableState.READY:
             raise self._refusal()
         self._look_around()
 
     @contextmanager
     def motion(self, ends_deg: tuple[float, ...], stop: Callable[[], bool]) -> Iterator[Motion]:
-        """Be `State.MOVING` for the length of a ``with`` block, on a way between ``ends_deg`` (of the table).
+        """Be `TableState.MOVING` for the length of a ``with`` block, on a way between ``ends_deg`` (of the table).
 
         Whatever breaks the block off calls ``stop``, which stops the table and returns whether the servo heard it; then
         it is STOPPED, DISCONNECTED, or a FAULT is latched. The way is on the disk before anything moves.
@@ -204,19 +204,19 @@ class Safety:
         ------
         NotReady
             The table may not move in this state.
-        StateNotKept
+        StateNotStored
             The way cannot be written down; nothing has moved.
         """
         self.require_ready()
         motion = Motion()
-        path = [self.reference.to_servo(angle) for angle in ends_deg]
+        path = [self.angle_reference.to_servo(angle) for angle in ends_deg]
         self._save(table=self._table(self._servo.read_state().position_deg, (min(path), max(path))))
         try:
-            self._go(Happening.START)
+            self._go(StateEvent.START)
             yield motion
             if motion.position_deg is None:
                 raise MotionStopped("The motion was broken off.", next_step="Start it anew.")
-            self._go(Happening.ARRIVE)
+            self._go(StateEvent.ARRIVE)
         except BaseException as symptom:
             error = self._guarded_cause(symptom)
             heard = False
@@ -229,14 +229,14 @@ class Safety:
             finally:
                 if isinstance(error, LATCHING):
                     self.latch(error)
-                elif self.state is State.MOVING:
-                    self._go(Happening.STOP if heard else Happening.LOSE)
+                elif self.state is TableState.MOVING:
+                    self._go(StateEvent.STOP if heard else StateEvent.LOSE)
             if error is not symptom:
                 raise error from symptom
             raise
         self._save(table=self._table(motion.position_deg))
 
-    def heed_stop(self) -> None:
+    def check_stop_request(self) -> None:
         """Raise `MotionStopped` if somebody asked for a stop, or what a device that guards the bench has stopped for.
 
         Called in every round of the control loop.
@@ -247,25 +247,25 @@ class Safety:
 
     def released(self) -> None:
         """Take note that the torque is off: where the table rests is kept, and a stop that was asked for is done."""
-        with suppress(DeviceSilent, StateNotKept):  # what was written before the motion stays true
+        with suppress(DeviceSilent, StateNotStored):  # what was written before the motion stays true
             if self._judged():
                 self._save(table=self._table(self._servo.read_state().position_deg))
         self._store.clear_stop()
 
     def latch(self, error: RigError) -> None:
         """Latch a fault: nothing moves until it is acknowledged. The first one stays until then."""
-        self._go(Happening.LATCH)
+        self._go(StateEvent.LATCH)
         if "rig acknowledge" not in error.next_step:
             error.next_step += " Then `rig acknowledge`."
         if self._kept.fault is None:
-            fault = Fault.of(error, self._clock.utc().isoformat(timespec="seconds"))
+            fault = LatchedFault.of(error, self._clock.utc().isoformat(timespec="seconds"))
             try:
                 self._save(fault=fault)
-            except StateNotKept as unkept:
+            except StateNotStored as unkept:
                 self._kept = self._kept.model_copy(update={"fault": fault})
                 error.add_note(f"The fault is latched in this program alone. {unkept.what}")
 
-    def acknowledge(self, *, reboot: bool = False) -> State:
+    def acknowledge(self, *, reboot: bool = False) -> TableState:
         """Acknowledge the latched fault after its cause is gone: servo, settings, supply and angle are verified.
 
         What cannot be seen in a table at rest (a jam, a loose platter) shows in the next motion.
@@ -277,7 +277,7 @@ class Safety:
 
         Returns
         -------
-        State
+        TableState
             READY, or UNREFERENCED where the turns are in doubt.
 
         Raises
@@ -285,9 +285,9 @@ class Safety:
         DeviceFault, Overheated, SupplyOutOfRange, DeviceMismatch, DeviceSilent
             The cause is still there; the fault stays.
         """
-        for restore in self.restores:
+        for restore in self.restore_actions:
             restore()
-        if self.state in (State.DISCONNECTED, State.STOPPED):
+        if self.state in (TableState.DISCONNECTED, TableState.STOPPED):
             self.prepare()
         if reboot:
             if self._judged():
@@ -295,17 +295,17 @@ class Safety:
             self._servo.reboot()
         else:
             self._servo.verify()
-        if cause := unfit(self._servo.read_state(), self._config.safety, self._servo.limits, again=True):
+        if cause := find_servo_fault(self._servo.read_state(), self._config.safety, self._servo.limits, again=True):
             raise cause
-        for check in self.checks:
+        for check in self.acknowledge_checks:
             check()
-        if self.state is State.FAULT:
+        if self.state is TableState.FAULT:
             self._save(fault=None)
-            self._go(Happening.ACKNOWLEDGE)
+            self._go(StateEvent.ACKNOWLEDGE)
         self._judge()
         return self.state
 
-    def declare(self, table_deg: float) -> None:
+    def set_angle(self, table_deg: float) -> None:
         """Take it from a person who has looked at the cable that the table now stands at ``table_deg``.
 
         Raises
@@ -313,15 +313,15 @@ class Safety:
         NotReady
             The servo is not connected, or a fault is latched.
         """
-        if not self._machine.takes(Happening.REFER):
+        if not self._machine.accepts(StateEvent.REFER):
             raise self._refusal()
         position_deg = self._servo.read_state().position_deg
-        self.reference.declare(position_deg, table_deg)
+        self.angle_reference.declare(position_deg, table_deg)
         self._save(table=self._table(position_deg))
         self._doubt = ""
-        self._go(Happening.REFER)
+        self._go(StateEvent.REFER)
 
-    def declare_turns(self, turns: int) -> None:
+    def set_revolutions(self, turns: int) -> None:
         """Take it from a person that the cable is wound up by ``turns`` whole turns; the zero stays where it was.
 
         Raises
@@ -334,24 +334,24 @@ class Safety:
                 "With a gear, the servo alone does not tell where within its turn the table stands.",
                 next_step="Turn the table by hand to its zero, the cable hanging free, then give `rig home --here`.",
             )
-        self.declare(self.reference.with_turns(self._servo.read_state().position_deg, turns))
+        self.set_angle(self.angle_reference.with_turns(self._servo.read_state().position_deg, turns))
 
     # -- inside -------------------------------------------------------------------------------------------------------
 
     def _look_around(self) -> None:
         """Ask the devices that guard the bench; what they have stopped it for is latched."""
-        for watch in self.watches:
+        for watch in self.monitors:
             try:
                 watch()
             except LATCHING as fault:
-                if self.state is not State.MOVING:  # a motion latches what breaks it off
+                if self.state is not TableState.MOVING:  # a motion latches what breaks it off
                     self.latch(fault)
                 raise
 
     def _guarded_cause(self, symptom: BaseException) -> BaseException:
         """Return why a device that guards the bench has stopped it, if it has: the servo then merely falls silent."""
         if isinstance(symptom, RigError) and not isinstance(symptom, LATCHING):
-            for watch in self.watches:
+            for watch in self.monitors:
                 try:
                     watch()
                 except LATCHING as cause:
@@ -360,10 +360,10 @@ class Safety:
                     continue  # it has nothing to tell: the symptom stands
         return symptom
 
-    def _go(self, happening: Happening) -> None:
-        if not self._machine.takes(happening):
+    def _go(self, event: StateEvent) -> None:
+        if not self._machine.accepts(event):
             raise self._refusal()
-        self._machine.go(happening)
+        self._machine.apply(event)
 
     def _judged(self) -> bool:
         """Compare what the servo says with what was written down; return whether the turns are beyond doubt."""
@@ -371,7 +371,7 @@ class Safety:
         check = check_saved_angle(
             self._kept.table, self._servo.identity, state.position_deg, condition, self._servo.turn_deg
         )
-        self.reference.shift_deg = check.shift_deg
+        self.angle_reference.shift_deg = check.shift_deg
         self._findings += [finding for finding in check.findings if finding not in self._findings]
         self._doubt = check.doubt
         return not check.doubt
@@ -379,8 +379,8 @@ class Safety:
     def _judge(self) -> None:
         """Go where the comparison leads; a fault stays."""
         certain = self._judged()
-        if self.state is not State.FAULT:
-            self._go(Happening.REFER if certain else Happening.DOUBT)
+        if self.state is not TableState.FAULT:
+            self._go(StateEvent.REFER if certain else StateEvent.DOUBT)
 
     def _refusal(self) -> NotReady:
         """Return why nothing may move, and what to do."""
@@ -392,13 +392,13 @@ class Safety:
                 evidence={"code": fault.code, **fault.evidence},
             )
         match self.state:
-            case State.UNREFERENCED:
+            case TableState.UNREFERENCED:
                 return Unreferenced(
                     f"How far the table's cable is wound up is in doubt: {self._doubt}.",
                     next_step="Look at the cable, then say how many whole turns it is wound up: `rig home --turns 0` "
                     "if it hangs free. Or turn the table by hand to where zero shall be: `rig home --here`.",
                 )
-            case State.STOPPED:
+            case TableState.STOPPED:
                 return NotReady(
                     "The last motion was broken off: where the table rests is in doubt.",
                     next_step="Find the cause, then leave the with block and enter it anew.",
@@ -415,11 +415,11 @@ class Safety:
             bus_id=identity.bus_id,
             firmware=identity.firmware,
             position_deg=position_deg,
-            shift_deg=self.reference.shift_deg,
+            shift_deg=self.angle_reference.shift_deg,
             path_deg=path_deg,
         )
 
-    def _save(self, **values: SavedTable | Fault | None) -> None:
+    def _save(self, **values: SavedTable | LatchedFault | None) -> None:
         kept: BenchState = self._kept.model_copy(update={**values, "damage": ""})
         if kept != self._kept:
             self._store.save(kept)

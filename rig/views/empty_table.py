@@ -13,7 +13,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationErro
 
 from hbr.segmentation import TRUSTED
 from rig.bench import Bench
-from rig.core.errors import StateNotKept
+from rig.core.errors import StateNotStored
 from rig.devices.camera import CameraIdentity, CameraLocks
 from rig.views import image_files as images
 
@@ -118,14 +118,14 @@ class EmptyTables:
 
         Raises
         ------
-        StateNotKept
+        StateNotStored
             The disk is full, or may not be written to.
         """
         png = images.encode(table.image_bgr)
         kept = _Kept.of(table, png)
         before = _facts(bench, quiet=True)
-        bench.state.keep_file(kept.image, png)
-        bench.state.keep_file(_FACTS, kept.model_dump_json(indent=1).encode())
+        bench.state.store_file(kept.image, png)
+        bench.state.store_file(_FACTS, kept.model_dump_json(indent=1).encode())
         if before is not None and before.image != kept.image:
             bench.state.remove_file(before.image)
 
@@ -134,8 +134,8 @@ class EmptyTables:
         """Remember what was seen that speaks against the bench's picture, so that the next program asks for another."""
         before = _facts(bench, quiet=True)
         if before is not None:
-            with suppress(StateNotKept):  # it was told; a full disk will be told by what needs it more
-                bench.state.keep_file(
+            with suppress(StateNotStored):  # it was told; a full disk will be told by what needs it more
+                bench.state.store_file(
                     _FACTS, before.model_copy(update={"doubt": why}).model_dump_json(indent=1).encode()
                 )
 
@@ -202,7 +202,7 @@ def _facts(bench: Bench, *, quiet: bool = False) -> _Kept | None:
     try:
         text = bench.state.read_file(_FACTS)
         kept = None if text is None else _Kept.model_validate_json(text)
-    except StateNotKept as error:
+    except StateNotStored as error:
         why = error.what
     except ValidationError as error:
         why = f"{_FACTS} is damaged ({error.errors(include_url=False)[0]['msg']})"
@@ -221,7 +221,7 @@ def _read(bench: Bench) -> EmptyTable | None:
         return None
     try:
         png = bench.state.read_file(kept.image)
-    except StateNotKept as error:
+    except StateNotStored as error:
         raise _Damaged(error.what) from error
     if png is None:
         raise _Damaged(f"{kept.image} is missing")

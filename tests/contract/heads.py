@@ -8,7 +8,7 @@ import pytest
 import serial
 
 from rig.core.clock import Clock, SystemClock
-from rig.devices.dynamixel.port import Wire
+from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
 from rig.devices.head.sensors import HeadSensor, head_sensor
@@ -71,7 +71,7 @@ def opened_head(
     noise: NoiseModel | None = None,
     *,
     sensor: Callable[[], HeadSensor] = mpu6050,
-    reopen: Callable[[SimHead], Wire] | None = None,
+    reopen: Callable[[SimHead], SerialConnection] | None = None,
     clock_error: float = CLOCK_ERROR,
     **options: float,
 ) -> Iterator[Head]:

@@ -75,7 +75,7 @@ def _mended(rig: Rig, scenario: Scenario) -> None:
         with pytest.raises(Unreferenced if scenario.step is Step.HOME else FaultLatched):
             Turntable(bench).__enter__()
         if scenario.step is Step.HOME:
-            bench.safety.declare_turns(0)
+            bench.safety.set_revolutions(0)
         else:
             bench.safety.acknowledge(reboot=scenario.step is Step.REBOOT)
 

@@ -60,7 +60,7 @@ def open_servo(wires: Wires, **options: Any) -> DynamixelServo:
 def motion_bench(*settings: str, noise: NoiseModel | None = None, seed: int = 0) -> Iterator[tuple[Bench, Wires]]:
     """Yield a bench of servo and IMU, whose cable hangs free, and its wires."""
     with sensor(servo_wires(noise, seed)) as (wires, i2c), program(wires, i2c, MemoryStore(), *settings) as bench:
-        bench.safety.declare_turns(0)
+        bench.safety.set_revolutions(0)
         yield bench, wires
 
 

@@ -17,7 +17,7 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 from pydantic import ValidationError
 
 from rig.catalog.exchange.package import ImageSource, Object, Package
-from rig.core.errors import ExportFailed, ImportRefused, RigError
+from rig.core.errors import ExportFailed, ImportRejected, RigError
 from rig.core.files import sync_file, sync_folder
 from rig.views import image_files as images
 
@@ -120,7 +120,7 @@ def open_bundle(path: Path) -> Package:
 
     Raises
     ------
-    ImportRefused
+    ImportRejected
         It is no bundle, is damaged, of a newer version, or says something that cannot be; nothing was unpacked.
     """
     try:
@@ -137,9 +137,9 @@ def open_bundle(path: Path) -> Package:
     )
 
 
-def refuse(path: Path, why: str) -> ImportRefused:
+def refuse(path: Path, why: str) -> ImportRejected:
     """Return the error that a bundle is not taken."""
-    return ImportRefused(
+    return ImportRejected(
         f"{path} is not taken: {why}",
         next_step="export the bundle anew where it comes from; do not unpack it by hand if you do not know its origin",
     )
@@ -210,7 +210,7 @@ def _objects(path: Path, archive: ZipFile, members: dict[str, ZipInfo]) -> tuple
         raise refuse(path, f"{MANIFEST} is not that of a bundle")
     version = manifest.get("version")
     if not isinstance(version, int) or version > VERSION:
-        raise ImportRefused(
+        raise ImportRejected(
             f"{path} was written by a newer program: its format has version {version}, this program knows {VERSION}",
             next_step="update hbr-rig on this computer",
         )

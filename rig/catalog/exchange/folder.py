@@ -23,7 +23,7 @@ from rig.catalog.exchange.package import (
     region_words,
 )
 from rig.catalog.records import EnrollmentStatus, this_software
-from rig.core.errors import ExportFailed, ImportRefused, UsageError
+from rig.core.errors import ExportFailed, ImportRejected, UsageError
 
 DEFAULT_PATTERN: Final = "{object}__{angle}"
 NAMES: Final = "objects.csv"
@@ -56,12 +56,12 @@ def read_folder(folder: Path, *, pattern: str = DEFAULT_PATTERN, table_angles: b
     ------
     UsageError
         The pattern does not name object and angle.
-    ImportRefused
+    ImportRejected
         There is no such folder, or no photograph in it.
     """
     named = _regex(pattern)
     if not folder.is_dir():
-        raise ImportRefused(f"there is no folder {folder}", next_step="check the path")
+        raise ImportRejected(f"there is no folder {folder}", next_step="check the path")
     real = folder.resolve()
     inside: dict[Path, bool] = {}
     names = _names(folder / NAMES)
@@ -83,7 +83,7 @@ def read_folder(folder: Path, *, pattern: str = DEFAULT_PATTERN, table_angles: b
             told = names.get(found["object"], {"name": found["object"]})
             photographs.append((found["object"], Photograph(path=path, azimuth_deg=azimuth_deg, values={}, **told)))
     if not photographs:
-        raise ImportRefused(
+        raise ImportRejected(
             f"no photograph in {folder} is named like {pattern}.png",
             next_step="say how they are named, e.g. --pattern '{object}/{angle}'",
             evidence={"refused": [f"{file.path} {file.reason}" for file in refused[:5]]},
@@ -160,7 +160,7 @@ def _names(path: Path) -> dict[str, dict[str, Any]]:
                 if row.get("object") and row.get("name")
             }
     except (OSError, ValueError, csv.Error) as error:
-        raise ImportRefused(
+        raise ImportRejected(
             f"{path} cannot be read: {error}",
             next_step="mend or remove it; without it objects are called as their files are",
         ) from error

@@ -12,9 +12,9 @@ from rig.catalog.exchange.plan import Plan
 from rig.catalog.exchange.stage import Staged, items_of, stage
 from rig.catalog.jobs import Progressed, portions, processes
 from rig.catalog.staging import staging
-from rig.core.errors import ImportRefused
+from rig.core.errors import ImportRejected
 from rig.core.files import sync_tree
-from rig.core.processes import over_processes
+from rig.core.processes import map_in_processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def bring_in(
     ------
     UsageError
         There is no such descriptor.
-    ImportRefused
+    ImportRejected
         Nothing is left to import, or an image was refused and all are wanted.
     ObjectExists
         Another process brought one of the objects in meanwhile.
@@ -78,7 +78,7 @@ def bring_in(
         staged: dict[str, Staged] = {}
         yield Progressed(0, len(items))
         work = partial(stage, folder)
-        for portion, found in over_processes(work, portions(items), processes(jobs, len(items))):
+        for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
             for item, one in zip(portion, found, strict=True):
                 staged[item.image] = one
                 if one.reason:
@@ -109,7 +109,7 @@ def preview_import(
 
     Raises
     ------
-    ImportRefused
+    ImportRejected
         An image was refused and all are wanted.
     """
     package = plan.package
@@ -117,7 +117,7 @@ def preview_import(
     items = list(items_of(plan))
     size = done = 0
     yield Progressed(0, len(items))
-    for portion, found in over_processes(partial(stage, None), portions(items), processes(jobs, len(items))):
+    for portion, found in map_in_processes(partial(stage, None), portions(items), processes(jobs, len(items))):
         for item, one in zip(portion, found, strict=True):
             size += one.size
             if one.reason:
@@ -136,8 +136,8 @@ def preview_import(
     )
 
 
-def _not_whole(package: Package, refused: list[Refused]) -> ImportRefused:
-    return ImportRefused(
+def _not_whole(package: Package, refused: list[Refused]) -> ImportRejected:
+    return ImportRejected(
         f"{package.origin} is not taken: {len(refused)} of its files cannot be used; nothing was imported",
         next_step="mend or remove the files listed and import it again",
         evidence={"refused": [f"{file.path}: {file.reason}" for file in refused[:20]]},

@@ -25,7 +25,7 @@ from rig.catalog.exchange.package import (
 )
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.catalog.schema import DESCRIPTOR
-from rig.core.errors import ExportFailed, ImportRefused
+from rig.core.errors import ExportFailed, ImportRejected
 
 TABLE: Final = "views.csv"
 _NUMBERS: Final = ("commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
@@ -45,18 +45,18 @@ def read_table(path: Path, *, now: datetime) -> Package:
 
     Raises
     ------
-    ImportRefused
+    ImportRejected
         It is no such file; a row that cannot be used is refused by itself.
     """
     folder = path.parent.resolve()
     photographs, refused = [], []
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise ImportRefused(f"{path} is absurdly large", next_step="split it")
+            raise ImportRejected(f"{path} is absurdly large", next_step="split it")
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, strict=True)
             if lacking := [name for name in _NEEDED if name not in (rows.fieldnames or ())]:
-                raise ImportRefused(
+                raise ImportRejected(
                     f"{path} has no column {' nor '.join(lacking)}",
                     next_step=f"name the columns in the first line: {', '.join(_NEEDED)}",
                     evidence={"columns": list(rows.fieldnames or ())},
@@ -67,9 +67,9 @@ def read_table(path: Path, *, now: datetime) -> Package:
                 except ValueError as error:
                     refused.append(Refused(f"{path.name}, line {rows.line_num}", str(error)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ImportRefused(f"{path} cannot be read: {error}", next_step="save it as CSV in UTF-8") from error
+        raise ImportRejected(f"{path} cannot be read: {error}", next_step="save it as CSV in UTF-8") from error
     if not photographs:
-        raise ImportRefused(
+        raise ImportRejected(
             f"{path} has no row that can be used",
             next_step="mend the rows listed" if refused else "add a row a view",
             evidence={"refused": [f"{file.path}: {file.reason}" for file in refused[:5]]},

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rig.config import RigConfig
     from rig.config.values import Values
-    from rig.config.wording import KeyResults
+    from rig.config.wording import KeyInfo
 
 app = typer.Typer(help="Look at the configuration, judge it, and change it.", no_args_is_help=True)
 
@@ -28,10 +28,10 @@ def check(settings: Settings) -> None:
 
     Example: rig config check --config rig.toml
     """
-    from rig.config.wording import key_facts
+    from rig.config.wording import key_info
 
     values, config, _ = _checked(settings)
-    given = sum(values.origin(facts.key) != "default" for facts in key_facts(type(config)))
+    given = sum(values.origin(facts.key) != "default" for facts in key_info(type(config)))
     where = str(values.path) if values.path else "No file: every key has its default"
     if settings.json:
         settings.print_json({"path": values.path, "valid": True, "keys_given": given})
@@ -169,15 +169,15 @@ def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseMode
     return values, *check_config(values)
 
 
-def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyResults, Any]]":
+def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyInfo, Any]]":
     """Yield the facts and the value in force of every key, those of the benches that have options last."""
-    from rig.config.wording import key_facts
+    from rig.config.wording import key_info
 
-    for facts in key_facts(type(config)):
+    for facts in key_info(type(config)):
         if facts.key != ("bench",):
             yield facts, _value(config, facts.key)
     for name, model in options.items():
-        for facts in key_facts(type(model), ("bench", name)):
+        for facts in key_info(type(model), ("bench", name)):
             yield facts, _value(model, facts.key[2:])
 
 

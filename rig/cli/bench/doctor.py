@@ -30,7 +30,7 @@ def doctor(
 
     if udev:
         with case_of(settings) as case:
-            print(udev_rules(case.host.serial_ports()), end="")
+            print(udev_rules(case.computer.serial_ports()), end="")
         return
     code = examination(settings)
     if code:

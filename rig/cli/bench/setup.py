@@ -14,7 +14,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
-    from rig.bench.computer import Node
+    from rig.bench.computer import DeviceFile
     from rig.config.toml_file import Key
     from rig.doctor.case import Case
     from rig.doctor.survey import Survey
@@ -96,11 +96,11 @@ class Dialogue:
         while not survey.servos and not survey.doubtful and self._again("No servo was found."):
             survey = Survey()
             self._survey(survey)
-        host = self.case.host
+        computer = self.case.computer
         servo = self._pick("servo", survey.servos, [f"{p.path}: {s}" for p, s in survey.servos], lambda pair: pair[0])
         if servo is not None:
             self.wanted |= servo_settings(*servo)
-            if host.same_file(servo[0].path, self.case.config.servo.port) and self._configured("servo", "port"):
+            if computer.same_file(servo[0].path, self.case.config.servo.port) and self._configured("servo", "port"):
                 self.wanted[("servo", "port")] = self.case.config.servo.port  # a name that a person chose
             self._permanent_settings()
         elif not survey.servos:
@@ -135,7 +135,7 @@ class Dialogue:
         return prompts.ask_yes_no(f"{what} Look again, after you have checked cables and supply?", default=False)
 
     def _pick(
-        self, what: str, found: Sequence[T], shown: Sequence[str], node: "Callable[[T], Node] | None" = None
+        self, what: str, found: Sequence[T], shown: Sequence[str], node: "Callable[[T], DeviceFile] | None" = None
     ) -> T | None:
         """Return the one that there is, or the one that the person means; None where there is none or no saying."""
         if len(found) <= 1:
@@ -152,10 +152,10 @@ class Dialogue:
         )
         if index is not None:
             return found[index]
-        pulled = self._pulled(what, lambda: [*self.case.host.serial_ports(), *self.case.host.cameras()])
+        pulled = self._pulled(what, lambda: [*self.case.computer.serial_ports(), *self.case.computer.cameras()])
         return next((each for each, its in zip(found, nodes, strict=True) if pulled and its.path == pulled.path), None)
 
-    def _pulled(self, what: str, there: "Callable[[], Sequence[Node]]") -> "Node | None":
+    def _pulled(self, what: str, there: "Callable[[], Sequence[DeviceFile]]") -> "DeviceFile | None":
         """Find out which device file belongs to a device by having it unplugged and plugged in again."""
         before = there()
         while True:
@@ -172,16 +172,16 @@ class Dialogue:
 
     def _which_port(self) -> None:
         """Without a servo that answers: at least its adapter may be known."""
-        ports = [port for port in self.case.host.serial_ports() if port.usb]
-        port: Node | None = ports[0] if len(ports) == 1 else None
+        ports = [port for port in self.case.computer.serial_ports() if port.usb]
+        port: DeviceFile | None = ports[0] if len(ports) == 1 else None
         if len(ports) > 1 and not self.ask_nothing:
             index = prompts.ask_choice(
                 "Which is the servo's adapter?",
                 [f"{each.path}: {each.name}" for each in ports],
                 other="find out by unplugging it",
             )
-            port = ports[index] if index is not None else self._pulled("adapter", self.case.host.serial_ports)
-        if port is not None and not self.case.host.same_file(port.path, self.case.config.servo.port):
+            port = ports[index] if index is not None else self._pulled("adapter", self.case.computer.serial_ports)
+        if port is not None and not self.case.computer.same_file(port.path, self.case.config.servo.port):
             self.wanted[("servo", "port")] = port.stable or port.path
 
     def _permanent_settings(self) -> None:

@@ -50,11 +50,11 @@ def home(
         raise UsageError("--here and --turns exclude each other.", next_step="Give one of them.")
     with settings.open_bench() as bench:
         if here:
-            bench.safety.declare(0.0)
+            bench.safety.set_angle(0.0)
             settings.say("Zero is where the table stands now.", {"table_deg": 0.0})
             return
         if turns is not None:
-            bench.safety.declare_turns(turns)
+            bench.safety.set_revolutions(turns)
         with Turntable(bench) as table:
             _turn(settings, table, 0.0)
 
@@ -89,7 +89,7 @@ def status(settings: Settings) -> None:
     with settings.open_bench(tell=False) as bench:
         state, safety = bench.servo.read_state(), bench.safety
         config = bench.config.table
-        table_deg = None if safety.doubt else safety.reference.to_table(state.position_deg)
+        table_deg = None if safety.doubt else safety.angle_reference.to_table(state.position_deg)
         report = {
             "bench": bench.name,
             "state": str(safety.state),
@@ -97,7 +97,7 @@ def status(settings: Settings) -> None:
             "doubt": safety.doubt or None,
             "table_deg": table_deg,
             "limits_deg": list(config.limits_deg),
-            "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.line)},
+            "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.bus_statistics)},
             "imu": {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()},
             **({"head": bench.head.report()} if bench.head else {}),
             "camera": {**plain(bench.camera.identity), "locks": plain(bench.camera.read_locks())},

@@ -120,7 +120,7 @@ def take_in(
 def _package(source: Path, pattern: str | None, table_angles: bool) -> "Package":
     from rig.catalog.exchange import DEFAULT_PATTERN, open_bundle, read_folder, read_table
     from rig.core.clock import SystemClock
-    from rig.core.errors import ImportRefused, UsageError
+    from rig.core.errors import ImportRejected, UsageError
 
     now = SystemClock().utc()
     if source.is_dir():
@@ -130,12 +130,12 @@ def _package(source: Path, pattern: str | None, table_angles: bool) -> "Package"
     if pattern is not None or table_angles:
         raise UsageError(f"{source} is no folder", next_step="--pattern and --table-angles are for folders")
     if not source.exists():
-        raise ImportRefused(f"there is no {source}", next_step="check the path")
+        raise ImportRejected(f"there is no {source}", next_step="check the path")
     if source.suffix.lower() == ".zip":
         return open_bundle(source)
     if source.suffix.lower() == ".csv":
         return read_table(source, now=now)
-    raise ImportRefused(
+    raise ImportRejected(
         f"{source} is neither a folder, a .zip nor a .csv", next_step="give one of those: rig import --help"
     )
 

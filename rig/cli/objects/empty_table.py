@@ -76,7 +76,7 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
     ``then`` is what stands on the table afterwards. Otherwise work goes on with the picture that there is, or without,
     and that is said.
     """
-    from rig.bench import ObjectStandsThere, TableClearer
+    from rig.bench import ObjectAlreadyPlaced, TableClearer
     from rig.core.errors import TableNotEmpty, ViewRejected
     from rig.events.wording import sentence
     from rig.views.empty_table import COMMAND, EmptyTables
@@ -92,7 +92,7 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
                 print(f"Note: {error.what} {error.next_step}", file=sys.stderr)
         return
     consequence = WITHOUT if standing.table is None else STALE
-    person = isinstance(bench.operator, ObjectStandsThere)
+    person = isinstance(bench.operator, ObjectAlreadyPlaced)
     if person and ask and not settings.json and is_interactive():
         if _asked(settings, bench, f"{sentence(standing.words)} Take everything off the table.", consequence) and then:
             _enter(f"Now put {then} on the table and take your hands away.\n  Enter goes on: ")

@@ -82,7 +82,7 @@ def enroll(
         return [f"The views taken so far are kept. {rerun}", f"  {shlex.join(words)}"]
 
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
-        from rig.bench import ObjectStandsThere
+        from rig.bench import ObjectAlreadyPlaced
         from rig.cli.catalog.catalog import tell_other_regions
         from rig.cli.objects.empty_table import ensure_empty_table_image
         from rig.cli.ui.operator_prompts import OperatorPrompts
@@ -98,7 +98,7 @@ def enroll(
             )
             job.run(events, lambda: again("Go on with:"), report)
         else:
-            person = isinstance(bench.operator, ObjectStandsThere)
+            person = isinstance(bench.operator, ObjectAlreadyPlaced)
             operator = OperatorPrompts(job.quiet) if person else AutomaticOperator()
             job.run(
                 enroll_tray(bench, catalog, items, views=views, operator=operator),

@@ -169,8 +169,8 @@ class _Keeper:
 
 def _bring_by_camera(bench: "Bench") -> None:
     """Have a bench without hands see by its camera when the next object stands there."""
-    from rig.bench import ObjectStandsThere
+    from rig.bench import ObjectAlreadyPlaced
     from rig.views.object_presence import TableWatcher
 
-    if isinstance(bench.operator, ObjectStandsThere):
+    if isinstance(bench.operator, ObjectAlreadyPlaced):
         bench.operator = TableWatcher(bench)

@@ -68,7 +68,7 @@ class Settings:
 
         bench = open_bench(self.bench_name, self.load(), seed=self.seed)
         # Before anything moves.
-        for finding in (*bench.safety.findings, *(bench.out_of_force if tell else ())):
+        for finding in (*bench.safety.findings, *(bench.calibration_findings if tell else ())):
             print(f"Note: {finding}.", file=sys.stderr)
         return bench
 

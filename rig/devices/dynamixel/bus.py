@@ -9,7 +9,7 @@ import serial
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
 from rig.core.clock import seconds_between
-from rig.core.errors import DeviceRefused, DeviceSilent, UsageError
+from rig.core.errors import DeviceSilent, RequestRejected, UsageError
 from rig.devices.dynamixel.packets import (
     BROADCAST_ID,
     PING,
@@ -22,7 +22,7 @@ from rig.devices.dynamixel.packets import (
     Packets2,
     Reply,
 )
-from rig.devices.dynamixel.port import ClockedPort, LineBabble
+from rig.devices.dynamixel.port import BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import Register
 
 OWED_S = 2.0
@@ -184,7 +184,7 @@ class DynamixelBus:
                     self.port.lost = True
                     step = "Check the adapter's USB plug, then start again."
                     raise self._silent(what, device_ids, f"the port failed: {unplugged}", step) from unplugged
-                except (LineBabble, IndexError):
+                except (BusBabble, IndexError):
                     # Of some noise the SDK makes a packet that is shorter than the bytes it then looks at.
                     replies, result = {}, COMM_RX_CORRUPT
                 finally:
@@ -271,9 +271,9 @@ class DynamixelBus:
             evidence={"reason": reason, "attempts": self._retries + 1, "baud": self.port.baudrate},
         )
 
-    def _refused(self, what: str, reply: Reply) -> DeviceRefused:
+    def _refused(self, what: str, reply: Reply) -> RequestRejected:
         reason = self._packets.refusals.get(reply.error, f"error {reply.error}")
-        return DeviceRefused(
+        return RequestRejected(
             f"Servo {reply.bus_id} refused the {what}: {reason}.",
             next_step="Run `rig status` to see the servo's state; a tripped watchdog or hardware error forbids motion.",
             evidence={"status_error": reply.error, "alert": bool(reply.alert)},

@@ -6,7 +6,7 @@ from rig.config import ServoConfig
 from rig.core.clock import Clock
 from rig.devices.dynamixel.ax12 import Ax12Servo
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.port import ClockedPort, Wire
+from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import protocol_of
 from rig.devices.dynamixel.servo import DynamixelServo
@@ -14,11 +14,11 @@ from rig.devices.dynamixel.settings import ServoMode
 
 
 def open_servo(
-    wire: Wire,
+    wire: SerialConnection,
     config: ServoConfig,
     clock: Clock,
     mode: str = "turntable",
-    reopen: Callable[[], Wire] | None = None,
+    reopen: Callable[[], SerialConnection] | None = None,
 ) -> RegisterServo:
     """Find the configured servo on ``wire``, to be used as ``mode`` (`table.mode`) says; writes nothing.
 

@@ -19,7 +19,7 @@ BABBLE_GRACE_MS = 50.0
 """How far past its timeout a packet may drag on while bytes keep coming; the SDK itself would go on for ever."""
 
 
-class Wire(Protocol):
+class SerialConnection(Protocol):
     """The part of `serial.Serial` that the port uses."""
 
     baudrate: int
@@ -32,11 +32,11 @@ class Wire(Protocol):
     def close(self) -> None: ...
 
 
-class LineBabble(Exception):
+class BusBabble(Exception):
     """Bytes keep coming, but no packet: another master, a wrong baud rate, an open line."""
 
 
-def open_serial(path: str, baud: int, device: str = "servo") -> Wire:
+def open_serial(path: str, baud: int, device: str = "servo") -> SerialConnection:
     """Open the serial port of a ``device`` (the section of the configuration) for this process alone.
 
     Raises
@@ -45,7 +45,7 @@ def open_serial(path: str, baud: int, device: str = "servo") -> Wire:
         With the likely reason: no such port, no permission, another program holds it.
     """
     try:
-        wire: Wire = serial.Serial(path, baud, timeout=READ_SLICE_S, write_timeout=1.0, exclusive=True)
+        wire: SerialConnection = serial.Serial(path, baud, timeout=READ_SLICE_S, write_timeout=1.0, exclusive=True)
     except (serial.SerialException, OSError, ValueError) as error:
         reason = getattr(error, "errno", None)
         if reason == errno.EACCES:
@@ -67,7 +67,9 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
     ``lost`` (its adapter was unplugged) is opened anew by `reconnect`, where ``reopen`` says how.
     """
 
-    def __init__(self, wire: Wire, clock: Clock, name: str = "", reopen: Callable[[], Wire] | None = None) -> None:
+    def __init__(
+        self, wire: SerialConnection, clock: Clock, name: str = "", reopen: Callable[[], SerialConnection] | None = None
+    ) -> None:
         super().__init__(name)
         self.ser = wire
         self.baudrate = wire.baudrate
@@ -125,7 +127,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
             return b""
         data: bytes = self.ser.read(length)
         if data and self.getTimeSinceStart() > self.packet_timeout + BABBLE_GRACE_MS:
-            raise LineBabble
+            raise BusBabble
         return data
 
     def drain(self, quiet_s: float = 0.005, limit_s: float = 0.25) -> None:

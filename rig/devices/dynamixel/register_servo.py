@@ -118,7 +118,7 @@ class RegisterServo(ABC):
         return self._bus
 
     @property
-    def line(self) -> dict[str, int]:
+    def bus_statistics(self) -> dict[str, int]:
         return self._bus.statistics.as_dict()
 
     @property

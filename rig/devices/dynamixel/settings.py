@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from rig.core.errors import DeviceRefused
+from rig.core.errors import RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.registers import ControlTable
 
@@ -115,7 +115,7 @@ def write(bus: DynamixelBus, bus_id: int, table: ControlTable, differences: Sequ
 
     Raises
     ------
-    DeviceRefused
+    RequestRejected
         The servo did not let go of its torque, refused a value, or did not keep it.
     DeviceSilent
         It stopped answering; what was written so far stays, and a new `compare` tells the rest.
@@ -133,7 +133,7 @@ def write(bus: DynamixelBus, bus_id: int, table: ControlTable, differences: Sequ
 
 def _expect(bus: DynamixelBus, bus_id: int, table: ControlTable, name: str, value: int) -> None:
     if (now := bus.read(bus_id, table[name])) != value:
-        raise DeviceRefused(
+        raise RequestRejected(
             f"Servo {bus_id} did not keep {name} = {value}.",
             next_step="Power-cycle the servo and try again; if it persists, its EEPROM may be worn.",
             evidence={"register": name, "wrote": value, "read_back": now},

@@ -21,16 +21,16 @@ from rig.core.errors import (
     DeviceFault,
     DeviceMismatch,
     DeviceNotFound,
-    DeviceRefused,
     DeviceSilent,
     DeviceUnplugged,
     EmergencyStop,
     FirmwareMismatch,
     HeadRestarted,
-    HostWasSilent,
+    HeartbeatLost,
+    RequestRejected,
     RigError,
 )
-from rig.devices.dynamixel.port import Wire
+from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.link import HeadLink
 from rig.devices.head.protocol import (
     BAUD,
@@ -40,26 +40,26 @@ from rig.devices.head.protocol import (
     PROTOCOL_VERSION,
     SERIAL_UNSET,
     Acknowledge,
-    Beat,
     Board,
-    Changed,
-    Count,
     Counters,
     Done,
-    Fault,
+    HeadFault,
+    HeadState,
+    Heartbeat,
+    HeartbeatReply,
     Hello,
     Identity,
     ImuStatus,
     Input,
     Light,
-    Pulse,
-    Refusal,
+    ReadCounters,
+    Rejection,
     Relay,
     Reset,
-    Rest,
     Sample,
     SampleFlag,
-    State,
+    Shutdown,
+    StatusChanged,
     Stream,
     Trigger,
     Triggered,
@@ -101,8 +101,8 @@ class HeadIdentity(ImuIdentity):
 class HeadStatus:
     """What the head last told of itself."""
 
-    state: State
-    faults: Fault
+    state: HeadState
+    faults: HeadFault
     estop_open: bool
     relay_closed: bool
     imu_status: ImuStatus
@@ -156,13 +156,13 @@ class RigHead:
 
     def __init__(
         self,
-        wire: Wire,
+        wire: SerialConnection,
         clock: Clock,
         sensor: HeadSensor,
         *,
         deadman_s: float = 0.25,
         name: str = "head",
-        reopen: Callable[[], Wire] | None = None,
+        reopen: Callable[[], SerialConnection] | None = None,
     ) -> None:
         self._deadman_ms = round(1000 * deadman_s)
         if not DEADMAN_MIN_MS <= self._deadman_ms <= DEADMAN_MAX_MS:
@@ -180,12 +180,12 @@ class RigHead:
         self._sample_us: int | None = None
         self._newest: Sample | None = None
         self._newest_ns = self._troubled_ns = self._beaten_ns = clock.now_ns()
-        self._status = HeadStatus(State.IDLE, Fault(0), False, False, ImuStatus.OFF, 0)
+        self._status = HeadStatus(HeadState.IDLE, HeadFault(0), False, False, ImuStatus.OFF, 0)
         self._restarted: Reset | None = None
         self._set_up = self._down = self._closed = False
         self.statistics = HeadStatistics()
         self._link = HeadLink(wire, clock, self._on_event, name)
-        self._timing = HeadClock(2 * self._link.frame_ns(Pulse.LAYOUT.size))
+        self._timing = HeadClock(2 * self._link.frame_ns(HeartbeatReply.LAYOUT.size))
         self._cancel: Callable[[], None] = lambda: None
         try:
             self._who = self._greet()
@@ -253,7 +253,7 @@ class RigHead:
         with self._lock:
             if not self._down:
                 with suppress(RigError):  # the head finds out by itself that nobody beats any more
-                    self._link.request(Rest(), Done)
+                    self._link.request(Shutdown(), Done)
             with suppress(OSError):
                 self._link.close()
 
@@ -268,21 +268,21 @@ class RigHead:
     def fault(self) -> RigError | None:
         """Why the head has made the bench safe, or None."""
         faults, evidence = self._status.faults, {"faults": self._status.faults.name, "port": self._link.name}
-        if Fault.ESTOP in faults:
+        if HeadFault.ESTOP in faults:
             return EmergencyStop(
                 "The e-stop is pressed, or its loop is open: light and servo power are off.",
                 next_step="Look at the bench; release the e-stop (or mend its cable), then: rig acknowledge.",
                 evidence=evidence,
             )
-        if self._restarted is not None or faults & (Fault.BROWN_OUT | Fault.WATCHDOG):
+        if self._restarted is not None or faults & (HeadFault.BROWN_OUT | HeadFault.WATCHDOG):
             cause = Reset(self._who.reset_cause) if self._restarted is None else self._restarted
             return HeadRestarted(
                 f"The rig head at {self._link.name} restarted {_RESTARTS[cause]}: light and servo power went off.",
                 next_step="Check its supply and USB cable, then: rig acknowledge.",
                 evidence={**evidence, "reset_cause": cause.name.lower()},
             )
-        if Fault.DEADMAN in faults:
-            return HostWasSilent(
+        if HeadFault.DEADMAN in faults:
+            return HeartbeatLost(
                 f"The rig head heard nothing from this computer for {self._deadman_ms} ms: light and servo power "
                 "are off.",
                 next_step="If a program was killed or a cable pulled, that is the reason; else a computer that stalls "
@@ -292,7 +292,7 @@ class RigHead:
         return None
 
     def check(self) -> None:
-        """Raise what the head has made the bench safe for (`EmergencyStop`, `HostWasSilent`, `HeadRestarted`)."""
+        """Raise what the head has made the bench safe for (`EmergencyStop`, `HeartbeatLost`, `HeadRestarted`)."""
         with self._alone():
             self._go_on()
         if fault := self.fault:
@@ -312,21 +312,21 @@ class RigHead:
             self._go_on()
             try:
                 self._link.request(Acknowledge(0xFF), Done)
-            except DeviceRefused as refused:
-                if refused.evidence["refusal"] == Refusal.CAUSE_PERSISTS and (fault := self.fault):
+            except RequestRejected as refused:
+                if refused.evidence["refusal"] == Rejection.CAUSE_PERSISTS and (fault := self.fault):
                     raise fault from refused
                 raise
             self._restarted = None
             self._beat()
 
     def set_light(self, level: float) -> None:
-        """Set the ring light, 0 to 1; raises DeviceRefused after a fault."""
+        """Set the ring light, 0 to 1; raises RequestRejected after a fault."""
         with self._alone():
             self._go_on()
             self._link.request(Light(round(255 * min(max(level, 0.0), 1.0))), Done)
 
     def set_power(self, on: bool) -> None:
-        """Close or open the servo's power relay; raises DeviceRefused where a fault is latched."""
+        """Close or open the servo's power relay; raises RequestRejected where a fault is latched."""
         with self._alone():
             self._go_on()
             self._link.request(Relay(int(on)), Done)
@@ -344,7 +344,7 @@ class RigHead:
     def counters(self) -> Counters:
         """Return the head's own counts since it started."""
         with self._alone():
-            return self._link.request(Count(), Counters)
+            return self._link.request(ReadCounters(), Counters)
 
     def report(self) -> dict[str, Any]:
         """Return in words how the head does, for people and records."""
@@ -463,7 +463,7 @@ class RigHead:
             yield
 
     def _beside(self) -> None:
-        """Beat, and take what has arrived, unless the program is doing so."""
+        """Heartbeat, and take what has arrived, unless the program is doing so."""
         if self._lock.acquire(blocking=False):
             try:
                 if not self._down and not self._closed:
@@ -501,10 +501,10 @@ class RigHead:
             raise
 
     def _beat(self) -> None:
-        """Beat until it is answered; a repetition is a beat of its own, whose times hold."""
+        """Heartbeat until it is answered; a repetition is a beat of its own, whose times hold."""
         for last in (False, False, True):
             try:
-                pulse = self._link.request(Beat(self._deadman_ms), Pulse, attempts=1)
+                pulse = self._link.request(Heartbeat(self._deadman_ms), HeartbeatReply, attempts=1)
                 break
             except DeviceSilent as silent:
                 if last or isinstance(silent, DeviceUnplugged):
@@ -554,13 +554,13 @@ class RigHead:
 
     # -- what arrives -----------------------------------------------------------------------------------------------
 
-    def _on_event(self, event: Sample | Changed) -> None:
-        if isinstance(event, Changed):
+    def _on_event(self, event: Sample | StatusChanged) -> None:
+        if isinstance(event, StatusChanged):
             self._take_status(event)
         elif self._timing.known and self._set_up:
             self._take_sample(event)
 
-    def _take_status(self, told: Pulse | Changed) -> bool:
+    def _take_status(self, told: HeartbeatReply | StatusChanged) -> bool:
         """Remember what the head tells; return whether it has restarted, and so forgotten its sensor."""
         try:
             status = self._read_status(told)
@@ -572,15 +572,15 @@ class RigHead:
         restarted = self._set_up and status.imu_status == ImuStatus.OFF
         if restarted:
             self._set_up = False
-            self._restarted = Reset(told.reset_cause) if isinstance(told, Changed) else Reset.UNKNOWN
+            self._restarted = Reset(told.reset_cause) if isinstance(told, StatusChanged) else Reset.UNKNOWN
             self.statistics.restarts += 1
         return restarted
 
     @staticmethod
-    def _read_status(told: Pulse | Changed) -> HeadStatus:
+    def _read_status(told: HeartbeatReply | StatusChanged) -> HeadStatus:
         return HeadStatus(
-            state=State(told.state),
-            faults=Fault(told.faults),
+            state=HeadState(told.state),
+            faults=HeadFault(told.faults),
             estop_open=bool(told.inputs & Input.ESTOP_OPEN),
             relay_closed=bool(told.inputs & Input.RELAY_CLOSED),
             imu_status=ImuStatus(told.imu_status),

@@ -6,11 +6,11 @@ from dataclasses import astuple, dataclass
 from typing import TypeVar
 
 from rig.core.clock import Clock
-from rig.core.errors import DeviceRefused, DeviceSilent, DeviceUnplugged
-from rig.devices.dynamixel.port import Wire
+from rig.core.errors import DeviceSilent, DeviceUnplugged, RequestRejected
+from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head import protocol
 from rig.devices.head.framing import CRC, HEADER, Deframer, Frame, encode
-from rig.devices.head.protocol import Answer, Changed, Done, Refusal, Request, Sample
+from rig.devices.head.protocol import Answer, Done, Rejection, Request, Sample, StatusChanged
 
 REPLY_S = 0.06
 """How long an answer may take: 6 ms behind a full transmitter, and twice a USB adapter's latency timer."""
@@ -19,13 +19,13 @@ ATTEMPTS = 3
 A = TypeVar("A")
 
 _REASONS: dict[int, str] = {
-    Refusal.UNKNOWN_REQUEST: "its firmware does not know the request",
-    Refusal.MALFORMED: "the request has another length than its firmware expects",
-    Refusal.OUT_OF_RANGE: "a value is out of range",
-    Refusal.FAULT_LATCHED: "a fault is latched",
-    Refusal.NOT_ACTIVE: "it hears no heartbeat",
-    Refusal.CAUSE_PERSISTS: "the cause of the fault is still there",
-    Refusal.BUSY: "it is still busy with the last one",
+    Rejection.UNKNOWN_REQUEST: "its firmware does not know the request",
+    Rejection.MALFORMED: "the request has another length than its firmware expects",
+    Rejection.OUT_OF_RANGE: "a value is out of range",
+    Rejection.FAULT_LATCHED: "a fault is latched",
+    Rejection.NOT_ACTIVE: "it hears no heartbeat",
+    Rejection.CAUSE_PERSISTS: "the cause of the fault is still there",
+    Rejection.BUSY: "it is still busy with the last one",
 }
 
 
@@ -55,12 +55,14 @@ class HeadLink:
     clock
         The bench's clock.
     on_event
-        Given each `Sample` and `Changed` that arrives.
+        Given each `Sample` and `StatusChanged` that arrives.
     name
         Of the port, for messages.
     """
 
-    def __init__(self, wire: Wire, clock: Clock, on_event: Callable[[Sample | Changed], None], name: str) -> None:
+    def __init__(
+        self, wire: SerialConnection, clock: Clock, on_event: Callable[[Sample | StatusChanged], None], name: str
+    ) -> None:
         self.name = name
         self.statistics = LinkStatistics()
         self.sent_ns = self.heard_ns = clock.now_ns()
@@ -80,7 +82,7 @@ class HeadLink:
     def close(self) -> None:
         self._wire.close()
 
-    def replace(self, wire: Wire) -> None:
+    def replace(self, wire: SerialConnection) -> None:
         """Go on with a port that was opened anew."""
         self._wire = wire
 
@@ -107,7 +109,7 @@ class HeadLink:
             There was no answer to any of the ``attempts``.
         DeviceUnplugged
             The line is gone.
-        DeviceRefused
+        RequestRejected
             The head did not do it, and says why.
         """
         self._sequence = (self._sequence + 1) % 256
@@ -146,8 +148,8 @@ class HeadLink:
             return None
         answer = _parse(frame)
         if isinstance(answer, Done):
-            if answer.request == message.ID and answer.refusal != Refusal.NONE:
-                raise refusal(self.name, message, answer.refusal)
+            if answer.request == message.ID and answer.rejection != Rejection.NONE:
+                raise refusal(self.name, message, answer.rejection)
             return answer if answer.request == message.ID else None
         return answer
 
@@ -157,7 +159,7 @@ class HeadLink:
 
     def _take(self, data: bytes) -> None:
         for frame in self._deframer.feed(data):
-            if frame.id in (Sample.ID, Changed.ID):
+            if frame.id in (Sample.ID, StatusChanged.ID):
                 self._event(frame)
             elif frame.sequence == self._sequence:
                 self._reply, self.heard_ns = frame, self._clock.now_ns()
@@ -166,7 +168,7 @@ class HeadLink:
 
     def _event(self, frame: Frame) -> None:
         event = _parse(frame)
-        if isinstance(event, Sample | Changed):
+        if isinstance(event, Sample | StatusChanged):
             if self._event_sequence is not None:
                 self.statistics.missed += (frame.sequence - self._event_sequence - 1) % 256
             self._event_sequence = frame.sequence
@@ -187,14 +189,14 @@ class HeadLink:
             ) from gone
 
 
-def refusal(name: str, message: Request, reason: int) -> DeviceRefused:
+def refusal(name: str, message: Request, reason: int) -> RequestRejected:
     """Return the error for a request that the head at ``name`` did not do."""
     words = _REASONS.get(reason, f"reason {reason}, which is not known here")
     what = type(message).__name__.lower()
-    return DeviceRefused(
+    return RequestRejected(
         f"the rig head at {name} refused the request '{what}': {words}",
         next_step="Remove the cause and acknowledge the fault (rig acknowledge)."
-        if reason in (Refusal.FAULT_LATCHED, Refusal.CAUSE_PERSISTS)
+        if reason in (Rejection.FAULT_LATCHED, Rejection.CAUSE_PERSISTS)
         else "Flash the firmware that belongs to this program: make -C firmware flash.",
         evidence={"request": what, "refusal": reason},
     )

@@ -6,12 +6,12 @@ from contextlib import contextmanager
 from rig.config import HeadConfig, RigConfig
 from rig.core.clock import Clock
 from rig.core.errors import EmergencyStop, RigError
-from rig.devices.dynamixel.port import Wire
+from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
 from rig.devices.head.sensors import head_sensor
 
 
-def open_head(config: RigConfig, open_port: Callable[[], Wire], clock: Clock) -> RigHead:
+def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> RigHead:
     """Open the head at ``config.head.port``; its outputs stay off.
 
     ``open_port`` opens its line, again where the cable was pulled meanwhile.
@@ -38,12 +38,12 @@ def open_head(config: RigConfig, open_port: Callable[[], Wire], clock: Clock) ->
 
 
 @contextmanager
-def powered(config: RigConfig, open_port: Callable[[], Wire], clock: Clock) -> Iterator[None]:
+def powered(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> Iterator[None]:
     """Feed the servo for the length of a ``with`` block, where its supply goes through a rig head.
 
     Raises
     ------
-    EmergencyStop, HostWasSilent, HeadRestarted
+    EmergencyStop, HeartbeatLost, HeadRestarted
         The head keeps the supply open until that is acknowledged.
     DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent
         See `RigHead`.

@@ -56,7 +56,7 @@ class Reset(IntEnum):
     WATCHDOG = 4
 
 
-class State(IntEnum):
+class HeadState(IntEnum):
     """Outputs are off in `idle` and in `fault`; beats keep it `active`."""
 
     IDLE = 0
@@ -64,7 +64,7 @@ class State(IntEnum):
     FAULT = 2
 
 
-class Fault(IntFlag):
+class HeadFault(IntFlag):
     """Bits of the latched reasons."""
 
     DEADMAN = 1
@@ -100,7 +100,7 @@ class ImuStatus(IntEnum):
     SETTINGS_LOST = 6
 
 
-class Refusal(IntEnum):
+class Rejection(IntEnum):
     """Why a request was not done."""
 
     NONE = 0
@@ -137,7 +137,7 @@ class Hello:
 
 
 @dataclass(frozen=True, slots=True)
-class Beat:
+class Heartbeat:
     """The host lives. As long as its reply, so that both take the same time on the line.
 
     Attributes
@@ -156,7 +156,7 @@ class Beat:
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
+class Shutdown:
     """The host leaves in peace: outputs off, no deadman, the stream ends."""
 
     ID: ClassVar[int] = 0x03
@@ -272,7 +272,7 @@ class Stream:
 
 
 @dataclass(frozen=True, slots=True)
-class Count:
+class ReadCounters:
     """Tell what has gone wrong since the start."""
 
     ID: ClassVar[int] = 0x0A
@@ -287,15 +287,15 @@ class Done:
     ----------
     request
         Its message id.
-    refusal
-        Refusal; 0 where it was done.
+    rejection
+        Rejection; 0 where it was done.
     """
 
     ID: ClassVar[int] = 0x80
     LAYOUT: ClassVar[Struct] = Struct("<BB")
 
     request: int
-    refusal: int
+    rejection: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,7 +335,7 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class Pulse:
+class HeartbeatReply:
     """Two times of the head's clock, and how it does.
 
     Attributes
@@ -466,7 +466,7 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class Changed:
+class StatusChanged:
     """The state, a fault, the e-stop or the sensor changed; also the first word after a start.
 
     Attributes
@@ -499,40 +499,40 @@ class Changed:
     reset_cause: int
 
 
-Request = Hello | Beat | Rest | Acknowledge | Light | Relay | Trigger | Imu | Stream | Count
+Request = Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger | Imu | Stream | ReadCounters
 
-Answer = Done | Identity | Pulse | Triggered | Counters | Sample | Changed
+Answer = Done | Identity | HeartbeatReply | Triggered | Counters | Sample | StatusChanged
 
 MESSAGES: dict[int, type[Request] | type[Answer]] = {
     Hello.ID: Hello,
-    Beat.ID: Beat,
-    Rest.ID: Rest,
+    Heartbeat.ID: Heartbeat,
+    Shutdown.ID: Shutdown,
     Acknowledge.ID: Acknowledge,
     Light.ID: Light,
     Relay.ID: Relay,
     Trigger.ID: Trigger,
     Imu.ID: Imu,
     Stream.ID: Stream,
-    Count.ID: Count,
+    ReadCounters.ID: ReadCounters,
     Done.ID: Done,
     Identity.ID: Identity,
-    Pulse.ID: Pulse,
+    HeartbeatReply.ID: HeartbeatReply,
     Triggered.ID: Triggered,
     Counters.ID: Counters,
     Sample.ID: Sample,
-    Changed.ID: Changed,
+    StatusChanged.ID: StatusChanged,
 }
 
 REPLIES: dict[type[Request], type[Answer]] = {
     Hello: Identity,
-    Beat: Pulse,
-    Rest: Done,
+    Heartbeat: HeartbeatReply,
+    Shutdown: Done,
     Acknowledge: Done,
     Light: Done,
     Relay: Done,
     Trigger: Triggered,
     Imu: Done,
     Stream: Done,
-    Count: Counters,
+    ReadCounters: Counters,
 }
 """The answer to a request that was not refused."""

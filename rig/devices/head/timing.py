@@ -25,7 +25,7 @@ _WRAP = 1 << 32
 
 
 @dataclass(frozen=True, slots=True)
-class Beat:
+class RoundTrip:
     """One round trip: the middle of it on both clocks, and what the line took."""
 
     head_us: float
@@ -48,7 +48,7 @@ class HeadClock:
 
     def restart(self) -> None:
         """Forget everything: the head's clock began anew."""
-        self._beats: deque[Beat] = deque(maxlen=MEMORY)
+        self._round_trips: deque[RoundTrip] = deque(maxlen=MEMORY)
         self._newest_us: int | None = None
         self._origin_us = self._origin_ns = 0.0
         self._fit = np.zeros(2)
@@ -57,7 +57,7 @@ class HeadClock:
 
     @property
     def known(self) -> bool:
-        return bool(self._beats)
+        return bool(self._round_trips)
 
     @property
     def drift_ppm(self) -> float:
@@ -82,12 +82,14 @@ class HeadClock:
     def add(self, sent_ns: int, received_us: int, answered_us: int, heard_ns: int) -> None:
         """Learn from one round trip; the head's times are unwrapped."""
         delay_ns = (heard_ns - sent_ns) - (answered_us - received_us) * 1000.0
-        self._beats.append(Beat((received_us + answered_us) / 2, (sent_ns + heard_ns) / 2, max(delay_ns, 0.0)))
-        beats = self._beats
-        self._origin_us, self._origin_ns = beats[-1].head_us, beats[-1].host_ns
-        x = np.array([b.head_us - self._origin_us for b in beats]) * 1e3
-        y = np.array([b.host_ns - self._origin_ns for b in beats]) - x
-        delays = np.array([b.delay_ns for b in beats])
+        self._round_trips.append(
+            RoundTrip((received_us + answered_us) / 2, (sent_ns + heard_ns) / 2, max(delay_ns, 0.0))
+        )
+        round_trips = self._round_trips
+        self._origin_us, self._origin_ns = round_trips[-1].head_us, round_trips[-1].host_ns
+        x = np.array([b.head_us - self._origin_us for b in round_trips]) * 1e3
+        y = np.array([b.host_ns - self._origin_ns for b in round_trips]) - x
+        delays = np.array([b.delay_ns for b in round_trips])
         # A line that is faster than its baud rate says is none that bytes pass one by one (a pseudo-terminal): then
         # nothing is known of how much of the shortest round trip was the line itself.
         shortest = float(delays.min())

@@ -4,19 +4,19 @@ import os
 
 import pytest
 
-from rig.bench.computer import LinuxHost, Process, User
-from sim.host import Computer
+from rig.bench.computer import LinuxComputer, Process, User
+from sim.computer import ComputerFiles
 
 GID = os.getgid()
 
 
 @pytest.fixture
 def computer(tmp_path):
-    return Computer(tmp_path)
+    return ComputerFiles(tmp_path)
 
 
-def host(computer: Computer, *gids: int, uid: int = 4242) -> LinuxHost:
-    return LinuxHost(computer.root, user=User("ada", uid, frozenset(gids)))
+def host(computer: ComputerFiles, *gids: int, uid: int = 4242) -> LinuxComputer:
+    return LinuxComputer(computer.root, user=User("ada", uid, frozenset(gids)))
 
 
 def test_a_serial_port_tells_its_adapter_its_lasting_name_and_its_latency(computer):
@@ -115,7 +115,7 @@ def test_a_camera_is_the_node_that_carries_images(computer):
 
 
 def test_an_empty_computer_has_nothing_and_says_so(tmp_path):
-    bare = host(Computer(tmp_path))
+    bare = host(ComputerFiles(tmp_path))
     assert (bare.serial_ports(), bare.i2c_buses(), bare.cameras()) == ([], [], [])
     assert bare.time_synchronised() is None
 
@@ -136,7 +136,7 @@ def test_a_network_disk_is_told_from_a_local_one(computer, tmp_path):
 
 
 def test_this_very_computer_can_be_looked_at():
-    here = LinuxHost()
+    here = LinuxComputer()
     for node in [*here.serial_ports(), *here.i2c_buses(), *here.cameras()]:
         assert node.path.startswith("/dev/")
     assert here.user.gids

@@ -42,7 +42,7 @@ from rig.catalog.exchange import (
 from rig.catalog.exchange.bundle import MANIFEST, OBJECTS
 from rig.catalog.upkeep import LOST
 from rig.catalog.verify import verify
-from rig.core.errors import CatalogError, ExportFailed, ImportRefused, ObjectExists, UsageError
+from rig.core.errors import CatalogError, ExportFailed, ImportRejected, ObjectExists, UsageError
 from rig.views import image_files as images
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, image, plan, true_fill, without_waiting
@@ -333,17 +333,17 @@ class TestFolders:
         photograph(tmp_path / "in" / "mug__0.png", 0)
         (tmp_path / "in" / "mug__5.png").write_bytes(b"x")
         catalog = open_catalog("catalog")
-        with pytest.raises(ImportRefused, match="nothing was imported") as refused:
+        with pytest.raises(ImportRejected, match="nothing was imported") as refused:
             come_in(catalog, read_folder(tmp_path / "in", now=NOW), strict=True)
         assert "mug__5.png" in str(refused.value.evidence["refused"])
         assert untouched(catalog)
 
     def test_a_folder_without_views_says_how_to_name_them(self, tmp_path: Path) -> None:
         photograph(tmp_path / "IMG.png", 0)
-        with pytest.raises(ImportRefused) as refused:
+        with pytest.raises(ImportRejected) as refused:
             read_folder(tmp_path, now=NOW)
         assert "--pattern" in refused.value.next_step
-        with pytest.raises(ImportRefused, match="no folder"):
+        with pytest.raises(ImportRejected, match="no folder"):
             read_folder(tmp_path / "nowhere", now=NOW)
 
 
@@ -388,7 +388,7 @@ class TestTables:
     def test_columns_that_lack_are_named(self, tmp_path: Path) -> None:
         path = tmp_path / "a.csv"
         path.write_text("object;angle\nmug;0\n")
-        with pytest.raises(ImportRefused, match="no column object nor azimuth_deg nor image"):
+        with pytest.raises(ImportRejected, match="no column object nor azimuth_deg nor image"):
             read_table(path, now=NOW)
 
     @pytest.mark.parametrize(
@@ -396,7 +396,7 @@ class TestTables:
     )
     def test_what_is_no_table_is_refused(self, tmp_path: Path, content: bytes) -> None:
         (tmp_path / "a.csv").write_bytes(content)
-        with pytest.raises(ImportRefused):
+        with pytest.raises(ImportRejected):
             read_table(tmp_path / "a.csv", now=NOW)
 
 
@@ -493,7 +493,7 @@ def view_of(line: dict[str, Any], place: int = 0) -> dict[str, Any]:
 class TestHostileBundles:
     def refused(self, open_catalog: Callable[[str], Catalog], path: Path) -> str:
         catalog = open_catalog("victim")
-        with pytest.raises(ImportRefused) as error:
+        with pytest.raises(ImportRejected) as error:
             come_in(catalog, open_bundle(path))
         assert untouched(catalog)
         return f"{error.value.what} {error.value.evidence}"
@@ -626,7 +626,7 @@ class TestHostileBundles:
             victim = victims[-1]
             try:
                 come_in(victim, open_bundle(path))
-            except ImportRefused:
+            except ImportRejected:
                 assert untouched(victim)
                 return
             assert finished(verify(victim, jobs=1)).findings == ()

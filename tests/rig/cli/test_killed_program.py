@@ -56,7 +56,7 @@ def go(settings: Settings) -> None:
     bench = Bench("hardware", config, CLOCK, servo, StillImu(), None, state=FileStore(config.state_path("hardware")))
     bench.safety.connect()
     if bench.safety.doubt:
-        bench.safety.declare(0.0)
+        bench.safety.set_angle(0.0)
     print(*bench.safety.findings, sep="; ", flush=True)
     with Turntable(bench, trust_gyro=False) as table:
         print("moving", flush=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from rig.bench import ObjectStandsThere
+from rig.bench import ObjectAlreadyPlaced
 from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.cli.objects.identify import _Model
@@ -304,7 +304,7 @@ def without_hands(monkeypatch):
     def open_without(self, config, options, seed):
         bench = really(self, config, options, seed)
         opened.append(bench.operator.world)
-        bench.operator = ObjectStandsThere()
+        bench.operator = ObjectAlreadyPlaced()
         return bench
 
     monkeypatch.setattr(SimBenchKind, "open", open_without)

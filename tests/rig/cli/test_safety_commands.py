@@ -15,7 +15,7 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import Stalled
 from rig.motion.stop_request import stop
-from rig.safety.saved_state import Fault, FileStore, holder
+from rig.safety.saved_state import FileStore, LatchedFault, holder
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 SMALL = ("--set", "camera.width=320", "--set", "camera.height=240", "--set", "view.roi=[40, 0, 240, 240]")
@@ -120,7 +120,7 @@ def test_a_fault_is_told_by_every_command_until_it_is_acknowledged(rig):
     stalled = Stalled(
         "The table is blocked at 7.0°.", next_step="Free it. Then `rig acknowledge`.", evidence={"load_percent": 99}
     )
-    store.save(store.load().model_copy(update={"fault": Fault.of(stalled, "2026-01-02T03:04:05+00:00")}))
+    store.save(store.load().model_copy(update={"fault": LatchedFault.of(stalled, "2026-01-02T03:04:05+00:00")}))
     for refused in (
         rig("goto", "0"),
         rig("home"),

@@ -45,8 +45,8 @@ def parts(home, monkeypatch):
 
             @contextmanager
             def host(self, config, options, seed):
-                bench.case.host._port = config.servo.port
-                yield bench.case.host
+                bench.case.computer._port = config.servo.port
+                yield bench.case.computer
 
         monkeypatch.setattr("rig.doctor.case.bench_kind", lambda _: Kind())
         yield bench

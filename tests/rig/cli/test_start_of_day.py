@@ -10,7 +10,7 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from rig.bench import ObjectStandsThere
+from rig.bench import ObjectAlreadyPlaced
 from rig.cli.main import app
 from rig.cli.objects.empty_table import ensure_empty_table_image
 from rig.cli.ui.settings import Settings
@@ -83,7 +83,7 @@ def asked(
     ) -> tuple[Any, str]:
         s = simulated(*SMALL)
         s.operator.place("toy-car")
-        s.bench.operator = ObjectStandsThere()
+        s.bench.operator = ObjectAlreadyPlaced()
         if isinstance(answers, Answers) and not stays:
             times = iter(range(99))
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time

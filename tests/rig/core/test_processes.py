@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from rig.core.errors import RigError
-from rig.core.processes import over_processes
+from rig.core.processes import map_in_processes
 
 
 def work(item: int) -> int:
@@ -17,9 +17,9 @@ def work(item: int) -> int:
 
 def test_a_killed_process_is_told_with_the_way_out() -> None:
     with pytest.raises(RigError, match="ended before it was done") as lost:
-        list(over_processes(work, range(6), 2))
+        list(map_in_processes(work, range(6), 2))
     assert "--jobs 1" in lost.value.next_step
 
 
 def test_one_process_is_this_one() -> None:
-    assert list(over_processes(work, [1, 2], 1)) == [(1, 1), (2, 4)]
+    assert list(map_in_processes(work, [1, 2], 1)) == [(1, 1), (2, 4)]

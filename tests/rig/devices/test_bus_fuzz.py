@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.config import ImuConfig
-from rig.core.errors import DeviceRefused, DeviceSilent, RigError
+from rig.core.errors import DeviceSilent, RequestRejected, RigError
 from rig.devices.dynamixel.registers import control_table
 from rig.devices.imu import Imu
 from rig.devices.open_imu import open_imu
@@ -26,7 +26,7 @@ from sim.servo.protocol1 import checksum, status_packet1
 from sim.servo.protocol2 import Status, crc16, status_packet
 from sim.world import World
 from tests.fuzzing import fuzz_settings
-from tests.rig.devices.scripted_wire import scripted_bus
+from tests.rig.devices.scripted_serial import scripted_bus
 
 pytestmark = pytest.mark.timeout(1200)  # the nightly profile's 20,000 cases a parser
 
@@ -103,7 +103,7 @@ def test_a_block_that_is_read_is_one_that_was_sent(protocol: int, data: st.DataO
     clock = bus.port.clock
     try:
         got = bus.read_block(1, 28, 4)
-    except (DeviceSilent, DeviceRefused):
+    except (DeviceSilent, RequestRejected):
         pass
     else:
         attempt = len(wire.written) - 1

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.core.clock import SystemClock
-from rig.core.errors import DeviceRefused, DeviceSilent
+from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table
@@ -107,7 +107,7 @@ def test_a_refusal_names_the_status_error_and_is_not_retried():
     wires = servo_wires()
     bus = open_bus(wires)
     bus.write(1, TABLE["Torque Enable"], 1)
-    with pytest.raises(DeviceRefused, match="access error"):
+    with pytest.raises(RequestRejected, match="access error"):
         bus.write(1, TABLE["Operating Mode"], 4)
     assert bus.statistics.retries == 0
 

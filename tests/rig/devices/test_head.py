@@ -8,16 +8,16 @@ from rig.core.errors import (
     ConfigError,
     DeviceMismatch,
     DeviceNotFound,
-    DeviceRefused,
     DeviceSilent,
     EmergencyStop,
     FirmwareMismatch,
     HeadRestarted,
-    HostWasSilent,
+    HeartbeatLost,
+    RequestRejected,
 )
 from rig.devices.head.head import RigHead
 from rig.devices.head.link import HeadLink
-from rig.devices.head.protocol import BAUD, PROTOCOL_VERSION, Fault, Light, Reset, State, Trigger, Triggered
+from rig.devices.head.protocol import BAUD, PROTOCOL_VERSION, HeadFault, HeadState, Light, Reset, Trigger, Triggered
 from sim.clock import VirtualClock
 from sim.head import build
 from sim.head.board import SimHead
@@ -130,7 +130,7 @@ def test_light_and_power_follow_while_the_program_lives(opened):
     assert opened.head.relay_closed
     opened.clock.sleep(5.0)  # the heart beats beside the program
     assert opened.head.relay_closed
-    assert opened.imu.status.state is State.ACTIVE
+    assert opened.imu.status.state is HeadState.ACTIVE
     opened.imu.close()
     assert not opened.head.relay_closed
     assert opened.head.light == 0
@@ -147,13 +147,13 @@ def test_a_pulse_is_as_wide_as_asked_and_dated(opened):
     assert (up, down) == (1, 0)
     assert began_ns == pytest.approx(up_ns, abs=2e3 * opened.imu.health()["time_uncertainty_us"])
     assert down_ns - up_ns == pytest.approx(2 * MS, rel=0.003)  # by a clock that is 0.2 % off
-    with pytest.raises(DeviceRefused, match="range"):
+    with pytest.raises(RequestRejected, match="range"):
         opened.imu.trigger(0.04)
 
 
 def test_a_second_pulse_within_the_first_is_refused(opened):
     opened.imu.trigger(0.03)
-    with pytest.raises(DeviceRefused, match="busy"):
+    with pytest.raises(RequestRejected, match="busy"):
         opened.imu.trigger(0.001)
 
 
@@ -169,11 +169,11 @@ def test_a_silent_host_leaves_the_bench_dark_and_unpowered(opened):
         time_ns, value = opened.head.pulses(pin)[-1]
         assert value == 0
         assert time_ns - last_ns <= 255 * MS
-    with pytest.raises(HostWasSilent) as caught:
+    with pytest.raises(HeartbeatLost) as caught:
         opened.imu.check()
     assert caught.value.exit_code == 5
     assert "rig acknowledge" in caught.value.next_step
-    with pytest.raises(DeviceRefused, match="fault is latched"):
+    with pytest.raises(RequestRejected, match="fault is latched"):
         opened.imu.set_power(True)
     opened.imu.acknowledge()
     assert opened.imu.fault is None
@@ -284,7 +284,7 @@ def test_corrupt_frames_are_counted_and_cost_samples_but_no_wrong_value(opened):
     elapsed_s = (opened.clock.now_ns() - start_ns) * 1e-9
     assert lost + sum(map(len, rates)) == pytest.approx(200 * elapsed_s, abs=6)
     assert all(np.diff(np.concatenate(times)) > 0)
-    assert opened.imu.status.state is State.ACTIVE  # a beat that is lost is beaten again in time
+    assert opened.imu.status.state is HeadState.ACTIVE  # a beat that is lost is beaten again in time
 
 
 def test_babble_in_both_directions_is_outlived(opened):
@@ -331,7 +331,7 @@ def test_a_message_of_an_unknown_kind_is_refused_in_words(opened):
     class Future(Light):
         ID = 0x55
 
-    with pytest.raises(DeviceRefused, match="does not know the request"):
+    with pytest.raises(RequestRejected, match="does not know the request"):
         opened.imu._link.request(Future(1), Triggered)
 
 
@@ -357,7 +357,7 @@ def test_a_cable_that_is_put_in_again_is_taken_up_by_itself_with_everything_off(
         assert len(samples.time_ns) > 50
         assert h.imu.statistics.reconnects == 1
         assert not h.head.relay_closed
-        assert isinstance(h.imu.fault, HostWasSilent)
+        assert isinstance(h.imu.fault, HeartbeatLost)
 
 
 def test_another_head_in_its_place_is_not_taken_for_it():
@@ -460,5 +460,5 @@ def test_samples_without_the_ready_line_come_just_the_same_but_dated_less_well(o
 def test_faults_are_named_in_the_evidence(opened):
     opened.head.estop_open = True
     opened.clock.sleep(0.1)
-    assert opened.imu.status.faults == Fault.ESTOP
+    assert opened.imu.status.faults == HeadFault.ESTOP
     assert opened.imu.fault.evidence["faults"] == "ESTOP"

@@ -89,4 +89,4 @@ def test_every_message_fits_its_frame_and_is_known_by_its_id():
     for number, kind in protocol.MESSAGES.items():
         assert number == kind.ID
         assert kind.LAYOUT.size <= protocol.MAX_BODY
-    assert protocol.Beat.LAYOUT.size == protocol.Pulse.LAYOUT.size  # the same time on the line, both ways
+    assert protocol.Heartbeat.LAYOUT.size == protocol.HeartbeatReply.LAYOUT.size  # the same time on the line, both ways

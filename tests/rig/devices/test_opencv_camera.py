@@ -49,7 +49,7 @@ def world() -> World:
 def test_the_settings_are_locked_and_read_back(world: World) -> None:
     settings = CameraSettings(exposure_us=8000, gain=3, white_balance_k=4200, focus=100)
     camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings, name="desk camera")
-    assert camera.not_taken == ()
+    assert camera.rejected_settings == ()
     locks = camera.read_locks()
     assert (locks.exposure_us, locks.gain, locks.white_balance_k) == (8000, 3, 4200)
     assert (locks.auto_exposure, locks.auto_white_balance) == (False, False)
@@ -72,7 +72,7 @@ def test_what_is_left_to_the_camera_stays_automatic(world: World) -> None:
 def test_a_setting_that_the_camera_does_not_take_is_reported(world: World) -> None:
     settings = CameraSettings(width=1920, exposure_us=90_000, gain=99)
     camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings)
-    assert {(n.setting, n.asked, n.reported) for n in camera.not_taken} == {
+    assert {(n.setting, n.asked, n.reported) for n in camera.rejected_settings} == {
         ("width", 1920, 640),
         ("exposure_100us", 900, 333),
         ("gain", 99, 24),
@@ -232,7 +232,7 @@ def test_a_recording_is_read_frame_by_frame_to_its_end(tmp_path: Path, world: Wo
         cv2.imwrite(str(tmp_path / f"img_{k:02d}.png"), np.full((48, 64, 3), level, np.uint8))
     camera = OpenCvCamera(open_capture(tmp_path / "img_%02d.png"), clock=world.clock)
     assert camera.time_base is TimeBase.RECORDED
-    assert "exposure_100us" in {n.setting for n in camera.not_taken}
+    assert "exposure_100us" in {n.setting for n in camera.rejected_settings}
     assert camera.read_locks().exposure_us is None
     for level in levels:
         after_ns = world.clock.now_ns() + 1000
@@ -302,7 +302,7 @@ def test_focus_is_held_where_it_is_and_told(world: World) -> None:
     locks = camera.read_locks()
     assert locks.autofocus is False
     assert locks.focus is not None
-    assert not [n for n in camera.not_taken if "focus" in n.setting]
+    assert not [n for n in camera.rejected_settings if "focus" in n.setting]
     capture.drift(autofocus=True)
     assert camera.read_locks() != locks
 
@@ -317,7 +317,7 @@ def test_a_fixed_lens_has_no_focus_to_complain_about(world: World) -> None:
 
     camera = OpenCvCamera(Fixed(world), clock=world.clock)
     assert (camera.read_locks().focus, camera.read_locks().autofocus) == (None, None)
-    assert camera.not_taken == ()
+    assert camera.rejected_settings == ()
 
 
 def returning(world: World, capture: SimCapture, away_s: float) -> OpenCvCamera:

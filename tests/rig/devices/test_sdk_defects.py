@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import rig.devices
 from rig.core.clock import SystemClock
-from rig.core.errors import DeviceNotFound, DeviceRefused, DeviceSilent
+from rig.core.errors import DeviceNotFound, DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.packets import WRITE, Packets2
 from rig.devices.dynamixel.port import ClockedPort, open_serial
@@ -27,7 +27,7 @@ from sim.servo import Frame, Source
 from sim.servo.protocol2 import PacketParser, Status, status_packet
 from tests.fuzzing import fuzz_settings
 from tests.rig.bench_parts import open_bus, servo_wires
-from tests.rig.devices.scripted_wire import scripted_bus
+from tests.rig.devices.scripted_serial import scripted_bus
 
 TABLE = control_table("xl430_w250")
 WORDS = {"Model Number": 1060, "Max Voltage Limit": 140, "Min Voltage Limit": 60, "PWM Limit": 885}
@@ -98,7 +98,7 @@ def test_a_reply_of_another_servo_is_none() -> None:
 def test_a_refusal_without_parameters_is_no_index_error() -> None:
     """Model and firmware of a ping that is answered by an error alone: the SDK looks at bytes that are not there."""
     bus, _ = scripted_bus(status_packet(1, Status(0x07)))
-    with pytest.raises(DeviceRefused, match="access error"):
+    with pytest.raises(RequestRejected, match="access error"):
         bus.ping(1)
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.config import ServoConfig, load_config
-from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceRefused, DeviceSilent, UsageError
+from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent, RequestRejected, UsageError
 from rig.devices.dynamixel import settings as permanent
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.register_servo import RegisterServo, prepare_servo
@@ -216,7 +216,7 @@ def test_a_pan_servo_stays_within_one_revolution() -> None:
     assert parts.servo.memory["Operating Mode"] == 3
     assert servo.reach_deg == pytest.approx((0.0, 359.9), abs=0.1)
     assert go(parts, servo, 10.0) == pytest.approx(-170.0, abs=0.1)
-    with pytest.raises(DeviceRefused, match="data limit"):
+    with pytest.raises(RequestRejected, match="data limit"):
         servo.move_to(400.0)
 
 
@@ -324,7 +324,7 @@ def test_a_setting_that_does_not_stay_is_an_error_that_names_it() -> None:
     parts = parts_of()
     servo = servo_of(parts, write=False)
     parts.servo._on_write["Homing Offset"] = lambda: parts.servo.memory.__setitem__("Homing Offset", 5)
-    with pytest.raises(DeviceRefused, match="Homing Offset") as caught:
+    with pytest.raises(RequestRejected, match="Homing Offset") as caught:
         servo.write_settings([SettingDifference("Homing Offset", 5, 0)])
     assert caught.value.evidence == {"register": "Homing Offset", "wrote": 0, "read_back": 5}
 

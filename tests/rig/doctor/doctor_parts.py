@@ -14,7 +14,7 @@ from rig.doctor.checks import CHECKS
 from rig.doctor.examination import examine
 from rig.doctor.finding import Finding, Level
 from sim.clock import VirtualClock
-from sim.host import Computer, SimHost
+from sim.computer import ComputerFiles, SimComputer
 from sim.noise import NoiseModel
 from sim.parts import SimParts
 from sim.servo import Frame, Source, XSeriesServo
@@ -25,7 +25,7 @@ from sim.world import World
 class Bench:
     """A bench that nobody has opened: its computer's files, its devices, and what went over the servo's line."""
 
-    computer: Computer
+    computer: ComputerFiles
     parts: SimParts
     case: Case
     sent: list[Frame] = field(default_factory=list)
@@ -79,13 +79,13 @@ def unopened(
             built = config.model_copy(update={"servo": there})
         world = World(noise=noise, clock=VirtualClock(start_utc=datetime(2026, 5, 1, tzinfo=UTC)))
         with SimParts.connected(built, world) as parts:
-            computer = Computer(Path(folder))
+            computer = ComputerFiles(Path(folder))
             if plugged:
                 computer.serial_port()
                 computer.i2c_bus()
                 computer.camera()
                 computer.keeps_time()
-            case = Case(SimHost(Path(folder), parts, config, user), config, "sim", ("--bench", "sim"))
+            case = Case(SimComputer(Path(folder), parts, config, user), config, "sim", ("--bench", "sim"))
             bench = Bench(computer, parts, case)
             parts.servo_bus.taps.append(bench.sent.append)
             yield bench

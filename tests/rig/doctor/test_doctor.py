@@ -17,9 +17,8 @@ from rig.doctor.checks import CHECKS
 from rig.doctor.computer import udev_rules
 from rig.doctor.examination import Check, examine
 from rig.doctor.finding import Level, fine
-from rig.safety.saved_state import BenchLock, FileStore, holder
+from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
 from rig.safety.saved_state import BenchState as State
-from rig.safety.saved_state import Fault as LatchedFault
 from sim.clock import VirtualClock
 from sim.faults import Faults, kinds
 from sim.faults.schedule import read_faults
@@ -99,7 +98,7 @@ def test_a_port_of_root_alone_is_mended_by_rules_for_udev():
         bench.computer.camera(mode=0o666)
         _, mend = one(bench.troubles("port"))
         assert mend.startswith("rig doctor --udev --bench sim | sudo tee /etc/udev/rules.d/")
-        rules = udev_rules(bench.case.host.serial_ports())
+        rules = udev_rules(bench.case.computer.serial_ports())
         assert 'ATTR{latency_timer}="1"' in rules
         assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT3M9M97"' in rules
         assert 'SYMLINK+="rig-servo"' in rules
@@ -172,7 +171,7 @@ def test_a_latched_fault_and_a_damaged_state_are_told():
 @pytest.mark.parametrize(("free", "level"), [(50e9, Level.FINE), (1e9, Level.WARNING), (1e8, Level.BAD)])
 def test_room_on_the_disk_is_told_in_objects(monkeypatch, free, level):
     with unopened() as bench:
-        monkeypatch.setattr(type(bench.case.host), "disk", lambda *_: Disk(int(free), network=False))
+        monkeypatch.setattr(type(bench.case.computer), "disk", lambda *_: Disk(int(free), network=False))
         (finding,) = bench.findings("disk")
         assert finding.level is level
         assert f"about {int(free / 500_000) // 72} more objects" in finding.text
@@ -180,7 +179,7 @@ def test_room_on_the_disk_is_told_in_objects(monkeypatch, free, level):
 
 def test_a_folder_that_may_not_be_written_to_is_told(monkeypatch):
     with unopened() as bench:
-        monkeypatch.setattr(type(bench.case.host), "disk", lambda *_: Disk(10**11, network=False, writable=False))
+        monkeypatch.setattr(type(bench.case.computer), "disk", lambda *_: Disk(10**11, network=False, writable=False))
         text, mend = one(bench.troubles("disk"))
         assert "may not write" in text
         assert mend == "rig config set catalog.path FOLDER"
@@ -188,7 +187,7 @@ def test_a_folder_that_may_not_be_written_to_is_told(monkeypatch):
 
 def test_a_catalog_on_another_computer_is_warned_of(monkeypatch):
     with unopened() as bench:
-        monkeypatch.setattr(type(bench.case.host), "disk", lambda *_: Disk(10**11, network=True))
+        monkeypatch.setattr(type(bench.case.computer), "disk", lambda *_: Disk(10**11, network=True))
         text, _ = one(bench.troubles("disk"))
         assert "network file system" in text
 
@@ -202,7 +201,7 @@ def test_a_clock_that_nobody_keeps_is_told_and_one_that_is_wrong_stops_the_work(
         assert mend == "sudo timedatectl set-ntp true"
         bench.computer.keeps_time()
         assert not bench.troubles("clock")
-        bench.case.host.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
+        bench.case.computer.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
         (wrong,) = [f for f in bench.findings("clock") if f.level is Level.BAD]
         assert "1970-01-01" in wrong.text
 
@@ -221,7 +220,7 @@ def test_a_civil_time_that_jumps_and_a_pause_that_drags_on_are_told():
             return super().utc() + self.jump
 
     with unopened() as bench:
-        bench.case.host.clock = Bad()
+        bench.case.computer.clock = Bad()
         texts = "\n".join(bench.troubles("clock"))
         assert "took 1020 ms" in texts
         assert "jumped by +3600.0 s" in texts
@@ -374,7 +373,7 @@ def test_an_imu_at_its_other_address_and_on_its_side():
         bench.parts.i2c.attach(0x68, device)
         assert one(bench.troubles("imu"))[1] == "rig config set imu.address 0x68"
     with unopened("imu.model=bno055") as bench:
-        bench.case.host.clock.sleep(1.0)  # it is silent for a while after power-up
+        bench.case.computer.clock.sleep(1.0)  # it is silent for a while after power-up
         assert not bench.troubles("imu")
     with unopened("imu.axis=x") as bench:
         assert one(bench.troubles("imu"))[1] == "rig config set imu.axis z"
@@ -450,7 +449,7 @@ def fact(bench, days_ago: float, valid_days: float | None = None, **device: obje
         limit=0.2,
         residual_unit="°",
         refusals=(),
-        when_utc=bench.case.host.clock.utc() - timedelta(days=days_ago),
+        when_utc=bench.case.computer.clock.utc() - timedelta(days=days_ago),
         device=device,
         evidence={},
         valid_days=valid_days,

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, DeviceRefused, SeveralServos, UsageError
+from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, RequestRejected, SeveralServos, UsageError
 from rig.devices.dynamixel.registers import control_table, model_numbers
 from rig.doctor.lone_servo import lone_servo
 from rig.doctor.register_words import baud_codes, words
@@ -77,14 +77,14 @@ def test_what_a_servo_cannot_be_set_to_is_refused_before_anything_is_written():
 def test_a_servo_that_keeps_its_old_id_is_not_believed(monkeypatch):
     with unopened() as bench, lone_servo(bench.case) as servo:
         monkeypatch.setattr(type(bench.parts.servo), "bus_id", property(lambda _: 1))
-        with pytest.raises(DeviceRefused, match="did not take the id 9"):
+        with pytest.raises(RequestRejected, match="did not take the id 9"):
             servo.set_id(9)
 
 
 def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
     with unopened() as bench, lone_servo(bench.case) as servo:
         monkeypatch.setattr(type(bench.parts.servo), "baudrate", property(lambda _: 57_600))
-        with pytest.raises(DeviceRefused, match="1000000 baud"):
+        with pytest.raises(RequestRejected, match="1000000 baud"):
             servo.set_baud(1_000_000)
         assert servo.read()["Baud Rate"] == 3  # what it was told; it answers at the rate that it has
 

@@ -17,7 +17,7 @@ PING, READ = 0x01, 0x02
 
 
 def heard(bench, *bauds: int, protocol: int = 2) -> list[Heard]:
-    return list(scan_servos(bench.parts.adapter, bench.case.host.clock, bauds or BAUD_RATES, protocol=protocol))
+    return list(scan_servos(bench.parts.adapter, bench.case.computer.clock, bauds or BAUD_RATES, protocol=protocol))
 
 
 places = st.tuples(
@@ -107,7 +107,7 @@ def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
             return getattr(self.wire, name)
 
     with unopened() as bench:
-        said = list(scan_servos(Relay(bench.parts.adapter), bench.case.host.clock))
+        said = list(scan_servos(Relay(bench.parts.adapter), bench.case.computer.clock))
         assert [len(each.servos) for each in said] == [1] * 8
         (once,) = without_echoes(said, 115_200)
         assert once.baud == 115_200
@@ -132,7 +132,7 @@ def test_rates_that_the_adapter_lacks_are_left_out():
             setattr(self.wire, name, value)
 
     with unopened() as bench:
-        rates = [said.baud for said in scan_servos(Slow(bench.parts.adapter), bench.case.host.clock)]
+        rates = [said.baud for said in scan_servos(Slow(bench.parts.adapter), bench.case.computer.clock)]
         assert rates == [57_600, 1_000_000, 115_200, 9_600]
 
 
@@ -185,7 +185,7 @@ def test_each_imu_is_known_by_its_own_register_at_each_of_its_addresses(chip):
             bench.parts.i2c.detach(0x68)
             device = RegisterFile({chip.register: chip.value})
             bench.parts.i2c.attach(address, device)
-            (found,) = scan_imus(bench.case.host, 1)
+            (found,) = scan_imus(bench.case.computer, 1)
             assert (found.name, found.driver, found.address) == (chip.name, chip.driver, address)
             assert all(len(data) == 1 for data in device.written)  # a register's number, never a value
 
@@ -196,7 +196,7 @@ def test_an_unknown_chip_is_told_with_what_it_says_and_foreign_addresses_are_lef
         clock, memory = RegisterFile({0x00: 0x37}), RegisterFile({})
         bench.parts.i2c.attach(0x68, clock)
         bench.parts.i2c.attach(0x50, memory)
-        (found,) = scan_imus(bench.case.host, 1)
+        (found,) = scan_imus(bench.case.computer, 1)
         assert found.driver is None
         assert "register 0x00 is 0x37" in str(found)
         assert not memory.written
@@ -206,4 +206,4 @@ def test_a_bus_that_is_held_low_is_an_error_of_the_system():
     with unopened() as bench:
         bench.parts.i2c.stuck = True
         with pytest.raises(TimeoutError):
-            scan_imus(bench.case.host, 1)
+            scan_imus(bench.case.computer, 1)

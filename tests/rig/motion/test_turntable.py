@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NotReady, Stalled
 from rig.devices.servo import MotionProfile
 from rig.motion.turntable import Turntable, motion_seconds
-from rig.safety.supervisor import State
+from rig.safety.supervisor import TableState
 from sim.noise import NoiseModel
 from sim.servo import Frame
 from tests.rig.bench_parts import motion_bench
@@ -95,7 +95,7 @@ def test_a_stop_runs_out_along_the_ramp_and_does_not_come_back():
         slowing = -np.diff(speeds).min() / 0.01
         assert slowing < 1.5 * bench.config.table.acceleration_dps2
         assert speeds[-1] == 0
-        assert bench.safety.state is State.STOPPED
+        assert bench.safety.state is TableState.STOPPED
 
 
 def test_a_target_beyond_the_cable_is_refused_before_anything_moves():
@@ -137,7 +137,7 @@ def test_a_jammed_table_is_found_long_before_the_servo_shuts_down_and_is_left_wi
             table.goto(60.0)
         assert (wires.world.clock.now_ns() - jammed_ns) * 1e-9 < 1.5
         assert caught.value.exit_code == 5
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
         assert bench.safety.fault.code == Stalled.code
         assert wires.device.memory["Hardware Error Status"] == 0
         assert wires.device.memory["Torque Enable"] == 0

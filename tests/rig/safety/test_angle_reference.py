@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hbr.core.angles import wrap180
 from rig.config import TableConfig
 from rig.devices.servo import ServoCondition, ServoIdentity
-from rig.safety.angle_reference import Reference, check_saved_angle
+from rig.safety.angle_reference import AngleReference, check_saved_angle
 from rig.safety.saved_state import SavedTable
 
 IDENTITY = ServoIdentity("xl430_w250", 1060, 1, 46)
@@ -21,13 +21,13 @@ def saved(position_deg: float, shift_deg: float = 0.0, path_deg: tuple[float, fl
 
 @given(st.sampled_from([1, -1]), st.floats(-180, 540), st.floats(-720, 720), st.floats(-400, 400))
 def test_servo_and_table_convert_both_ways(direction, zero_deg, shift_deg, table_deg):
-    reference = Reference(TableConfig(direction=direction, zero_deg=zero_deg), shift_deg)
+    reference = AngleReference(TableConfig(direction=direction, zero_deg=zero_deg), shift_deg)
     assert reference.to_table(reference.to_servo(table_deg)) == pytest.approx(table_deg, abs=1e-9)
 
 
 @given(st.sampled_from([1, -1]), st.floats(-720, 720), st.floats(-720, 720), st.integers(-3, 3))
 def test_what_a_person_declares_holds(direction, position_deg, table_deg, turns):
-    reference = Reference(TableConfig(direction=direction))
+    reference = AngleReference(TableConfig(direction=direction))
     before_deg = reference.to_table(position_deg)
     wound_deg = reference.with_turns(position_deg, turns)
     assert wrap180(wound_deg - before_deg) == pytest.approx(0, abs=1e-6)

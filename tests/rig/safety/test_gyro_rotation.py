@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rig.core.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
 from rig.devices.imu import ImuSamples
 from rig.devices.mpu6050 import Mpu6050
-from rig.safety.gyro_rotation import GyroHeading, Rotation, compare
+from rig.safety.gyro_rotation import GyroRotationMeter, Rotation, compare
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
 from sim.motion import to_position, to_velocity
@@ -28,7 +28,7 @@ class Bench:
         self.bus = SimI2cBus(self.clock)
         self.bus.attach(0x68, self.sensor)
         self.imu = Mpu6050(self.bus.path, clock=self.clock, rate_hz=rate_hz)
-        self.heading = GyroHeading(self.imu, self.clock, **heading)
+        self.heading = GyroRotationMeter(self.imu, self.clock, **heading)
 
     def __enter__(self) -> "Bench":
         return self
@@ -324,7 +324,7 @@ def test_a_rest_drops_the_rotation_of_a_move_that_was_broken_off(bench: Bench) -
 @pytest.mark.parametrize("wrong", [{"axis": "w"}, {"sign": 0}, {"scale": 0.0}, {"scale": -1.0}, {"scale_sigma": -0.1}])
 def test_an_impossible_mounting_is_refused(bench: Bench, wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        GyroHeading(bench.imu, bench.clock, **wrong)
+        GyroRotationMeter(bench.imu, bench.clock, **wrong)
 
 
 @given(

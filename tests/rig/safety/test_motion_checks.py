@@ -19,8 +19,8 @@ from rig.core.errors import (
 from rig.devices.servo import ServoLimits, ServoState
 from rig.motion.turntable import Turntable
 from rig.safety.gyro_rotation import Rotation
-from rig.safety.motion_checks import SlipWatch, Watch, unfit
-from rig.safety.supervisor import State
+from rig.safety.motion_checks import MotionMonitor, SlipMonitor, find_servo_fault
+from rig.safety.supervisor import TableState
 from sim.servo import motor
 from tests.rig.bench_parts import motion_bench
 
@@ -62,7 +62,7 @@ def test_a_fault_in_a_motion_is_found_in_time_and_leaves_the_table_stopped_and_l
                 assert (clock.now_ns() - begun_ns[0]) * 1e-9 < within_s + 0.6
                 assert wires.world.shaft()[1] == 0
                 raise
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
         assert bench.safety.fault.code == caught.value.code
         assert caught.value.exit_code in (4, 5)
         assert caught.value.next_step
@@ -79,7 +79,7 @@ def test_a_table_that_is_hard_to_turn_is_an_overload(monkeypatch):
             table.goto(300.0)
         assert caught.value.evidence["load_percent"] == pytest.approx(85, abs=10)
         assert wires.device.memory["Hardware Error Status"] == 0
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
 
 
 def test_a_servo_whose_torque_is_gone_makes_no_progress():
@@ -89,7 +89,7 @@ def test_a_servo_whose_torque_is_gone_makes_no_progress():
             wires.device.memory["Torque Enable"] = 0
             wires.device.motor.release()
             table.goto(60.0)
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
         bench.safety.acknowledge()
         with Turntable(bench) as table:
             assert table.goto(60.0).agrees
@@ -128,12 +128,12 @@ def test_heat_at_rest_is_found_before_anything_moves_and_is_forgiven_when_it_has
             pytest.fail("it moves")
         assert not any(driven)
         assert "below 62 °C" in caught.value.next_step
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
         wires.device.set_temperature(65.0)  # not too hot any more, but not cool either
         with pytest.raises(Overheated):
             bench.safety.acknowledge()
         wires.device.set_temperature(50.0)
-        assert bench.safety.acknowledge() is State.READY
+        assert bench.safety.acknowledge() is TableState.READY
 
 
 def test_heat_and_a_request_to_stop_are_heeded_between_two_motions_too():
@@ -147,7 +147,7 @@ def test_heat_and_a_request_to_stop_are_heeded_between_two_motions_too():
             table.goto(40.0)
             wires.device.set_temperature(70.0)
             table.check_still()
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
         assert wires.device.memory["Torque Enable"] == 0
 
 
@@ -172,7 +172,7 @@ def test_a_platter_that_slips_less_than_the_bound_is_left_to_the_end_of_the_move
         clock.call_at(clock.now_ns() + 1_000_000_000, lambda: wires.world.slip(-6.0, 0.2))
         move = table.goto(120.0)
         assert not move.agrees
-        assert bench.safety.state is State.READY
+        assert bench.safety.state is TableState.READY
 
 
 def test_a_calibration_of_the_gyro_does_not_trust_it():
@@ -199,15 +199,15 @@ def test_no_honest_motion_is_broken_off(velocity, target):
 # -- the watch alone -------------------------------------------------------------------------------------------------
 
 
-def a_watch(goal_deg: float = 300.0) -> Watch:
-    return Watch(CONFIG, LIMITS, start_deg=0.0, goal_deg=goal_deg, tolerance_deg=0.6, cruise_dps=90.0)
+def a_watch(goal_deg: float = 300.0) -> MotionMonitor:
+    return MotionMonitor(CONFIG, LIMITS, start_deg=0.0, goal_deg=goal_deg, tolerance_deg=0.6, cruise_dps=90.0)
 
 
 def at(k: int, **values) -> ServoState:
     return replace(WELL, time_ns=round(k * PERIOD_S * 1e9), **values)
 
 
-def readings_until(error, watch: Watch, state, angle_deg, lag_deg) -> float:
+def readings_until(error, watch: MotionMonitor, state, angle_deg, lag_deg) -> float:
     """Return after how many seconds of such readings the watch raises ``error``."""
     for k in range(200):
         try:
@@ -249,15 +249,15 @@ def test_a_push_that_ends_is_forgotten():
 
 def test_hardware_errors_come_first_and_a_servo_that_was_hot_must_be_cool():
     assert isinstance(
-        unfit(replace(WELL, hardware_errors=("overload",), temperature_c=90.0), CONFIG, LIMITS), DeviceFault
+        find_servo_fault(replace(WELL, hardware_errors=("overload",), temperature_c=90.0), CONFIG, LIMITS), DeviceFault
     )
     warm = replace(WELL, temperature_c=64.0)
-    assert unfit(warm, CONFIG, LIMITS) is None
-    assert isinstance(unfit(warm, CONFIG, LIMITS, again=True), Overheated)
+    assert find_servo_fault(warm, CONFIG, LIMITS) is None
+    assert isinstance(find_servo_fault(warm, CONFIG, LIMITS, again=True), Overheated)
 
 
 def test_a_slip_is_judged_at_the_same_moment_and_by_what_the_gyro_is_sure_of():
-    slip = SlipWatch(CONFIG, start_deg=5.0)
+    slip = SlipMonitor(CONFIG, start_deg=5.0)
     for k in range(10):
         slip.note(k * 40, 5.0 + k)
     assert slip.encoder_deg(-1) is None

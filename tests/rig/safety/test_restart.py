@@ -20,7 +20,7 @@ from rig.core.errors import (
 )
 from rig.motion.turntable import Turntable
 from rig.safety.saved_state import FileStore
-from rig.safety.supervisor import State
+from rig.safety.supervisor import TableState
 from sim.servo import XSeriesServo
 from tests.rig.bench_parts import Wires, kill, program, sensor, servo_wires
 
@@ -31,11 +31,11 @@ def bench_of(tmp_path):
     with sensor(servo_wires()) as (wires, i2c):
         store = FileStore(tmp_path / "state")
         with program(wires, i2c, store) as bench:
-            assert bench.safety.state is State.UNREFERENCED
+            assert bench.safety.state is TableState.UNREFERENCED
             with pytest.raises(Unreferenced) as refused, Turntable(bench):
                 pass
             assert "rig home --turns 0" in refused.value.next_step
-            bench.safety.declare_turns(0)
+            bench.safety.set_revolutions(0)
         yield lambda: program(wires, i2c, FileStore(tmp_path / "state")), wires
 
 
@@ -59,7 +59,7 @@ def killed_in_motion(bench: Bench, wires: Wires, target_deg: float, after_s: flo
         motion.__enter__()
         yield
         bench.servo.arm_watchdog(bench.config.table.watchdog_s)
-        bench.servo.move_to(bench.safety.reference.to_servo(target_deg))
+        bench.servo.move_to(bench.safety.angle_reference.to_servo(target_deg))
         after(wires, after_s, die)
         with suppress(Killed):
             while True:
@@ -90,7 +90,7 @@ def test_after_sigkill_the_servo_stops_by_itself_and_the_next_program_says_so_be
         assert "torque was on" in told
         assert "watchdog had stopped it" in told
         assert "cut off in the middle of a motion" in told
-        assert bench.safety.state is State.READY  # it kept its supply: it has counted its turns
+        assert bench.safety.state is TableState.READY  # it kept its supply: it has counted its turns
         assert all(frame[7] != 3 for frame in wires.instructions[sent:])  # no write, so nothing moved
         with Turntable(bench) as table:
             assert wires.world.shaft()[0] == pytest.approx(stands_deg, abs=0.1)
@@ -109,12 +109,12 @@ def test_after_sigkill_and_a_power_cut_the_turns_are_in_doubt_and_a_person_tells
     stands_deg = wires.world.shaft()[0]
     assert stands_deg > 200  # 200° read as 20° would wind the cable up by a turn
     with start() as bench:
-        assert bench.safety.state is State.UNREFERENCED
+        assert bench.safety.state is TableState.UNREFERENCED
         assert "in the middle of a motion" in bench.safety.doubt
         with pytest.raises(Unreferenced), Turntable(bench):
             pass
         assert wires.device.memory["Torque Enable"] == 0
-        bench.safety.declare_turns(1 if stands_deg > 180 else 0)
+        bench.safety.set_revolutions(1 if stands_deg > 180 else 0)
         with Turntable(bench) as table:
             assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
             table.goto(0.0)
@@ -136,7 +136,7 @@ def test_a_power_cut_between_programs_costs_no_turn(bench_of):
         assert wires.world.shaft()[0] == pytest.approx(-360.0, abs=0.3)
     with start() as bench:  # what was restored is written down
         assert not bench.findings
-        assert bench.safety.state is State.READY
+        assert bench.safety.state is TableState.READY
 
 
 def test_turns_that_were_restored_survive_a_program_that_is_killed_at_rest(bench_of):
@@ -150,8 +150,10 @@ def test_turns_that_were_restored_survive_a_program_that_is_killed_at_rest(bench
         table.__enter__()  # and it is killed, with the torque on
         kill(wires)
     with start() as bench:
-        assert bench.safety.state is State.READY
-        assert bench.safety.reference.to_table(bench.servo.read_state().position_deg) == pytest.approx(-370.0, abs=0.3)
+        assert bench.safety.state is TableState.READY
+        assert bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg) == pytest.approx(
+            -370.0, abs=0.3
+        )
 
 
 def test_a_table_that_was_turned_while_the_supply_was_off_is_in_doubt(bench_of):
@@ -188,7 +190,7 @@ def test_a_supply_that_dips_in_the_middle_of_a_motion_ends_it_and_the_turns_are_
         with pytest.raises(Unreferenced), Turntable(bench):
             pass
     with start() as bench:
-        assert bench.safety.state is State.UNREFERENCED
+        assert bench.safety.state is TableState.UNREFERENCED
 
 
 def test_a_pulled_cable_ends_the_motion_and_on_its_return_nothing_moves_by_itself(bench_of):
@@ -197,7 +199,7 @@ def test_a_pulled_cable_ends_the_motion_and_on_its_return_nothing_moves_by_itsel
         with pytest.raises(DeviceSilent), Turntable(bench) as table:
             after(wires, 1.2, lambda: wires.bus.detach(wires.device))
             table.goto(300.0)
-        assert bench.safety.state is State.DISCONNECTED
+        assert bench.safety.state is TableState.DISCONNECTED
         wires.world.clock.sleep(1.0)
         stands_deg, speed_dps = wires.world.shaft()
         assert speed_dps == 0
@@ -221,7 +223,7 @@ def test_another_servo_on_the_cable_is_refused(bench_of, other):
         wires.bus.attach(XSeriesServo(wires.world, **other))
         with pytest.raises(DeviceMismatch), Turntable(bench):
             pass
-        assert bench.safety.state is State.DISCONNECTED
+        assert bench.safety.state is TableState.DISCONNECTED
 
 
 def test_a_watchdog_that_trips_under_a_live_program_is_told_as_such_and_leaves_no_fault(bench_of):
@@ -244,13 +246,13 @@ def test_a_fault_outlives_the_program_and_is_acknowledged_when_its_cause_is_gone
         wires.device.jam()
         table.goto(60.0)
     with start() as bench:
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
         with pytest.raises(FaultLatched, match="blocked") as refused, Turntable(bench):
             pass
         assert refused.value.evidence["code"] == Stalled.code
         assert "rig acknowledge" in refused.value.next_step
         wires.device.free()
-        assert bench.safety.acknowledge() is State.READY
+        assert bench.safety.acknowledge() is TableState.READY
     with start() as bench, Turntable(bench) as table:
         assert table.goto(60.0).agrees
 
@@ -268,8 +270,8 @@ def test_a_hardware_error_needs_a_reboot_after_which_all_is_verified_and_no_turn
         with pytest.raises(DeviceFault) as still:
             bench.safety.acknowledge()
         assert "rig acknowledge --reboot" in still.value.next_step
-        assert bench.safety.state is State.FAULT
-        assert bench.safety.acknowledge(reboot=True) is State.READY
+        assert bench.safety.state is TableState.FAULT
+        assert bench.safety.acknowledge(reboot=True) is TableState.READY
         assert wires.world.shaft() == (stands_deg, 0.0)
         with Turntable(bench) as table:
             assert table.rest_deg == pytest.approx(stands_deg, abs=0.3)
@@ -287,7 +289,7 @@ def test_a_reboot_that_shows_other_settings_leaves_the_fault(bench_of):
         wires.device.memory["Operating Mode"] = 3
         with pytest.raises(DeviceMismatch, match="EEPROM"):
             bench.safety.acknowledge(reboot=True)
-        assert bench.safety.state is State.FAULT
+        assert bench.safety.state is TableState.FAULT
 
 
 def test_an_old_goal_does_not_go_on_when_the_torque_that_a_killed_program_left_is_taken_over(bench_of):
@@ -309,7 +311,7 @@ def test_a_bench_whose_state_was_damaged_says_so_and_is_in_doubt(bench_of, tmp_p
     (tmp_path / "state" / "state.json").write_bytes(b'{"version": 1, "tab')
     with start() as bench:
         assert "is damaged" in bench.findings[0]
-        assert bench.safety.state is State.UNREFERENCED
+        assert bench.safety.state is TableState.UNREFERENCED
 
 
 def test_a_stop_that_was_asked_for_ends_the_motion_with_torque_off(bench_of, tmp_path):

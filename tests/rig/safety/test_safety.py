@@ -18,14 +18,14 @@ from rig.core.errors import (
     NotReady,
     RigError,
     Stalled,
-    StateNotKept,
+    StateNotStored,
     Unreferenced,
     UsageError,
 )
 from rig.devices.servo import ServoCondition, ServoIdentity, ServoLimits, ServoState
 from rig.safety.saved_state import BenchState, MemoryStore
-from rig.safety.state_machine import TRANSITIONS, Happening
-from rig.safety.supervisor import LATCHING, Safety, State
+from rig.safety.state_machine import TRANSITIONS, StateEvent
+from rig.safety.supervisor import LATCHING, Safety, TableState
 from sim.clock import VirtualClock
 from tests.fuzzing import fuzz_settings
 
@@ -104,8 +104,8 @@ class Bench(RuleBasedStateMachine):
 
     def keeps_its_promise(self) -> None:
         """What is READY knows its turns."""
-        if self.safety.state is State.READY:
-            told_deg = self.safety.reference.to_table(self.shaft.read_state().position_deg)
+        if self.safety.state is TableState.READY:
+            told_deg = self.safety.angle_reference.to_table(self.shaft.read_state().position_deg)
             assert told_deg == pytest.approx(self.shaft.cable_deg, abs=1e-6)
 
     # -- programs -----------------------------------------------------------------------------------------------------
@@ -126,9 +126,9 @@ class Bench(RuleBasedStateMachine):
     )
     def a_move(self, to_deg: float, share: float, end: str) -> None:
         safety, shaft = self.safety, self.shaft
-        with suppress(FaultLatched, Unreferenced, DeviceSilent, DeviceMismatch):
+        with suppress(DeviceFault, FaultLatched, Unreferenced, DeviceSilent, DeviceMismatch):
             safety.prepare()
-        if safety.state is not State.READY:
+        if safety.state is not TableState.READY:
             with pytest.raises(NotReady), safety.motion((0.0, to_deg), lambda: True):
                 pytest.fail("it moves")
             return
@@ -141,7 +141,7 @@ class Bench(RuleBasedStateMachine):
         with suppress(KeyboardInterrupt, ZeroDivisionError, RigError):
             with ExitStack() as block:
                 begun = block.enter_context(motion)
-                assert safety.state is State.MOVING
+                assert safety.state is TableState.MOVING
                 with pytest.raises(NotReady):
                     safety.require_ready()
                 shaft.cable_deg = start_deg + (to_deg - start_deg) * (1.0 if end == "arrives" else share)
@@ -154,11 +154,11 @@ class Bench(RuleBasedStateMachine):
             assert end == "arrives"
         error = ENDS.get(end)
         if error is None and end == "arrives":
-            assert safety.state is State.READY
+            assert safety.state is TableState.READY
         elif isinstance(error, LATCHING) or end == "supply lost":
-            assert safety.state is State.FAULT
+            assert safety.state is TableState.FAULT
         else:
-            assert safety.state is (State.STOPPED if shaft.there else State.DISCONNECTED)
+            assert safety.state is (TableState.STOPPED if shaft.there else TableState.DISCONNECTED)
         safety.released()
 
     def what_ends_it(self, end: str) -> None:
@@ -180,7 +180,7 @@ class Bench(RuleBasedStateMachine):
             self.safety.acknowledge(reboot=reboot)
             assert well
             assert self.safety.fault is None
-            assert self.safety.state in (State.READY, State.UNREFERENCED)
+            assert self.safety.state in (TableState.READY, TableState.UNREFERENCED)
             return
         assert self.safety.fault == fault
         assert not well or fault is None
@@ -190,7 +190,7 @@ class Bench(RuleBasedStateMachine):
     def a_plan_finds_something_wrong(self) -> None:
         self.safety.latch(Stalled(f"Fault {self.latched}.", next_step="Look."))
         self.latched += 1
-        assert self.safety.state is State.FAULT
+        assert self.safety.state is TableState.FAULT
 
     @rule()
     def everything_is_mended(self) -> None:
@@ -209,17 +209,17 @@ class Bench(RuleBasedStateMachine):
     def somebody_looks_at_the_cable(self, zero_here: bool) -> None:
         with suppress(NotReady):
             if zero_here:
-                self.safety.declare(0.0)
+                self.safety.set_angle(0.0)
                 self.shaft.count_deg += self.shaft.cable_deg
                 self.shaft.cable_deg = 0.0
             elif self.safety.doubt and "nobody" not in self.safety.doubt:
                 within_deg = float(wrap180(self.shaft.cable_deg))
-                self.safety.declare_turns(round((self.shaft.cable_deg - within_deg) / 360.0))
+                self.safety.set_revolutions(round((self.shaft.cable_deg - within_deg) / 360.0))
             else:
-                self.safety.declare(self.shaft.cable_deg)
-            assert self.safety.state is State.READY
+                self.safety.set_angle(self.shaft.cable_deg)
+            assert self.safety.state is TableState.READY
             return
-        assert self.safety.state in (State.FAULT, State.STOPPED, State.DISCONNECTED)
+        assert self.safety.state in (TableState.FAULT, TableState.STOPPED, TableState.DISCONNECTED)
 
     @rule(by_deg=st.floats(-720, 720) | st.sampled_from([-360.0, -180.0, 0.0, 180.0, 360.0]))
     def the_table_is_turned_by_hand(self, by_deg: float) -> None:
@@ -249,9 +249,9 @@ class Bench(RuleBasedStateMachine):
     @invariant()
     def a_fault_outlives_its_program(self) -> None:
         if self.safety.fault:
-            assert self.safety.state is State.FAULT
+            assert self.safety.state is TableState.FAULT
             again = self.process()
-            assert again.state is State.FAULT
+            assert again.state is TableState.FAULT
             assert again.fault == self.safety.fault
             with pytest.raises(FaultLatched, match=self.safety.fault.what):
                 again.require_ready()
@@ -263,14 +263,18 @@ TestBench.settings = settings(fuzz_settings(0.2), stateful_step_count=30)
 
 def test_the_table_of_transitions_lets_nothing_out_of_a_fault_but_an_acknowledgement():
     leaving = [(s, h, to) for s, ways in TRANSITIONS.items() for h, to in ways.items() if s is not to]
-    assert {h for s, h, _ in leaving if s is State.FAULT} == {Happening.ACKNOWLEDGE}
-    assert {(s, h) for s, h, to in leaving if to is State.MOVING} == {(State.READY, Happening.START)}
-    assert all(ways[Happening.LATCH] is State.FAULT for ways in TRANSITIONS.values())
-    assert {s for s, h, to in leaving if to is State.READY} == {State.CONNECTED, State.UNREFERENCED, State.MOVING}
+    assert {h for s, h, _ in leaving if s is TableState.FAULT} == {StateEvent.ACKNOWLEDGE}
+    assert {(s, h) for s, h, to in leaving if to is TableState.MOVING} == {(TableState.READY, StateEvent.START)}
+    assert all(ways[StateEvent.LATCH] is TableState.FAULT for ways in TRANSITIONS.values())
+    assert {s for s, h, to in leaving if to is TableState.READY} == {
+        TableState.CONNECTED,
+        TableState.UNREFERENCED,
+        TableState.MOVING,
+    }
     with pytest.raises(TypeError):
-        TRANSITIONS[State.FAULT] = {}
+        TRANSITIONS[TableState.FAULT] = {}
     with pytest.raises(AttributeError):
-        Safety(Shaft(), RigConfig(), VirtualClock()).state = State.READY
+        Safety(Shaft(), RigConfig(), VirtualClock()).state = TableState.READY
 
 
 def test_a_state_that_cannot_be_written_down_lets_nothing_move():
@@ -279,32 +283,32 @@ def test_a_state_that_cannot_be_written_down_lets_nothing_move():
 
         def save(self, state: BenchState) -> None:
             if self.full:
-                raise StateNotKept("The disk is full.", next_step="Make room.")
+                raise StateNotStored("The disk is full.", next_step="Make room.")
             super().save(state)
 
     store = Full()
     safety = Safety(Shaft(), RigConfig(), VirtualClock(), store)
     safety.connect()
-    safety.declare(0.0)
+    safety.set_angle(0.0)
     store.full = True
-    with pytest.raises(StateNotKept), safety.motion((0.0, 90.0), lambda: True):
+    with pytest.raises(StateNotStored), safety.motion((0.0, 90.0), lambda: True):
         pytest.fail("it moves")
-    assert safety.state is State.READY
+    assert safety.state is TableState.READY
     stalled = Stalled("Blocked.", next_step="Free it.")
     safety.latch(stalled)  # a fault is a fault, whether the disk is full or not
-    assert safety.state is State.FAULT
+    assert safety.state is TableState.FAULT
     assert "in this program alone" in stalled.__notes__[0]
 
 
 def test_a_motion_that_nobody_said_to_have_arrived_was_broken_off():
     safety = Safety(Shaft(), RigConfig(), VirtualClock())
     safety.connect()
-    safety.declare(0.0)
+    safety.set_angle(0.0)
     stops = []
     with pytest.raises(MotionStopped), safety.motion((0.0, 90.0), lambda: bool(stops.append(1)) or True):
         pass
     assert stops == [1]
-    assert safety.state is State.STOPPED
+    assert safety.state is TableState.STOPPED
 
 
 def test_evidence_that_json_does_not_know_is_kept_in_words():
@@ -331,9 +335,9 @@ def test_an_acknowledgement_asks_every_device_that_has_a_say():
     def gyro() -> None:
         raise UsageError("the gyro is not well", next_step="look at it")
 
-    safety.checks.append(gyro)
+    safety.acknowledge_checks.append(gyro)
     with pytest.raises(UsageError):
         safety.acknowledge()
-    assert safety.state is State.FAULT
-    safety.checks.clear()
-    assert safety.acknowledge() is State.UNREFERENCED
+    assert safety.state is TableState.FAULT
+    safety.acknowledge_checks.clear()
+    assert safety.acknowledge() is TableState.UNREFERENCED

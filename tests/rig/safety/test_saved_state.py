@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from rig.config import load_config
 from rig.core.clock import SystemClock
-from rig.core.errors import BenchBusy, Stalled, StateNotKept
-from rig.safety.saved_state import BenchLock, BenchState, Fault, FileStore, Holder, SavedTable, holder
+from rig.core.errors import BenchBusy, Stalled, StateNotStored
+from rig.safety.saved_state import BenchLock, BenchState, FileStore, Holder, LatchedFault, SavedTable, holder
 from tests.fuzzing import fuzz_settings
 
 HOLD = """
@@ -54,7 +54,7 @@ def somebody(tmp_path):
     what=st.text(),
 )
 def test_what_was_written_is_read(tmp_path_factory, table, what):
-    fault = Fault.of(Stalled(what, next_step="Free it.", evidence={"load_percent": 99.0}), "2026-01-02T03:04:05")
+    fault = LatchedFault.of(Stalled(what, next_step="Free it.", evidence={"load_percent": 99.0}), "2026-01-02T03:04:05")
     state = BenchState(table=table, fault=fault)
     folder = tmp_path_factory.getbasetemp() / "state"
     FileStore(folder).save(state)
@@ -85,10 +85,10 @@ def test_another_version_or_shape_is_not_guessed_at(tmp_path, text):
 
 def test_a_folder_that_cannot_be_written_to_is_told_with_what_to_do(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StateNotKept, match="nothing may move") as caught:
+    with pytest.raises(StateNotStored, match="nothing may move") as caught:
         FileStore(tmp_path / "file" / "bench").save(BenchState(table=TABLE))
     assert "state_dir" in caught.value.next_step
-    with pytest.raises(StateNotKept):
+    with pytest.raises(StateNotStored):
         BenchLock(tmp_path / "file" / "bench", SystemClock())
 
 
@@ -100,7 +100,7 @@ def test_a_half_written_state_leaves_the_old_one(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(StateNotKept) as caught:
+    with pytest.raises(StateNotStored) as caught:
         store.save(BenchState())
     assert caught.value.evidence["reason"] == "No space left on device"
     assert store.load().table == TABLE

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import RigConfig, load_config
-from rig.core.errors import StateNotKept, TableNotEmpty, UsageError, ViewRejected
+from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
 from rig.events.events import EmptyTableImage, Warned
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
@@ -196,15 +196,15 @@ def test_a_full_disk_is_told_and_the_picture_before_stays(simulated: Open, tmp_p
     class Full(FileStore):
         """Full where pictures go; the table's turns were kept before."""
 
-        def keep_file(self, name: str, content: bytes) -> None:
+        def store_file(self, name: str, content: bytes) -> None:
             free = disk.fill()
             try:
-                super().keep_file(name, content)
+                super().store_file(name, content)
             finally:
                 free()
 
     s.bench.state = Full(tmp_path)
-    with pytest.raises(StateNotKept, match="cannot be kept") as caught:
+    with pytest.raises(StateNotStored, match="cannot be kept") as caught:
         photographed(s.bench)
     assert "Make room" in caught.value.next_step
     s.bench.state = store

@@ -13,7 +13,7 @@ from rig.events.events import Accepted
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
-from rig.safety.supervisor import State
+from rig.safety.supervisor import TableState
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.parts import SimParts
@@ -68,7 +68,7 @@ def test_an_estop_in_mid_motion_stops_the_table_and_latches(on_head):
     with pytest.raises(EmergencyStop), Turntable(s.bench) as table:
         s.world.clock.call_at(s.world.clock.now_ns() + 1_500_000_000, lambda: setattr(head, "estop_open", True))
         table.goto(300.0)
-    assert s.bench.safety.state is State.FAULT
+    assert s.bench.safety.state is TableState.FAULT
     assert "e-stop" in s.bench.safety.fault.what
     stopped_deg = s.world.table_deg()
     assert 1.0 < stopped_deg < 299.0
@@ -83,7 +83,7 @@ def test_an_estop_in_mid_motion_stops_the_table_and_latches(on_head):
     s.bench.safety.acknowledge()
     assert head.relay_closed
     assert s.world.table_deg() == pytest.approx(stopped_deg, abs=2.0)  # nothing moved by itself
-    assert s.bench.safety.state in (State.READY, State.UNREFERENCED)
+    assert s.bench.safety.state in (TableState.READY, TableState.UNREFERENCED)
 
 
 def test_an_estop_while_the_table_rests_is_found_before_the_next_motion(on_head):
@@ -93,7 +93,7 @@ def test_an_estop_while_the_table_rests_is_found_before_the_next_motion(on_head)
         s.operator.parts.head.estop_open = True
         s.world.clock.sleep(0.2)
         table.goto(40.0)
-    assert s.bench.safety.state is State.FAULT
+    assert s.bench.safety.state is TableState.FAULT
     assert s.world.table_deg() == pytest.approx(20.0, abs=1.0)
 
 
@@ -131,12 +131,12 @@ def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
     operator = ShelfOperator(world, shelf())
     config = load_config(None, WIRED)
     first = open_sim_bench(config, operator)
-    parts, wires = operator.parts, first.wires.pop_all()
+    parts, wires = operator.parts, first.connections.pop_all()
     first.head._cancel()  # kill -9
     world.clock.sleep(1.0)
     assert not parts.head.relay_closed
     with open_sim_bench(config, operator, parts=parts) as second:
-        assert second.safety.state is State.FAULT
+        assert second.safety.state is TableState.FAULT
         with pytest.raises(FaultLatched, match="heard nothing"), Turntable(second):
             pass
         assert parts.head.relay_closed  # the servo can be asked how it is; it has no torque
@@ -165,7 +165,7 @@ def test_a_bench_whose_estop_is_pressed_says_what_to_do():
     operator = ShelfOperator(world, shelf())
     config = load_config(None, WIRED)
     with open_sim_bench(config, operator) as bench:
-        parts, wires = operator.parts, bench.wires.pop_all()
+        parts, wires = operator.parts, bench.connections.pop_all()
     parts.head.estop_open = True
     world.clock.sleep(0.1)
     with pytest.raises(EmergencyStop) as caught:

@@ -5,21 +5,21 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from rig.core.errors import DeviceRefused
+from rig.core.errors import RequestRejected
 from rig.devices.head.link import HeadLink
 from rig.devices.head.protocol import (
     DEADMAN_MAX_MS,
     DEADMAN_MIN_MS,
     Acknowledge,
-    Beat,
     Done,
-    Fault,
+    HeadFault,
+    HeadState,
+    Heartbeat,
+    HeartbeatReply,
     Light,
-    Pulse,
     Relay,
     Reset,
-    Rest,
-    State,
+    Shutdown,
     Trigger,
     Triggered,
 )
@@ -42,12 +42,12 @@ class Head(RuleBasedStateMachine):
         self.head = SimHead(self.world)
         self.link = HeadLink(HeadSerial(self.head), self.world.clock, lambda _event: None, "head")
         self.link.start()
-        self.told: Pulse | None = None
+        self.told: HeartbeatReply | None = None
         self.deadman_ns = 0
         self.beaten_ns: int | None = None
         self.acknowledged_ns = 0
         self.opened_ns: int | None = None
-        self.latched = Fault(0)
+        self.latched = HeadFault(0)
 
     def teardown(self):
         if hasattr(self, "head"):
@@ -59,7 +59,7 @@ class Head(RuleBasedStateMachine):
     def ask(self, message, expected) -> bool:
         try:
             self.link.request(message, expected)
-        except DeviceRefused:
+        except RequestRejected:
             return False
         return True
 
@@ -68,7 +68,7 @@ class Head(RuleBasedStateMachine):
     @rule(deadman_ms=st.sampled_from([DEADMAN_MIN_MS, 100, 250, DEADMAN_MAX_MS]))
     def beat(self, deadman_ms):
         self.expire()
-        self.told = self.link.request(Beat(deadman_ms), Pulse)
+        self.told = self.link.request(Heartbeat(deadman_ms), HeartbeatReply)
         self.deadman_ns, self.beaten_ns = deadman_ms * MS, self.link.heard_ns
 
     @rule(level=st.integers(0, 255))
@@ -91,20 +91,20 @@ class Head(RuleBasedStateMachine):
         if self.ask(Trigger(width_us), Triggered):
             assert not self.latched
 
-    @rule(seen=st.sampled_from([0xFF, int(Fault.DEADMAN), int(Fault.ESTOP), 0]))
+    @rule(seen=st.sampled_from([0xFF, int(HeadFault.DEADMAN), int(HeadFault.ESTOP), 0]))
     def acknowledge(self, seen):
         self.expire()
         if self.ask(Acknowledge(seen), Done):
-            assert not (seen & Fault.ESTOP and self.head.estop_open)
+            assert not (seen & HeadFault.ESTOP and self.head.estop_open)
             if self.latched:
-                self.latched &= ~Fault(seen)
+                self.latched &= ~HeadFault(seen)
                 if not self.latched:
                     self.beaten_ns = None
 
     @rule()
     def rest(self):
         self.expire()
-        self.ask(Rest(), Done)
+        self.ask(Shutdown(), Done)
         self.beaten_ns = None if not self.latched else self.beaten_ns
 
     @precondition(lambda self: not self.head.estop_open)
@@ -112,7 +112,7 @@ class Head(RuleBasedStateMachine):
     def press(self):
         self.head.estop_open = True
         self.world.clock.sleep(0.0015)
-        self.latched |= Fault.ESTOP
+        self.latched |= HeadFault.ESTOP
         assert not self.head.relay_closed
         assert self.head.light == 0
 
@@ -133,10 +133,12 @@ class Head(RuleBasedStateMachine):
         assert not self.head.relay_closed
         assert self.head.light == 0
         self.beaten_ns = None
-        self.latched = {Reset.BROWN_OUT: Fault.BROWN_OUT, Reset.WATCHDOG: Fault.WATCHDOG}.get(cause, Fault(0))
+        self.latched = {Reset.BROWN_OUT: HeadFault.BROWN_OUT, Reset.WATCHDOG: HeadFault.WATCHDOG}.get(
+            cause, HeadFault(0)
+        )
         self.world.clock.sleep(0.01)
         if self.head.estop_open:
-            self.latched |= Fault.ESTOP
+            self.latched |= HeadFault.ESTOP
 
     @rule(noise=st.binary(min_size=1, max_size=40))
     def babble(self, noise):
@@ -155,7 +157,7 @@ class Head(RuleBasedStateMachine):
             self.world.clock.sleep(2 * SLACK_NS * 1e-9)
             silent_ns = self.now_ns() - self.beaten_ns
         if silent_ns > self.deadman_ns:
-            self.latched |= Fault.DEADMAN
+            self.latched |= HeadFault.DEADMAN
 
     @invariant()
     def nothing_is_on_that_must_not_be(self):
@@ -173,9 +175,9 @@ class Head(RuleBasedStateMachine):
     def it_tells_what_it_does(self):
         if getattr(self, "told", None) is not None:
             told, self.told = self.told, None
-            assert Fault(told.faults) == self.latched
-            assert (told.state == State.FAULT) == bool(self.latched)
-            assert told.state != State.IDLE
+            assert HeadFault(told.faults) == self.latched
+            assert (told.state == HeadState.FAULT) == bool(self.latched)
+            assert told.state != HeadState.IDLE
 
 
 TestHead = pytest.mark.skipif(bool(missing("memory")), reason=missing("memory"))(Head.TestCase)

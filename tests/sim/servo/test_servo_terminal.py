@@ -96,7 +96,7 @@ def test_the_sdks_own_port_and_the_rigs_driver_find_it(
         seen.append(servo.read_state().position_deg - start_deg)
     assert seen[-1] == pytest.approx(60.0, abs=1.0)
     assert any(5 < angle < 55 for angle in seen)
-    assert servo.line["retries"] == 0
+    assert servo.bus_statistics["retries"] == 0
     servo.torque_off()
     servo.close()
 

@@ -6,19 +6,19 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rig.bench.computer import SERIAL_NAMES, LinuxHost, User
+from rig.bench.computer import SERIAL_NAMES, LinuxComputer, User
 from rig.config import RigConfig
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.port import ClockedPort, Wire
+from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.devices.opencv_camera import Capture
 from sim.i2c import SimI2cBus
 from sim.parts import SimParts
 
 
-class Computer:
+class ComputerFiles:
     """Lays out, below a folder, what Linux shows of devices: device files, sysfs, /proc and /etc/group."""
 
     def __init__(self, root: Path) -> None:
@@ -91,7 +91,7 @@ class Computer:
             self.write("run/systemd/timesync/synchronized")
 
 
-class SimHost(LinuxHost):
+class SimComputer(LinuxComputer):
     """A laid-out computer with the simulated devices at the places where ``config`` looks for them."""
 
     def __init__(self, root: Path, parts: SimParts, config: RigConfig, user: User | None = None) -> None:
@@ -101,7 +101,7 @@ class SimHost(LinuxHost):
         self._head_port = config.head.port
         self._bus = self.i2c_name(config.imu.bus)
 
-    def open_wire(self, path: str, baud: int) -> Wire:
+    def open_serial(self, path: str, baud: int) -> SerialConnection:
         if self.parts.head is not None and self.same_file(path, self._head_port):
             return self.parts.head_port()
         if not self.same_file(path, self._port):
@@ -119,10 +119,10 @@ class SimHost(LinuxHost):
 
 
 @contextmanager
-def simulated_host(config: RigConfig, parts: SimParts) -> Iterator[SimHost]:
+def simulated_computer(config: RigConfig, parts: SimParts) -> Iterator[SimComputer]:
     """Yield the computer of a simulated bench, its servo set up as the bench does when it is opened."""
     with TemporaryDirectory(prefix="sim-host-") as folder:
-        computer = Computer(Path(folder))
+        computer = ComputerFiles(Path(folder))
         name = Path(config.servo.port).name
         stable = config.servo.port.startswith("/dev/serial/by-id/")
         if SERIAL_NAMES.fullmatch(name):
@@ -143,7 +143,7 @@ def simulated_host(config: RigConfig, parts: SimParts) -> Iterator[SimHost]:
         computer.keeps_time()
         with suppress(RigError):  # no supply, a fault: the doctor tells
             _set_up(parts, config.servo.id, config.servo.model)
-        yield SimHost(Path(folder), parts, config)
+        yield SimComputer(Path(folder), parts, config)
 
 
 def _set_up(parts: SimParts, bus_id: int, model: str) -> None:

@@ -7,7 +7,7 @@ from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
 from sim.clock import VirtualClock
 
 
-class ScriptedWire:
+class ScriptedSerial:
     """Answers each write with the next of ``answers``, byte by byte, and then stays silent."""
 
     def __init__(self, clock: VirtualClock, answers: Iterable[bytes], baudrate: int = 1_000_000) -> None:
@@ -40,7 +40,7 @@ class ScriptedWire:
     def close(self) -> None: ...
 
 
-def scripted_bus(*answers: bytes, retries: int = 0, protocol: int = 2) -> tuple[DynamixelBus, ScriptedWire]:
+def scripted_bus(*answers: bytes, retries: int = 0, protocol: int = 2) -> tuple[DynamixelBus, ScriptedSerial]:
     clock = VirtualClock()
-    wire = ScriptedWire(clock, answers)
+    wire = ScriptedSerial(clock, answers)
     return DynamixelBus(ClockedPort(wire, clock, "scripted"), retries, protocol), wire
