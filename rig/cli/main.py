@@ -1,4 +1,4 @@
-"""The command `rig`."""
+"""The command line program `rig`: all commands, grouped as in its help."""
 
 import sys
 from importlib.metadata import entry_points, version
@@ -20,13 +20,15 @@ from rig.cli.ui.command import (
     SetOption,
     without_color,
 )
+from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.cli.ui.settings import Settings
 
 GROUP = "rig.commands"
 
 app = typer.Typer(
     name="rig",
-    help="Turntable rig: enroll objects as views at known angles, and find them again by active retrieval.",
+    help="Control the turntable rig: enroll objects as views at known angles, and identify them.",
+    epilog="\n".join(["Exit codes", "", *(f"{code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())]),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -52,13 +54,13 @@ def common(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Take the common options before the subcommand; they may also follow it."""
+    """Read the common options before the command; they can also follow it."""
     ctx.obj = Settings().merged(bench, config, overrides, seed, json_)
 
 
-common.__doc__ = None  # the help of the program is the app's
+common.__doc__ = None  # or it would replace the help of the app
 
-OBJECTS, BENCH, MORE = "Objects", "Bench", "More"  # headings of the help
+OBJECTS, BENCH, MORE = "Objects", "Bench", "More"  # panels of the help
 
 app.command("enroll", rich_help_panel=OBJECTS)(enroll.enroll)
 app.command("identify", rich_help_panel=OBJECTS)(identify.identify)
@@ -84,8 +86,11 @@ app.command("eval", rich_help_panel=MORE)(evaluate.evaluate)
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
     try:
         _plugin = _point.load()
-    except (ImportError, AttributeError) as _broken:  # somebody's broken plug-in must not take the rig's commands along
-        print(f"The command {_point.name} of {_point.value} is left out: {_broken}", file=sys.stderr)
+    except (ImportError, AttributeError) as _broken:  # the other commands work without this plug-in
+        print(
+            f"The plug-in {_point.value} cannot be loaded, so there is no command {_point.name}: {_broken}",
+            file=sys.stderr,
+        )
         continue
     if isinstance(_plugin, typer.Typer):
         app.add_typer(_plugin, name=_point.name, rich_help_panel=MORE)
@@ -96,8 +101,8 @@ for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
 def main() -> None:
     """Run the command line."""
     if "--no-color" in sys.argv:
-        without_color()  # before anything is printed, help and mistakes of usage included
+        without_color()  # before Typer prints help or a usage error
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without ° or − gets ?, not a traceback
+            stream.reconfigure(errors="replace")  # a terminal that cannot show ° or − shows ? instead of a traceback
     app()

@@ -1,8 +1,8 @@
-"""`rig empty-table`: the picture of the bench without an object, and the question for it at the start of a day."""
+"""`rig empty-table`: take the empty-table image; enrollment asks for it once a day."""
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -13,68 +13,48 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from rig.bench import Bench
 
-WITHOUT = "objects are found before a plain background only, and less surely in other light"
-STALE = "the one that is there is used, as far as frames look like it"
+WITHOUT_IMAGE: Final = "without it, objects are found only before a plain background, and less well in other light"
+OLD_IMAGE: Final = "the old image is used for the frames that still match it"
 
 
 @command
 def empty_table(
     settings: Settings,
     show: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Only write the picture that is there, as PNG.")
+        Path | None, typer.Option(metavar="FILE", help="Only write the stored image to a PNG file.")
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Keep it although something on the table turns: a pattern, a screw.")
+        bool,
+        typer.Option("--anyway", help="Store the image although something on the table rotates: a pattern or a screw."),
     ] = False,
 ) -> None:
-    """Take the picture of the empty table that objects are found by; once a day, and when the light has changed.
+    """Take an image of the empty table. Do this once a day, and when the light has changed.
 
-    Take off what stands on the table first. It turns a little, to see that it is empty. A picture that is refused
-    leaves the one before in its place.
+    Objects are found by comparing views with this image. First take everything off the table. The table rotates a
+    little to check that it is empty. If the check fails, the previous image stays in use.
 
     Example: rig empty-table --bench sim
 
     Example: rig empty-table --show empty.png
     """
     from rig.core.errors import UsageError
-    from rig.views.empty_table import EmptyTables
 
     if show is not None and anyway:
-        raise UsageError("--show takes no picture.", next_step="Leave --anyway out.")
+        raise UsageError("--show takes no image, so --anyway has no effect.", next_step="Remove --anyway.")
     with settings.open_bench() as bench:
-        if show is None:
-            _photograph(settings, bench, anyway=anyway)
-            settings.note("photographed the empty table", anyway=anyway)
+        if show is not None:
+            _show(settings, bench, show)
             return
-        standing = EmptyTables.standing(bench)
-        if standing.table is None:
-            raise UsageError(
-                f"There is nothing to show: {standing.words}.", next_step="Take the picture: rig empty-table"
-            )
-        from rig.core.files import write
-        from rig.views import image_files as images
-
-        try:
-            write(show, images.encode(standing.table.image_bgr))
-        except OSError as error:
-            raise UsageError(
-                f"{show} cannot be written.",
-                next_step="Name another file with --show.",
-                evidence={"reason": error.strerror or str(error)},
-            ) from error
-        words = f"{show}: {standing.words}"
-        settings.say(
-            words,
-            {"file": str(show), "taken_utc": standing.table.taken_utc.isoformat(), "doubts": list(standing.doubts)},
-        )
+        _take(settings, bench, anyway=anyway)
+        settings.note("photographed the empty table", anyway=anyway)
 
 
 def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, then: str | None = None) -> None:
-    """Have a picture of the empty table for today, before objects are put on it.
+    """See to it that the bench has an empty-table image of today before objects are put on the table.
 
-    An operator who can empties the table unasked. A person is asked, where ``ask`` allows it and somebody is there;
-    ``then`` is what stands on the table afterwards. Otherwise work goes on with the picture that there is, or without,
-    and that is said.
+    An operator that can clear the table by itself does so. Otherwise the operator is asked at the terminal if ``ask``
+    is set; ``then`` names the object to put on the table afterwards. If nobody can be asked, a note says that the work
+    continues with the old image or without one.
     """
     from rig.bench import ObjectAlreadyPlaced, TableClearer
     from rig.core.errors import TableNotEmpty, ViewRejected
@@ -87,43 +67,66 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
     if isinstance(bench.operator, TableClearer):
         if bench.operator.clear():
             try:
-                _photograph(settings, bench, aside=True)
-            except (TableNotEmpty, ViewRejected) as error:  # nobody is asked, and the work goes on
+                _take(settings, bench, within_plan=True)
+            except (TableNotEmpty, ViewRejected) as error:  # enrollment can continue without the image
                 print(f"Note: {error.what} {error.next_step}", file=sys.stderr)
         return
-    consequence = WITHOUT if standing.table is None else STALE
-    person = isinstance(bench.operator, ObjectAlreadyPlaced)
-    if person and ask and not settings.json and is_interactive():
-        if _asked(settings, bench, f"{sentence(standing.words)} Take everything off the table.", consequence) and then:
-            _enter(f"Now put {then} on the table and take your hands away.\n  Enter goes on: ")
+    consequence = WITHOUT_IMAGE if standing.table is None else OLD_IMAGE
+    if isinstance(bench.operator, ObjectAlreadyPlaced) and ask and not settings.json and is_interactive():
+        question = f"{sentence(standing.words)} Take everything off the table."
+        if _take_with_operator(settings, bench, question, consequence) and then:
+            _answer(f"Put {then} on the table and take your hands away.\n  Enter: continue ")
         return
-    print(f"Note: {standing.words}; {consequence}. {COMMAND} takes one.", file=sys.stderr)
+    print(f"Note: {standing.words}; {consequence}. To take a new one: {COMMAND}", file=sys.stderr)
 
 
-def _asked(settings: Settings, bench: "Bench", question: str, consequence: str) -> bool:
-    """Ask until there is a picture or somebody goes on without; return whether the table is empty now."""
+def _show(settings: Settings, bench: "Bench", path: Path) -> None:
+    from rig.core.errors import UsageError
+    from rig.core.files import write
+    from rig.views import image_files as images
+    from rig.views.empty_table import EmptyTables
+
+    standing = EmptyTables.standing(bench)
+    if standing.table is None:
+        raise UsageError(
+            f"There is no image to show: {standing.words}.", next_step="Take the image with rig empty-table."
+        )
+    try:
+        write(path, images.encode(standing.table.image_bgr))
+    except OSError as error:
+        raise UsageError(
+            f"{path} cannot be written.",
+            next_step="Choose another file with --show.",
+            evidence={"reason": error.strerror or str(error)},
+        ) from error
+    taken = standing.table.taken_utc.isoformat()
+    settings.say(f"{path}: {standing.words}", {"file": str(path), "taken_utc": taken, "doubts": list(standing.doubts)})
+
+
+def _take_with_operator(settings: Settings, bench: "Bench", question: str, consequence: str) -> bool:
+    """Ask until the image is taken or the operator continues without it; return whether the table is empty now."""
     from rig.core.errors import TableNotEmpty, ViewRejected
 
-    keep = ""
+    accept = ""  # offered only after the check has failed
     while True:
-        said = _enter(f"{question}\n  Enter takes its picture,{keep} s goes on without\n  ({consequence}): ")
-        if said in ("s", None):
+        answer = _answer(f"{question}\n  Enter: take the image,{accept} s: continue without\n  ({consequence}) ")
+        if answer in ("s", None):
             return False
-        if said not in ("", "k" if keep else ""):
+        if answer not in ("", "k" if accept else ""):
             continue
         try:
-            _photograph(settings, bench, anyway=said == "k", aside=True)
+            _take(settings, bench, anyway=answer == "k", within_plan=True)
         except ViewRejected as error:
             question = f"{error.what}\n{error.next_step}"
         except TableNotEmpty as error:
-            question = f"{error.what} Take it off, and stand back."
-            keep = " k takes it with what always stays there (a pattern, a screw),"
+            question = f"{error.what} Take it off the table and stand back."
+            accept = " k: keep what is there because it always stays on the table (a pattern, a screw),"
         else:
             return True
 
 
-def _enter(question: str) -> str | None:
-    """Return what was answered; None at the end of the answers."""
+def _answer(question: str) -> str | None:
+    """Return the answer to a question; None at the end of the input."""
     print(question, end="", file=sys.stderr, flush=True)
     answer = sys.stdin.readline()
     if not answer:
@@ -132,14 +135,14 @@ def _enter(question: str) -> str | None:
     return answer.strip().lower()
 
 
-def _photograph(settings: Settings, bench: "Bench", *, anyway: bool = False, aside: bool = False) -> None:
-    """Take the picture; ``aside`` of another plan, whose events begin with its own."""
+def _take(settings: Settings, bench: "Bench", *, anyway: bool = False, within_plan: bool = False) -> None:
+    """Take the image; ``within_plan`` prints to stderr, because stdout belongs to the events of another plan."""
     from rig.cli.ui.present import line
     from rig.events.events import event_dict
     from rig.plans.photograph_table import photograph_table
 
     for event in photograph_table(bench, anyway=anyway):
-        if aside:
+        if within_plan:
             print(line(event), file=sys.stderr)
         else:
             settings.say(line(event), event_dict(event))

@@ -3,7 +3,6 @@
 import os
 import shlex
 import sys
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,40 +25,49 @@ def enroll(
     settings: Settings,
     name: Annotated[
         str | None,
-        typer.Argument(
-            metavar="NAME", help="Name of the object that stands on the table.", autocompletion=object_names
-        ),
+        typer.Argument(metavar="NAME", help="Name of the object on the table.", autocompletion=object_names),
     ] = None,
-    views: Annotated[int | None, typer.Option(min=4, max=720, help="Views in a turn; enroll.views otherwise.")] = None,
+    views: Annotated[
+        int | None,
+        typer.Option(min=4, max=720, metavar="N", help="Number of views in a revolution (default: enroll.views)."),
+    ] = None,
     step: Annotated[
-        float | None, typer.Option(min=0.5, max=90, metavar="DEGREES", help="Angle between two views, instead.")
+        float | None,
+        typer.Option(min=0.5, max=90, metavar="DEGREES", help="Angle between two views, instead of --views."),
     ] = None,
-    label: Annotated[list[str] | None, typer.Option(help="A label, to sort and filter by. Repeatable.")] = None,
-    note: Annotated[str | None, typer.Option(help="A remark.")] = None,
+    label: Annotated[
+        list[str] | None, typer.Option(metavar="TEXT", help="Label to sort and filter by. Repeatable.")
+    ] = None,
+    note: Annotated[str | None, typer.Option(metavar="TEXT", help="Note about the object.")] = None,
     tray: Annotated[
         Path | None,
-        typer.Option("--list", metavar="FILE", help="Enroll all objects of a CSV file: name, label, note, views."),
+        typer.Option(
+            "--list", metavar="FILE", help="Enroll all objects of a CSV file with the columns name, label, note, views."
+        ),
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Take the missing views of an interrupted enrollment.")
     ] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Enroll anew; the old views stay in use until the new ones are complete.")
+        bool,
+        typer.Option("--replace", help="Enroll again. The old views stay in use until the new ones are complete."),
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say what would be done, how long it takes and where the table goes.")
+        bool, typer.Option("--dry-run", help="Only show the plan: views, duration, table angles. Nothing moves.")
     ] = False,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a page with all views and what was measured.")
+        Path | None, typer.Option(metavar="FILE", help="Write an HTML page with all views and measurements.")
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask for an empty table: go on with its picture, or without.")
+        bool,
+        typer.Option("--yes", "-y", help="Do not ask for an empty-table image. Use the old one, or none."),
     ] = False,
 ) -> None:
-    """Enroll an object: one turn of the table, a checked view at every step.
+    """Enroll an object: one revolution of the table, with a checked view at every step.
 
-    Once a day the table is to be left empty first, for the picture that objects are found by (rig empty-table).
-    p or the space bar pauses and goes on, Ctrl+Z too; Ctrl+C stops and keeps the views.
+    Once a day, the command first asks for an empty table and takes its image (see rig empty-table).
+
+    p or the space bar pauses and resumes. Ctrl+Z pauses, fg resumes. Ctrl+C stops; the views taken so far stay stored.
 
     Example: rig enroll mug-white --bench sim --views 36 --report mug.html
 
@@ -67,19 +75,15 @@ def enroll(
     """
     from rig.plans.tray import read_tray
 
+    # Reject wrong options before a device is opened.
     views = _views(views, step)
     _check(name, tray, label=label, note=note, resume=resume, replace=replace)
     if report is not None:
-        _check_folder(report)
+        _check_writable(report)
     items = read_tray(tray) if tray else ()
-    labels = ", ".join(label) if label else None
     if dry_run:
         _dry_run(settings, [name] if name else [item.name for item in items], views, resume=resume, replace=replace)
         return
-
-    def again(rerun: str) -> list[str]:
-        words = ["rig", "enroll", *([name, "--resume"] if name else ["--list", str(tray)]), *settings.arguments()]
-        return [f"The views taken so far are kept. {rerun}", f"  {shlex.join(words)}"]
 
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
         from rig.bench import ObjectAlreadyPlaced
@@ -93,23 +97,28 @@ def enroll(
         ensure_empty_table_image(settings, bench, ask=not yes, then=name)
         job = _Job(settings, bench, catalog)
         if name is not None:
+            labels = ", ".join(label) if label else None
             events = enroll_one(
                 bench, catalog, name, views=views, label=labels, note=note, resume=resume, replace=replace
             )
-            job.run(events, lambda: again("Go on with:"), report)
+            job.run(events, ["To continue:", _command(settings, name, "--resume")], report)
         else:
-            person = isinstance(bench.operator, ObjectAlreadyPlaced)
-            operator = OperatorPrompts(job.quiet) if person else AutomaticOperator()
+            asks = isinstance(bench.operator, ObjectAlreadyPlaced)
+            operator = OperatorPrompts(job.close_view) if asks else AutomaticOperator()
             job.run(
                 enroll_tray(bench, catalog, items, views=views, operator=operator),
-                lambda: again("The same command goes on with the others:"),
+                ["To continue with the other objects:", _command(settings, "--list", str(tray))],
                 report,
             )
-            job.sum_up(len(items))
+            job.print_total(len(items))
+
+
+def _command(settings: Settings, *arguments: str) -> str:
+    return f"  {shlex.join(['rig', 'enroll', *arguments, *settings.arguments()])}"
 
 
 class _Job:
-    """Runs the plan of one or more enrollments, shows it, and writes the report."""
+    """Runs the plan of one or more enrollments, shows its events, and writes the report."""
 
     def __init__(self, settings: Settings, bench: "Bench", catalog: "Catalog") -> None:
         from rig.cli.ui.live import EnrollView
@@ -122,47 +131,48 @@ class _Job:
         self._view: EnrollView | None = None
         self._heading = ""
         self._records: list[EnrollmentRecord] = []
-        self._kept = 0
-        self._done = 0
+        self._stored_views = 0
+        self._enrolled = 0
 
-    def quiet(self) -> None:
-        """Take the live table off the screen."""
+    def close_view(self) -> None:
+        """Remove the live table from the screen."""
         if self._view is not None:
             self._view.__exit__(None, None, None)
             self._view = None
 
-    def run(self, events: Any, how_on: Callable[[], list[str]], report: Path | None) -> None:
+    def run(self, events: Any, how_to_continue: list[str], report: Path | None) -> None:
+        """Run the plan to its end; after an interruption print how to continue."""
         from rig.events.events import Enrolled, Item
         from rig.plans.similar_objects import similar_objects
 
         try:
             for event in events:
                 if isinstance(event, Item):
-                    self.quiet()
+                    self.close_view()
                     self._heading = f"{event.number} of {event.of} "
-                if isinstance(event, Enrolled):  # it is in the catalog; that stays the last word about it
-                    self._tell(similar_objects(self._catalog.views().views, event.name))
-                self._tell(event)
+                if isinstance(event, Enrolled):  # it is in the catalog now; Enrolled stays its last event
+                    self._show(similar_objects(self._catalog.views().views, event.name))
+                self._show(event)
                 if isinstance(event, Enrolled):
-                    self._done += 1
+                    self._enrolled += 1
                     self._complete()
-                    self._kept = 0
+                    self._stored_views = 0
         except BaseException:
-            self.quiet()
-            if self._kept or self._done:
-                print("\n".join(how_on()), file=sys.stderr)
+            self.close_view()
+            if self._stored_views or self._enrolled:
+                print("\n".join(["The views taken so far are stored.", *how_to_continue]), file=sys.stderr)
             raise
         finally:
             events.close()
-            self.quiet()
+            self.close_view()
             if report is not None and self._records:
                 self._write(report)
 
-    def sum_up(self, items: int) -> None:
+    def print_total(self, items: int) -> None:
         if not self._settings.json:
-            print(f"{self._done} enrolled now; {items} in the list.", file=sys.stderr)
+            print(f"{self._enrolled} of {items} objects enrolled in this run.", file=sys.stderr)
 
-    def _tell(self, event: "Event") -> None:
+    def _show(self, event: "Event") -> None:
         from rig.cli.ui.live import EnrollView
         from rig.events.events import Accepted, Started, event_dict
         from rig.report import EnrollmentRecord
@@ -170,20 +180,20 @@ class _Job:
         if self._settings.json:
             self._settings.print_json(event_dict(event))
         if isinstance(event, Started):
-            self.quiet()
+            self.close_view()
             self._records.append(EnrollmentRecord(region=self._bench.config.view.roi))
         if self._view is None:
             self._view = EnrollView(self._screen, self._bench.config, self._heading)
             self._view.__enter__()
-        self._kept += isinstance(event, Accepted)
+        self._stored_views += isinstance(event, Accepted)
         if self._records:
             self._records[-1].add(event)
-        # people's lines would be the same as the JSON, once more, where neither is looked at
+        # in a pipe, the text on stderr would only repeat the JSON
         if not self._settings.json or self._screen.is_terminal:
             self._view.add(event)
 
     def _complete(self) -> None:
-        """Put the views of earlier sittings into the record of a resumed enrollment."""
+        """Add the views of earlier sessions to the record of a resumed enrollment."""
         record = self._records[-1]
         stored = self._catalog.object(record.name).views
         if len(stored) > len(record.views):
@@ -206,12 +216,12 @@ def _views(views: int | None, step: float | None) -> int | None:
     if step is None:
         return views
     if views is not None:
-        raise UsageError("Both --views and --step say how many views there are.", next_step="Give one of them.")
+        raise UsageError("--views and --step cannot be used together.", next_step="Remove one of them.")
     count = round(360.0 / step)
     if abs(count * step - 360.0) > 1e-6:
         raise UsageError(
-            f"Steps of {step:g}° do not divide a turn evenly.",
-            next_step=f"Give --views {count}, which are {360.0 / count:.2f}° apart, or a step that divides 360.",
+            f"A revolution cannot be divided into steps of {step:g}°.",
+            next_step=f"Use --views {count} (steps of {360.0 / count:.2f}°), or a step that divides 360.",
         )
     return count
 
@@ -221,20 +231,20 @@ def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, 
 
     if (name is None) == (tray is None):
         raise UsageError(
-            "There is no object to enroll." if name is None else f"Both {name!r} and a list are to be enrolled.",
-            next_step="Give the name of the object, or a list of objects with --list FILE.",
+            "No object is given." if name is None else "NAME and --list cannot be used together.",
+            next_step="Give the name of one object, or a list of objects with --list FILE.",
         )
     given = [f"--{key}" for key, value in {**texts, "resume": resume, "replace": replace}.items() if value]
     if tray is not None and given:
         raise UsageError(
-            f"{', '.join(given)} cannot be used with a list.",
-            next_step="Labels and notes are columns of the list, and it resumes by itself; "
-            "enroll single objects anew with rig enroll NAME --replace.",
+            f"{', '.join(given)} cannot be used with --list.",
+            next_step="Write labels and notes into the columns of the list. Interrupted enrollments of a list are "
+            "resumed without an option. To replace one object: rig enroll NAME --replace",
         )
 
 
-def _check_folder(report: Path) -> None:
-    """Refuse a page that could not be written, before the hours that it is to tell of."""
+def _check_writable(report: Path) -> None:
+    """Reject a report that cannot be written now rather than after hours of enrollment."""
     from rig.core.errors import UsageError
 
     reason = "it is a folder" if report.is_dir() else ""
@@ -243,17 +253,17 @@ def _check_folder(report: Path) -> None:
     except OSError as error:
         reason = error.strerror or str(error)
     if not reason and not os.access(report.parent, os.W_OK):
-        reason = "its folder may not be written to"
+        reason = "its folder is not writable"
     if reason:
         raise UsageError(
             f"The report cannot be written to {report}.",
-            next_step="Name another file with --report.",
+            next_step="Choose another file with --report.",
             evidence={"reason": reason},
         )
 
 
 def _dry_run(settings: Settings, names: list[str], views: int | None, *, resume: bool, replace: bool) -> None:
-    """Print what an enrollment would do; moves nothing and stores nothing."""
+    """Print the plan of an enrollment; nothing moves and nothing is stored."""
     from rig.cli.ui.present import console, dry_run_lines
     from rig.events.events import plain
     from rig.plans.estimate import dry_run

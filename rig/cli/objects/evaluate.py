@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.ui.command import EXIT_INTERRUPTED, command
+from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:

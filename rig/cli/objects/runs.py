@@ -1,8 +1,7 @@
-"""`rig replay` and `rig report`: what `rig identify --save-run` has kept."""
+"""`rig replay` and `rig report`: read what `rig identify --save-run` has saved."""
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -13,7 +12,8 @@ if TYPE_CHECKING:
     from rig.search.saved_run import SavedRun
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")]
-SHOWN = 20
+SHOWN: Final = 20
+"""Differences that an error lists."""
 
 
 @command
@@ -21,10 +21,11 @@ def replay(
     settings: Settings,
     run: RunArgument,
     check: Annotated[
-        bool, typer.Option("--check", help="Compute every decision again from the frames; exit code 6 if one differs.")
+        bool,
+        typer.Option("--check", help="Compute every decision again from the images; exit code 6 if one differs."),
     ] = False,
 ) -> None:
-    """Walk through a saved run: what was seen, thought and decided.
+    """Show a saved run again: each view, the candidates after it, and each decision.
 
     Example: rig replay runs/1 --check
     """
@@ -43,7 +44,7 @@ def replay(
             settings.print_json(event_dict(event))
         return
     about = saved.about
-    print(f"{about['bench']}, {about['started_utc']}, {len(saved.views.object_names)} objects enrolled")
+    print(f"Bench {about['bench']}, {about['started_utc']}, {len(saved.views.object_names)} objects enrolled")
     with IdentifyView(console(plain=True)) as view:
         for event in saved.events():
             view.show(event)
@@ -56,10 +57,10 @@ def report(
     settings: Settings,
     run: RunArgument,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Where the page is written; report.html in the run otherwise.")
+        Path | None, typer.Option(metavar="FILE", help="File to write (default: report.html in the run's folder).")
     ] = None,
 ) -> None:
-    """Write a page about a saved run: the camera's way, the candidates' scores, the frames and decisions.
+    """Write an HTML page about a saved run: the answer, the camera's path, the scores, the views and the decisions.
 
     Example: rig report runs/1 --out run-1.html
     """
@@ -72,8 +73,8 @@ def report(
     for event in saved.events():
         record.add(event)
     answer = record.answer
-    found = "no answer" if answer is None else answer.name or "unknown"
-    summary = answer_words(answer) if answer else "The search ended before an answer."
+    found = "no answer" if answer is None else answer.name or "unknown object"
+    summary = answer_words(answer) if answer else "The search ended without an answer."
     about = saved.about
     meta = Meta(
         conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
@@ -81,10 +82,7 @@ def report(
     )
     path = out or run / "report.html"
     write_report(path, render_report(f"Search: {found}", summary, [], [record], meta=meta))
-    if settings.json:
-        settings.print_json({"report": str(path)})
-    else:
-        print(f"Report: {path}")
+    settings.say(f"Report: {path}", {"report": str(path)})
 
 
 def _check(settings: Settings, saved: "SavedRun") -> None:
@@ -94,17 +92,14 @@ def _check(settings: Settings, saved: "SavedRun") -> None:
     from rig.search.replay import check
 
     found = check(saved)
-    words = f"{counted(found.views, 'view')} described and {counted(found.decisions, 'decision')} made again"
+    done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."
     if found.differences:
         more = len(found.differences) - SHOWN
         listed = [str(difference) for difference in found.differences[:SHOWN]]
         raise ReplayMismatch(
-            f"{words}: {counted(len(found.differences), 'number')} came out otherwise.",
-            next_step="The frames or events were changed, or this program decides otherwise than "
-            f"{saved.about['software']}, which saved them.",
+            f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {done}",
+            next_step="Check whether the files of the run were changed. If not, this version of the program decides "
+            f"differently from {saved.about['software']}, which saved the run.",
             evidence={"differences": [*listed, f"and {more} more"] if more > 0 else listed},
         )
-    if settings.json:
-        settings.print_json(plain(found))
-    else:
-        print(f"{words}: all as saved.", file=sys.stdout)
+    settings.say(f"{done} All are as saved.", plain(found))

@@ -1,6 +1,6 @@
-"""What every command shares: the common options, and how errors leave the program.
+"""The frame of every command: common options, errors and signals.
 
-Nothing here imports numpy, cv2, scipy or sqlalchemy: `rig --help` must be instant.
+This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
 """
 
 import functools
@@ -10,45 +10,61 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from rig.cli.ui.complete import bench_names
+from rig.cli.ui.exit_codes import EXIT_BY_SIGNAL, EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
 from rig.core.errors import RigError
 
-if TYPE_CHECKING:
-    pass
-
-EXIT_INTERRUPTED = 130
-EXIT_BY_SIGNAL = 128  # plus the signal's number, as shells do
+COMMON: str = "Common options"
+"""Panel of the help."""
 
 BenchOption = Annotated[
     str | None,
     typer.Option(
         "--bench",
         metavar="NAME",
-        help="Bench to work on: hardware, sim, or a plug-in's.",
+        help="Bench to use: hardware, sim or the bench of a plug-in (default: default_bench).",
         autocompletion=bench_names,
+        rich_help_panel=COMMON,
     ),
 ]
-ConfigOption = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="Configuration (rig.toml).")]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Configuration file (default: rig.toml).", rich_help_panel=COMMON),
+]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, e.g. identify.max_views=4. Repeatable."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace one setting, for example identify.max_views=4. Repeatable.",
+        rich_help_panel=COMMON,
+    ),
 ]
-SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of a simulated bench.")]
-NoColorOption = Annotated[bool, typer.Option("--no-color", help="No colours; so does NO_COLOR in the environment.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout; text for people goes to stderr.")]
+SeedOption = Annotated[
+    int | None,
+    typer.Option("--seed", min=0, metavar="N", help="Seed of the simulated bench.", rich_help_panel=COMMON),
+]
+NoColorOption = Annotated[
+    bool,
+    typer.Option("--no-color", help="Print without colors, as with NO_COLOR=1.", rich_help_panel=COMMON),
+]
+JsonOption = Annotated[
+    bool,
+    typer.Option("--json", help="Print JSON on stdout and text on stderr.", rich_help_panel=COMMON),
+]
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function whose first parameter is the `Settings`.
+    """Turn a function whose first parameter is `Settings` into a command.
 
-    The common options are added to its own; errors of the registry are printed with their next step and become the exit
-    code; Ctrl+C, SIGTERM and a lost terminal unwind the stack, so that everything that is open is closed (torque off),
-    and then end it.
+    The command also takes the common options. It prints an error of the registry with its next step and exits with the
+    error's exit code. Ctrl+C, SIGTERM and SIGHUP unwind the stack, so that every open device is closed (torque off)
+    before the program ends.
     """
     signature = inspect.signature(function, eval_str=True)
     own = list(signature.parameters.values())[1:]
@@ -72,33 +88,35 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         if values.pop("no_color"):
             without_color()
         for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is signal.SIG_DFL:  # nohup has a hang-up ignored; so be it
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP; leave that as it is
                 signal.signal(number, _terminate)
         try:
             function(settings, **values)
         except RigError as error:
             show_error(error, settings)
             raise typer.Exit(error.exit_code) from None
-        except BrokenPipeError:  # the reader, such as head, has seen enough
+        except BrokenPipeError:  # the reader of a pipe, such as head, has ended
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(EXIT_BY_SIGNAL + signal.SIGPIPE) from None
         except KeyboardInterrupt:
-            print("Interrupted; a table that was in use is let go, its torque off.", file=sys.stderr)
+            print("Interrupted. The servo's torque is off if the command used the table.", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
     run.__signature__ = inspect.Signature([context, *own, *shared])  # type: ignore[attr-defined]
-    # Typer reads the annotations beside the signature; those of the wrapped function would hide the added ones.
+    # Typer also reads the annotations; those of the wrapped function do not have the common options.
     run.__annotations__ = {p.name: p.annotation for p in [context, *own, *shared]}
+    # Typer prints single line breaks of a docstring as they are; let it wrap paragraphs to the terminal instead.
+    run.__doc__ = "\n\n".join(" ".join(part.split()) for part in (function.__doc__ or "").split("\n\n"))
     return run
 
 
 def without_color() -> None:
-    """Have everything that is printed from now on, by this program and those it starts, come without colours."""
+    """Print without colors from now on, in this program and in those that it starts."""
     os.environ["NO_COLOR"] = "1"
 
 
 def show_error(error: RigError, settings: Settings) -> None:
-    """Print what happened, the evidence, and the next step; never a traceback."""
+    """Print an error with its evidence and its next step, without a traceback."""
     if settings.json:
         settings.print_json(error.as_dict())
     lines = [f"Error {error.code} ({error.title}): {error.what}"]

@@ -1,4 +1,4 @@
-"""What the shell offers on Tab; reads no more than it must, and says nothing where something is wrong."""
+"""Shell completion of names; it offers nothing if something is wrong."""
 
 from contextlib import closing, suppress
 from importlib.metadata import entry_points
@@ -7,17 +7,17 @@ import typer
 
 
 def object_names(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the names of the enrolled objects that begin with what was typed."""
+    """Return the names of the enrolled objects that begin with ``incomplete``."""
     import sqlite3
 
     from rig.cli.ui.settings import Settings
 
-    # a line that is being typed may hold anything: an unknown bench, a file that is no configuration
+    # An unfinished command line can hold anything, such as an unknown bench or a file that is not a configuration.
     with suppress(Exception):
         given = {**(ctx.parent.params if ctx.parent else {}), **ctx.params}
         settings = Settings().merged(given.get("bench"), given.get("config"), given.get("overrides"), None, False)
         path = settings.load().catalog_path(settings.bench_name) / "catalog.sqlite"
-        # sqlite3 itself: SQLAlchemy takes longer to import than a person waits for a name
+        # sqlite3 directly: importing SQLAlchemy takes too long for completion.
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=0.2)) as database:
             rows = database.execute(
                 "SELECT name FROM objects WHERE substr(name, 1, ?) = ? AND deleted_utc IS NULL ORDER BY name",
@@ -33,6 +33,6 @@ def bench_names(incomplete: str) -> list[str]:
 
 
 def strategy_names(incomplete: str) -> list[str]:
-    """Return the names of the strategies of a search."""
+    """Return the names of the search strategies."""
     plugged = [point.name for point in entry_points(group="rig.strategies")]
     return [name for name in ("dense", "ahbr", "hbr", "sweep", "random", *plugged) if name.startswith(incomplete)]

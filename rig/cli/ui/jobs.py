@@ -1,4 +1,4 @@
-"""Long jobs of the catalog on a terminal, and the questions before what cannot be undone."""
+"""Progress of the catalog's long jobs, questions before deletions, and tables."""
 
 import sys
 from collections.abc import Generator, Iterable, Sequence
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
+from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ _T = TypeVar("_T")
 
 
 def run_job(title: str, job: "Generator[Progressed, None, _T]", *, interrupted: str) -> _T:
-    """Carry a job out with a bar on stderr and return its result; ``interrupted`` is what Ctrl+C leaves behind."""
+    """Run a job with a progress bar on stderr and return its result; Ctrl+C prints ``interrupted``."""
     from rig.cli.ui.present import Progress
 
     try:
@@ -37,25 +38,31 @@ def run_job(title: str, job: "Generator[Progressed, None, _T]", *, interrupted: 
 
 
 def is_interactive() -> bool:
-    """Tell whether a person can answer."""
+    """Return whether an operator can answer questions: standard input is a terminal."""
     return sys.stdin.isatty()
 
 
 def confirm(question: str, *, yes: bool, settings: Settings) -> None:
-    """Ask before a deletion; without a person at the terminal ``--yes`` is the answer, or nothing is done."""
+    """Ask before a deletion.
+
+    Raises
+    ------
+    UsageError
+        There is no terminal to ask on, and ``yes`` is not set.
+    """
     from rig.core.errors import UsageError
 
     if yes:
         return
     if settings.json or not is_interactive():
-        raise UsageError(f"{question} Nobody is there to answer.", next_step="give --yes if you mean it")
+        raise UsageError(f"{question} This needs a confirmation.", next_step="Add --yes to confirm.")
     if not typer.confirm(question, err=True):
         print("Nothing was changed.", file=sys.stderr)
-        raise typer.Exit(1)
+        raise typer.Exit(EXIT_DECLINED)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
-    """Print a table as wide as the terminal has it; into a pipe in full, a line a row."""
+    """Print a table as wide as the terminal; in a pipe print every row in full, as one line."""
     from rich.console import Console
     from rich.measure import Measurement
     from rich.table import Table
@@ -78,7 +85,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right:
 
 
 def size_words(size: float) -> str:
-    """Write a number of bytes as people read it."""
+    """Return a number of bytes with a unit: "12.3 MB"."""
     for unit in ("bytes", "kB", "MB", "GB"):
         if size < 1000 or unit == "GB":
             return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
@@ -89,4 +96,4 @@ def size_words(size: float) -> str:
 def _plain(cell: Any) -> Any:
     from rich.text import Text
 
-    return Text(str(cell))  # names may hold what rich takes for markup
+    return Text(str(cell))  # a name can contain what rich would read as markup

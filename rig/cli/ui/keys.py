@@ -1,4 +1,4 @@
-"""Pause and go on: a key on a terminal, Ctrl+Z or SIGTSTP anywhere; never in the middle of a motion."""
+"""Pause a plan between two views: with a key on the terminal, or with Ctrl+Z (SIGTSTP)."""
 
 import os
 import select
@@ -12,14 +12,14 @@ from types import FrameType, TracebackType
 from typing import Any, Final, Self
 
 PAUSE_KEYS: Final = b"p "
-HINT: Final = "p pauses"
+HINT: Final = "p: pause"
 
 
 class Pause(AbstractContextManager["Pause"]):
-    """Watches for the wish to pause, in a ``with`` block; whoever runs a plan calls `point` where it may rest.
+    """Watches for a request to pause, in a ``with`` block.
 
-    With ``keys``, p or the space bar on the terminal pause and go on. Ctrl+Z, or SIGTSTP from elsewhere, stops the
-    process at the next point; `fg` or SIGCONT goes on.
+    The owner of the plan calls `point` where the plan can pause. With ``keys``, p or the space bar pauses and resumes.
+    Ctrl+Z (SIGTSTP) stops the process at the next point; `fg` (SIGCONT) resumes it.
     """
 
     def __init__(self, *, keys: bool) -> None:
@@ -30,7 +30,7 @@ class Pause(AbstractContextManager["Pause"]):
         self._before: Any = None
 
     def __enter__(self) -> Self:
-        if signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL:  # a shell without job control has it ignored
+        if signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL:  # a shell without job control ignores it
             self._before = signal.signal(signal.SIGTSTP, self._on_stop)
         self._listen()
         return self
@@ -45,23 +45,23 @@ class Pause(AbstractContextManager["Pause"]):
 
     @property
     def listens(self) -> bool:
-        """Whether a key pauses."""
+        """Whether the pause keys work."""
         return self._terminal is not None
 
     def point(self, tell: Callable[[str], None]) -> None:
-        """Rest here as long as somebody wants; the table holds its place meanwhile. ``tell`` shows a line."""
+        """Pause here if the operator asked for it; the table holds its angle. ``tell`` shows a line."""
         if self._suspend:
             self._suspend = False
-            tell("Paused: fg (or SIGCONT) goes on.")
+            tell("Paused. To resume: fg (or SIGCONT).")
             self._release()
             os.kill(os.getpid(), signal.SIGSTOP)
             self._listen()
-            tell("Going on.")
+            tell("Resumed.")
         if self._pressed():
-            tell("Paused, the table holds its place: p goes on, Ctrl+C stops and keeps the views.")
+            tell("Paused. The table holds its angle. p: resume, Ctrl+C: stop (the views stay stored).")
             while os.read(sys.stdin.fileno(), 1) not in (bytes([key]) for key in PAUSE_KEYS):
                 pass
-            tell("Going on.")
+            tell("Resumed.")
 
     def _pressed(self) -> bool:
         if self._terminal is None:
@@ -69,7 +69,7 @@ class Pause(AbstractContextManager["Pause"]):
         pressed = b""
         while select.select([sys.stdin], [], [], 0)[0]:
             key = os.read(sys.stdin.fileno(), 64)
-            if not key:  # the terminal is gone
+            if not key:  # the terminal was closed
                 self._terminal = None
                 break
             pressed += key
@@ -80,7 +80,7 @@ class Pause(AbstractContextManager["Pause"]):
 
     def _listen(self) -> None:
         if self._keys:
-            with suppress(termios.error):  # it is no terminal after all
+            with suppress(termios.error):  # not a terminal after all
                 self._terminal = termios.tcgetattr(sys.stdin)
                 tty.setcbreak(sys.stdin)
 

@@ -1,6 +1,6 @@
-"""The common options of every command, and what they open.
+"""The common options of every command; they open the bench and the catalog.
 
-Nothing here imports numpy, cv2, scipy or sqlalchemy: `rig --help` must be instant.
+This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
 """
 
 import json
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Settings:
-    """The common options, as given before and after the subcommand."""
+    """The common options, given before or after the command."""
 
     bench: str | None = None
     config: Path | None = None
@@ -32,7 +32,7 @@ class Settings:
     def merged(
         self, bench: str | None, config: Path | None, overrides: list[str] | None, seed: int | None, json: bool
     ) -> "Settings":
-        """Return these settings with those that follow the subcommand, which win."""
+        """Return these settings, replaced by those that follow the command."""
         return replace(
             self,
             bench=bench or self.bench,
@@ -52,7 +52,7 @@ class Settings:
         return self._loaded["config"]
 
     def arguments(self) -> list[str]:
-        """Return the words that give these settings to another command."""
+        """Return the arguments that pass these settings to another command."""
         words = [] if self.bench is None else ["--bench", self.bench]
         words += [] if self.config is None else ["--config", str(self.config)]
         words += [word for override in self.overrides for word in ("--set", override)]
@@ -63,17 +63,16 @@ class Settings:
         return self.bench or self.load().default_bench
 
     def open_bench(self, *, tell: bool = True) -> "Bench":
-        """Open the bench and say what a person should know of it, unless the command does so itself (``tell``)."""
+        """Open the bench and print its notes; with ``tell`` false the command prints those on calibration itself."""
         from rig.bench import open_bench
 
         bench = open_bench(self.bench_name, self.load(), seed=self.seed)
-        # Before anything moves.
         for finding in (*bench.safety.findings, *(bench.calibration_findings if tell else ())):
             print(f"Note: {finding}.", file=sys.stderr)
         return bench
 
     def open_catalog(self, *, clock: "Clock | None" = None, create: bool = False, read_only: bool = False) -> "Catalog":
-        """Open the bench's catalog; to add views to it takes the ``clock`` that they were captured by, the bench's."""
+        """Open the bench's catalog; to add views, pass the ``clock`` of the bench that captures them."""
         from rig.catalog import Catalog
         from rig.core.clock import SystemClock
 
@@ -81,23 +80,23 @@ class Settings:
         return Catalog.open(path, clock=clock or SystemClock(), create=create, read_only=read_only)
 
     def catalog_there(self) -> "Catalog | None":
-        """Return the bench's catalog, to be read and closed; None where none was made yet."""
+        """Return the bench's catalog, opened for reading; None if there is none yet."""
         path = self.load().catalog_path(self.bench_name)
         return self.open_catalog(read_only=True) if (path / "catalog.sqlite").exists() else None
 
     def note(self, action: str, **details: Any) -> None:
-        """Write into the log of the bench's catalog, where there is one, what was done with the bench (`rig log`)."""
+        """Write an action on the bench into the log of its catalog (`rig log`), if it has one."""
         path = self.load().catalog_path(self.bench_name)
         if not (path / "catalog.sqlite").exists():
             return
         try:
             with self.open_catalog() as catalog:
                 catalog.note(action, **details)
-        except RigError as error:  # what was done was done
-            print(f"Note: this is not in the log: {error.what}.", file=sys.stderr)
+        except RigError as error:  # the action itself succeeded
+            print(f"Note: the log has no entry for this action. {error.what}", file=sys.stderr)
 
     def say(self, text: str, data: Any) -> None:
-        """Print ``text`` for people, or ``data`` as one line of JSON."""
+        """Print ``text``, or with ``--json`` ``data`` as one line of JSON."""
         if self.json:
             self.print_json(data)
         else:

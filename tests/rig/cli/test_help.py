@@ -10,6 +10,8 @@ import typer
 from typer.testing import CliRunner
 
 from rig.cli.main import app
+from rig.cli.ui.exit_codes import EXIT_CODES
+from rig.core.errors import RigError
 
 BUDGET_S = 0.35
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
@@ -40,6 +42,18 @@ def test_every_command_has_an_example_that_begins_with_its_name(words):
     assert done.exit_code == 0
     text = " ".join(done.output.split())
     assert f"Example: rig {' '.join(words)}" in text
+
+
+def test_every_error_has_an_exit_code_that_the_help_explains():
+    def kinds(kind: type[RigError]) -> Iterator[type[RigError]]:
+        yield kind
+        for each in kind.__subclasses__():
+            yield from kinds(each)
+
+    assert {kind.code // 100 for kind in kinds(RigError)} <= EXIT_CODES.keys()
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "100"}).output
+    for code, meaning in EXIT_CODES.items():
+        assert f"{code:>3}  {meaning}" in shown
 
 
 def test_help_is_light_and_takes_little_time():

@@ -94,7 +94,7 @@ def test_a_saved_run_is_walked_through_checked_and_reported(rig, enrolled):
     assert (events[0]["event"], events[-1]["event"]) == ("started", "identified")
     checked = rig("replay", "runs/1", "--check")
     assert checked.exit_code == 0
-    assert "all as saved" in checked.stdout
+    assert "All are as saved" in checked.stdout
     assert json.loads(rig("replay", "runs/1", "--check", "--json").stdout)["differences"] == []
     assert rig("report", "runs/1").exit_code == 0
     page = (folder / "runs" / "1" / "report.html").read_text(encoding="utf-8")
@@ -233,9 +233,9 @@ def test_a_dry_run_says_all_and_does_nothing(rig):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("enroll",), "There is no object"),
-        (("enroll", "clock", "--list", "x.csv"), "Both 'clock' and a list"),
-        (("enroll", "clock", "--views", "8", "--step", "45"), "Both --views and --step"),
+        (("enroll",), "No object is given"),
+        (("enroll", "clock", "--list", "x.csv"), "NAME and --list cannot be used together"),
+        (("enroll", "clock", "--views", "8", "--step", "45"), "--views and --step cannot be used together"),
         (("enroll", "clock", "--step", "50"), "--views 7"),
         (("enroll", "--list", "x.csv", "--replace", "--label", "a"), "--label, --replace"),
         (("enroll", "--list", "x.csv"), "cannot be read"),
@@ -322,7 +322,7 @@ def test_on_a_bench_without_hands_a_person_is_asked_for_each_object(rig, without
     assert "3 of 4: put clock on the table" in done.stderr
     assert "3 of 4  clock: left out, as asked" in done.stdout
     assert "4 of 4: put book-atlas on the table" in done.stderr
-    assert "1 enrolled now; 4 in the list." in done.stderr
+    assert "1 of 4 objects enrolled in this run." in done.stderr
     names = {o["name"] for o in json.loads(rig("catalog", "list", "--json").stdout)["objects"]}
     assert "radio" in names
     assert not {"clock", "book-atlas"} & names

@@ -99,16 +99,16 @@ def test_a_person_is_asked_again_when_the_object_was_forgotten(asked: Callable[.
     assert table is not None
     assert "No picture of the empty table was taken yet. Take everything off the table." in said
     assert "Something stands on the table" in said
-    assert said.count("Enter takes its picture") == 2
-    assert "Now put toy-car on the table" in said
+    assert said.count("Enter: take the image") == 2
+    assert "Put toy-car on the table" in said
 
 
 def test_what_always_turns_with_the_table_is_kept_when_asked(asked: Callable[..., tuple[Any, str]]) -> None:
     table, said = asked(Answers("k\n\nk\n\n"), stays=True)
     assert table is not None
     assert table.evidence["turning_share"] > 0.004
-    assert said.count("Enter takes its picture, s goes on") == 2  # nothing is kept unseen: k counts once it was refused
-    assert said.count("k takes it with what always stays there") == 1
+    assert said.count("Enter: take the image, s: continue") == 2  # k counts only after the check has failed
+    assert said.count("k: keep what is there") == 1
 
 
 @pytest.mark.parametrize("answer", ["s\n", "what?\ns\n", ""])
@@ -117,8 +117,8 @@ def test_a_person_may_go_on_without_and_knows_what_that_means(
 ) -> None:
     table, said = asked(Answers(answer))
     assert table is None
-    assert "s goes on without\n  (objects are found before a plain background only" in said
-    assert "Now put" not in said
+    assert "s: continue without\n  (without it, objects are found only before a plain background" in said
+    assert "Put toy-car" not in said
 
 
 @pytest.mark.parametrize("options", [{"ask": False}, {"as_json": True}])
@@ -126,7 +126,7 @@ def test_automation_is_never_asked(asked: Callable[..., tuple[Any, str]], option
     table, said = asked(Answers("\n\n\n"), **options)
     assert table is None
     assert said.startswith("Note: no picture of the empty table was taken yet;")
-    assert "rig empty-table takes one" in said
+    assert "To take a new one: rig empty-table" in said
 
 
 def test_without_a_terminal_nobody_is_asked(asked: Callable[..., tuple[Any, str]]) -> None:

@@ -178,19 +178,19 @@ def folder(tmp_path):
 def keyboard(folder):
     """Return a terminal in which an enrollment of many views has begun."""
     keyboard = Keyboard(folder, "enroll", "dice", "--views", "24")
-    keyboard.until("p pauses")
+    keyboard.until("p: pause")
     yield keyboard
     keyboard.close()
 
 
 def test_a_key_pauses_and_goes_on_and_the_terminal_is_left_as_it_was(keyboard):
     keyboard.type(" ")
-    keyboard.until("Paused, the table holds its place")
+    keyboard.until("Paused. The table holds its angle.")
     assert "24 views enrolled" not in keyboard.seen
     keyboard.type("xyzp")
     keyboard.until("24 views enrolled")
     assert keyboard.end() == 0
-    assert "Going on." in keyboard.seen
+    assert "Resumed." in keyboard.seen
     assert termios.tcgetattr(keyboard.slave) == keyboard.before
 
 
@@ -225,7 +225,7 @@ def test_sigtstp_stops_between_two_views_and_sigcont_goes_on(folder):
     process.send_signal(signal.SIGCONT)
     rest, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
-    assert "Paused: fg (or SIGCONT) goes on." in rest
+    assert "Paused. To resume: fg (or SIGCONT)." in rest
     assert "12 views enrolled" in rest
 
 

@@ -1,0 +1,26 @@
+"""The exit codes of every command; the hundreds of an error's code are its exit code."""
+
+from typing import Final
+
+EXIT_DECLINED: Final = 1
+EXIT_QUALITY: Final = 6
+EXIT_UNKNOWN: Final = 8
+EXIT_BY_SIGNAL: Final = 128
+"""Plus the number of the signal, as in shells."""
+EXIT_INTERRUPTED: Final = 130
+
+EXIT_CODES: Final = {
+    0: "Success.",
+    EXIT_DECLINED: "You answered no to a question, or the program has a bug.",
+    2: "The command, an option or an argument is wrong.",
+    3: "The configuration has a mistake.",
+    4: "A device does not answer, or it reports a fault.",
+    5: "Motion or safety: the table did not start, or it was stopped.",
+    EXIT_QUALITY: "Quality: a view, a calibration, a replay or a demo is not good enough.",
+    7: "The catalog cannot do this, or it is damaged.",
+    EXIT_UNKNOWN: "The object is unknown.",
+    9: "Another program uses the bench or the catalog.",
+    EXIT_INTERRUPTED: "You pressed Ctrl+C.",
+    143: "The program was terminated (SIGTERM; 129 for SIGHUP).",
+}
+"""Exit code and meaning, in the order of the help and of the reference."""
