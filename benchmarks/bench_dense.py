@@ -101,9 +101,9 @@ def bench_describe(name: str, frame: ImageArray, empty: ImageArray | None) -> No
     background = None if empty is None else Background(empty)
     plain = milliseconds(lambda _: descriptor("cedd").describe(frame), REPEATS)
     row(name, "cedd of the whole frame (= 1)", plain, plain)
-    found = milliseconds(lambda _: segment(frame, reference=background), REPEATS)
+    found = milliseconds(lambda _: segment(frame, empty_table=background), REPEATS)
     row(name, "find the object and its light", found, plain)
-    seen = segment(frame, reference=background)
+    seen = segment(frame, empty_table=background)
 
     def describe(kind: str) -> object:
         seen.__dict__.pop("alone", None)  # each has to make it anew

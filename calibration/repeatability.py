@@ -33,7 +33,7 @@ from rig.events.events import Accepted, Event
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
 from rig.views.capture import Viewer
-from rig.views.description import PAPER_DESCRIPTOR, Describer
+from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
 
 NAME = "noise.repeatability"
 VALID_DAYS = 180
@@ -76,7 +76,7 @@ def live(
         )
     when_utc = bench.clock.utc()
     viewer = Viewer(bench.camera, bench.config.view)
-    describe = Describer(bench.config.view, (PAPER_DESCRIPTOR,))
+    describe = ViewDescriber(bench.config.view, (PAPER_DESCRIPTOR,))
     sittings: list[Sitting] = []
     index = 0
     for placing in range(1, placements + 1):

@@ -1,7 +1,6 @@
-"""Descriptors of a view behind one small protocol, chosen by name; several may stand side by side in a catalog."""
+"""Descriptors of views: one interface, chosen by name. A catalog can store several descriptors for each view."""
 
 from hbr.descriptors.base import Comparison, Descriptor
 from hbr.descriptors.registry import PAPERS, descriptor, names
-from hbr.descriptors.rows import unpack_rows
 
-__all__ = ["PAPERS", "Comparison", "Descriptor", "descriptor", "names", "unpack_rows"]
+__all__ = ["PAPERS", "Comparison", "Descriptor", "descriptor", "names"]

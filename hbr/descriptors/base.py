@@ -1,40 +1,49 @@
-"""What retrieval asks of a descriptor."""
+"""The interface of descriptors, and what they share."""
 
 from typing import Protocol
+
+import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.segmentation import Segmentation
 
 
 class Comparison(Protocol):
-    """Rows of levels made ready for many comparisons."""
+    """Rows of levels, prepared for many comparisons."""
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
-        """Similarity of every query, uint8 (n, length), to every row, float64 (n, m)."""
+        """Return the similarity of every query, uint8 (n, length), to every row, float64 (n, m)."""
         ...
 
     def only(self, rows: IndexArray, /) -> "Comparison":
-        """Some of the rows, in this order, as rows of their own."""
+        """Return the comparison with some of the rows, in this order."""
         ...
 
     def among(self, rows: IndexArray, /) -> FloatArray:
-        """Similarity of rows to each other within groups: indices (g, k) in, float64 (g, k, k) out."""
+        """Return the similarity of rows to each other within groups: indices (g, k) in, float64 (g, k, k) out."""
         ...
 
 
 class Descriptor(Protocol):
-    """A way to put a view into a few bytes, and to compare such bytes.
+    """Describes views by a few bytes, and compares such descriptions.
+
+    A class that inherits from this one implements `describe` and `prepared` and sets the attributes; the other methods
+    are correct for a descriptor that stores each level in one byte.
 
     Attributes
     ----------
     name : str
-        By which it is asked for, and stored with every view.
+        Name by which the descriptor is chosen, stored with every view.
     version : int
-        Rises when the same image gives other levels; levels of different versions must not be compared.
+        Rises if the same image gives other levels. Levels of different versions must not be compared.
     size_bytes : int
-        Of a packed view.
+        Size of a packed view.
     length : int
-        Levels of a view.
+        Number of levels of a view.
+    max_level : int
+        Largest level.
+    whole_image : bool
+        Whether the whole image is described, as the paper does, and not only the object.
     """
 
     @property
@@ -45,47 +54,55 @@ class Descriptor(Protocol):
     def size_bytes(self) -> int: ...
     @property
     def length(self) -> int: ...
+    @property
+    def max_level(self) -> int:
+        return 255
+
+    @property
+    def whole_image(self) -> bool:
+        return False
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
-        """Describe a view by levels, uint8 (length,).
+        """Return the levels of a view, uint8 (length,).
 
         Parameters
         ----------
         view : uint8 array (H, W, 3), or Segmentation
-            An image in BGR is taken as it is by the paper's descriptor, and goes through `hbr.segment` for those that
-            need the object alone; a `Segmentation` has been through it, and serves several descriptors.
+            An image in BGR, or the result of `hbr.segment`, which can be shared by several descriptors. Descriptors of
+            the object segment an image themselves.
 
         Raises
         ------
         TypeError, ValueError
-            It is no such image.
+            The array is no such image.
         """
         ...
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
-        """Make rows, uint8 (m, length), ready to be compared with many queries; takes several times their memory.
+        """Prepare rows, uint8 (m, length), for comparison with many queries; takes several times their memory.
 
         Raises
         ------
         TypeError, ValueError
-            They are no levels of this descriptor.
+            The rows are no levels of this descriptor.
         """
         ...
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        """Similarity of every row of `a`, (n, length), to every row of `b`, (m, length).
+        """Return the similarity of every row of `a`, (n, length), to every row of `b`, (m, length).
 
         Returns
         -------
         float64 array (n, m)
-            0..1; 1 for equal rows that show anything, to 1e-6.
+            0..1; 1 for equal rows that are not empty, to 1e-6.
 
         Raises
         ------
         ValueError
             The rows are not of this descriptor's length.
         """
-        ...
+        self.check_rows(a)
+        return self.prepared(b).similarity(a)
 
     def pack(self, levels: LevelArray) -> bytes:
         """Pack the levels of one view, (length,), into `size_bytes` bytes.
@@ -95,14 +112,69 @@ class Descriptor(Protocol):
         TypeError, ValueError
             They are no levels of this descriptor.
         """
-        ...
+        self.check_rows(levels)
+        return levels.tobytes()
 
     def unpack(self, packed: bytes) -> LevelArray:
-        """Restore the levels of one view, uint8 (length,), the inverse of `pack`.
+        """Return the levels of one packed view, uint8 (length,); the inverse of `pack`.
 
         Raises
         ------
         ValueError
             There are not exactly `size_bytes` bytes.
         """
-        ...
+        if len(packed) != self.size_bytes:
+            raise ValueError(f"{len(packed)} bytes; {self.name} has {self.size_bytes}, check how it was stored")
+        levels: LevelArray = self.unpack_rows(packed)[0]
+        return levels
+
+    def unpack_rows(self, packed: bytes) -> LevelArray:
+        """Return the levels of many packed views, joined: uint8 (n, length).
+
+        Raises
+        ------
+        ValueError
+            The number of bytes is not a multiple of `size_bytes`.
+        """
+        return self.packed_rows(packed)
+
+    def packed_rows(self, packed: bytes) -> LevelArray:
+        """Return packed views as rows of bytes, uint8 (n, size_bytes).
+
+        Raises
+        ------
+        ValueError
+            The number of bytes is not a multiple of `size_bytes`.
+        """
+        if len(packed) % self.size_bytes:
+            raise ValueError(f"{len(packed)} bytes are no multiple of {self.size_bytes}, check how they were stored")
+        return np.frombuffer(packed, np.uint8).reshape(-1, self.size_bytes)
+
+    def check_rows(self, *rows: LevelArray) -> None:
+        """Check the type and the length of arrays (..., length) of levels.
+
+        Raises
+        ------
+        TypeError, ValueError
+            An array is not of uint8, or its last axis has another length.
+        """
+        for levels in rows:
+            if levels.dtype != np.uint8:
+                raise TypeError(f"the levels are of {levels.dtype}; pass the uint8 levels that describe returns")
+            if levels.shape[-1:] != (self.length,):
+                raise ValueError(
+                    f"levels of shape {levels.shape}; {self.name} has {self.length}, compare one descriptor only"
+                )
+
+    def check_levels(self, rows: LevelArray) -> None:
+        """Check that no level is above `max_level`.
+
+        Raises
+        ------
+        ValueError
+            A level is: often of descriptors that are still packed.
+        """
+        if rows.size and rows.max() > self.max_level:
+            raise ValueError(
+                f"a level of {rows.max()}; {self.name} has levels 0..{self.max_level}, unpack packed descriptors first"
+            )

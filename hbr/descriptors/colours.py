@@ -1,4 +1,4 @@
-"""Where which colour is on the object, in 32 bytes."""
+"""Distribution of colours over the object, in 32 bytes."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,24 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.descriptors.levels import check_levels
+from hbr.descriptors.base import Descriptor
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
 _CELLS: Final = 8
 _PIXELS: Final = CROP_PX // 2
 #: Added to grey levels before the logarithm.
 _FLOOR: Final = 12.0
-#: Coefficients that are kept of brightness, red against green, and blue against both.
+#: Number of coefficients that are stored of brightness, red − green, and blue − yellow.
 _KEPT: Final = (12, 10, 10)
-#: How much of the object's mean is taken out of each: all of the brightness, half of the colours.
-_TAKEN: Final = np.array([1.0, 0.5, 0.5])
-#: From B, G, R to the three channels.
+#: Share of the object's mean that is subtracted from each: all of the brightness, half of the colours.
+_SUBTRACTED: Final = np.array([1.0, 0.5, 0.5])
+#: Matrix from B, G, R to the three channels.
 _OPPONENT: Final = np.array([[1 / 3, 0.0, 1.0], [1 / 3, -1.0, -0.5], [1 / 3, 1.0, -0.5]])
-#: Coefficients are stored in these steps, 128 for 0.
+#: Quantisation steps of the coefficients; level 128 is 0.
 _STEP: Final = np.repeat([0.04, 0.03, 0.03], _KEPT)
-#: Distance at which the similarity has fallen to exp(-1/2).
+#: Distance at which the similarity is exp(-1/2).
 _WIDTH: Final = 2.5
-_LEAST_COVER: Final = 0.1
+#: Cells of which the object covers less are left out.
+_MIN_COVERED: Final = 0.1
 
 
 def _zigzag(kept: int) -> tuple[list[int], list[int]]:
@@ -40,13 +41,13 @@ _ZIGZAG: Final = [_zigzag(kept) for kept in _KEPT]
 
 
 @dataclass(frozen=True)
-class Colours:
-    """Brightness and two opponent colours over the object's square, as a few cosines, compared by a Gaussian kernel.
+class Colours(Descriptor):
+    """Low-frequency cosine coefficients of brightness and two opponent colours, compared by a Gaussian kernel.
 
     After the colour layout of MPEG-7 (ISO/IEC 15938-3): the mean colours of 8 x 8 cells and the first coefficients of
-    their cosine transform. Other than there, the colours are logarithms, where light of another colour or strength only
-    adds a constant, and half of the object's mean colour is taken out: a compromise between light that is known not to
-    have changed and light that nothing is known of.
+    their cosine transform. Two differences: the colours are logarithms, in which another colour or strength of the
+    light only adds a constant, and half of the object's mean colour is subtracted. That is a compromise between a known
+    and an unknown colour of the light.
     """
 
     name: str = "colours"
@@ -55,27 +56,14 @@ class Colours:
     length: int = sum(_KEPT)
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
-        seen = view if isinstance(view, Segmentation) else segment(view)
-        steps = np.rint(_coefficients(seen.crop, seen.cover) / _STEP)
+        found = view if isinstance(view, Segmentation) else segment(view)
+        steps = np.rint(_coefficients(found.crop, found.mask) / _STEP)
         levels: FloatArray = np.clip(steps + 128, 0, 255)
         return levels.astype(np.uint8)
 
     def prepared(self, rows: LevelArray, /) -> "_Kernel":
-        check_levels(self, rows)
+        self.check_rows(rows)
         return _Kernel(rows * _STEP)
-
-    def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        check_levels(self, a)
-        return self.prepared(b).similarity(a)
-
-    def pack(self, levels: LevelArray) -> bytes:
-        check_levels(self, levels)
-        return levels.tobytes()
-
-    def unpack(self, packed: bytes) -> LevelArray:
-        if len(packed) != self.size_bytes:
-            raise ValueError(f"{len(packed)} bytes; {self.name} has {self.size_bytes}, check how it was stored")
-        return np.frombuffer(packed, np.uint8)
 
 
 class _Kernel:
@@ -86,36 +74,34 @@ class _Kernel:
     def similarity(self, queries: LevelArray, /) -> FloatArray:
         own = queries * _STEP
         apart = np.einsum("ij,ij->i", own, own)[:, None] + self._squares - 2 * own @ self._rows.T
-        return _fallen(apart)
+        return _kernel(apart)
 
     def only(self, rows: IndexArray, /) -> "_Kernel":
         return _Kernel(self._rows[rows])
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         part, squares = self._rows[rows], self._squares[rows]
-        return _fallen(squares[:, :, None] + squares[:, None, :] - 2 * part @ part.transpose(0, 2, 1))
+        return _kernel(squares[:, :, None] + squares[:, None, :] - 2 * part @ part.transpose(0, 2, 1))
 
 
-def _fallen(squares: FloatArray) -> FloatArray:
-    """The kernel at these squared distances."""
+def _kernel(squares: FloatArray) -> FloatArray:
+    """Return the kernel at these squared distances."""
     similar: FloatArray = np.exp(np.maximum(squares, 0) / (-2 * _WIDTH**2))
     return similar
 
 
-def _coefficients(crop: ImageArray, cover: NDArray[np.uint8]) -> FloatArray:
-    # two steps: OpenCV's area average is quick where it halves
+def _coefficients(crop: ImageArray, mask: NDArray[np.uint8]) -> FloatArray:
+    # in two steps, because OpenCV averages fast when it halves the size
     half = cv2.resize(crop, (_PIXELS, _PIXELS), interpolation=cv2.INTER_AREA)
-    weight = cv2.resize(cover, (_PIXELS, _PIXELS), interpolation=cv2.INTER_AREA).astype(np.float32) * np.float32(
-        1 / 255
-    )
+    weight = cv2.resize(mask, (_PIXELS, _PIXELS), interpolation=cv2.INTER_AREA).astype(np.float32) * np.float32(1 / 255)
     covered = _means(weight)
     totals = _means(half * weight[:, :, None])
-    share = np.where(covered > _LEAST_COVER, covered, 0.0)
+    share = np.where(covered > _MIN_COVERED, covered, 0.0)
     colour = totals / np.maximum(covered, 1e-3)[:, :, None]
     channels = np.log(colour + _FLOOR) @ _OPPONENT
     whole = share.sum()
     if whole > 0:
-        channels -= _TAKEN * (channels * share[:, :, None]).sum(axis=(0, 1)) / whole
+        channels -= _SUBTRACTED * (channels * share[:, :, None]).sum(axis=(0, 1)) / whole
     channels *= share[:, :, None]
     return np.concatenate(
         [cv2.dct(np.ascontiguousarray(channels[:, :, c]))[kept] for c, kept in enumerate(_ZIGZAG)], dtype=np.float64

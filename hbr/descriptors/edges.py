@@ -1,4 +1,4 @@
-"""Edge directions over the object: a coarse histogram of oriented gradients in 128 bytes."""
+"""Edge directions over the object: a coarse histogram of oriented gradients, in 128 bytes."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, LevelArray
+from hbr.descriptors.base import Descriptor
 from hbr.descriptors.cosine import Cosine
-from hbr.descriptors.levels import check_levels, pack_quarters, unpack_quarters
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
 _CELLS: Final = 8
@@ -17,16 +17,16 @@ _DIRECTIONS: Final = 8
 _PIXELS: Final = CROP_PX // 2
 #: Blur before the gradient, in pixels of the small image.
 _BLUR: Final = 1.25
-#: No single direction of a cell has more than this share of the whole length.
+#: Largest share of the whole length that one direction of a cell may have.
 _CLIP: Final = 0.25
-#: What the four levels stand for: the roots of a normalised histogram's entries, by Lloyd's method.
+#: Values of the four levels: square roots of a normalised histogram's entries, quantised by Lloyd's method.
 _REPRESENTATIVES: Final = np.array([0.0114, 0.1062, 0.2173, 0.3713])
 _TABLE: Final = np.pad(_REPRESENTATIVES, (0, 252)).astype(np.float32)
 _BORDERS: Final = ((_REPRESENTATIVES[1:] + _REPRESENTATIVES[:-1]) / 2).astype(np.float32)
 
 
 def _shares() -> NDArray[np.float32]:
-    """Shares of every row of pixels in the rows of cells, by linear interpolation between their middles, (8, 80)."""
+    """Return the weight of every row of pixels in every row of cells, by linear interpolation, float32 (8, 80)."""
     place = (np.arange(_PIXELS) + 0.5) * _CELLS / _PIXELS - 0.5
     shares: FloatArray = np.clip(1 - np.abs(place - np.arange(_CELLS)[:, None]), 0, 1)
     return shares.astype(np.float32)
@@ -36,39 +36,38 @@ _SHARES: Final = _shares()
 
 
 @dataclass(frozen=True)
-class Edges:
-    """Histograms of edge direction in 8 x 8 cells around the object, 8 directions without sign, by cosine.
+class Edges(Descriptor):
+    """Histograms of 8 unsigned edge directions in 8 x 8 cells of the object, compared by cosine.
 
-    After N. Dalal and B. Triggs, "Histograms of Oriented Gradients for Human Detection", CVPR 2005, with one
-    normalisation for the whole object, the square root of the entries (Hellinger's kernel), and two bits for each. Grey
-    levels enter by their square root and are normalised: exposure and gamma hardly matter.
+    After N. Dalal and B. Triggs, "Histograms of Oriented Gradients for Human Detection", CVPR 2005. Three differences:
+    one normalisation for the whole object, square roots of the entries (Hellinger's kernel), and two bits for each.
+    Gradients are of the square roots of grey levels and are normalised, so that exposure and gamma hardly matter.
     """
 
     name: str = "edges"
     version: int = 1
     size_bytes: int = _CELLS * _CELLS * _DIRECTIONS // 4
     length: int = _CELLS * _CELLS * _DIRECTIONS
+    max_level: int = 3
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
         image = (view if isinstance(view, Segmentation) else segment(view)).alone
         return np.searchsorted(_BORDERS, _histogram(image)).astype(np.uint8)
 
     def prepared(self, rows: LevelArray, /) -> Cosine:
-        check_levels(self, rows)
+        self.check_rows(rows)
         return Cosine(_unit(rows), _unit)
 
-    def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        check_levels(self, a)
-        return self.prepared(b).similarity(a)
-
     def pack(self, levels: LevelArray) -> bytes:
-        check_levels(self, levels)
-        return pack_quarters(levels)
+        """Pack four levels into each byte, the first one in the highest bits."""
+        self.check_rows(levels)
+        self.check_levels(levels)
+        parts = levels.reshape(-1, 4)
+        return (parts[:, 0] << 6 | parts[:, 1] << 4 | parts[:, 2] << 2 | parts[:, 3]).astype(np.uint8).tobytes()
 
-    def unpack(self, packed: bytes) -> LevelArray:
-        if len(packed) != self.size_bytes:
-            raise ValueError(f"{len(packed)} bytes; {self.name} has {self.size_bytes}, check how it was stored")
-        return unpack_quarters(packed)
+    def unpack_rows(self, packed: bytes) -> LevelArray:
+        rows = self.packed_rows(packed)
+        return np.stack([rows >> 6, rows >> 4 & 3, rows >> 2 & 3, rows & 3], axis=2).reshape(-1, self.length)
 
 
 def _histogram(image: ImageArray) -> NDArray[np.float32]:
@@ -76,7 +75,7 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
     levels = cv2.GaussianBlur(np.sqrt(small, dtype=np.float32), (0, 0), _BLUR)
     x, y = cv2.Sobel(levels, cv2.CV_32F, 1, 0), cv2.Sobel(levels, cv2.CV_32F, 0, 1)
     strength = x * x + y * y
-    # the channel with the strongest edge, at every pixel
+    # at every pixel, use the channel with the strongest edge
     channel = strength.argmax(axis=2)[:, :, None]
     x, y = (np.take_along_axis(part, channel, axis=2)[:, :, 0] for part in (x, y))
     magnitude, angle = cv2.cartToPolar(x, y)
@@ -97,7 +96,7 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
 
 
 def _unit(levels: LevelArray) -> NDArray[np.float32]:
-    # of a large catalog several times as fast as numpy's indexing
+    # several times as fast as NumPy's indexing for a large catalog
     rows = cv2.LUT(np.ascontiguousarray(levels), _TABLE).astype(np.float32, copy=False).reshape(levels.shape)
     rows /= np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))[:, None]
     return rows

@@ -1,4 +1,4 @@
-"""A network's embedding of the object, by a model file that the user brings."""
+"""Embedding of the object by a neural network, from a model file that the user provides."""
 
 import zlib
 from pathlib import Path
@@ -8,54 +8,69 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import FloatArray, ImageArray, LevelArray
+from hbr.core.arrays import ImageArray, LevelArray
+from hbr.descriptors.base import Descriptor
 from hbr.descriptors.cosine import Cosine
-from hbr.descriptors.levels import check_levels
 from hbr.segmentation import Segmentation, segment
 
-#: Name of such a descriptor: this, and the model's file.
+#: The name of such a descriptor is this prefix and the path of the model file.
 PREFIX: Final = "onnx:"
 _SIDE_PX: Final = 224
-#: Mean and standard deviation of R, G, B in ImageNet's photographs, which most models were trained with.
+#: Mean and standard deviation of R, G, B in ImageNet, with which most models were trained.
 _MEAN: Final = (0.485 * 255, 0.456 * 255, 0.406 * 255)
 _DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(1, 3, 1, 1)
-#: Levels a standard deviation of an embedding's entries takes.
+#: Number of levels in one standard deviation of an embedding's entries.
 _STEPS: Final = 32.0
 
 
-class Embedding:
-    """The output of an ONNX model for the object's crop, one byte an entry, compared by cosine.
+class Embedding(Descriptor):
+    """Output of an ONNX model for the object's crop, one byte for each entry, compared by cosine.
 
-    The model takes one image, float (1, 3, 224, 224) in R, G, B, normalised as ImageNet's usually are, and returns one
-    vector, the embedding before any classifier.
+    The model takes one image, float (1, 3, 224, 224) in R, G, B, normalised by ImageNet's mean and deviation, and
+    returns one vector: the embedding before the classifier.
 
     Parameters
     ----------
     path : Path
-        The model.
+        The model file.
 
     Raises
     ------
     ValueError
-        The file is missing, is no model that OpenCV can run, or does not return one vector.
+        The file is missing, OpenCV cannot run the model, or it does not return one vector.
     """
 
     def __init__(self, path: Path) -> None:
-        self.name = f"{PREFIX}{path}"
+        self._path = path
         try:
             content = path.read_bytes()
         except OSError as error:
             raise ValueError(f"the model {path} cannot be read: {error.strerror}; check the path") from error
-        #: Models differ by their content, whatever their file is called.
-        self.version = zlib.crc32(content)
+        self._checksum = zlib.crc32(content)
         try:
             self._net = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
-            self.length = self._run(np.zeros((8, 8, 3), np.uint8)).size
+            self._length = self._run(np.zeros((8, 8, 3), np.uint8)).size
         except cv2.error as error:
             raise ValueError(f"{path} is no model that OpenCV can run: {error.err}; export it again as ONNX") from error
-        if self.length < 2:
-            raise ValueError(f"{path} returns {self.length} number; an embedding has more, take the layer before")
-        self.size_bytes = self.length
+        if self._length < 2:
+            raise ValueError(f"{path} returns {self._length} number; an embedding has more, export the layer before")
+
+    @property
+    def name(self) -> str:
+        return f"{PREFIX}{self._path}"
+
+    @property
+    def version(self) -> int:
+        """Checksum of the model's content, whatever its file is called."""
+        return self._checksum
+
+    @property
+    def length(self) -> int:
+        return self._length
+
+    @property
+    def size_bytes(self) -> int:
+        return self._length
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
         vector = self._run((view if isinstance(view, Segmentation) else segment(view)).alone)
@@ -65,21 +80,8 @@ class Embedding:
         return levels.astype(np.uint8)
 
     def prepared(self, rows: LevelArray, /) -> Cosine:
-        check_levels(self, rows)
+        self.check_rows(rows)
         return Cosine(_unit(rows), _unit)
-
-    def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        check_levels(self, a)
-        return self.prepared(b).similarity(a)
-
-    def pack(self, levels: LevelArray) -> bytes:
-        check_levels(self, levels)
-        return levels.tobytes()
-
-    def unpack(self, packed: bytes) -> LevelArray:
-        if len(packed) != self.size_bytes:
-            raise ValueError(f"{len(packed)} bytes; {self.name} has {self.size_bytes}, check how it was stored")
-        return np.frombuffer(packed, np.uint8)
 
     def _run(self, image: ImageArray) -> NDArray[np.float32]:
         blob = cv2.dnn.blobFromImage(image, 1 / 255, (_SIDE_PX, _SIDE_PX), _MEAN, swapRB=True)

@@ -7,18 +7,17 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import Comparison, Descriptor
-from hbr.descriptors.levels import check_levels
 from hbr.segmentation import Segmentation, segment
 
 
 @dataclass(frozen=True)
-class Joined:
-    """Descriptors side by side, their similarities averaged with weights that add up to 1."""
+class Joined(Descriptor):
+    """Descriptors side by side. The similarity is the mean of theirs, with weights that add up to 1."""
 
-    name: str
-    version: int
-    parts: tuple[Descriptor, ...]
-    weights: tuple[float, ...]
+    name: str = ""
+    version: int = 1
+    parts: tuple[Descriptor, ...] = ()
+    weights: tuple[float, ...] = ()
 
     @property
     def size_bytes(self) -> int:
@@ -29,35 +28,30 @@ class Joined:
         return sum(part.length for part in self.parts)
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
-        seen = view if isinstance(view, Segmentation) else segment(view)
-        return np.concatenate([part.describe(seen) for part in self.parts])
+        found = view if isinstance(view, Segmentation) else segment(view)
+        return np.concatenate([part.describe(found) for part in self.parts])
 
     def prepared(self, rows: LevelArray, /) -> "_Average":
-        check_levels(self, rows)
+        self.check_rows(rows)
         columns = self._columns()
         parts = [part.prepared(rows[:, own]) for part, own in zip(self.parts, columns, strict=True)]
         return _Average(parts, self.weights, columns)
 
-    def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
-        check_levels(self, a)
-        return self.prepared(b).similarity(a)
-
     def pack(self, levels: LevelArray) -> bytes:
-        check_levels(self, levels)
+        self.check_rows(levels)
         return b"".join(part.pack(levels[columns]) for part, columns in zip(self.parts, self._columns(), strict=True))
 
-    def unpack(self, packed: bytes) -> LevelArray:
-        if len(packed) != self.size_bytes:
-            raise ValueError(f"{len(packed)} bytes; {self.name} has {self.size_bytes}, check how it was stored")
-        levels, at = [], 0
-        for part in self.parts:
-            levels.append(part.unpack(packed[at : at + part.size_bytes]))
-            at += part.size_bytes
-        return np.concatenate(levels)
+    def unpack_rows(self, packed: bytes) -> LevelArray:
+        rows = self.packed_rows(packed)
+        columns = zip(self.parts, _slices([part.size_bytes for part in self.parts]), strict=True)
+        return np.concatenate([part.unpack_rows(rows[:, own].tobytes()) for part, own in columns], axis=1)
+
+    def check_levels(self, rows: LevelArray) -> None:
+        for part, columns in zip(self.parts, self._columns(), strict=True):
+            part.check_levels(rows[:, columns])
 
     def _columns(self) -> list[slice]:
-        ends = np.cumsum([part.length for part in self.parts]).tolist()
-        return [slice(end - part.length, end) for end, part in zip(ends, self.parts, strict=True)]
+        return _slices([part.length for part in self.parts])
 
 
 class _Average:
@@ -80,3 +74,8 @@ class _Average:
         for weight, part in zip(self._weights[1:], similar[1:], strict=True):
             total += weight * part
         return total
+
+
+def _slices(lengths: list[int]) -> list[slice]:
+    ends = np.cumsum(lengths).tolist()
+    return [slice(end - length, end) for end, length in zip(ends, lengths, strict=True)]

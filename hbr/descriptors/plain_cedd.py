@@ -1,4 +1,4 @@
-"""CEDD: the paper's descriptor, as it is and after a blur."""
+"""CEDD, the paper's descriptor: of the image as it is, or blurred."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,31 +8,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.descriptors.base import Descriptor
 from hbr.descriptors.cedd import BINS, cedd, covered, describe
-from hbr.descriptors.cedd_packing import PACKED_BYTES, pack, unpack
-from hbr.descriptors.levels import check_levels
+from hbr.descriptors.cedd_packing import PACKED_BYTES, pack, unpack_rows
 from hbr.descriptors.tanimoto import squares, tanimoto, tanimoto_of_dots
 from hbr.segmentation import Segmentation
 
-#: Blocks of the grid along either side of an image that it covers.
+#: Blocks of CEDD's grid along each side of an image.
 _BLOCKS: Final = 40
 
 
 @dataclass(frozen=True)
-class Cedd:
+class Cedd(Descriptor):
     """CEDD of the whole image, compared by Tanimoto.
 
     Attributes
     ----------
     blur : float
-        Standard deviation of a Gaussian blur, in blocks of the grid; 0 is the paper's CEDD. Noise makes an edge of
-        every block that is not wider than its grain; a blur of about a block takes it away and leaves the edges.
+        Standard deviation of a Gaussian blur, in blocks of the grid; 0 is the paper's CEDD. Noise looks like an edge
+        in blocks that are as small as its grain. A blur of about one block removes the noise and leaves the edges.
     """
 
     name: str = "cedd"
     version: int = 1
     size_bytes: int = PACKED_BYTES
     length: int = BINS
+    max_level: int = 7
+    whole_image: bool = True
     blur: float = 0.0
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
@@ -45,8 +47,8 @@ class Cedd:
         return cedd(blurred.astype(np.uint8, copy=False))
 
     def prepared(self, rows: LevelArray, /) -> "_Tanimoto":
-        check_levels(self, rows)
-        return _Tanimoto(rows.astype(np.float32))  # which holds products of levels 0..7 exactly
+        self.check_rows(rows)
+        return _Tanimoto(rows.astype(np.float32))  # which represents products of levels 0..7 exactly
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return tanimoto(a, b)
@@ -54,8 +56,8 @@ class Cedd:
     def pack(self, levels: LevelArray) -> bytes:
         return pack(levels)
 
-    def unpack(self, packed: bytes) -> LevelArray:
-        return unpack(packed)
+    def unpack_rows(self, packed: bytes) -> LevelArray:
+        return unpack_rows(packed)
 
 
 class _Tanimoto:

@@ -1,4 +1,4 @@
-"""The descriptors by name."""
+"""The known descriptors and their names."""
 
 from functools import cache
 from pathlib import Path
@@ -26,18 +26,17 @@ _KNOWN: Final[dict[str, Descriptor]] = {
     )
 }
 
-
-#: Those that the paper's voting compares: CEDD's levels.
-PAPERS: Final = tuple(known.name for known in _KNOWN.values() if isinstance(known, Cedd))
+#: Names of the descriptors of the whole image, which the paper's voting compares.
+PAPERS: Final = tuple(known.name for known in _KNOWN.values() if known.whole_image)
 
 
 def descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name, or of ``onnx:FILE``, a network's embedding.
+    """Return the descriptor of this name; ``onnx:FILE`` is the embedding of a neural network.
 
     Raises
     ------
     ValueError
-        There is none, and the message lists those there are; or the model file cannot be used.
+        The name is unknown (the message lists the known ones), or the model file cannot be used.
     """
     if name.startswith(PREFIX):
         return _embedding(name.removeprefix(PREFIX))
@@ -52,5 +51,5 @@ def _embedding(path: str) -> Descriptor:
 
 
 def names() -> tuple[str, ...]:
-    """Names of all descriptors that come with the library, the paper's first."""
+    """Return the names of all descriptors that come with the library, the paper's first."""
     return tuple(_KNOWN)

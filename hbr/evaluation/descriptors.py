@@ -24,7 +24,7 @@ def enrolled_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[
         condition.enrolled(image, generator(0, name, "enrolled", i))
         for i, image in enumerate(_images(dataset, j, size))
     )
-    return np.stack([describe(image, descriptor=condition.descriptor, reference=empty) for image, empty in shots])
+    return np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in shots])
 
 
 def query_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int) -> LevelArray:
@@ -34,7 +34,7 @@ def query_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int
         condition.query(image, generator(seed, name, "photograph", i))
         for i, image in enumerate(_images(dataset, j, size))
     )
-    return np.stack([describe(image, descriptor=condition.descriptor, reference=empty) for image, empty in shots])
+    return np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in shots])
 
 
 def _images(dataset: Dataset, j: int, size: tuple[int, int]) -> Iterator[ImageArray]:

@@ -69,7 +69,7 @@ def enrolled_few(dataset: Dataset, j: int, condition: Condition, size: tuple[int
         condition.enrolled(read_photograph(item.photographs[i].path, size), generator(0, item.name, "enrolled", i))
         for i in kept.tolist()
     ]
-    levels = np.stack([describe(image, descriptor=condition.descriptor, reference=empty) for image, empty in shots])
+    levels = np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in shots])
     return Views.of_object(item.name, levels, item.azimuth_deg[kept], condition.descriptor)
 
 
@@ -107,7 +107,7 @@ def hits(
                     read_photograph(item.photographs[i].path, size),
                     generator(protocol.seed, item.name, "photograph", i),
                 )
-                described[i] = describe(shot.image, descriptor=condition.descriptor, reference=shot.empty)
+                described[i] = describe(shot.image, descriptor=condition.descriptor, empty_table=shot.empty)
             so_far = belief = update_belief(described[i], float(azimuth_deg[i] + error_deg[n]), so_far)
             found[t, n] = belief.ranking().object_index[0] == own
             away_deg = np.abs(wrap180(azimuth_deg[free] - azimuth_deg[i] - _STEP_DEG))

@@ -12,7 +12,6 @@ from hbr.core.angles import wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import ranges
 from hbr.descriptors import descriptor as descriptor_of
-from hbr.descriptors.cedd import BINS
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -132,11 +131,11 @@ def _check_views(
     descriptors: object, azimuth_deg: FloatArray, object_index: NDArray[np.generic], name_count: int, descriptor: str
 ) -> None:
     if not isinstance(descriptors, np.ndarray) or descriptors.dtype != np.uint8:
-        kind = getattr(descriptors, "dtype", type(descriptors).__name__)
-        raise TypeError(f"descriptors are of {kind}; stack the uint8 rows that cedd or describe returns")
-    length = descriptor_of(descriptor).length
-    if descriptors.ndim != 2 or descriptors.shape[1] != length:
-        raise ValueError(f"descriptors have shape {descriptors.shape}; {descriptor} needs the shape (n, {length})")
+        found = getattr(descriptors, "dtype", type(descriptors).__name__)
+        raise TypeError(f"descriptors are of {found}; stack the uint8 rows that cedd or describe returns")
+    kind = descriptor_of(descriptor)
+    if descriptors.ndim != 2 or descriptors.shape[1] != kind.length:
+        raise ValueError(f"descriptors have shape {descriptors.shape}; {descriptor} needs the shape (n, {kind.length})")
     count = len(descriptors)
     for name, column in (("azimuth_deg", azimuth_deg), ("object_index", object_index)):
         if column.shape != (count,):
@@ -145,8 +144,7 @@ def _check_views(
         raise TypeError(f"object_index is of {object_index.dtype}; integers are needed")
     if not count:
         return
-    if descriptor.startswith("cedd") and descriptors[:, :BINS].max() > 7:
-        raise ValueError(f"a level of {descriptors.max()}; CEDD levels are 0..7, unpack packed descriptors first")
+    kind.check_levels(descriptors)
     if not np.isfinite(azimuth_deg).all():
         raise ValueError(f"azimuth of view {np.isfinite(azimuth_deg).argmin()} is not finite; leave such views out")
     if object_index.min() < 0 or object_index.max() >= name_count:

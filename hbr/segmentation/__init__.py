@@ -1,6 +1,7 @@
-"""From a frame to the object in it: exposure and white balance, silhouette, box, and a crop of one scale."""
+"""Segmentation: finds the object in a frame, corrects its illumination, and brings it to a fixed size."""
 
-from hbr.segmentation.background import TRUSTED, Background
+from hbr.segmentation.background import MIN_AGREEMENT, Background
+from hbr.segmentation.evidence import Issue, IssueCode, Method
 from hbr.segmentation.segment import CROP_PX, Box, Segmentation, segment
 
-__all__ = ["CROP_PX", "TRUSTED", "Background", "Box", "Segmentation", "segment"]
+__all__ = ["CROP_PX", "MIN_AGREEMENT", "Background", "Box", "Issue", "IssueCode", "Method", "Segmentation", "segment"]

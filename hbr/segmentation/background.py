@@ -1,7 +1,7 @@
-"""The empty table: how a frame differs from it, in light and by what stands there.
+"""Comparison of a frame with the empty-table image: difference of illumination, and pixels that show the object.
 
-Everything is done on small images and on the logarithm of the grey levels, where a change of exposure, of white balance
-or of a lamp's place is a plane added to each channel, and a shadow the same amount taken from all three.
+The comparison uses small images and the logarithm of the grey levels. There a change of exposure, of white balance or
+of a lamp's position adds a plane to each channel, and a shadow subtracts the same amount from all three channels.
 """
 
 from collections.abc import Sequence
@@ -14,56 +14,57 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray
 from hbr.core.validation import check_frame
+from hbr.segmentation.evidence import IssueCode
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 #: Longer side of the images that are compared.
 SIDE_PX: Final = 128
-#: Every so many-th pixel each way is enough to fit a plane to.
+#: Step between the pixels that a plane is fitted to.
 _EVERY: Final = 5
-#: Added to grey levels before the logarithm: below it there is more noise than light.
+#: Added to grey levels before the logarithm, because noise dominates below this level.
 _FLOOR: Final = 6.0
 _LOG: Final = np.log(np.arange(256) + _FLOOR).astype(np.float32)
-#: How far the logarithm of a grey level is off by noise.
+#: Noise of the logarithm of each grey level.
 _NOISE: Final = (0.35 * 8.0 / (np.arange(256) + _FLOOR)).astype(np.float32)
-#: A logarithm of this much is a fifth more or less light.
+#: A pixel agrees if the residual is smaller than this, in logarithms: about 15 % more or less light.
 _AGREES: Final = 0.15
-#: Cells of a 4 x 4 grid at the frame's border; the object stands in the middle.
+#: Cells of a 4 x 4 grid at the frame's border; the object is in the middle.
 _BORDER: Final = tuple((y, x) for y in range(4) for x in range(4) if y in (0, 3) or x in (0, 3))
-#: A cell agrees when this share of its pixels do.
+#: A cell agrees if this share of its pixels agree.
 _CELL_SHARE: Final = 0.6
-#: A reference is trusted when this share of the border cells agree.
-TRUSTED: Final = 0.65
-#: How unlike the border cells of a plain backdrop may be, and how far from grey, in logarithms.
+#: The empty-table image is used if at least this share of the border cells agree.
+MIN_AGREEMENT: Final = 0.65
+#: Largest difference between the border cells of a plain backdrop, and its largest distance from grey, in logarithms.
 _PLAIN: Final = 0.12
 _NEAR_GREY: Final = 0.35
-#: The grey that a plain backdrop is brought to, and the farthest that this may brighten or darken a frame.
+#: Grey level that a plain backdrop is corrected to, and the largest correction of the exposure, as a logarithm.
 _BACKDROP_LEVEL: Final = 128.0
-_FARTHEST: Final = np.log(1.7)
+_MAX_EXPOSURE: Final = np.log(1.7)
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
-    """How a frame's light differs from what it is brought to.
+class Illumination:
+    """Illumination correction of a frame: a plane for each channel.
 
     Attributes
     ----------
     slopes : float64 array (3, 3)
-        Rows: at the frame's middle, rise over its width, rise over its height. Columns: B, G, R. Logarithms of the
-        factors that the frame is multiplied by.
+        Logarithms of the factors that the frame is multiplied by. Rows: value at the frame's middle, rise over its
+        width, rise over its height. Columns: B, G, R.
     """
 
     slopes: FloatArray
 
     @property
     def gains(self) -> tuple[float, float, float]:
-        """Factors of B, G, R at the middle of the frame."""
+        """Factors for B, G, R at the middle of the frame."""
         blue, green, red = np.exp(self.slopes[0]).tolist()
         return blue, green, red
 
     def over(self, height: int, width: int) -> Floats:
-        """Logarithms of the factors for every pixel, (H, W, 3)."""
+        """Return the logarithms of the factors for every pixel, float32 (H, W, 3)."""
         x = ((np.arange(width) + 0.5) / width - 0.5)[None, :, None]
         y = ((np.arange(height) + 0.5) / height - 0.5)[:, None, None]
         along, down = (self.slopes[0] + x * self.slopes[1]).astype(np.float32), (y * self.slopes[2]).astype(np.float32)
@@ -73,98 +74,105 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """What a frame shows that the empty table does not.
+    """Difference between a frame and the empty-table image.
 
     Attributes
     ----------
     agreement : float
-        Share of the border's cells that look like the reference under some even light.
-    surely : bool array (h, w)
-        Another colour, or brighter than the table can be.
-    perhaps : bool array (h, w)
-        Darker by the same share in all colours: a shadow, or a grey thing.
-    light : Light
-        That brings the frame to the reference.
+        Share of the border's cells that look like the empty-table image after illumination correction.
+    certain : bool array (h, w)
+        Pixels of another colour, or brighter than the table can be.
+    possible : bool array (h, w)
+        Pixels that are darker by the same share in all colours: a shadow, or a grey object.
+    correction : Illumination
+        Brings the frame's illumination to that of the empty-table image.
     """
 
     agreement: float
-    surely: Mask
-    perhaps: Mask
-    light: Light
+    certain: Mask
+    possible: Mask
+    correction: Illumination
 
     @property
-    def trusted(self) -> bool:
-        return self.agreement >= TRUSTED
+    def reliable(self) -> bool:
+        """Whether the frame's border looks like the empty-table image."""
+        return self.agreement >= MIN_AGREEMENT
 
 
 class Background:
-    """The empty table as a photograph shows it, made ready for comparison with many frames.
+    """An empty-table image, prepared for comparison with many frames.
 
     Parameters
     ----------
-    reference_bgr : uint8 array (H, W, 3)
-        The table without any object, from the camera's place of the frames that it is compared with; the light may
-        have changed since.
+    empty_table_bgr : uint8 array (H, W, 3)
+        The table without an object, from the same camera position as the frames. The light may differ.
+
+    Attributes
+    ----------
+    correction : Illumination or None
+        Makes a plain backdrop grey; None if its colour cannot be taken for grey.
+    issue : IssueCode or None
+        Why the correction is missing or incomplete.
 
     Raises
     ------
     TypeError, ValueError
-        It is no such image.
+        The array is no such image.
     """
 
-    def __init__(self, reference_bgr: ImageArray) -> None:
-        check_frame(reference_bgr)
-        self.shape = reference_bgr.shape[:2]
-        self._grey_levels = shrunk(reference_bgr)
+    def __init__(self, empty_table_bgr: ImageArray) -> None:
+        check_frame(empty_table_bgr)
+        self.shape = empty_table_bgr.shape[:2]
+        self._grey_levels = shrunk(empty_table_bgr)
         self._log = _logarithm(self._grey_levels)
         self._useful = _useful(self._grey_levels)
-        self.light, self.words = self._own_light()
+        self.correction, self.issue = self._backdrop_correction()
 
     def difference(self, small: ImageArray) -> Difference:
-        """Compare a frame, brought to size by `shrunk`, with the empty table."""
+        """Compare a small frame, as `shrunk` returns it, with the empty-table image."""
         ratio = _logarithm(small) - self._log
         slopes = _fit(ratio, self._useful & _useful(small))
-        residual = cv2.split(ratio - Light(slopes).over(*ratio.shape[:2]))
+        residual = cv2.split(ratio - Illumination(slopes).over(*ratio.shape[:2]))
         evenly = (residual[0] + residual[1] + residual[2]) * np.float32(1 / 3)
         coloured = _largest([cv2.absdiff(part, evenly) for part in residual])
-        # a grey level of noise counts for more where there is little light
+        # one grey level of noise is a larger share of a dark pixel
         noise = cv2.LUT(_smallest(cv2.split(cv2.min(small, self._grey_levels))), _NOISE)
-        surely = (coloured > 0.08 + noise) | (evenly > 0.10 + noise) | (evenly < -1.1)
-        perhaps = (evenly < -0.12) & ~surely
-        # a shadow is smooth; what has a grain that the table has not is a thing
+        certain = (coloured > 0.08 + noise) | (evenly > 0.10 + noise) | (evenly < -1.1)
+        possible = (evenly < -0.12) & ~certain
+        # a shadow is smooth: a fine texture that the table does not have belongs to an object
         grain = (np.abs(cv2.Laplacian(evenly, cv2.CV_32F, ksize=3)) > 0.5).astype(np.float32)
-        surely |= perhaps & (cv2.blur(grain, (5, 5)) > 0.15)
+        certain |= possible & (cv2.blur(grain, (5, 5)) > 0.15)
         agrees = _largest([np.abs(part) for part in residual]) < _AGREES
         shares = np.array([cell.mean() for cell in border_cells(agrees)])
-        return Difference(float((shares > _CELL_SHARE).mean()), surely, perhaps & ~surely, Light(-slopes))
+        return Difference(float((shares > _CELL_SHARE).mean()), certain, possible & ~certain, Illumination(-slopes))
 
-    def _own_light(self) -> tuple[Light | None, str]:
-        """Light that makes the backdrop grey, if it is plain and nearly so; and why not, or in what part."""
+    def _backdrop_correction(self) -> tuple[Illumination | None, IssueCode | None]:
+        """Return the correction that makes a plain, nearly grey backdrop grey, and what prevents it or a part of it."""
         cells = [
             np.median(cell[ok], axis=0)
             for cell, ok in zip(border_cells(self._log), border_cells(self._useful), strict=True)
             if ok.mean() > 0.5
         ]
         if len(cells) < len(_BORDER) / 2:
-            return None, "the backdrop is too dark or overexposed to tell the light's colour"
+            return None, IssueCode.BACKDROP_EXPOSURE
         colours = np.array(cells)
         opponent = colours - colours.mean(axis=1, keepdims=True)
         middle = np.median(opponent, axis=0)
         if np.quantile(np.abs(opponent - middle).max(axis=1), 0.75) > _PLAIN:
-            return None, "the backdrop has several colours; none is sure to be grey"
+            return None, IssueCode.BACKDROP_COLOURS
         if np.abs(middle).max() > _NEAR_GREY:
-            return None, "the backdrop is too colourful to be taken for grey"
+            return None, IssueCode.BACKDROP_COLOURFUL
         exposure = float(np.log(_BACKDROP_LEVEL + _FLOOR) - np.median(colours.mean(axis=1)))
         slopes = np.zeros((3, 3))
         slopes[0] = -middle
-        if abs(exposure) > _FARTHEST:
-            return Light(slopes), "the backdrop is too dark or too bright to take the exposure from"
+        if abs(exposure) > _MAX_EXPOSURE:
+            return Illumination(slopes), IssueCode.BACKDROP_LEVEL
         slopes[0] += exposure
-        return Light(slopes), ""
+        return Illumination(slopes), None
 
 
 def shrunk(image_bgr: ImageArray) -> ImageArray:
-    """The image at a size of at most 128 pixels, slightly blurred."""
+    """Return the image with sides of at most 128 pixels, slightly blurred."""
     scale = SIDE_PX / max(image_bgr.shape[:2])
     if scale < 1:
         size = max(1, round(image_bgr.shape[1] * scale)), max(1, round(image_bgr.shape[0] * scale))
@@ -173,7 +181,7 @@ def shrunk(image_bgr: ImageArray) -> ImageArray:
 
 
 def border_cells(image: NDArray[np.generic]) -> list[NDArray[np.generic]]:
-    """The cells of a 4 x 4 grid that lie at the border."""
+    """Return the 12 cells of a 4 x 4 grid that lie at the border."""
     rows, columns = (np.linspace(0, side, 5).astype(int) for side in image.shape[:2])
     return [image[rows[y] : rows[y + 1], columns[x] : columns[x + 1]] for y, x in _BORDER]
 
@@ -183,14 +191,14 @@ def _logarithm(image: ImageArray) -> Floats:
 
 
 def _useful(image: ImageArray) -> Mask:
-    """Neither black nor overexposed."""
+    """Return which pixels are neither black nor overexposed."""
     brightest = _largest(cv2.split(image))
     useful: Mask = (brightest > _FLOOR) & (brightest < 250)
     return useful
 
 
 def _largest(channels: Sequence[cv2.typing.MatLike]) -> cv2.typing.MatLike:
-    # numpy's reduction over a last axis of three is several times slower
+    # NumPy's reduction over a last axis of length 3 is several times slower
     return cv2.max(cv2.max(channels[0], channels[1]), channels[2])
 
 
@@ -199,7 +207,7 @@ def _smallest(channels: Sequence[cv2.typing.MatLike]) -> cv2.typing.MatLike:
 
 
 def _fit(ratio: Floats, useful: Mask) -> FloatArray:
-    """The plane that most pixels lie on, for each channel: least squares, again and again without the outliers."""
+    """Fit a plane to each channel by least squares, repeated without the outliers."""
     height, width = useful.shape
     keep = useful[2::_EVERY, 2::_EVERY]
     rows, columns = np.nonzero(keep)

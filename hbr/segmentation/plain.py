@@ -1,4 +1,4 @@
-"""The object before a plain background that no reference shows."""
+"""Difference of a frame from a plain background, without an empty-table image."""
 
 from typing import Final
 
@@ -8,22 +8,22 @@ import numpy as np
 from hbr.core.arrays import ImageArray
 from hbr.segmentation.background import Mask
 
-#: A pixel differs when it does by this many grey levels, or by this share of what the object differs.
+#: A pixel differs from the background by at least this many grey levels, and by this share of the object's contrast.
 _LEAST_LEVELS: Final = 12.0
 _SHARE: Final = 0.25
-#: A backdrop is plain where three corners of the frame have one colour, within so many grey levels each, or two if they
-#: are as dark as this,
+#: A backdrop is plain if three corners of the frame have the same colour within this many grey levels (two corners are
+#: enough if they are darker than `_DARK`),
 _ONE_COLOUR: Final = 12.0
 _DARK: Final = 40.0
-#: and the smoothest of them is off by no more than this and its noise.
+#: and if the smoothest corner differs from the background by at most this, plus its noise.
 _SMOOTH: Final = 3.0
 _NOISE: Final = 1.5
 
 
 def plain_difference(small: ImageArray) -> Mask | None:
-    """Where a small image differs from its background, bool (h, w); None where its border is not plain.
+    """Return where a small image differs from its background, bool (h, w); None if the background is not plain.
 
-    The background of a row is what lies between its two ends, which a horizon does not disturb.
+    The background of each row is interpolated between its two ends, so that a horizon does no harm.
     """
     height, width = small.shape[:2]
     image = cv2.GaussianBlur(small, (7, 7), 1.3)
@@ -39,7 +39,7 @@ def plain_difference(small: ImageArray) -> Mask | None:
     threshold = max(_LEAST_LEVELS, 4 * float(np.median(border)))
     if not _backdrop(image, away, cv2.absdiff(small, image), edge + 2):
         return None
-    # the object's own contrast: what a twentieth of the frame exceeds, of every third pixel each way
+    # the object's contrast: 5 % of the frame exceed it; every third pixel in each direction is enough
     sample = np.sort(away[::3, ::3], axis=None)
     contrast = float(sample[-(len(sample) // 20 + 1)])
     differs: Mask = away > max(threshold, _SHARE * contrast)
@@ -47,17 +47,18 @@ def plain_difference(small: ImageArray) -> Mask | None:
 
 
 def _backdrop(image: cv2.typing.MatLike, away: cv2.typing.MatLike, noise: cv2.typing.MatLike, edge: int) -> bool:
-    """Whether the corners show one smooth backdrop; not so a wall and a table, nor a pattern."""
+    """Return whether the corners show one smooth backdrop, and not a wall and a table, or a pattern."""
     height, width = (max(1, side // 8) for side in away.shape)
     corners = [(rows, part) for rows in (np.s_[:height], np.s_[-height:]) for part in (np.s_[:width], np.s_[-width:])]
     colours = np.array([np.median(image[corner].reshape(-1, 3), axis=0) for corner in corners])
-    alike = (np.abs(colours[:, None] - colours).max(axis=2) <= _ONE_COLOUR).sum(axis=1)
+    same = (np.abs(colours[:, None] - colours).max(axis=2) <= _ONE_COLOUR).sum(axis=1)
     dark = colours.max(axis=1) < _DARK
-    if not (alike >= np.where(dark, 2, 3)).any():
+    if not (same >= np.where(dark, 2, 3)).any():
         return False
     edge = min(edge, (away.shape[1] - 1) // 2)
-    inner = away[:, edge : -edge or None], noise[:, edge : -edge or None]  # the edges are what is compared with
-    unrest, grain = min(
+    # not at the edges: the background is interpolated from them, so that the difference is always small there
+    inner = away[:, edge : -edge or None], noise[:, edge : -edge or None]
+    difference, grain = min(
         (float(np.median(inner[0][corner])), float(inner[1][corner].max(axis=2).mean())) for corner in corners
     )
-    return unrest <= _SMOOTH + _NOISE * grain
+    return difference <= _SMOOTH + _NOISE * grain

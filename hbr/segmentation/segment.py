@@ -1,4 +1,4 @@
-"""The object in a frame."""
+"""Segmentation of a frame: the object's box, mask and illumination, and a crop of fixed size."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,19 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
+from hbr.core.deprecation import renamed_keyword
 from hbr.core.validation import check_frame
-from hbr.segmentation.background import Background, Light, shrunk
-from hbr.segmentation.guess import guessed
+from hbr.segmentation.background import Background, Illumination, shrunk
+from hbr.segmentation.evidence import Issue, IssueCode, Method
+from hbr.segmentation.guess import guess_object
 from hbr.segmentation.plain import plain_difference
 from hbr.segmentation.silhouette import silhouette
 
-#: Sides of the square that an object is brought to.
+#: Side of the square crop around an object.
 CROP_PX: Final = 160
-#: The square is this much larger than the box.
+#: Side of the crop, as a multiple of the longer side of the box.
 _MARGIN: Final = 1.1
-#: Grey levels of a patch that differ by more than this are no patch.
+#: A patch whose grey levels differ by more than this is uneven.
 _PATCH_SPREAD: Final = 12.0
-#: What takes the background's place, as a share of the object's own brightness.
+#: Brightness of the grey that replaces the background, as a share of the object's brightness.
 _SURROUND: Final = 0.5
 
 Box = tuple[int, int, int, int]
@@ -29,143 +31,159 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """An object cut out of its frame, and on what evidence.
+    """An object cut out of its frame, with the evidence.
 
     Attributes
     ----------
     crop : uint8 array (160, 160, 3)
-        The square around the object, in BGR, in the light that it was brought to.
-    cover : uint8 array (160, 160)
-        How much of each pixel the object covers, 0..255; 255 everywhere where it was not found.
+        Square around the object, in BGR, after illumination correction.
+    mask : uint8 array (160, 160)
+        Share of each pixel that belongs to the object, 0..255; 255 everywhere if no object was found.
     box : (int, int, int, int) or None
-        The object's x, y, width and height in pixels of the frame; None where it was not found.
+        The object's x, y, width and height in pixels of the frame; None if no object was found.
     gains : (float, float, float) or None
-        Factors of B, G, R by which the frame was brought to its light; None where nothing was changed.
+        Factors of the illumination correction for B, G, R; None without correction.
     agreement : float or None
-        Share of the frame's border that looks like the reference; None without one.
-    refused : tuple of str
-        What could not be done, each with its reason.
+        Share of the frame's border that looks like the empty-table image; None without such an image.
+    method : Method
+        How the box was found.
+    issues : tuple of Issue
+        What could not be done, and why.
     """
 
     crop: ImageArray
-    cover: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
     box: Box | None
     gains: tuple[float, float, float] | None
     agreement: float | None
-    refused: tuple[str, ...] = ()
+    method: Method
+    issues: tuple[Issue, ...] = ()
 
     def evidence(self) -> dict[str, Any]:
-        """Return what was found and refused as JSON values, to be stored with the view."""
+        """Return method, box, gains, agreement and issues as JSON values, to be stored with the view."""
         return {
+            "method": self.method.value,
             "box_px": None if self.box is None else list(self.box),
             "gains_bgr": None if self.gains is None else [round(gain, 4) for gain in self.gains],
             "agreement": None if self.agreement is None else round(self.agreement, 3),
-            "refused": list(self.refused),
+            "issues": [issue.as_json() for issue in self.issues],
         }
 
     @cached_property
     def alone(self) -> ImageArray:
-        """The crop with an even grey behind the object, half as bright as the object itself, uint8 (160, 160, 3)."""
+        """The crop with an even grey instead of the background, half as bright as the object, uint8 (160, 160, 3)."""
         if self.box is None:
             return self.crop
-        share = cv2.GaussianBlur(self.cover, (0, 0), 2.5)
-        level = _SURROUND * float(np.mean(cv2.mean(self.crop, mask=(self.cover > 127).astype(np.uint8))[:3]))
+        share = cv2.GaussianBlur(self.mask, (0, 0), 2.5)
+        level = _SURROUND * float(np.mean(cv2.mean(self.crop, mask=(self.mask > 127).astype(np.uint8))[:3]))
         ground = np.full_like(self.crop, round(level))
         weight = share.astype(np.float32) * np.float32(1 / 255)
         return cv2.blendLinear(self.crop, ground, weight, 1 - weight).astype(np.uint8, copy=False)
 
 
+@renamed_keyword("reference", "empty_table")
 def segment(
     image_bgr: ImageArray,
     *,
-    reference: Background | ImageArray | None = None,
+    empty_table: Background | ImageArray | None = None,
     box: Box | None = None,
     grey_patch: Box | None = None,
 ) -> Segmentation:
-    """Find the object in a frame, bring it to one scale, and its light to that of the empty table.
+    """Find the object in a frame, crop it to a fixed size, and correct its illumination.
 
-    With a reference the object is what differs from it, whatever pattern the table and the wall have. The frame's light
-    is brought to the reference's, as far as the frame's border shows the same background; and to a plain grey backdrop,
-    if the reference shows one. A border that does not look like the reference (the table was changed, the camera was
-    moved) is noticed, and the reference is left alone. Without a reference, or where it is refused, the object is what
-    differs from a plain background, and where there is none, what has other colours than the frame's border: a guess.
-    What was refused, and what is a guess, stands in `Segmentation.refused`.
+    1. With an empty-table image, the object is what differs from it. The frame's illumination is corrected to that of
+       the image, and further to a plain grey backdrop if the image shows one. If the frame's border does not look like
+       the image (the table has changed, the camera has moved), the image is not used.
+    2. Otherwise the object is what differs from a plain background.
+    3. If the background is not plain, the object is guessed: what has other colours than the frame's border.
+
+    `Segmentation.method` says which of these found the object, `Segmentation.issues` why the others did not.
 
     Parameters
     ----------
     image_bgr : uint8 array (H, W, 3)
         The frame.
-    reference : Background, or uint8 array (H, W, 3), optional
-        The empty table. For many frames pass a `Background`, which is made ready once.
+    empty_table : Background, or uint8 array (H, W, 3), optional
+        The empty-table image. For many frames, pass a `Background`: it is prepared only once.
     box : (int, int, int, int), optional
-        Where the object is, x, y, width, height in pixels, if that is known; it is not looked for then.
+        The object's x, y, width, height in pixels, if they are known. The object is not searched for then.
     grey_patch : (int, int, int, int), optional
-        Where the frame shows a neutral grey; exposure and white balance are taken from there, not from the reference.
+        Box of a neutral grey in the frame. Exposure and white balance are corrected by it, not by the empty-table
+        image.
 
     Returns
     -------
     Segmentation
-        Where no object was found, of the largest square in the middle of the frame.
+        Of the largest square in the middle of the frame if no object was found.
 
     Raises
     ------
     TypeError, ValueError
-        The frame is no such image, the reference has another size, or a box lies outside.
+        The frame is no such image, the empty-table image has another size, or a box is outside the frame.
     """
     check_frame(image_bgr)
-    background = Background(reference) if isinstance(reference, np.ndarray) else reference
+    background = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
     height, width = image_bgr.shape[:2]
     if background is not None and background.shape != (height, width):
         raise ValueError(
-            f"the reference has {background.shape[1]} x {background.shape[0]} pixels, the frame {width} x {height}; "
-            "take the reference with the camera's present settings"
+            f"the empty-table image has {background.shape[1]} x {background.shape[0]} pixels, the frame "
+            f"{width} x {height}; take the image with the present camera settings"
         )
     for name, part in (("box", box), ("grey_patch", grey_patch)):
         if part is not None:
             _check_box(name, part, width, height)
 
     small = shrunk(image_bgr)
-    refused: list[str] = []
+    issues: list[Issue] = []
     agreement: float | None = None
-    light: Light | None = None
+    correction: Illumination | None = None
     found: NDArray[np.bool_] | None = None
+    method = Method.EMPTY_TABLE
     if background is not None:
         difference = background.difference(small)
         agreement = difference.agreement
-        if difference.trusted:
-            found = silhouette(difference.surely, difference.perhaps, framed=True)
-            light = difference.light
-            if background.words:
-                refused.append(background.words)
-            if background.light is not None:
-                light = Light(light.slopes + background.light.slopes)
+        if difference.reliable:
+            found = silhouette(difference.certain, difference.possible, framed=True)
+            correction = difference.correction
+            if background.issue is not None:
+                issues.append(Issue(background.issue))
+            if background.correction is not None:
+                correction = Illumination(correction.slopes + background.correction.slopes)
         else:
-            refused.append(f"the reference: only {agreement:.0%} of the frame's border looks like it")
+            issues.append(Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(agreement, 3)}))
     if found is None and box is None:
         differs = plain_difference(small)
-        if differs is None:
-            refused.append("the silhouette: the background is not plain enough; guessed from colours")
-            cut = guessed(small)
-            found = None if cut is None else silhouette(cut, framed=False)
-            if found is None:
-                refused.append("the guess: no part of the frame stands out")
-        else:
+        if differs is not None:
+            method = Method.PLAIN_BACKGROUND
             found = silhouette(differs, framed=False)
             if found is None:
-                refused.append("the silhouette: nothing differs from the background")
+                issues.append(Issue(IssueCode.NO_DIFFERENCE))
+        else:
+            method = Method.GUESS
+            issues.append(Issue(IssueCode.BACKGROUND_NOT_PLAIN))
+            cut = guess_object(small)
+            found = None if cut is None else silhouette(cut, framed=False)
+            if found is None:
+                issues.append(Issue(IssueCode.NO_GUESS))
+    if box is not None:
+        method = Method.GIVEN_BOX
+    elif found is None:
+        method = Method.NONE
     if grey_patch is not None:
-        light, words = _patch_light(image_bgr, grey_patch)
-        refused.extend(words)
-    return _cut_out(image_bgr, found, box, light, agreement, tuple(refused))
+        correction, problem = _patch_correction(image_bgr, grey_patch)
+        if problem is not None:
+            issues.append(Issue(problem))
+    return _cut_out(image_bgr, found, box, correction, agreement, method, tuple(issues))
 
 
 def _cut_out(
     image: ImageArray,
     found: NDArray[np.bool_] | None,
     box: Box | None,
-    light: Light | None,
+    correction: Illumination | None,
     agreement: float | None,
-    refused: tuple[str, ...],
+    method: Method,
+    issues: tuple[Issue, ...],
 ) -> Segmentation:
     height, width = image.shape[:2]
     if box is None and found is not None:
@@ -177,16 +195,17 @@ def _cut_out(
         side = max(box[2], box[3]) * _MARGIN
         left, top = box[0] + (box[2] - side) / 2, box[1] + (box[3] - side) / 2
     crop = _square(image, left, top, side)
-    if light is not None:
-        crop = _lit(crop, light, left, top, side, width, height)
-    if found is None:
-        cover = np.full((CROP_PX, CROP_PX), 255, np.uint8)
-        if box is not None:
-            cover = _covered(box, left, top, side)
-    else:
+    if correction is not None:
+        crop = _corrected(crop, correction, left, top, side, width, height)
+    if found is not None:
         ratio = found.shape[1] / width
-        cover = _square(found.astype(np.uint8) * 255, left * ratio, top * ratio, side * ratio, cv2.BORDER_CONSTANT)
-    return Segmentation(crop, cover, box, None if light is None else light.gains, agreement, refused)
+        mask = _square(found.astype(np.uint8) * 255, left * ratio, top * ratio, side * ratio, cv2.BORDER_CONSTANT)
+    elif box is not None:
+        mask = _box_mask(box, left, top, side)
+    else:
+        mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
+    gains = None if correction is None else correction.gains
+    return Segmentation(crop, mask, box, gains, agreement, method, issues)
 
 
 def _box_of(found: NDArray[np.bool_], width: int, height: int) -> Box:
@@ -196,21 +215,21 @@ def _box_of(found: NDArray[np.bool_], width: int, height: int) -> Box:
     return left, top, min(width, round((x + w) * across)) - left, min(height, round((y + h) * down)) - top
 
 
-def _covered(box: Box, left: float, top: float, side: float) -> NDArray[np.uint8]:
+def _box_mask(box: Box, left: float, top: float, side: float) -> NDArray[np.uint8]:
     scale = CROP_PX / side
-    cover = np.zeros((CROP_PX, CROP_PX), np.uint8)
+    mask = np.zeros((CROP_PX, CROP_PX), np.uint8)
     x, y = round((box[0] - left) * scale), round((box[1] - top) * scale)
-    cover[y : y + round(box[3] * scale), x : x + round(box[2] * scale)] = 255
-    return cover
+    mask[y : y + round(box[3] * scale), x : x + round(box[2] * scale)] = 255
+    return mask
 
 
 def _square(
     image: NDArray[np.uint8], left: float, top: float, side: float, border: int = cv2.BORDER_REPLICATE
 ) -> NDArray[np.uint8]:
-    """A square of the image, brought to one size: by area where it shrinks, linearly where it grows."""
+    """Return a square of the image, scaled to `CROP_PX`: averaged by area if it shrinks, linearly if it grows."""
     scale = CROP_PX / side
     if scale < 1:
-        # to whole pixels, so that the areas can be averaged
+        # whole pixels, because INTER_AREA needs an integer region
         x, y, size = round(left), round(top), max(1, round(side))
         height, width = image.shape[:2]
         out = max(0, -x), max(0, -y), max(0, x + size - width), max(0, y + size - height)
@@ -225,32 +244,34 @@ def _square(
     )
 
 
-def _lit(crop: ImageArray, light: Light, left: float, top: float, side: float, width: int, height: int) -> ImageArray:
-    """The crop in the light, whose planes lie over the whole frame."""
-    local = light.slopes.copy()
+def _corrected(
+    crop: ImageArray, correction: Illumination, left: float, top: float, side: float, width: int, height: int
+) -> ImageArray:
+    """Apply to the crop the correction, whose planes extend over the whole frame."""
+    local = correction.slopes.copy()
     local[0] += local[1] * ((left + side / 2) / width - 0.5) + local[2] * ((top + side / 2) / height - 0.5)
     local[1] *= side / width
     local[2] *= side / height
-    coarse = cv2.exp(Light(local).over(8, 8))
+    coarse = cv2.exp(Illumination(local).over(8, 8))
     factors = cv2.resize(coarse, (CROP_PX, CROP_PX), interpolation=cv2.INTER_LINEAR)
     return cv2.multiply(crop, factors, dtype=cv2.CV_8U).astype(np.uint8, copy=False)
 
 
-def _patch_light(image: ImageArray, patch: Box) -> tuple[Light | None, list[str]]:
+def _patch_correction(image: ImageArray, patch: Box) -> tuple[Illumination | None, IssueCode | None]:
     x, y, w, h = patch
     pixels = image[y : y + h, x : x + w].reshape(-1, 3).astype(np.float64)
     level = np.median(pixels, axis=0)
     spread = np.quantile(np.abs(pixels - level), 0.9)
     if spread > _PATCH_SPREAD:
-        return None, ["the grey patch: it is not even"]
+        return None, IssueCode.PATCH_UNEVEN
     if level.max() >= 250 or level.min() < 16:
-        return None, ["the grey patch: it is overexposed or too dark"]
+        return None, IssueCode.PATCH_EXPOSURE
     slopes = np.zeros((3, 3))
     slopes[0] = np.log(128.0 / level)
-    return Light(slopes), []
+    return Illumination(slopes), None
 
 
 def _check_box(name: str, box: Box, width: int, height: int) -> None:
     x, y, w, h = box
     if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
-        raise ValueError(f"{name} {box} is not within the frame of {width} x {height} pixels; x, y, width, height")
+        raise ValueError(f"{name} {box} is not within the frame of {width} x {height} pixels; give x, y, width, height")

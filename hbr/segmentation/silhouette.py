@@ -1,4 +1,4 @@
-"""Which of the pixels that differ from the background are the object."""
+"""The object's silhouette, from the pixels that differ from the background."""
 
 from functools import lru_cache
 from typing import Final
@@ -11,46 +11,46 @@ from hbr.segmentation.background import Mask
 
 Binary = NDArray[np.uint8]
 
-#: The object takes at least this share of the frame.
+#: Smallest share of the frame that an object takes.
 _LEAST: Final = 0.004
-#: A part beside the largest one belongs to the object if it has this share of its area.
+#: Another part belongs to the object if it has this share of the largest part's area.
 _PART: Final = 0.08
-#: Radii of the bars that are cut off where something reaches into the frame, in pixels of the small image.
+#: Radii of the bars that are removed when something reaches into the frame, in pixels of the small image.
 _BARS: Final = (0, 2, 3, 4, 5)
-#: Rows at the foot that are narrower than this share of the usual row are the stump of a bar.
+#: Rows at the foot that are narrower than this share of the median row are the rest of a removed bar.
 _STUMP: Final = 0.35
 
 
-def silhouette(surely: Mask, perhaps: Mask | None = None, *, framed: bool) -> Mask | None:
-    """Return the object's silhouette, without holes; None where there is none.
+def silhouette(certain: Mask, possible: Mask | None = None, *, framed: bool) -> Mask | None:
+    """Return the object's silhouette without holes, bool (h, w); None if there is no object.
 
     Parameters
     ----------
-    surely, perhaps : bool arrays (h, w)
-        What is no background, and what may be shadow: it counts where the object is around it.
+    certain, possible : bool arrays (h, w)
+        Pixels that are not background, and pixels that may be shadow; the latter count inside the object's hull.
     framed : bool
-        Whether whatever touches the frame's border is no object: a holder, a hand, a shelf.
+        Whether anything that touches the frame's border is not the object: a holder, a hand, a shelf.
     """
     grown = cv2.morphologyEx(
-        cv2.morphologyEx(surely.astype(np.uint8), cv2.MORPH_OPEN, _disc(1)), cv2.MORPH_CLOSE, _disc(3)
+        cv2.morphologyEx(certain.astype(np.uint8), cv2.MORPH_OPEN, _disc(1)), cv2.MORPH_CLOSE, _disc(3)
     )
     everything = grown.astype(np.uint8)
     for radius in _BARS if framed else _BARS[:1]:
         kept = _main_parts(_opened(everything, radius), framed=framed)
         if kept is None:
             continue
-        if radius:  # what was rounded off comes back
+        if radius:  # restore the corners that the opening rounded off
             kept = _without_stump(cv2.dilate(kept, _disc(1)).astype(np.uint8) & everything)
-        if perhaps is not None:
+        if possible is not None:
             hull = np.zeros_like(kept)
             cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(kept)), (1,))
-            kept |= hull & perhaps
+            kept |= hull & possible
         return _filled(kept)
     return None
 
 
 def _without_stump(mask: Binary) -> Binary:
-    """What is left of a holder from below, where a bar was cut off: things stand on more than that."""
+    """Remove the rest of a holder from below: objects stand on a wider base."""
     widths = np.count_nonzero(mask, axis=1)
     foot = np.flatnonzero(widths >= _STUMP * np.median(widths[widths > 0]))[-1]
     mask[foot + 1 :] = 0
@@ -62,7 +62,7 @@ def _opened(mask: Binary, radius: int) -> Binary:
 
 
 def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
-    """The largest part and those close by, if it outweighs whatever reaches in from the border."""
+    """Return the largest part and those close to it; None if a part that touches the border is much larger."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     if count < 2:
         return None
@@ -80,7 +80,7 @@ def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
 
 
 def _filled(mask: Binary) -> Mask:
-    margin = 12  # closing must not see the frame's border as background
+    margin = 12  # so that closing does not see the frame's border as background
     wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
     wide = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8))
     contours, _ = cv2.findContours(wide, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

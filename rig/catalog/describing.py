@@ -13,7 +13,7 @@ from rig.catalog.records import JsonObject, Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
-from rig.views.description import Describer
+from rig.views.description import ViewDescriber
 
 
 class Reference(NamedTuple):
@@ -30,7 +30,7 @@ class Reference(NamedTuple):
 @lru_cache(maxsize=4)
 def stored_describer(
     root: Path, names: tuple[str, ...], region: Region | None, reference: Reference | None
-) -> Describer:
+) -> ViewDescriber:
     """Return what describes stored images as the bench did that took them: with its picture of the empty table.
 
     Raises
@@ -41,7 +41,7 @@ def stored_describer(
     if all(name in PAPERS for name in names):
         reference = None  # they look for no object
     empty_table = None if reference is None else images.read(root / reference.image, reference.sha256)
-    return Describer(ViewConfig(roi=region), names, empty_table)
+    return ViewDescriber(ViewConfig(roi=region), names, empty_table)
 
 
 def known_descriptor(name: str) -> Descriptor:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Row, Text, and_, cast, func, select
 
 import hbr
-from hbr.descriptors import Descriptor, descriptor, unpack_rows
+from hbr.descriptors import Descriptor, descriptor
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog.describing import region_of
 from rig.catalog.records import (
@@ -217,7 +217,7 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
         raise _outdated(connection, kind, {name for name, levels in zip(names, packed, strict=True) if levels is None})
     _, first, object_index = np.unique(np.array(object_ids, np.int64), return_index=True, return_inverse=True)
     loaded = hbr.Views(
-        descriptors=unpack_rows(kind, b"".join(packed)),
+        descriptors=kind.unpack_rows(b"".join(packed)),
         azimuth_deg=np.array(azimuths_deg, np.float64),
         object_index=object_index,
         object_names=tuple(names[i] for i in first),

@@ -15,7 +15,7 @@ from rig.motion.turntable import Move, Turntable
 from rig.plans.capture import announced, capture, moved
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Viewer, image_similarity
-from rig.views.description import DESCRIPTORS, PAPER_DESCRIPTOR, Describer
+from rig.views.description import DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
 from rig.views.empty_table import COMMAND, Drift, EmptyTables
 
 SAME_SIMILARITY = 0.97
@@ -98,7 +98,7 @@ def enroll(
         if empty_table is not None:
             enrollment.set_reference_image(empty_table)
         retakes = yield from _take_views(
-            bench, enrollment, to_go, Describer(bench.config.view, DESCRIPTORS, empty_table)
+            bench, enrollment, to_go, ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
         )
     enrollment.finish()
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
@@ -107,7 +107,7 @@ def enroll(
 
 
 def _take_views(
-    bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: Describer
+    bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
 ) -> Generator[Event, None, int]:
     """Take and store the views at these table angles, turn back to 0, and return how many frames were taken again."""
     viewer = Viewer(bench.camera, bench.config.view)

@@ -17,7 +17,7 @@ from rig.search.model import Model, empty_table_for
 from rig.search.session import SHOWN, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.capture import Viewer
-from rig.views.description import Describer
+from rig.views.description import ViewDescriber
 from rig.views.empty_table import COMMAND, Drift, EmptyTables
 
 
@@ -72,7 +72,7 @@ def identify(
     if empty_table is None and isinstance(model, Model):
         empty_table, told = empty_table_for(bench, model)
         notes += told
-    describe, drift = Describer(bench.config.view, (search.descriptor,), empty_table), Drift()
+    describe, drift = ViewDescriber(bench.config.view, (search.descriptor,), empty_table), Drift()
     yield Started(
         "identify",
         None,

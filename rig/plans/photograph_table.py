@@ -4,7 +4,7 @@ from collections.abc import Generator
 from typing import Final
 
 import hbr
-from hbr.segmentation import TRUSTED
+from hbr.segmentation import MIN_AGREEMENT
 from rig.bench import Bench, TableClearer
 from rig.core.clock import seconds_between
 from rig.core.errors import TableNotEmpty, UsageError
@@ -76,7 +76,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         pictures = [picture(shot.image_bgr, config) for shot in (first, turned)]
         share = changed_cells(*pictures) / GRID**2
         parts = [within(shot.image_bgr, config.roi) for shot in (first, turned)]
-        agreement = hbr.segment(parts[1], reference=hbr.Background(parts[0])).agreement
+        agreement = hbr.segment(parts[1], empty_table=hbr.Background(parts[0])).agreement
         if not anyway:
             _check(share, agreement)
     before = EmptyTables.standing(bench)
@@ -119,12 +119,12 @@ def _away_deg(begin_deg: float, limits_deg: tuple[float, float]) -> float:
 
 def _check(share: float, agreement: float | None) -> None:
     numbers = {"turning_share": round(share, 4), "most_turning_share": NOTICED_SHARE}
-    if agreement is not None and agreement < TRUSTED:
+    if agreement is not None and agreement < MIN_AGREEMENT:
         raise TableNotEmpty(
             "The surroundings of the table are not the same in two pictures: somebody moved in them, or the table "
             "reaches to the border.",
             next_step=f"Stand back and take it again; let view.roi show a rim of the background: {COMMAND}",
-            evidence={"agreement": round(agreement, 3), "least_agreement": TRUSTED, **numbers},
+            evidence={"agreement": round(agreement, 3), "least_agreement": MIN_AGREEMENT, **numbers},
         )
     if share > NOTICED_SHARE:
         raise TableNotEmpty(

@@ -9,7 +9,7 @@ from rig.events.events import Accepted, Decided, Identified, Moved, Ranked, plai
 from rig.search.saved_run import SavedRun
 from rig.search.session import Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
-from rig.views.description import Describer
+from rig.views.description import ViewDescriber
 
 TOLERANCE = 1e-9
 """Numbers that differ less are equal: another machine may sum in another order."""
@@ -55,7 +55,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     started = run.started
     found = Check()
     search: Search | None = None
-    describe = Describer(run.config.view, (run.views.descriptor,), run.empty_table)
+    describe = ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
     ranked: Ranked | None = None
     step: Rotate | Finish | None = None
     table_deg = 0.0

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.descriptors import descriptor, unpack_rows
+from hbr.descriptors import descriptor
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.config.values import validate
@@ -30,6 +30,7 @@ from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as RULES
 from rig.search.stopping_rules import read_rules, write_rules
 from rig.views import image_files as images
+from rig.views.segmentation_evidence import upgrade_evidence
 
 FORMAT: Final = "hbr-rig run"
 VERSION: Final = 2
@@ -257,6 +258,8 @@ def event_of(values: dict[str, Any], frame: Any) -> Event:
         values["image_bgr"] = frame(values["index"])
         if "front_end" in values:  # its name in runs of version 2 and before
             values["segmentation"] = values.pop("front_end")
+        if values.get("segmentation") is not None:
+            values["segmentation"] = upgrade_evidence(values["segmentation"])
     event: Event = built(_KINDS[name], values)
     return event
 
@@ -298,7 +301,7 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
     parts = [
         hbr.Views.of_object(
             line["object"],
-            unpack_rows(descriptor(kind), bytes.fromhex("".join(line["descriptors"]))),
+            descriptor(kind).unpack_rows(bytes.fromhex("".join(line["descriptors"]))),
             line["azimuth_deg"],
             kind,
         )

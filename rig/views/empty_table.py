@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
-from hbr.segmentation import TRUSTED
+from hbr.segmentation import MIN_AGREEMENT
 from rig.bench import Bench
 from rig.core.errors import StateNotStored
 from rig.devices.camera import CameraIdentity, CameraLocks
@@ -156,7 +156,7 @@ class Drift:
         agreement = None if segmentation is None else segmentation.get("agreement")
         if agreement is None:
             return ""
-        self._low = [*self._low, agreement] if agreement < TRUSTED else []
+        self._low = [*self._low, agreement] if agreement < MIN_AGREEMENT else []
         if self._told or len(self._low) < IN_A_ROW:
             return ""
         self._told = True

@@ -16,7 +16,7 @@ from rig.catalog.schema import DESCRIPTOR
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views import image_files as images
-from rig.views.description import Describer
+from rig.views.description import ViewDescriber
 
 
 class Item(NamedTuple):
@@ -89,7 +89,7 @@ def _stage_one(root: Path | None, item: Item) -> Staged:
     packed, segmentation = [], None
     if item.descriptors:
         try:
-            described = Describer(ViewConfig(roi=item.region), item.descriptors)(image)
+            described = ViewDescriber(ViewConfig(roi=item.region), item.descriptors)(image)
         except UsageError as error:
             return Staged("", reason=error.what)
         except ValueError as error:

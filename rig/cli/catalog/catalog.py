@@ -74,7 +74,7 @@ def show(settings: Settings, name: NameArgument) -> None:
 
     Example: rig catalog show mug-white --bench sim
     """
-    from rig.views.description import SegmentationSummary
+    from rig.views.segmentation_evidence import SegmentationSummary
 
     with settings.open_catalog(read_only=True) as catalog:
         details = catalog.object(name)
@@ -86,7 +86,7 @@ def show(settings: Settings, name: NameArgument) -> None:
         for view, told_view in zip(details.views, told["views"], strict=True):
             levels = view.record.descriptor
             told_view["record"]["descriptor"] = None if levels is None else levels.tolist()
-        told["sightings"] = plain(SegmentationSummary.of(view.record.segmentation for view in details.views))
+        told["segmentation"] = plain(SegmentationSummary.of(view.record.segmentation for view in details.views))
         settings.print_json(told)
         return
     summary = details.summary
@@ -105,8 +105,8 @@ def show(settings: Settings, name: NameArgument) -> None:
             print(f"    {_facts(provenance.conditions)}")
     if not details.views:
         return
-    if sighted := SegmentationSummary.of(view.record.segmentation for view in details.views).words:
-        print(sighted)
+    if text := SegmentationSummary.of(view.record.segmentation for view in details.views).text:
+        print(text)
     print(f"images in {(folder / details.views[0].image).parent}")
     print("view  azimuth  encoder      IMU   sharpness")
     for view in details.views:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hbr import DenseIndex, ViewIndex, Views, update_belief
-from hbr.descriptors import Descriptor, descriptor, names, unpack_rows
+from hbr.descriptors import Descriptor, descriptor, names
 
 
 @pytest.fixture(params=names())
@@ -147,8 +147,8 @@ def test_many_packed_views_come_back_as_each_alone(name: str) -> None:
     kind, rng = descriptor(name), np.random.default_rng(0)
     images = rng.integers(0, 256, (5, 64, 64, 3), np.uint8)
     packed = [kind.pack(kind.describe(image)) for image in images]
-    rows = unpack_rows(kind, b"".join(packed))
+    rows = kind.unpack_rows(b"".join(packed))
     np.testing.assert_array_equal(rows, [kind.unpack(one) for one in packed])
-    assert unpack_rows(kind, b"").shape == (0, kind.length)
+    assert kind.unpack_rows(b"").shape == (0, kind.length)
     with pytest.raises(ValueError, match="no multiple"):
-        unpack_rows(kind, packed[0][1:])
+        kind.unpack_rows(packed[0][1:])

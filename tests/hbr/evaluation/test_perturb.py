@@ -103,7 +103,7 @@ def test_the_bench_s_own_descriptor_knows_a_thing_on_another_bench_where_cedd_do
     similar = {}
     for name, condition in conditions.items():
         enrolled, query = condition.enrolled(ball()), condition.query(ball(), np.random.default_rng(4))
-        levels = [describe(image, descriptor=name, reference=empty) for image, empty in (enrolled, query)]
+        levels = [describe(image, descriptor=name, empty_table=empty) for image, empty in (enrolled, query)]
         plain = [describe(image, descriptor=name) for image, _ in (enrolled, query)]
         similar[name] = [float(descriptor(name).similarity(a[None], b[None])[0, 0]) for a, b in (levels, plain)]
     assert similar["edges+colours"][0] > 0.85

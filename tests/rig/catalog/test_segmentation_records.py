@@ -18,7 +18,8 @@ from rig.catalog.verify import Problem, verify
 from rig.config import ViewConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import DescriptorOutdated, UsageError
-from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR, Describer, SegmentationSummary
+from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR, ViewDescriber
+from rig.views.segmentation_evidence import SegmentationSummary
 from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record, without_waiting
 
 REGION = (8, 0, 64, 64)
@@ -59,7 +60,7 @@ def enrolled(catalog: Catalog, name: str, *, further: bool = True, reference: bo
     enrollment = catalog.begin(name, planned_azimuth_deg=plan(VIEWS), provenance=PROVENANCE)
     if reference:
         enrollment.set_reference_image(table())
-    describe = Describer(ViewConfig(roi=REGION), empty_table=table() if reference else None)
+    describe = ViewDescriber(ViewConfig(roi=REGION), empty_table=table() if reference else None)
     for index in range(VIEWS):
         described = describe(view(index))
         levels = dict(described.levels)
@@ -80,7 +81,7 @@ def test_an_older_catalog_is_described_as_the_bench_would_have(open_catalog: Cal
     with pytest.raises(DescriptorOutdated, match="box") as caught:
         old.views(BENCH_DESCRIPTOR)
     assert f"redescribe --descriptor {BENCH_DESCRIPTOR}" in caught.value.next_step
-    assert sightings(old, "box").words == ""
+    assert sightings(old, "box").text == ""
     assert finished(redescribe(old, BENCH_DESCRIPTOR, jobs=1)).described == VIEWS
     assert np.array_equal(old.views(BENCH_DESCRIPTOR).views.descriptors, new.views(BENCH_DESCRIPTOR).views.descriptors)
     assert sightings(old, "box") == sightings(new, "box")

@@ -83,8 +83,8 @@ def test_a_picture_of_another_size_is_refused_and_the_search_goes_on(simulated, 
     s = simulated(*SMALL)
     events, answer = search(s, shelf, "lamp", empty_table=np.full(shape, 90, np.uint8))
     assert answer.name == "lamp"
-    refused = [e.segmentation["refused"] for e in events if isinstance(e, Accepted)]
-    assert all(f"it has {shape[1]} x {shape[0]} pixels, the frame 320 x 240" in " ".join(one) for one in refused)
+    issue = {"code": "empty-table-size", "table_px": [shape[1], shape[0]], "frame_px": [320, 240]}
+    assert all(issue in e.segmentation["issues"] for e in events if isinstance(e, Accepted))
 
 
 def test_a_picture_of_another_bench_is_warned_of_once_and_left_alone(simulated, shelf):

@@ -4,7 +4,7 @@ import pytest
 
 from rig.motion.turntable import Turntable
 from rig.views.capture import Attempt, Viewer
-from rig.views.description import Describer
+from rig.views.description import ViewDescriber
 
 
 def look(simulated, table, viewer) -> list[Attempt]:
@@ -102,7 +102,7 @@ def test_the_region_of_interest_is_what_is_described(on_the_table):
     s, table, viewer = on_the_table
     (attempt,) = look(s, table, viewer)
     x, y, width, height = s.bench.config.view.roi
-    levels = Describer(s.bench.config.view)(attempt.image_bgr).levels["cedd"]
+    levels = ViewDescriber(s.bench.config.view)(attempt.image_bgr).levels["cedd"]
     assert (levels == hbr.describe(attempt.image_bgr[y : y + height, x : x + width])).all()
 
 

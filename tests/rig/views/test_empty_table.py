@@ -20,9 +20,10 @@ from rig.events.events import EmptyTableImage, Warned
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
-from rig.views.description import BENCH_DESCRIPTOR, SegmentationSummary
+from rig.views.description import BENCH_DESCRIPTOR
 from rig.views.empty_table import HOLDS_H, Drift, EmptyTables
 from rig.views.object_presence import TableWatcher
+from rig.views.segmentation_evidence import SegmentationSummary
 from sim import disk
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES
@@ -228,9 +229,9 @@ def test_every_enrolled_view_has_both_descriptors_its_evidence_and_the_empty_tab
         assert (tmp_path / sitting.reference_image).exists()
     assert loaded.descriptor == BENCH_DESCRIPTOR
     assert len(loaded) == 4
-    sightings = SegmentationSummary.of(view.record.segmentation for view in details.views)
-    assert (sightings.views, sightings.found, sightings.guessed, sightings.lit) == (4, 4, 0, 4)
-    assert sightings.words.startswith("object found in 4 of 4 views, light normalised in 4")
+    summary = SegmentationSummary.of(view.record.segmentation for view in details.views)
+    assert (summary.views, summary.found, summary.guessed, summary.corrected) == (4, 4, 0, 4)
+    assert summary.text.startswith("object found in 4 of 4 views, illumination corrected in 4")
     assert f"{taken.taken_utc:.10}" in sitting.provenance.conditions["empty_table"]
     assert not any(isinstance(event, Warned) for event in events)
 
@@ -244,7 +245,7 @@ def test_another_wall_is_noticed_told_once_and_remembered(simulated: Open, tmp_p
         views = catalog.object("toy-car").views
     assert [event.index for event in warned] == [2]
     assert "rig empty-table" in warned[0].next_step
-    assert all("the reference: only" in view.record.segmentation["refused"][0] for view in views)
+    assert all(view.record.segmentation["issues"][0]["code"] == "empty-table-differs" for view in views)
     assert any("3 frames in a row" in doubt for doubt in EmptyTables.standing(s.bench).doubts)
     photographed(s.bench)
     assert EmptyTables.standing(s.bench).doubts == ()
