@@ -6,11 +6,12 @@ READY  := .venv/.ready
 # With several threads small matrix products wait for each other; one is faster here.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test lint docs wheel bench lock clean help
+.PHONY: demo test test-nightly lint docs wheel bench lock clean help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
-	@echo "make test   run all tests"
+	@echo "make test   run the tests (about three minutes on two cores)"
+	@echo "make test-nightly  run all tests, with many more cases in each"
 	@echo "make lint   formatting, lint, types, import contracts"
 	@echo "make docs   the documentation as a site in site/"
 	@echo "make wheel  build wheel and sdist in dist/, and try the wheel in an empty environment"
@@ -21,7 +22,11 @@ demo: $(READY)
 	@$(BIN)/rig demo
 
 test: $(READY)
-	@$(BIN)/python -m pytest -n auto -rs
+	@$(BIN)/python -m pytest -n auto --dist worksteal -rs
+
+# The empty -m selects the tests marked nightly, too.
+test-nightly: $(READY)
+	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly
 
 lint: $(READY)
 	@$(BIN)/ruff format --check .

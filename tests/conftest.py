@@ -1,5 +1,6 @@
 """Fixtures for the whole suite: a simulated bench with its world in reach."""
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,6 +20,11 @@ from sim.world import World
 settings.register_profile("rig", deadline=None, derandomize=True, database=None)
 settings.register_profile("nightly", deadline=None)
 settings.load_profile("rig")
+
+# A background job of a shell without job control ignores SIGINT, and so do the processes that it starts. Tests start
+# processes and interrupt them.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="session")

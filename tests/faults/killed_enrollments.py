@@ -1,78 +1,109 @@
-"""As a program: enrollments that are killed at random moments, each a process of its own.
+"""A program that runs enrollments and kills each at another point of its progress.
 
     python killed_enrollments.py FOLDER KILLS SEED
 
-Each child enrolls into FOLDER/<number> on a simulated bench that was opened before, and reports every view on a pipe as
-soon as the plan says that it is stored. It prints a line of JSON for each: the number, whether the child was killed
-before it was done, and what it had reported.
+Progress is counted in calls that store something: each counts when it starts and when it returns. The
+program enrolls once to count them, then spreads KILLS points evenly over the count. Each enrollment runs in a child
+process, writes to FOLDER/<number> and reports every view on a pipe when the plan says that it is stored. The child dies
+within `JITTER_S` of its point, so some die inside a call. The program prints one line of JSON for each child: its number
+and the views that it reported.
 """
 
+import io
 import json
 import os
 import random
-import select
 import signal
+import sqlite3
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 from rig.catalog import Catalog
-from rig.core.clock import SystemClock, seconds_between
 from rig.events.events import Accepted
 from rig.plans.enroll import enroll
 from tests.faults.fault_runs import NAME, Rig, new_rig
 
 VIEWS = 8
+STORING = {os.mkdir, os.open, os.fsync, os.rename, os.replace, os.unlink}
+STORING_METHODS = {"write", "execute", "commit"}
+STORING_TYPES = (io.BufferedWriter, sqlite3.Connection, sqlite3.Cursor)
+JITTER_S = 0.002
 
 
 def main() -> None:
     folder, kills, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    moments = random.Random(seed)
-    clock = SystemClock()
+    random_numbers = random.Random(seed)
     with new_rig(folder / "bench") as rig:
-        whole_s = float("inf")
-        for name in ("cold", "warm"):
-            begun_ns = clock.now_ns()
-            _child(rig, folder / name, None)
-            whole_s = min(whole_s, seconds_between(begun_ns, clock.now_ns()))
+        counted: list[int] = []
+        _count_calls(lambda: counted.append(1))
+        _enroll(rig, folder / "counted", lambda _index: None)
+        sys.setprofile(None)
         for number in range(kills):
-            begun_ns = clock.now_ns()
-            moment_s = moments.uniform(0.0, whole_s)
-            killed, reported = _child(rig, folder / str(number), moment_s)
-            if not killed:  # the computer has less to do than before: it was done already
-                whole_s = min(whole_s, seconds_between(begun_ns, clock.now_ns()))
-            print(json.dumps({"number": number, "killed": killed, "reported": reported}), flush=True)
+            point = round((number + random_numbers.random()) * len(counted) / kills)
+            delay_s = random_numbers.uniform(1e-6, JITTER_S)
+            reported = _killed_child(rig, folder / str(number), point, delay_s)
+            print(json.dumps({"number": number, "reported": reported}), flush=True)
 
 
-def _child(rig: Rig, folder: Path, kill_after_s: float | None) -> tuple[bool, list[int]]:
-    """Run one enrollment in a process of its own; return whether it was killed, and what it had reported."""
-    reports, told = os.pipe()
+def _count_calls(count: Callable[[], None]) -> None:
+    """Call ``count`` from now on when a storing call starts and when it returns."""
+
+    def profile(_frame: FrameType, event: str, function: Any) -> None:
+        if event not in ("c_call", "c_return"):
+            return
+        owner = getattr(function, "__self__", None)
+        if function in STORING or (isinstance(owner, STORING_TYPES) and function.__name__ in STORING_METHODS):
+            count()
+
+    sys.setprofile(profile)
+
+
+def _killed_child(rig: Rig, folder: Path, point: int, delay_s: float) -> list[int]:
+    """Enroll in a child process that dies ``delay_s`` after its storing call number ``point``; return what it reported."""
+    reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
-        status = 1
         try:
-            _enroll(rig, folder, told)
-            status = 0
+            _die_at(point, delay_s)
+            _enroll(rig, folder, lambda index: os.write(writing, bytes([index])))
+            signal.pause()  # the last point is less than the delay before the end
         finally:
-            os._exit(status)
-    os.close(told)
-    if kill_after_s is not None:
-        select.select([], [], [], kill_after_s)
-        os.kill(pid, signal.SIGKILL)
-    reported = b""
-    while chunk := os.read(reports, 1024):
-        reported += chunk
-    os.close(reports)
+            os._exit(1)
+    os.close(writing)
+    with os.fdopen(reading, "rb") as pipe:
+        reported = list(pipe.read())
     status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    if status not in (0, -signal.SIGKILL):
-        raise SystemExit(f"an enrollment ended with {status}")
-    return status != 0, list(reported)
+    if status != -signal.SIGALRM:
+        raise SystemExit(f"The enrollment that should die at point {point} ended with {status}.")
+    return reported
 
 
-def _enroll(rig: Rig, folder: Path, told: int) -> None:
+def _die_at(point: int, delay_s: float) -> None:
+    """Start a timer at the point; its signal ends the process without any handler, as SIGKILL does."""
+    remaining = point
+
+    def count() -> None:
+        nonlocal remaining
+        remaining -= 1
+        if remaining == 0:
+            signal.setitimer(signal.ITIMER_REAL, delay_s)
+            sys.setprofile(None)
+
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    if point == 0:
+        signal.setitimer(signal.ITIMER_REAL, delay_s)
+    else:
+        _count_calls(count)
+
+
+def _enroll(rig: Rig, folder: Path, report: Callable[[int], object]) -> None:
     with rig.bench() as bench, Catalog.open(folder, clock=bench.clock) as catalog:
         for event in enroll(bench, catalog, NAME, views=VIEWS):
             if isinstance(event, Accepted):
-                os.write(told, bytes([event.index]))
+                report(event.index)
 
 
 if __name__ == "__main__":

@@ -75,7 +75,11 @@ class Scenario:
 
     @property
     def of_identification(self) -> str:
-        return self.identify or self.fault.replace("@move20", "@move1").replace("@view20", "@view0")
+        return self.identify or self.at_move(1)
+
+    def at_move(self, number: int) -> str:
+        """Return the fault of the enrollment, during another move or after another view."""
+        return self.fault.replace("@move3", f"@move{number}").replace("@view3", f"@view{number}")
 
 
 def stopped(fault: str, code: int, found: str, then: str, **more: object) -> Scenario:
@@ -94,13 +98,13 @@ SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
         # -- the servo -------------------------------------------------------------------------------------------
-        stopped("servo.off@move20", 402, SILENT, "give the servo its supply", step=Step.HOME),
+        stopped("servo.off@move3", 402, SILENT, "give the servo its supply", step=Step.HOME),
         stopped(
-            "servo.stuck@move20", 509, "the encoder's angle does not change", "restart the servo", answer=502, step=ACK
+            "servo.stuck@move3", 509, "the encoder's angle does not change", "restart the servo", answer=502, step=ACK
         ),
-        stopped("servo.garbage@move20", 404, "readings that no servo can have", "restart the servo", step=ACK),
+        stopped("servo.garbage@move3", 404, "readings that no servo can have", "restart the servo", step=ACK),
         stopped(
-            "servo.wrong@move20",
+            "servo.wrong@move3",
             502,
             "encoder and gyro disagree",
             "mount the magnet",
@@ -112,21 +116,21 @@ SCENARIOS: dict[str, Scenario] = {
         stopped("servo.delayed", 502, "encoder and gyro disagree in the return to 0", "restart the servo", step=ACK),
         survived("servo.intermittent", "timeouts; each transaction is repeated, and counted"),
         # -- the gyro --------------------------------------------------------------------------------------------
-        stopped("imu.off@move20", 402, "no acknowledge, after three attempts", "plug the sensor in"),
+        stopped("imu.off@move3", 402, "no acknowledge, after three attempts", "plug the sensor in"),
         stopped(
-            "imu.stuck@move20", 404, "equal samples: noise alone would change them", "restart the sensor", step=ACK
+            "imu.stuck@move3", 404, "equal samples: noise alone would change them", "restart the sensor", step=ACK
         ),
-        stopped("imu.garbage@move20", 502, "encoder and gyro disagree", "restart the sensor", step=ACK),
-        stopped("imu.wrong@move20", 502, "encoder and gyro disagree", "change the sensor, or calibrate it", step=ACK),
+        stopped("imu.garbage@move3", 502, "encoder and gyro disagree", "restart the sensor", step=ACK),
+        stopped("imu.wrong@move3", 502, "encoder and gyro disagree", "change the sensor, or calibrate it", step=ACK),
         stopped(
-            "imu.slow@move20",
+            "imu.slow@move3",
             404,
             "samples are missing: the table never counts as at rest",
             "restart the sensor",
             step=ACK,
         ),
         stopped(
-            "imu.delayed@move20",
+            "imu.delayed@move3",
             404,
             "the gyro tells of a turn while the encoder stands",
             "restart the sensor",
@@ -134,13 +138,13 @@ SCENARIOS: dict[str, Scenario] = {
             step=ACK,
         ),
         stopped(
-            "imu.intermittent@move20", 404, "the sensor fell asleep and lost its settings", "mend its supply", step=ACK
+            "imu.intermittent@move3", 404, "the sensor fell asleep and lost its settings", "mend its supply", step=ACK
         ),
         # -- the camera ------------------------------------------------------------------------------------------
-        stopped("camera.off@move20", 402, "five frames in a row fail", "plug the camera in"),
-        stopped("camera.stuck@move20", 402, "no frame within the time-out", "open the camera anew"),
-        stopped("camera.garbage@move20", 600, "the picture is noise", "change the cable"),
-        stopped("camera.wrong@move20", 404, "a frame of another size than the camera's", "open the camera anew"),
+        stopped("camera.off@move3", 402, "five frames in a row fail", "plug the camera in"),
+        stopped("camera.stuck@move3", 402, "no frame within the time-out", "open the camera anew"),
+        stopped("camera.garbage@move3", 600, "the picture is noise", "change the cable"),
+        stopped("camera.wrong@move3", 404, "a frame of another size than the camera's", "open the camera anew"),
         survived("camera.slow", "not at all: a view takes as long as the next frame"),
         survived("camera.delayed", "frames are chosen by their time stamp, late ones too"),
         survived("camera.intermittent", "a frame that fails is fetched again, four times at most"),
@@ -153,20 +157,20 @@ SCENARIOS: dict[str, Scenario] = {
         survived("babble", "bytes that are no packet are skipped, within a deadline"),
         survived("echo", "the adapter's echo is no status packet, and is skipped"),
         stopped(
-            "unplug@move20",
+            "unplug@move3",
             402,
             "the port fails; the servo's own watchdog stops the table",
             "plug the adapter in",
             torque=True,
         ),
-        stopped("brownout@move20", 402, SILENT, "mend the supply", step=Step.HOME),
-        stopped("overload@move20", 404, "the alert bit of every answer", "let it cool down", step=Step.REBOOT),
-        stopped("overheat@move20", 404, "the alert bit of every answer", "let it cool down", step=Step.REBOOT),
-        stopped("watchdog_trip@move20", 510, "the servo's watchdog register", "find what kept the computer busy"),
-        stopped("duplicate_id@move20", 402, "answers spoil each other: no valid packet", "give each servo its own id"),
+        stopped("brownout@move3", 402, SILENT, "mend the supply", step=Step.HOME),
+        stopped("overload@move3", 404, "the alert bit of every answer", "let it cool down", step=Step.REBOOT),
+        stopped("overheat@move3", 404, "the alert bit of every answer", "let it cool down", step=Step.REBOOT),
+        stopped("watchdog_trip@move3", 510, "the servo's watchdog register", "find what kept the computer busy"),
+        stopped("duplicate_id@move3", 402, "answers spoil each other: no valid packet", "give each servo its own id"),
         stopped("wrong_model", 401, "Model Number, when the bench is opened", "connect the right servo"),
         stopped(
-            "backlash@move20",
+            "backlash@move3",
             502,
             "encoder and gyro disagree",
             "mend the gears",
@@ -175,7 +179,7 @@ SCENARIOS: dict[str, Scenario] = {
             step=ACK,
         ),
         stopped(
-            "slip@move20",
+            "slip@move3",
             502,
             "encoder and gyro disagree",
             "tighten the platter",
@@ -184,7 +188,7 @@ SCENARIOS: dict[str, Scenario] = {
             step=ACK,
         ),
         stopped(
-            "jam@move20",
+            "jam@move3",
             509,
             "the encoder's angle does not change, or the load is high",
             "free it",
@@ -193,25 +197,25 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         # -- the gyro's bus and range ----------------------------------------------------------------------------
         survived("i2c_nack", "errno; the transfer is repeated, and counted"),
-        stopped("i2c_stuck@move20", 402, "the kernel's timeout, three times", "power-cycle the sensor"),
+        stopped("i2c_stuck@move3", 402, "the kernel's timeout, three times", "power-cycle the sensor"),
         stopped(
-            "imu_saturated@move20",
+            "imu_saturated@move3",
             404,
             "the gyro's rate stands at the end of its range",
             "restart the sensor",
             step=ACK,
         ),
         # -- pictures --------------------------------------------------------------------------------------------
-        stopped("frozen_frame@move20", 600, "two equal frames", "open the camera anew", answer=FOUND),
-        stopped("black_frame@move20", 600, "mean level and share of black pixels", "take the cap off"),
-        stopped("blur@move20", 600, "variance of the Laplacian", "focus"),
-        stopped("exposure_jump@move20", 600, "the camera's locks, read back with every frame", "open the camera anew"),
+        stopped("frozen_frame@move3", 600, "two equal frames", "open the camera anew", answer=FOUND),
+        stopped("black_frame@move3", 600, "mean level and share of black pixels", "take the cap off"),
+        stopped("blur@move3", 600, "variance of the Laplacian", "focus"),
+        stopped("exposure_jump@move3", 600, "the camera's locks, read back with every frame", "open the camera anew"),
         survived(
             "light_flicker", "not at all at this depth: CEDD hardly sees it; the mean level is kept with each view"
         ),
         # -- around ----------------------------------------------------------------------------------------------
         stopped(
-            "object_falls@move20",
+            "object_falls@move3",
             601,
             "the last view, taken at 0 again, does not look like the first",
             "put the object back",
@@ -219,9 +223,9 @@ SCENARIOS: dict[str, Scenario] = {
             answer=FOUND,
             shown=False,
         ),
-        stopped("disk_full@move20", 700, "the write that is to be durable", "free some space", answer=FOUND),
+        stopped("disk_full@move3", 700, "the write that is to be durable", "free some space", answer=FOUND),
         survived(
-            "clock_jump@view20", "not at all: time is measured on the monotonic clock", identify="clock_jump@view0"
+            "clock_jump@view3", "not at all: time is measured on the monotonic clock", identify="clock_jump@view0"
         ),
     )
 }

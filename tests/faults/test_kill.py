@@ -1,4 +1,4 @@
-"""A process that is killed at any moment of an enrollment loses no view that it has reported, and can go on."""
+"""A process that is killed at any point of an enrollment loses no view that it has reported, and can go on."""
 
 import json
 import os
@@ -13,37 +13,27 @@ from tests.faults import killed_enrollments
 from tests.faults.fault_runs import NAME, check_stored, enrolled, enrollment, new_rig
 from tests.faults.killed_enrollments import VIEWS
 
-BATCHES = 5
-KILLS, KILLS_NIGHTLY = 40, 200
 
-
-@pytest.mark.timeout(900)  # a night's worth on a busy computer
-@pytest.mark.parametrize("batch", range(BATCHES))
-def test_whatever_moment_a_process_is_killed_at_its_reported_views_are_whole_and_it_resumes(
-    tmp_path: Path, request: pytest.FixtureRequest, batch: int
-) -> None:
-    """40 kills; with ``--hypothesis-profile=nightly`` 200."""
-    nightly = request.config.getoption("--hypothesis-profile") == "nightly"
-    kills = (KILLS_NIGHTLY if nightly else KILLS) // BATCHES
+@pytest.mark.parametrize(
+    "kills", [16, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])]
+)
+def test_killed_enrollment_keeps_reported_views_and_resumes(tmp_path: Path, kills: int) -> None:
     done = subprocess.run(
-        [sys.executable, killed_enrollments.__file__, str(tmp_path), str(kills), str(batch)],
+        [sys.executable, killed_enrollments.__file__, str(tmp_path), str(kills), "1"],
         capture_output=True,
         text=True,
         check=False,
-        timeout=800,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
     )
     assert done.returncode == 0, done.stderr
     runs = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(runs) == kills
-    killed = [run for run in runs if run["killed"]]
-    assert len(killed) > kills / 4
-    assert len({len(run["reported"]) for run in killed}) > 1  # at different moments indeed
+    assert len({len(run["reported"]) for run in runs}) > VIEWS / 2  # they died at different points
     for run in runs:
-        check_one(tmp_path / str(run["number"]), run["reported"])
+        check_run(tmp_path / str(run["number"]), run["reported"])
 
 
-def check_one(folder: Path, reported: list[int]) -> None:
+def check_run(folder: Path, reported: list[int]) -> None:
     assert reported == list(range(len(reported)))
     with new_rig(folder, seed=1) as rig:
         with Catalog.open(folder, clock=rig.world.clock) as catalog:

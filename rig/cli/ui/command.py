@@ -87,9 +87,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         settings = (ctx.obj or Settings()).merged(*given)
         if values.pop("no_color"):
             without_color()
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP; leave that as it is
-                signal.signal(number, _terminate)
+        _handle_signals()
         try:
             function(settings, **values)
         except RigError as error:
@@ -127,6 +125,19 @@ def show_error(error: RigError, settings: Settings) -> None:
             lines.append(f"  {key}: {value}")
     lines += [f"  {note}" for note in getattr(error, "__notes__", ())]
     print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
+
+
+def _handle_signals() -> None:
+    """Have SIGINT, SIGTERM and SIGHUP unwind the stack, so that the table stops with its torque off.
+
+    A shell without job control starts background jobs with SIGINT ignored, and their children inherit that. A stop must
+    reach a moving table anyway. An ignored SIGHUP is what `nohup` is for, and stays ignored.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _terminate)
 
 
 def _terminate(number: int, _frame: object) -> None:

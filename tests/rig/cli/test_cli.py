@@ -165,6 +165,7 @@ def test_signals_end_an_enrollment_with_their_code_and_it_resumes(tmp_path, numb
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),  # as a background job of a script begins
     )
     stored = 0
     for line in process.stdout:
