@@ -117,9 +117,7 @@ SCENARIOS: dict[str, Scenario] = {
         survived("servo.intermittent", "timeouts; each transaction is repeated, and counted"),
         # -- the gyro --------------------------------------------------------------------------------------------
         stopped("imu.off@move3", 402, "no acknowledge, after three attempts", "plug the sensor in"),
-        stopped(
-            "imu.stuck@move3", 404, "equal samples: noise alone would change them", "restart the sensor", step=ACK
-        ),
+        stopped("imu.stuck@move3", 404, "equal samples: noise alone would change them", "restart the sensor", step=ACK),
         stopped("imu.garbage@move3", 502, "encoder and gyro disagree", "restart the sensor", step=ACK),
         stopped("imu.wrong@move3", 502, "encoder and gyro disagree", "change the sensor, or calibrate it", step=ACK),
         stopped(
