@@ -2,11 +2,11 @@
 
     python killed_enrollments.py FOLDER KILLS SEED
 
-Progress is counted in calls that store something: each counts when it starts and when it returns. The
-program enrolls once to count them, then spreads KILLS points evenly over the count. Each enrollment runs in a child
-process, writes to FOLDER/<number> and reports every view on a pipe when the plan says that it is stored. The child dies
-within `JITTER_S` of its point, so some die inside a call. The program prints one line of JSON for each child: its number
-and the views that it reported.
+Progress is counted in calls that store something: each counts when it starts and when it returns. The program enrolls
+once to count them, then spreads KILLS points evenly over the count. Each enrollment runs in a child process, writes to
+FOLDER/<number> and reports every view on a pipe when the plan says that it is stored. The child dies within `JITTER_S`
+of its point, so some die inside a call. The program prints one line of JSON for each child: its number and the views
+that it reported.
 """
 
 import io
@@ -62,7 +62,7 @@ def _count_calls(count: Callable[[], None]) -> None:
 
 
 def _killed_child(rig: Rig, folder: Path, point: int, delay_s: float) -> list[int]:
-    """Enroll in a child process that dies ``delay_s`` after its storing call number ``point``; return what it reported."""
+    """Enroll in a child process that dies ``delay_s`` after storing call ``point``; return the reported views."""
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
