@@ -1,4 +1,4 @@
-"""Enroll the objects of a CSV list; what is enrolled already is skipped, what was interrupted goes on."""
+"""Enroll the objects of a CSV list; skip complete objects and resume interrupted ones."""
 
 import argparse
 from pathlib import Path
@@ -18,21 +18,21 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=72)
     arguments = parser.parse_args()
 
-    items = read_tray(arguments.tray)  # every mistake at once, with its line
+    items = read_tray(arguments.tray)  # reports all mistakes at once, with their lines
     with (
         open_bench(arguments.bench, load_config()) as bench,
         Catalog.open(arguments.catalog, clock=bench.clock) as catalog,
     ):
-        if isinstance(bench.operator, TableClearer):  # a person has run `rig empty-table` today
+        if isinstance(bench.operator, TableClearer):  # otherwise the operator runs `rig empty-table`
             list(photograph_table(bench))
         for event in enroll_tray(bench, catalog, items, views=arguments.views):
             match event:
                 case Item():
-                    print(f"{event.number}/{event.of} {event.name}: {event.action} {event.why}".rstrip())
+                    print(f"{event.number}/{event.of} {event.name}: {event.action} {event.reason or ''}".rstrip())
                 case Rejected():
-                    print(f"  view {event.index + 1} again: {'; '.join(event.reasons)}")
+                    print(f"  view {event.index + 1} repeated: {'; '.join(event.reasons)}")
                 case Enrolled():
-                    print(f"  {event.views} views in {event.seconds:.0f} s of the bench")
+                    print(f"  {event.views} views in {event.seconds:.0f} s")
                 case _:
                     pass
 

@@ -1,4 +1,4 @@
-"""Identify one object after the other, and write every event as a line of JSON; errors too, as the last line."""
+"""Identify one object after the other and write every event as a line of JSON; an error is the last line."""
 
 import argparse
 import json
@@ -19,7 +19,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bench", default="sim")
     parser.add_argument("--catalog", type=Path, required=True, help="folder of the catalog")
-    parser.add_argument("--answers", type=int, help="end after so many; endless otherwise")
+    parser.add_argument("--answers", type=int, help="number of answers after which the loop ends (default: endless)")
     arguments = parser.parse_args()
 
     try:
@@ -27,13 +27,13 @@ def main() -> int:
             Catalog.open(arguments.catalog, clock=SystemClock(), read_only=True) as catalog,
             open_bench(arguments.bench, load_config()) as bench,
         ):
-            if isinstance(bench.operator, ObjectAlreadyPlaced):  # nobody presses a key: the camera sees what comes
+            if isinstance(bench.operator, ObjectAlreadyPlaced):  # no operator at the keyboard: use the camera
                 bench.operator = TableWatcher(bench)
             if isinstance(bench.operator, TableClearer):
-                for taken in photograph_table(bench):  # begin with an empty table
+                for taken in photograph_table(bench):  # start with an empty table
                     print(json.dumps(event_dict(taken)), flush=True)
             answers = 0
-            # The model is loaded before each search: what was enrolled meanwhile is found.
+            # The model is loaded before each search, so that newly enrolled objects are found, too.
             for event in watch(bench, lambda: load_model(catalog)):
                 print(json.dumps(event_dict(event)), flush=True)
                 answers += isinstance(event, Identified)

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass, field, fields, is_dataclass
+from enum import StrEnum
 from math import isfinite
 from typing import Any
 
@@ -166,19 +167,28 @@ class Enrolled:
     seconds: float
 
 
+class SkipReason(StrEnum):
+    """Why an object of a tray is skipped."""
+
+    ALREADY_ENROLLED = "already_enrolled"
+    OPERATOR = "operator"
+    ERROR = "error"
+
+
 @dataclass(frozen=True, slots=True)
 class Item:
     """The next object of a tray, ``number`` (from 1) ``of`` so many.
 
     ``action`` is "enroll", "resume" (take the missing views), "replace" (repeat an interrupted enrollment, because
-    the object was moved), or "skip", with the reason in ``why``.
+    the object was moved), or "skip". A skipped object has a ``reason``, and after an error its ``error_code``.
     """
 
     number: int
     of: int
     name: str
     action: str
-    why: str = ""
+    reason: SkipReason | None = None
+    error_code: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

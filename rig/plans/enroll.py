@@ -1,4 +1,7 @@
-"""The plan that enrolls an object: one turn, a checked view at every step, each durable before the table turns on."""
+"""The plan that enrolls an object: one revolution, with a checked view at every step.
+
+Each view is stored before the table rotates to the next one.
+"""
 
 from collections.abc import Generator, Mapping
 
@@ -19,7 +22,7 @@ from rig.views.description import DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
 from rig.views.empty_table import COMMAND, Drift, EmptyTables
 
 SAME_SIMILARITY = 0.97
-"""Two frames of an object at one angle are more alike; one that was shifted by a centimetre, or taken away, is less."""
+"""Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
 
 
 def enroll(
@@ -35,10 +38,11 @@ def enroll(
 ) -> Generator[Event, None, Enrolled]:
     """Enroll the object ``name`` with views at even steps; yields events and returns the last of them.
 
-    The table turns upwards from 0, so that its play is taken up; view k has the azimuth −k·360/views (+ where the servo
-    takes the camera around the object). Where the cable does not reach for that, it begins further back; a servo that
-    pans over less than a turn takes the views that it reaches. An interrupted enrollment keeps its views: ``resume``
-    takes the missing ones, of an object that nobody has moved since. Closing the generator takes the torque off.
+    The table rotates upwards from 0, so that its backlash stays taken up. View k has the azimuth −k·360/views, or + if
+    the servo moves the camera around the object. If the cable budget does not allow that, the table starts further
+    back; a table that covers less than a revolution takes the views within its limits. An interrupted enrollment keeps
+    its views: ``resume`` takes the missing ones, provided that the object was not moved. Closing the generator switches
+    the torque off.
 
     Every view is described by `rig.views.description.DESCRIPTORS`. Segmentation uses the bench's empty-table image, if
     there is one (`rig.plans.photograph_table`); the enrollment stores it.
@@ -48,12 +52,12 @@ def enroll(
     ObjectExists, CatalogError, CatalogBusy
         See `Catalog.begin` and `Catalog.resume`.
     RotationDisagreement
-        Encoder and gyro differ by more than their uncertainty, or the gyro lost the rotation: no view is stored at an
-        angle in doubt.
+        Encoder and gyro differ by more than their uncertainty, or the gyro has no value: no view is stored at an
+        uncertain angle.
     ObjectMoved
-        The object does not stand as it stood for the first view of this sitting: the enrollment is abandoned.
+        The object is not where it was for the first view of this session: the enrollment is abandoned.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.views.capture` and `rig.motion.turntable`; views stored so far stay.
+        See `rig.views.capture` and `rig.motion.turntable`; the views stored so far stay.
     """
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     standing = EmptyTables.standing(bench)
@@ -92,7 +96,7 @@ def enroll(
             bench.operator.place(enrollment.object_name)
         except RigError:
             if not resume:
-                enrollment.discard()  # a mistyped name leaves nothing behind
+                enrollment.discard()  # so that a mistyped name is not left in the catalog
             raise
         empty_table = None if standing.table is None else standing.table.image_bgr
         if empty_table is not None:
@@ -109,7 +113,7 @@ def enroll(
 def _take_views(
     bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
 ) -> Generator[Event, None, int]:
-    """Take and store the views at these table angles, turn back to 0, and return how many frames were taken again."""
+    """Take and store the views at these table angles, return to 0, and return the number of repeated images."""
     viewer = Viewer(bench.camera, bench.config.view)
     drift = Drift()
     sign = bench.config.table.orientation_sign
@@ -123,12 +127,12 @@ def _take_views(
             if move.agreement is None or not move.agreement.agrees:
                 disagreement = _disagreement(move)
                 if move.agreement is not None:
-                    bench.safety.latch(disagreement)  # a platter that slips once slips again
+                    bench.safety.latch(disagreement)  # a platter that has slipped once will slip again
                 raise disagreement
             imu.add(move)
-            shot = yield from capture(index, viewer, table, move.settled_ns)
-            retakes += shot.number - 1
-            described = describe(shot.image_bgr)
+            attempt = yield from capture(index, viewer, table, move.settled_ns)
+            retakes += attempt.number - 1
+            described = describe(attempt.image_bgr)
             levels = dict(described.levels)
             record = ViewRecord(
                 index=index,
@@ -136,29 +140,34 @@ def _take_views(
                 encoder_deg=move.encoder_deg,
                 azimuth_deg=float(wrap360(sign * (imu.angle_deg if move.by_gyro else move.encoder_deg))),
                 descriptor=levels.pop(PAPER_DESCRIPTOR),
-                captured_ns=shot.evidence.exposed_ns,
+                captured_ns=attempt.evidence.exposed_ns,
                 imu_deg=imu.angle_deg,
                 imu_sigma_deg=imu.sigma_deg,
-                evidence=plain(shot.evidence),
+                evidence=plain(attempt.evidence),
                 region=bench.config.view.roi,
                 segmentation=described.segmentation,
                 further=levels,
             )
-            enrollment.add(record, shot.image_bgr)
-            yield Accepted(index, record.azimuth_deg, shot.evidence, shot.image_bgr, described.segmentation)
+            enrollment.add(record, attempt.image_bgr)
+            yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
             if drifted := drift.look(described.segmentation):
                 EmptyTables.doubt(bench, drifted)
-                yield Warned(index, drifted, f"Go on, these views do without it; then take a new one: {COMMAND}")
-            first = first or (index, angle_deg, shot.image_bgr)
+                yield Warned(
+                    index,
+                    drifted,
+                    f"Continue: these views are segmented without the image. Then take a new one: {COMMAND}",
+                )
+            first = first or (index, angle_deg, attempt.image_bgr)
+        # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
+        # supply the servo forgets whole revolutions, and a cable that stays wound up is wound further the next time.
         if first and first[0] != index:
-            yield from _look_again(bench, enrollment, table, viewer, *first)
-        # The servo forgets whole turns without its supply; a cable left wound up would be wound further the next time.
+            yield from _check_not_moved(bench, enrollment, table, viewer, *first)
         if first is None or first[0] == index or first[1] != 0.0:
             yield from announced(index, table, 0.0)
     return retakes
 
 
-def _look_again(
+def _check_not_moved(
     bench: Bench,
     enrollment: Enrollment,
     table: Turntable,
@@ -167,12 +176,12 @@ def _look_again(
     angle_deg: float,
     image_bgr: NDArray[np.uint8],
 ) -> Generator[Event, None, None]:
-    """Go back to where view ``index`` was taken, and see that the object stands as it stood.
+    """Return to the angle of view ``index`` and check that the object is still where it was.
 
     Raises
     ------
     ObjectMoved
-        It fell, was pushed, or has crept: which views it still stood for, nobody knows, and so they are abandoned.
+        It was moved between any two views, so all views of this session are abandoned.
     """
     move = yield from announced(index, table, angle_deg)
     again = yield from capture(index, viewer, table, move.settled_ns)
@@ -180,16 +189,15 @@ def _look_again(
     if alike < SAME_SIMILARITY:
         enrollment.abandon()
         raise ObjectMoved(
-            f"{enrollment.object_name} does not stand as it stood for view {index}: it fell, was pushed, or creeps "
-            "on the platter.",
-            next_step="Put it back on its mark, with something that holds it, and enroll it anew with --replace; "
-            "the views taken are abandoned.",
+            f"{enrollment.object_name} is not where it was for view {index + 1}: it fell, was pushed, or slid on the "
+            "platter. The views of this session are abandoned.",
+            next_step="Put the object back on its mark, fasten it, and enroll it again with --replace.",
             evidence={"similarity": round(alike, 3), "smallest_similarity": SAME_SIMILARITY, "table_deg": angle_deg},
         )
 
 
 class _ImuAngle:
-    """The table's angle by the gyro alone, from where the encoder first was."""
+    """The table angle by the gyro alone, from the first angle of the encoder."""
 
     def __init__(self) -> None:
         self.angle_deg = 0.0
@@ -199,7 +207,7 @@ class _ImuAngle:
     def add(self, move: Move) -> None:
         if self._begun:
             self.angle_deg += move.gyro.angle_deg
-            self.sigma_deg += move.gyro.sigma_deg  # not in squares: bias and scale errors are common to all moves
+            self.sigma_deg += move.gyro.sigma_deg  # added linearly: all moves share the same bias and scale error
         else:
             self._begun = True
             self.angle_deg = move.commanded_deg if move.by_gyro else move.encoder_deg
@@ -208,15 +216,16 @@ class _ImuAngle:
 def _disagreement(move: Move) -> RotationDisagreement:
     if move.agreement is None:
         return RotationDisagreement(
-            f"Whether the platter turned {move.rotation_encoder_deg:.2f}° with the servo is unknown: "
+            f"It is not known whether the platter followed the servo's rotation of {move.rotation_encoder_deg:.2f}°: "
             f"{move.gyro.reason}.",
-            next_step="If nothing knocked the table, go on with --resume; else enroll the object anew with --replace.",
+            next_step="If nothing hit the table, continue with --resume. Otherwise enroll the object again with "
+            "--replace.",
             evidence={"table_deg": round(move.encoder_deg, 2)},
         )
     return RotationDisagreement(
-        f"The servo turned {move.rotation_encoder_deg:.2f}°, the platter {move.gyro.angle_deg:.2f}°.",
-        next_step="Tighten the platter, `rig acknowledge`, and enroll the object anew with --replace: "
-        "views from before and after a slip do not fit together.",
+        f"The servo rotated {move.rotation_encoder_deg:.2f}°, but the platter {move.gyro.angle_deg:.2f}°.",
+        next_step="Tighten the platter, run `rig acknowledge`, and enroll the object again with --replace. Views from "
+        "before and after a slip do not fit together.",
         evidence={
             "difference_deg": round(move.agreement.difference_deg, 3),
             "bound_deg": round(move.agreement.bound_deg, 3),

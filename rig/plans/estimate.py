@@ -1,7 +1,8 @@
-"""How long an enrollment takes, and where the table goes for it: known before anything moves."""
+"""The course of an enrollment before anything moves: table angles, duration, and whether it is possible."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from itertools import pairwise
 from math import ceil, floor
 from typing import Final
@@ -19,19 +20,19 @@ _FLOAT_DEG: Final = 1e-6
 
 
 def even_azimuths(views: int, limits_deg: tuple[float, float], sign: int = -1) -> list[float]:
-    """Return the azimuths of ``views`` even steps of one turn, in the order in which the table takes them.
+    """Return the azimuths of ``views`` even steps of a revolution, in the order in which the table takes them.
 
-    They begin at azimuth 0, where the cable's limits let the table turn up from 0; else further back. Of a servo that
-    pans over less than a turn they are those within its limits: the object is seen from some of its sides.
+    The first azimuth is 0 if the cable budget allows a revolution upwards from the table angle 0; otherwise the table
+    starts further back. If the limits allow less than a revolution, only the azimuths within them are returned.
 
     Parameters
     ----------
     views
-        How many there would be in a whole turn.
+        Number of views in a whole revolution.
     limits_deg
         Lowest and highest table angle.
     sign
-        Sense of the orientation: -1 where the table turns the object, +1 where it takes the camera around it
+        Sense of the azimuth: -1 if the table rotates the object, +1 if it moves the camera around the object
         (`TableConfig.orientation_sign`).
     """
     step_deg = 360.0 / views
@@ -46,15 +47,14 @@ def even_azimuths(views: int, limits_deg: tuple[float, float], sign: int = -1) -
 
 
 def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], sign: int = -1) -> tuple[float, ...]:
-    """Return the table's angle, unwrapped, for each planned azimuth: upwards all the way, within the limits.
+    """Return the unwrapped table angle for each planned azimuth: always upwards, and within the limits.
 
-    The table turns backwards under a camera that goes around (``sign`` -1), and upwards so that its play stays taken
-    up.
+    The table always rotates upwards, so that the backlash stays taken up.
 
     Raises
     ------
     LimitExceeded
-        The cable does not reach for so many views in a row.
+        The cable budget does not allow so many views in one direction.
     """
     if not azimuth_deg:
         return ()
@@ -62,38 +62,48 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
     for before, after in pairwise(azimuth_deg):
         angles.append(angles[-1] + float(wrap360(sign * (after - before))))
     low, high = limits_deg
-    turns = [
+    revolutions = [
         whole
         for whole in range(int(low // 360) - 1, int(high // 360) + 3)
         if low - _FLOAT_DEG <= angles[0] + 360.0 * whole and angles[-1] + 360.0 * whole <= high + _FLOAT_DEG
     ]
-    if not turns:
+    if not revolutions:
         raise LimitExceeded(
-            f"The cable does not reach for these views: they take {angles[-1] - angles[0]:.0f}° in one direction.",
-            next_step="Widen table.limits_deg if the cable allows it, or enroll the object anew with --replace: "
-            "views planned on this bench fit its cable.",
+            f"The views need {angles[-1] - angles[0]:.0f}° in one direction. The cable budget does not allow that.",
+            next_step="Increase table.limits_deg if the cable is long enough. Otherwise enroll the object again with "
+            "--replace: the views are then planned for this bench.",
             evidence={
                 "from_deg": angles[0],
                 "to_deg": angles[-1],
                 "limits_deg": list(limits_deg),
             },
         )
-    nearest = min(turns, key=lambda whole: (abs(angles[0] + 360.0 * whole), whole))
+    nearest = min(revolutions, key=lambda whole: (abs(angles[0] + 360.0 * whole), whole))
     return tuple(angle + 360.0 * nearest for angle in angles)
+
+
+class Obstacle(StrEnum):
+    """Why an object would not be enrolled."""
+
+    ALREADY_ENROLLED = "already_enrolled"
+    INTERRUPTED = "interrupted"
+    NOT_INTERRUPTED = "not_interrupted"
 
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
     """What an enrollment would do.
 
-    ``action`` is "enroll", "resume", "replace", "skip" (it is enrolled already) or "refuse", with the reason in
-    ``why``. ``angles_deg`` are the table's, unwrapped, of the views in their order, ``azimuths_deg`` the views';
-    ``table_deg`` is where the table stands before, ``travel_deg`` what it turns through in all, unwinding included.
+    ``action`` is "enroll", "resume", "replace", "skip" or "reject"; the last two have an ``obstacle``.
+    ``enrolled_views`` is the number of views that the object has already. ``angles_deg`` and ``azimuths_deg`` are those
+    of the views in their order. ``table_deg`` is the table angle before; ``travel_deg`` is the sum of all rotations,
+    unwinding included.
     """
 
     name: str
     action: str
-    why: str
+    obstacle: Obstacle | None
+    enrolled_views: int
     views: int
     azimuths_deg: tuple[float, ...]
     angles_deg: tuple[float, ...]
@@ -112,16 +122,16 @@ def dry_run(
     resume: bool = False,
     replace: bool = False,
 ) -> tuple[DryRun, ...]:
-    """Say what enrolling these objects would do; nothing moves and nothing is stored.
+    """Return what enrolling these objects would do. Nothing moves and nothing is stored.
 
     Parameters
     ----------
     bench
-        An open one.
+        An open bench.
     catalog
-        None where none was made yet.
+        None if there is none yet.
     names
-        Of the objects. Of more than one, complete ones are skipped and interrupted ones resumed, as a tray does.
+        Names of the objects. Of several objects, complete ones are skipped and interrupted ones resumed, as in a tray.
     views, resume, replace
         As for `enroll`.
 
@@ -130,7 +140,7 @@ def dry_run(
     UsageError
         A name cannot be used.
     LimitExceeded
-        The cable does not reach for the views that are left.
+        The cable budget does not allow the missing views.
     """
     known = {} if catalog is None else {summary.name: summary for summary in catalog.objects()}
     table_deg = Turntable(bench).angle_deg()
@@ -138,7 +148,8 @@ def dry_run(
     model = MotionModel(bench.config)
     found = []
     for name in map(clean_name, names):
-        action, why = _action(known.get(name), resume=resume, replace=replace, tray=len(names) > 1)
+        summary = known.get(name)
+        action, obstacle = _action(summary, resume=resume, replace=replace, tray=len(names) > 1)
         azimuths: Sequence[float] = ()
         if action in ("enroll", "replace"):
             azimuths = even_azimuths(views or bench.config.enroll.views, limits_deg, sign)
@@ -154,7 +165,8 @@ def dry_run(
             DryRun(
                 name=name,
                 action=action,
-                why=why,
+                obstacle=obstacle,
+                enrolled_views=summary.views if summary else 0,
                 views=len(angles),
                 azimuths_deg=tuple(azimuths),
                 angles_deg=angles,
@@ -168,31 +180,27 @@ def dry_run(
     return tuple(found)
 
 
-def _action(known: ObjectSummary | None, *, resume: bool, replace: bool, tray: bool) -> tuple[str, str]:
-    unfinished = known.unfinished_views if known else None
-    if unfinished is not None:
+def _action(known: ObjectSummary | None, *, resume: bool, replace: bool, tray: bool) -> tuple[str, Obstacle | None]:
+    if known is not None and known.unfinished_views is not None:
         if resume or tray:
-            return "resume", ""
-        return ("replace", "") if replace else ("refuse", "its enrollment is unfinished: add --resume or --replace")
+            return "resume", None
+        return ("replace", None) if replace else ("reject", Obstacle.INTERRUPTED)
     if resume:
-        return "refuse", "it has no unfinished enrollment: leave --resume out"
+        return "reject", Obstacle.NOT_INTERRUPTED
     if known is not None and known.views:
-        if replace:
-            return "replace", ""
-        why = f"it is enrolled already, with {known.views} views"
-        return ("skip", why) if tray else ("refuse", f"{why}: add --replace to enroll it anew")
-    return "enroll", ""
+        return ("replace", None) if replace else ("skip" if tray else "reject", Obstacle.ALREADY_ENROLLED)
+    return "enroll", None
 
 
 class TimeLeft:
-    """Time left of an enrollment: the motion model, corrected by how long the views so far really took.
+    """Remaining time of an enrollment: the motion model, scaled by the time that the views so far really took.
 
     Parameters
     ----------
     model
-        Of the bench.
+        Motion model of the bench.
     angles_deg
-        Table angles of the views to come, in their order.
+        Table angles of the coming views, in their order.
     """
 
     def __init__(self, model: MotionModel, angles_deg: Sequence[float]) -> None:
@@ -209,7 +217,7 @@ class TimeLeft:
 
     @property
     def seconds(self) -> float:
-        """Time of the bench until the table is back at 0."""
+        """Remaining time in the bench's clock, until the table is back at 0."""
         model, done, angles = self._model, self._done, self._angles_deg
         if not angles:
             return 0.0

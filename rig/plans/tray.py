@@ -1,4 +1,4 @@
-"""A whole tray of objects, listed in a CSV file, one after the other; what is enrolled already is skipped."""
+"""A tray: objects of a CSV list that are enrolled one after the other. Complete ones are skipped."""
 
 import csv
 from collections import Counter
@@ -12,20 +12,20 @@ from typing import Final, Protocol
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
 from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected
-from rig.events.events import Event, Item
+from rig.events.events import Event, Item, SkipReason
 from rig.plans.enroll import enroll
 
 COLUMNS: Final = ("name", "label", "note", "views")
-FEWEST, MOST = 4, 720
-"""Views that an enrollment may have, as `enroll.views` of the configuration."""
+MIN_VIEWS, MAX_VIEWS = 4, 720
+"""Limits of the number of views, as for `enroll.views` of the configuration."""
 
-AT_THE_OBJECT: Final = (ViewRejected, RotationDisagreement, ObjectNotFound)
-"""Errors that lie with one object, so that the next one may do; any other ends the tray."""
+OBJECT_ERRORS: Final = (ViewRejected, RotationDisagreement, ObjectNotFound)
+"""Errors that concern one object: the tray can continue with the next one. Any other error ends the tray."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrayItem:
-    """A line of the list: ``line`` in the file, from 1; ``views`` None where the list leaves it to the program."""
+    """One object of the list; ``line`` is its line in the file, from 1. ``views`` is None for the default."""
 
     line: int
     name: str
@@ -35,7 +35,7 @@ class TrayItem:
 
 
 class TrayDecision(StrEnum):
-    """What somebody says about an object."""
+    """What the operator decides about an object."""
 
     PROCEED = "proceed"
     RESTART = "restart"
@@ -44,19 +44,23 @@ class TrayDecision(StrEnum):
 
 
 class TrayOperator(Protocol):
-    """Whoever brings the objects, or somebody who answers for hands that bring them by themselves."""
+    """Puts the objects on the table and decides what happens with each."""
 
     def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:
-        """Ask for the object; PROCEED, or RESTART if an interrupted one (``kept``) was moved meanwhile."""
+        """Return once the object is on the table.
+
+        ``kept`` is its interrupted enrollment, if there is one: PROCEED resumes it, RESTART repeats it because the
+        object was moved.
+        """
         ...
 
     def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:
-        """Say whether an object that failed is tried again (PROCEED), skipped, or the tray stopped."""
+        """Return whether to try an object again after an error (PROCEED), skip it, or stop the tray."""
         ...
 
 
 class AutomaticOperator:
-    """AutomaticOperator that put every object by the platter's mark, the same way each time, and ask nobody."""
+    """An operator that is never asked, for benches that put each object on the same mark by themselves."""
 
     def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:  # noqa: ARG002
         return TrayDecision.PROCEED
@@ -66,26 +70,26 @@ class AutomaticOperator:
 
 
 def read_tray(path: Path) -> tuple[TrayItem, ...]:
-    """Read a list of objects: CSV in UTF-8, separated by commas or semicolons, with a line of headings.
+    """Read a list of objects: CSV in UTF-8 with a header line, separated by commas or semicolons.
 
     Raises
     ------
     UsageError
-        It cannot be read, or lines of it are wrong: all of them, each with its number.
+        The file cannot be read, or it has mistakes; the evidence lists all of them with their lines.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise UsageError(
             f"The list {path} cannot be read.",
-            next_step="Give a CSV file with --list.",
+            next_step="Choose a CSV file with --list.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise UsageError(
-            f"The list {path} is not in UTF-8.",
-            next_step="Save it as CSV UTF-8.",
+            f"The list {path} is not encoded in UTF-8.",
+            next_step='Save it as "CSV UTF-8".',
             evidence={"mistakes": [f"line {line}: byte 0x{error.object[error.start]:02x}"]},
         ) from error
     mistakes: list[str] = []
@@ -103,19 +107,19 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
                     except UsageError as error:
                         mistakes.append(f"line {line}: {error.what}")
     except csv.Error as error:
-        mistakes.append(f"this is no CSV: {error}")
+        mistakes.append(f"this is not CSV: {error}")
     counts = Counter(item.name for item in items)
     mistakes += [
-        f"line {item.line}: {item.name!r} is listed {counts[item.name]} times"
+        f"line {item.line}: {item.name!r} is in the list {counts[item.name]} times"
         for item in items
         if counts[item.name] > 1
     ]
     if not items and not mistakes:
-        mistakes.append("there is no object in it")
+        mistakes.append("the list has no objects")
     if mistakes:
         raise UsageError(
-            f"{len(mistakes)} mistake{'s' if len(mistakes) > 1 else ''} in the list {path}.",
-            next_step="Mend the lines listed; nothing was enrolled.",
+            f"The list {path} has {len(mistakes)} mistake{'s' if len(mistakes) > 1 else ''}.",
+            next_step="Correct these lines. Nothing was enrolled.",
             evidence={"mistakes": mistakes},
         )
     return tuple(items)
@@ -131,24 +135,24 @@ def enroll_tray(
 ) -> Generator[Event, None, None]:
     """Enroll the objects of a tray one after the other; yields an `Item` before the events of each.
 
-    Objects that are complete in the catalog are skipped, interrupted ones go on with the views they lack: after an
-    interruption the same call does what is left.
+    Complete objects are skipped, and interrupted enrollments are resumed. After an interruption, the same call
+    therefore does what is left.
 
     Parameters
     ----------
     bench, catalog
-        Open.
+        Both open.
     items
         From `read_tray`.
     views
-        Views of objects for which the list says nothing; ``enroll.views`` otherwise.
+        Number of views for objects without their own; by default ``enroll.views``.
     operator
-        Brings the objects; without one they are taken to stand there when their turn comes.
+        Puts the objects on the table; by default an `AutomaticOperator`.
 
     Raises
     ------
     RigError
-        As `enroll`, where the operator does not want to go on.
+        As in `enroll`, if the operator decides to stop.
     """
     operator = operator or AutomaticOperator()
     for number, item in enumerate(items, 1):
@@ -156,15 +160,15 @@ def enroll_tray(
             known = {summary.name: summary for summary in catalog.objects()}.get(item.name)
             kept = known if known is not None and known.unfinished_views is not None else None
             if known is not None and kept is None and known.views:
-                yield Item(number, len(items), item.name, "skip", "it is enrolled already")
+                yield Item(number, len(items), item.name, "skip", SkipReason.ALREADY_ENROLLED)
                 break
-            answer = operator.request(item, number, len(items), kept)
-            if answer is TrayDecision.STOP:
+            decision = operator.request(item, number, len(items), kept)
+            if decision is TrayDecision.STOP:
                 return
-            if answer is TrayDecision.SKIP:
-                yield Item(number, len(items), item.name, "skip", "as asked")
+            if decision is TrayDecision.SKIP:
+                yield Item(number, len(items), item.name, "skip", SkipReason.OPERATOR)
                 break
-            resume = kept is not None and answer is TrayDecision.PROCEED
+            resume = kept is not None and decision is TrayDecision.PROCEED
             action = "resume" if resume else "replace" if kept else "enroll"
             yield Item(number, len(items), item.name, action)
             try:
@@ -178,21 +182,21 @@ def enroll_tray(
                     resume=resume,
                     replace=kept is not None and not resume,
                 )
-            except AT_THE_OBJECT as error:
-                answer = operator.decide_after_error(item, error)
-                if answer is TrayDecision.STOP:
+            except OBJECT_ERRORS as error:
+                decision = operator.decide_after_error(item, error)
+                if decision is TrayDecision.STOP:
                     raise
-                if answer is TrayDecision.SKIP:
-                    yield Item(number, len(items), item.name, "skip", error.what)
+                if decision is TrayDecision.SKIP:
+                    yield Item(number, len(items), item.name, "skip", SkipReason.ERROR, error.code)
                     break
             else:
                 break
 
 
 def _rows(text: str) -> Generator[tuple[int, list[str]], None, None]:
-    """Yield each row with the line it begins on."""
-    heading = text.partition("\n")[0]
-    separator = ";" if heading.count(";") > heading.count(",") else ","
+    """Yield each row with its first line in the file, from 1."""
+    header = text.partition("\n")[0]
+    separator = ";" if header.count(";") > header.count(",") else ","
     reader = csv.reader(text.splitlines(keepends=True), delimiter=separator, strict=True)
     line = 1
     for cells in reader:
@@ -201,29 +205,29 @@ def _rows(text: str) -> Generator[tuple[int, list[str]], None, None]:
 
 
 def _heading_mistakes(line: int, headings: Sequence[str]) -> list[str]:
-    mistakes = [
-        f"line {line}: {heading!r} is no column" + (f"; did you mean {near[0]}?" if near else f": {', '.join(COLUMNS)}")
-        for heading in headings
-        if heading not in COLUMNS
-        for near in [get_close_matches(heading, COLUMNS, n=1)]
-    ]
-    mistakes += [f"line {line}: the column {h} comes twice" for h, n in Counter(headings).items() if n > 1]
+    mistakes = []
+    for heading in headings:
+        if heading not in COLUMNS:
+            near = get_close_matches(heading, COLUMNS, n=1)
+            hint = f"Did you mean {near[0]}?" if near else f"The columns are {', '.join(COLUMNS)}."
+            mistakes.append(f"line {line}: {heading!r} is not a column. {hint}")
+    mistakes += [f"line {line}: the column {h} is there twice" for h, n in Counter(headings).items() if n > 1]
     if "name" not in headings and not mistakes:
-        mistakes.append(f"line {line}: there is no column name; write the headings {','.join(COLUMNS[:3])} first")
+        mistakes.append(f"line {line}: there is no column name; the first line must be {','.join(COLUMNS)}")
     return mistakes
 
 
 def _item(line: int, headings: Sequence[str], cells: Sequence[str]) -> TrayItem:
     if len(cells) > len(headings):
         raise UsageError(
-            f"{len(cells)} values under {len(headings)} headings", next_step="Put text that holds a comma in quotes."
+            f"{len(cells)} values in {len(headings)} columns", next_step="Put text with a comma in quotes."
         )
     values = {heading: cell.strip() for heading, cell in zip(headings, cells, strict=False)}
     views = None
     if values.get("views"):
-        if not values["views"].isdecimal() or not FEWEST <= int(values["views"]) <= MOST:
+        if not values["views"].isdecimal() or not MIN_VIEWS <= int(values["views"]) <= MAX_VIEWS:
             raise UsageError(
-                f"views is {values['views']!r}, not a number from {FEWEST} to {MOST}", next_step="Mend it."
+                f"views is {values['views']!r}, not a number from {MIN_VIEWS} to {MAX_VIEWS}", next_step="Correct it."
             )
         views = int(values["views"])
     return TrayItem(line, clean_name(values.get("name", "")), values.get("label"), values.get("note"), views)

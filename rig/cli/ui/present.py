@@ -23,12 +23,14 @@ from rig.events.events import (
     Ranked,
     Rejected,
     SimilarObjects,
+    SkipReason,
     Started,
     Unwinding,
     Waiting,
     Warned,
 )
 from rig.events.wording import (
+    angle_words,
     answer_lines,
     azimuth_words,
     counted,
@@ -40,7 +42,7 @@ from rig.events.wording import (
     similar_objects_words,
     unwinding_words,
 )
-from rig.plans.estimate import DryRun
+from rig.plans.estimate import DryRun, Obstacle
 
 SHOWN = 3
 
@@ -88,7 +90,7 @@ def line(event: Event) -> str:
             )
             return "\n  ".join([*answer_lines(event), numbers])
         case Item(action="skip"):
-            return f"{event.number} of {event.of}  {event.name}: left out, {event.why}"
+            return f"{event.number} of {event.of}  {event.name}: skipped, {_skip_words(event)}"
         case Item():
             return ""
         case SimilarObjects():
@@ -109,26 +111,34 @@ def _leader(one: Candidate) -> str:
     return f"{one.name} {one.score:.3f}{odds} at {azimuth_words(one.pose_deg)}°"
 
 
+def _skip_words(item: Item) -> str:
+    match item.reason:
+        case SkipReason.OPERATOR:
+            return "as the operator asked"
+        case SkipReason.ERROR:
+            return f"because of error {item.error_code}"
+        case _:
+            return "it is already enrolled"
+
+
 def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
-    """Return what enrollments would do, in lines."""
+    """Return the plan of enrollments, in lines."""
     lines = []
     for one in found:
         if not one.views:
-            lines.append(f"{one.name}: {'left out' if one.action == 'skip' else 'would be refused'}, {one.why}")
+            lines.append(f"{one.name}: {'skipped' if one.action == 'skip' else 'not possible'}, {_obstacle_words(one)}")
             continue
-        lines.append(
-            f"{one.name}: {one.action}, {counted(one.views, 'view')}, about {duration_words(one.seconds)} of the bench"
-        )
+        lines.append(f"{one.name}: {one.action}, {counted(one.views, 'view')}, about {duration_words(one.seconds)}")
         if len(found) > 1:
             continue
         first, last = one.angles_deg[0], one.angles_deg[-1]
+        low, high = (f"{angle:g}°".replace("-", "−") for angle in one.limits_deg)
         lines += [
-            f"  The table stands at {one.table_deg:.1f}° and "
-            + _beginning(one.table_deg, first)
-            + f", goes up to {last:.1f}° and back to 0°: {one.travel_deg:.0f}° of travel.",
-            f"  Its cable reaches from {one.limits_deg[0]:g}° to {one.limits_deg[1]:g}°.",
-            "  Table angles: " + ", ".join(f"{angle:.1f}" for angle in one.angles_deg),
-            "  Azimuths:     " + ", ".join(azimuth_words(azimuth) for azimuth in one.azimuths_deg),
+            f"  The table is at {angle_words(one.table_deg)}. {_beginning(one.table_deg, first)}, rotates up to "
+            f"{angle_words(last)} and back to 0°: {one.travel_deg:.0f}° of rotation.",
+            f"  The cable budget is {low} to {high}.",
+            "  Table angles: " + ", ".join(angle_words(angle) for angle in one.angles_deg),
+            "  Azimuths:     " + ", ".join(f"{azimuth_words(azimuth)}°" for azimuth in one.azimuths_deg),
         ]
     if len(found) > 1:
         views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
@@ -136,10 +146,22 @@ def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
     return [*lines, "Nothing was moved or stored."]
 
 
+def _obstacle_words(one: DryRun) -> str:
+    match one.obstacle:
+        case Obstacle.INTERRUPTED:
+            return "its enrollment was interrupted: add --resume or --replace"
+        case Obstacle.NOT_INTERRUPTED:
+            return "it has no interrupted enrollment: remove --resume"
+        case _:
+            hint = "" if one.action == "skip" else ": add --replace to enroll it again"
+            return f"it is already enrolled, with {counted(one.enrolled_views, 'view')}{hint}"
+
+
 def _beginning(table_deg: float, first_deg: float) -> str:
     if abs(table_deg - first_deg) < 1:
-        return "begins there"
-    return f"first {'unwinds' if abs(table_deg) - abs(first_deg) > 180 else 'turns'} to {first_deg:.1f}°"
+        return "It starts there"
+    verb = "unwinds" if abs(table_deg) - abs(first_deg) > 180 else "rotates"
+    return f"It first {verb} to {angle_words(first_deg)}"
 
 
 class Progress:

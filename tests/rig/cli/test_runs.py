@@ -222,9 +222,9 @@ def test_a_dry_run_says_all_and_does_nothing(rig):
     done = rig("enroll", "clock", "--step", "60", "--dry-run")
     assert done.exit_code == 0
     assert "clock: enroll, 6 views, about" in done.stdout
-    assert "Table angles: 0.0, 60.0, 120.0, 180.0, 240.0, 300.0" in done.stdout
-    assert "travel" in done.stdout
-    assert "would be refused, it is enrolled already" in rig("enroll", "lamp", "--dry-run").stdout
+    assert "Table angles: 0.0°, 60.0°, 120.0°, 180.0°, 240.0°, 300.0°" in done.stdout
+    assert "600° of rotation" in done.stdout
+    assert "not possible, it is already enrolled" in rig("enroll", "lamp", "--dry-run").stdout
     (told,) = json.loads(rig("enroll", "lamp", "--replace", "--dry-run", "--json").stdout)["dry_run"]
     assert (told["action"], told["views"]) == ("replace", 8)
     assert sorted(Path("catalog").rglob("*.png")) == before
@@ -317,10 +317,10 @@ def test_on_a_bench_without_hands_a_person_is_asked_for_each_object(rig, without
         app, ["enroll", "--list", "tray.csv", "--views", "4", "--set", "view.min_sharpness=0"], input="\ns\nq\n"
     )
     assert done.exit_code == 0, done.output
-    assert "1 of 4  lamp: left out, it is enrolled already" in done.stdout
+    assert "1 of 4  lamp: skipped, it is already enrolled" in done.stdout
     assert "2 of 4: put radio (desk) on the table" in done.stderr
     assert "3 of 4: put clock on the table" in done.stderr
-    assert "3 of 4  clock: left out, as asked" in done.stdout
+    assert "3 of 4  clock: skipped, as the operator asked" in done.stdout
     assert "4 of 4: put book-atlas on the table" in done.stderr
     assert "1 of 4 objects enrolled in this run." in done.stderr
     names = {o["name"] for o in json.loads(rig("catalog", "list", "--json").stdout)["objects"]}

@@ -94,11 +94,11 @@ def test_a_rehearsal_moves_and_stores_nothing_and_says_what_would_happen(simulat
             return [(one.name, one.action, one.views) for one in found]
 
         assert actions("dice", "lamp", "clock") == [("dice", "skip", 0), ("lamp", "resume", 4), ("clock", "enroll", 5)]
-        assert actions("dice") == [("dice", "refuse", 0)]
+        assert actions("dice") == [("dice", "reject", 0)]
         assert actions("dice", replace=True) == [("dice", "replace", 5)]
-        assert actions("lamp") == [("lamp", "refuse", 0)]
+        assert actions("lamp") == [("lamp", "reject", 0)]
         assert actions("lamp", resume=True) == [("lamp", "resume", 4)]
-        assert actions("clock", resume=True) == [("clock", "refuse", 0)]
+        assert actions("clock", resume=True) == [("clock", "reject", 0)]
         (resumed,) = dry_run(s.bench, catalog, ["lamp"], resume=True)
         assert resumed.angles_deg == (120.0, 180.0, 240.0, 300.0)
         assert resumed.table_deg == pytest.approx(60.0, abs=0.3)

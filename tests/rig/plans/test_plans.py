@@ -234,7 +234,7 @@ def test_a_plan_that_outlives_its_bench_ends_quietly(simulated, catalog):
 
 def test_a_blow_beyond_the_gyros_range_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
     s = simulated()
-    with pytest.raises(RotationDisagreement, match="unknown"):
+    with pytest.raises(RotationDisagreement, match="not known"):
         for event in enroll(s.bench, catalog, "dice", views=6):
             if isinstance(event, Accepted) and event.index == 2:
                 s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-10.0))

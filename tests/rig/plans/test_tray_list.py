@@ -12,7 +12,7 @@ from rig.catalog import Catalog
 from rig.core.errors import ObjectNotFound, RotationDisagreement, UsageError, ViewRejected
 from rig.events.events import Accepted, Enrolled, Item
 from rig.plans.enroll import enroll
-from rig.plans.tray import AT_THE_OBJECT, TrayDecision, TrayItem, enroll_tray, read_tray
+from rig.plans.tray import OBJECT_ERRORS, TrayDecision, TrayItem, enroll_tray, read_tray
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 TEXT = st.text(string.ascii_letters + string.digits + " äöü,;\"'-_", min_size=1, max_size=12).map(str.strip)
@@ -82,11 +82,11 @@ def test_every_mistake_is_told_with_its_line(tmp_path):
     ("text", "words"),
     [
         ("", "no column name"),
-        ("name,label\n", "no object"),
-        ("naem,label\nmug,a\n", "line 1: 'naem' is no column; did you mean name?"),
+        ("name,label\n", "no objects"),
+        ("naem,label\nmug,a\n", "line 1: 'naem' is not a column. Did you mean name?"),
         ("label,note\na,b\n", "no column name"),
         ("name,name\na,b\n", "twice"),
-        ('name\n"mug\n', "no CSV"),
+        ('name\n"mug\n', "not CSV"),
         ("name\nmug\nname\xe4\n".encode("latin-1"), "line 3: byte 0xe4"),
         ("name,views\nmug,3\n", "from 4 to 720"),
     ],
@@ -195,7 +195,7 @@ def test_an_object_that_fails_is_left_out_or_ends_the_tray(simulated, catalog):
     assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
     with pytest.raises(ObjectNotFound):
         list(enroll_tray(s.bench, catalog, items("nonsense"), views=4))
-    assert {ViewRejected, RotationDisagreement, ObjectNotFound} == set(AT_THE_OBJECT)
+    assert {ViewRejected, RotationDisagreement, ObjectNotFound} == set(OBJECT_ERRORS)
 
 
 def test_the_lists_views_label_and_note_win(simulated, catalog):

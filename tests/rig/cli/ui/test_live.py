@@ -21,7 +21,7 @@ from rig.cli.ui.operator_prompts import OperatorPrompts
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
-from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, Waiting
+from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, SkipReason, Waiting
 from rig.plans.tray import TrayDecision, TrayItem
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
@@ -275,5 +275,5 @@ def test_where_nobody_can_be_asked_that_is_said():
 
 def test_items_that_are_skipped_are_told():
     console = screen(80, terminal=False)
-    text = shown(console, EnrollView(console, load_config()), [Item(1, 2, "mug", "skip", "it is enrolled already")])
-    assert text == "1 of 2  mug: left out, it is enrolled already\n"
+    text = shown(console, EnrollView(console, load_config()), [Item(1, 2, "mug", "skip", SkipReason.ALREADY_ENROLLED)])
+    assert text == "1 of 2  mug: skipped, it is already enrolled\n"
