@@ -1,4 +1,4 @@
-"""Chart: the views of an enrollment around the object, with the evidence that they were accepted on."""
+"""Chart of an enrollment: the sharpness of each view at its azimuth."""
 
 from collections.abc import Sequence
 from statistics import median
@@ -13,7 +13,7 @@ _CEILING: Final = 150.0
 
 
 class RingView(NamedTuple):
-    """A view of an enrollment: its azimuth, its sharpness in squared levels, and the frames refused before it."""
+    """A view of an enrollment: its azimuth, its sharpness in squared levels, and the frames rejected before it."""
 
     azimuth_deg: float
     sharpness: float
@@ -21,9 +21,9 @@ class RingView(NamedTuple):
 
 
 def azimuth_ring(views: Sequence[RingView]) -> str:
-    """Draw each view as a bar at its azimuth, as long as it is sharp; retaken ones carry a mark on the rim.
+    """Draw each view as a bar at its azimuth; retaken views have a mark on the rim.
 
-    Bars begin at sharpness 0; the longest reaches `_CEILING`.
+    The length of a bar is proportional to the sharpness; the longest bar reaches `_CEILING`.
 
     Raises
     ------

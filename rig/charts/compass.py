@@ -1,4 +1,4 @@
-"""The circle around the table that two charts share: azimuths as seen from above."""
+"""The circle of azimuths around the table, seen from above, that three charts share."""
 
 from math import cos, radians, sin
 from typing import Final
@@ -12,16 +12,16 @@ RIM: Final = 160.0
 
 
 def polar(radius: float, azimuth_deg: float) -> Point:
-    """Return the point at an azimuth: 0° at the top, growing counter-clockwise.
+    """Return the point at an azimuth: 0° is at the top, angles grow counter-clockwise.
 
-    With 0° at the top, a camera that goes to its left goes to the left of the page.
+    A camera that moves to its left moves to the left of the page.
     """
     angle = radians(azimuth_deg)
     return CENTRE[0] - radius * sin(angle), CENTRE[1] - radius * cos(angle)
 
 
 def rim(radius: float = RIM) -> list[str]:
-    """Draw the circle with its scale outside: ticks every 10°, numbers every 30°."""
+    """Draw the circle and its scale: a tick every 10°, a number every 30°."""
     parts = [svg.circle(CENTRE, radius, "rim")]
     for azimuth in range(0, 360, 10):
         named = azimuth % 30 == 0

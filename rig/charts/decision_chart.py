@@ -1,4 +1,4 @@
-"""Chart: what the dense search weighed before a turn, all around the object: the confusion left, and the motion."""
+"""Chart of a decision of the dense search: expected confusion and motion cost of every possible rotation."""
 
 from collections.abc import Sequence
 from math import exp
@@ -25,33 +25,33 @@ def decision_chart(
     weighed: Weighed,
     rotation_deg: float,
     *,
-    rivals: Sequence[str] = (),
+    candidates: Sequence[str] = (),
     seen_deg: Sequence[float] = (),
     number: int = 1,
 ) -> str:
-    """Draw the confusion that is expected after every turn, what the motion costs, and the turn that was chosen.
+    """Draw the expected confusion and the motion cost of every possible rotation, and the chosen rotation.
 
     Parameters
     ----------
     here_deg
-        Azimuth of the view after which it was decided.
+        Azimuth of the view before the decision.
     weighed
-        All turns.
+        All possible rotations.
     rotation_deg
-        The chosen one, of the camera around the object.
-    rivals
-        The two objects that it separates; empty where no second one is likely.
+        The chosen rotation of the camera around the object.
+    candidates
+        The two objects that it separates; empty if only one object is likely.
     seen_deg
         Azimuths of the views so far.
     number
-        Of that view, from 1.
+        Number of the view before the decision, from 1.
 
     Returns
     -------
-    SVG markup. The curve lies further in where less confusion is left; bars outside it are as long as the motion's
-    cost; the dashed curve lies further in where the two rivals look less alike.
+    SVG markup. The solid curve is close to the centre where little confusion would remain, the dashed curve where the
+    two candidates are least similar. The length of the bars outside is the motion cost.
     """
-    azimuth_deg = [here_deg + turn for turn in weighed.rotations_deg]
+    azimuth_deg = [here_deg + rotation for rotation in weighed.rotations_deg]
     around = sorted(range(len(azimuth_deg)), key=lambda i: azimuth_deg[i] % 360)
     curve = _radii(weighed.confusion)
     parts = [*rim(RIM)]
@@ -75,29 +75,33 @@ def decision_chart(
         x, y = polar(RIM, seen)
         parts.append(svg.text(str(k + 1), (x, y + 4), "stop-number"))
     side = "left" if rotation_deg >= 0 else "right"
-    turn = f"{side} {abs(rotation_deg):.0f}°, to {azimuth_words(azimuth_deg[chosen])}°"
-    lines = [(f"view {number} → {number + 1}", "small"), (turn, "turn-name"), *_reasons(weighed, chosen, rivals)]
-    listed = [
-        svg.text(words, (_LIST_X, _LIST_TOP + _ROW * row), look, anchor="start")
-        for row, (words, look) in enumerate(lines)
+    chosen_words = f"{side} {abs(rotation_deg):.0f}°, to {azimuth_words(azimuth_deg[chosen])}°"
+    lines = [
+        (f"view {number} → {number + 1}", "small"),
+        (chosen_words, "step-name"),
+        *_reasons(weighed, chosen, candidates),
     ]
-    label = f"What was weighed after view {number}: " + ", ".join(words for words, _ in lines[1:] if words)
+    listed = [
+        svg.text(words, (_LIST_X, _LIST_TOP + _ROW * row), class_, anchor="start")
+        for row, (words, class_) in enumerate(lines)
+    ]
+    label = f"Decision after view {number}: " + ", ".join(words for words, _ in lines[1:] if words)
     height = max(SIZE, _LIST_TOP + _ROW * len(lines))
     return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *listed])
 
 
-def _reasons(weighed: Weighed, chosen: int, rivals: Sequence[str]) -> list[tuple[str, str]]:
-    if len(rivals) < 2 or weighed.alike is None:
-        reason = [("no second object is likely:", "small"), ("what is new helps its pose", "small")]
+def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> list[tuple[str, str]]:
+    if len(candidates) < 2 or weighed.alike is None:
+        reason = [("only one object is likely:", "small"), ("a new side improves its pose", "small")]
         return [*reason, *_cost(weighed, chosen)]
     least, most = min(weighed.alike), max(weighed.alike)
     left, worst = (percent_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
     return [
         ("", "small"),
-        ("to tell", "small"),
-        (short(rivals[0], _LETTERS), "turn-name"),
-        ("from", "small"),
-        (short(rivals[1], _LETTERS), "turn-name"),
+        ("separates", "small"),
+        (short(candidates[0], _LETTERS), "step-name"),
+        ("and", "small"),
+        (short(candidates[1], _LETTERS), "step-name"),
         (f"alike there {weighed.alike[chosen]:.2f}", "small"),
         (f"({least:.2f} to {most:.2f} all around)", "small"),
         ("", "small"),
@@ -110,19 +114,19 @@ def _reasons(weighed: Weighed, chosen: int, rivals: Sequence[str]) -> list[tuple
 def _cost(weighed: Weighed, chosen: int) -> list[tuple[str, str]]:
     return [
         ("", "small"),
-        ("the motion costs", "small"),
-        (f"{weighed.cost[chosen]:.2f} of {max(weighed.cost):.2f}", "small"),
+        ("cost of the motion", "small"),
+        (f"{weighed.cost[chosen]:.2f}, at most {max(weighed.cost):.2f}", "small"),
     ]
 
 
 def _words(weighed: Weighed, i: int, azimuth_deg: float) -> str:
-    alike = "" if weighed.alike is None else f", rivals {weighed.alike[i]:.2f} alike"
+    alike = "" if weighed.alike is None else f"; similarity of the candidates {weighed.alike[i]:.2f}"
     confusion, cost = f"{weighed.confusion[i]:.2f}", f"{weighed.cost[i]:.2f}"
     return f"to {azimuth_words(azimuth_deg)}°: log confusion {confusion}, motion {cost}{alike}"
 
 
 def _radii(values: Sequence[float]) -> list[float]:
-    """From the inner circle, for the smallest, to the outer one."""
+    """Scale values to radii between the inner circle (smallest value) and the outer one."""
     low, high = min(values), max(values)
     span = high - low
     return [_INNER + (_OUTER - _INNER) * ((value - low) / span if span > 0 else 0.5) for value in values]

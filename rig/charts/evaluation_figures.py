@@ -70,11 +70,11 @@ def hit_rate_figure(results: dict[str, Any]) -> Chart:
 
 
 def travel_figure(results: dict[str, Any]) -> Chart:
-    """Hit-rate against the mean of the degrees turned: what the views cost."""
+    """Hit-rate against the mean rotation."""
     series = []
     for m, method in enumerate(results["methods"]):
         if method["name"] in ("single", "hbr-visual", "hbr-0", "hbr-0-orient"):
-            continue  # they turn as HBR does
+            continue  # the same rotations as HBR
         colour, dashed = _look(method["name"], m)
         travelled = [p["travelled_mean_deg"] for p in method["curve"]]
         drawn = _rates(method["label"], colour, dashed, travelled, method["curve"])
@@ -87,7 +87,7 @@ def travel_figure(results: dict[str, Any]) -> Chart:
 def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> Chart:
     """RMSE of the estimated orientation of each object after all views (Fig. 5 of the paper), sorted by size.
 
-    Once as it is (dashed), once to the nearest orientation from which the object looks the same (solid).
+    Dashed: the plain error. Solid: the error to the nearest orientation from which the object looks the same.
     """
     series = []
     for m, method in enumerate(methods):
@@ -105,7 +105,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> C
 
 
 def _sweep_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]], prefix: str, x_label: str) -> Chart:
-    """Hit-rate against a setting, for some numbers of views; the setting's values stand at equal distances."""
+    """Hit-rate against a setting, for several numbers of views; the values of the setting have equal distances."""
     values = [method["name"].removeprefix(prefix) for method in methods]
     series = []
     for i, n in enumerate(range(2, len(methods[0]["curve"]) + 1, 2)):

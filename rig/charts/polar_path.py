@@ -1,4 +1,4 @@
-"""Chart: where the camera stood during a retrieval, and how it got from view to view."""
+"""Chart of a search: the camera's positions around the object, and the rotations between them."""
 
 from collections.abc import Sequence
 from math import atan2, ceil, cos, hypot, sin
@@ -24,61 +24,62 @@ _LIST_ROW: Final = 38.0
 _NOTE_LETTERS: Final = 28
 
 
-class Turn(NamedTuple):
-    """A rotation of the camera around the object, positive to the left, and the sums it was decided on (Eq. 6).
+class PathStep(NamedTuple):
+    """A rotation of the camera around the object, positive to the left, and its reason.
 
-    Where there are none, the two ``rivals`` that it is to tell apart, or nothing: the turn was fixed.
+    The reason is the two similarity sums of Eq. 6, or the two candidates that the next view separates; a fixed step has
+    neither.
     """
 
     rotation_deg: float
     s_left: float | None = None
     s_right: float | None = None
-    rivals: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         return f"{'left' if self.rotation_deg >= 0 else 'right'} {abs(self.rotation_deg):.1f}°"
 
 
-def polar_path(start_deg: float, turns: Sequence[Turn], *, scale: str) -> str:
-    """Draw the camera's positions seen from above, numbered, and the rotations between them.
+def polar_path(start_deg: float, steps: Sequence[PathStep], *, scale: str) -> str:
+    """Draw the camera's numbered positions, seen from above, and the rotations between them.
 
-    The path winds outwards view by view, so that it never runs over itself.
+    The path is a spiral: its radius grows with every view, so that it never covers itself.
 
     Parameters
     ----------
     start_deg
         Azimuth of the first view.
-    turns
-        The rotations that followed, as the table made them.
+    steps
+        The measured rotations between the views.
     scale
-        What the azimuths on the rim are of.
+        Caption of the azimuth scale.
 
     Returns
     -------
-    SVG markup. View k lies at the sum of ``start_deg`` and the first k rotations; the arc to it ends there.
+    SVG markup. View k is at the sum of ``start_deg`` and the first k rotations.
     """
     azimuth_deg = [start_deg]
-    for turn in turns:
-        azimuth_deg.append(azimuth_deg[-1] + turn.rotation_deg)
+    for step in steps:
+        azimuth_deg.append(azimuth_deg[-1] + step.rotation_deg)
     radii = _radii(len(azimuth_deg))
     stops = [polar(radius, azimuth) for radius, azimuth in zip(radii, azimuth_deg, strict=True)]
-    arcs = [_arc((radii[k], azimuth_deg[k]), (radii[k + 1], azimuth_deg[k + 1])) for k in range(len(turns))]
+    arcs = [_arc((radii[k], azimuth_deg[k]), (radii[k + 1], azimuth_deg[k + 1])) for k in range(len(steps))]
     parts = [*rim(), svg.circle(CENTRE, 24, "object"), svg.text("object", (CENTRE[0], CENTRE[1] + 4), "small")]
-    for k, (turn, arc) in enumerate(zip(turns, arcs, strict=True)):
-        parts.append(svg.path(arc, "turn", svg.title(f"view {k + 1} to {k + 2}: {turn.words}")))
+    for k, (step, arc) in enumerate(zip(steps, arcs, strict=True)):
+        parts.append(svg.path(arc, "step", svg.title(f"view {k + 1} to {k + 2}: {step.words}")))
         parts.append(_arrowhead(arc))
     for k, (x, y) in enumerate(stops):
-        look = " last" if k == len(turns) else ""
+        last = " last" if k == len(steps) else ""
         words = svg.title(f"view {k + 1} at {azimuth_words(azimuth_deg[k])}°")
-        parts.append(svg.circle((x, y), _STOP_PX, f"stop{look}", words))
-        parts.append(svg.text(str(k + 1), (x, y + 4), f"stop-number{look}"))
-    for turn, (x, y) in zip(turns, _label_spots(arcs, stops), strict=True):
-        parts.append(svg.text(f"{abs(turn.rotation_deg):.1f}°", (x, y + 4), "turn-label"))
+        parts.append(svg.circle((x, y), _STOP_PX, f"stop{last}", words))
+        parts.append(svg.text(str(k + 1), (x, y + 4), f"stop-number{last}"))
+    for step, (x, y) in zip(steps, _label_spots(arcs, stops), strict=True):
+        parts.append(svg.text(f"{abs(step.rotation_deg):.1f}°", (x, y + 4), "step-label"))
     where = ", ".join(f"{azimuth_words(a)}°" for a in azimuth_deg)
-    label = f"Camera positions seen from above, view by view: {where}"
-    height = max(SIZE, _LIST_TOP + _LIST_ROW * len(turns))
-    return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *_list(turns, scale)])
+    label = f"Camera positions seen from above, in the order of the views: {where}"
+    height = max(SIZE, _LIST_TOP + _LIST_ROW * len(steps))
+    return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *_list(steps, scale)])
 
 
 def _radii(n: int) -> list[float]:
@@ -95,7 +96,7 @@ def _arc(start: tuple[float, float], end: tuple[float, float]) -> list[Point]:
 
 
 def _arrowhead(arc: Sequence[Point]) -> str:
-    """A triangle that points along the end of the arc and touches the view's disc."""
+    """Return a triangle at the end of an arc that touches the disc of the view."""
     x, y = arc[-1]
     before = next((p for p in reversed(arc) if hypot(p[0] - x, p[1] - y) >= _STOP_PX + _ARROW_PX), arc[0])
     heading = atan2(y - before[1], x - before[0])
@@ -108,7 +109,7 @@ def _arrowhead(arc: Sequence[Point]) -> str:
 
 
 def _label_spots(arcs: Sequence[Sequence[Point]], stops: Sequence[Point]) -> list[Point]:
-    """A spot for each arc's label, on it or else beside it, where it covers no view and no other label."""
+    """Return a position for the label of each arc that covers no view and no other label, if there is one."""
     taken = [*stops, CENTRE]
     for arc in arcs:
         wanted = [arc[round(share * (len(arc) - 1))] for share in _LABEL_SPOTS]
@@ -127,20 +128,20 @@ def _covers(a: Point, b: Point) -> bool:
     return abs(a[0] - b[0]) < _LABEL_PX[0] and abs(a[1] - b[1]) < _LABEL_PX[1]
 
 
-def _list(turns: Sequence[Turn], scale: str) -> list[str]:
-    """The turns one below the other, each with the sums it was decided on."""
+def _list(steps: Sequence[PathStep], scale: str) -> list[str]:
+    """List the rotations, each with its reason."""
     parts = [
         svg.text(scale, (_LIST_X, 16), "small", anchor="start"),
         svg.text("left is counter-clockwise", (_LIST_X, 31), "small", anchor="start"),
     ]
-    for k, turn in enumerate(turns):
+    for k, step in enumerate(steps):
         y = _LIST_TOP + _LIST_ROW * k
         parts.append(svg.text(f"{k + 1} → {k + 2}", (_LIST_X, y), "small", anchor="start"))
-        parts.append(svg.text(turn.words, (_LIST_X + 44, y), "turn-name", anchor="start"))
-        if turn.s_left is None or turn.s_right is None:
-            why = short(" or ".join(turn.rivals), _NOTE_LETTERS) or "fixed"
+        parts.append(svg.text(step.words, (_LIST_X + 44, y), "step-name", anchor="start"))
+        if step.s_left is None or step.s_right is None:
+            why = short(" or ".join(step.candidates), _NOTE_LETTERS) or "fixed"
         else:
-            left, right = distinct(turn.s_left, turn.s_right)
+            left, right = distinct(step.s_left, step.s_right)
             why = f"S left {left}, right {right}"
         parts.append(svg.text(why, (_LIST_X + 44, y + 15), "small", anchor="start"))
     return parts

@@ -1,4 +1,4 @@
-"""Chart: how the candidates' scores went as views were added."""
+"""Chart of a search: the score of each leading candidate after each view."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -15,7 +15,7 @@ _NAME_X: Final = _RIGHT + 34
 _LINE_HEIGHT: Final = 16.0
 _NAME_LETTERS: Final = 17
 _FAR: Final = 3.0
-"""A threshold further from the scores than so many times their span is off the scale."""
+"""A threshold is off the scale if its distance from the scores exceeds their range by this factor."""
 _STEPS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 
 
@@ -27,24 +27,24 @@ def score_chart(
     min_score: float | None = None,
     top: int = 5,
 ) -> str:
-    """Draw the scores per view of the leading candidates over the views; names stand at the ends of their lines.
+    """Draw the score per view of the leading candidates after each view; names are at the ends of the lines.
 
     Parameters
     ----------
     rounds
-        After each view the scores of the leading candidates, by name.
+        The scores of the leading candidates after each view, by name.
     winner
-        The answer; its line is the heavy one.
+        The answer; its line is thick.
     truth
-        What stood on the table; its name is marked.
+        The object on the table; its name has a mark.
     min_score
-        Below this score an object counts as unknown; drawn dashed, at the edge where it lies far off the scores.
+        An object with a lower score is unknown. The line is dashed; it is at the edge if it is far from the scores.
     top
-        So many candidates are drawn: the best of the last round.
+        Number of candidates to draw: the best of the last round.
 
     Returns
     -------
-    SVG markup. A line has a gap where its candidate was not among the leading ones.
+    SVG markup. A line has a gap after views at which its candidate was not among the leading ones.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def score_chart(
         raise ValueError("a score chart needs at least one round, and a candidate in each")
     names = sorted(rounds[-1], key=lambda name: -rounds[-1][name])[:top]
     shown = [scores[name] for scores in rounds for name in names if name in scores]
-    ticks = _ticks(shown, min_score, rivals=len(names) > 1)
+    ticks = _ticks(shown, min_score, several=len(names) > 1)
     low, high = ticks[0], ticks[-1]
 
     def at(view: int, score: float) -> Point:
@@ -78,31 +78,31 @@ def score_chart(
     parts.append(svg.text("views taken", ((_LEFT + _RIGHT) / 2, _BOTTOM + 38), "small"))
     if min_score is not None:
         y = at(0, min(max(min_score, low), high))[1]
-        words = f"unknown below {round(min_score, 3):g}"
+        words = f"threshold {round(min_score, 3):g}"
         if min_score < low:
-            words += ", further down ↓"
+            words += ", below the scale ↓"
         elif min_score > high:
-            words += ", further up ↑"
+            words += ", above the scale ↑"
         parts.append(svg.line((_LEFT, y), (_RIGHT, y), "threshold"))
         above = y - 5 if min_score <= high else y + 13
         parts.append(svg.text(words, (_LEFT + 3, above), "threshold-label", anchor="start"))
     for rank in reversed(range(len(names))):  # the best is drawn last, on top
-        parts.extend(_line(rounds, names[rank], _look(rank, names[rank] == winner), at))
+        parts.extend(_line(rounds, names[rank], _class(rank, names[rank] == winner), at))
     parts.extend(_legend(rounds, names, winner, truth, at))
     finals = ", ".join(f"{name} {rounds[-1][name]:.3f}" for name in names)
     label = f"Scores per view of the leading candidates after {len(rounds)} views: {finals}"
     return svg.drawing(_WIDTH, _HEIGHT, label, parts)
 
 
-def _ticks(values: Sequence[float], min_score: float | None, *, rivals: bool) -> list[float]:
-    """Round numbers that span ``values``, three to seven of them, and ``min_score`` too.
+def _ticks(values: Sequence[float], min_score: float | None, *, several: bool) -> list[float]:
+    """Return three to seven round numbers that span ``values`` and ``min_score``.
 
-    Not a threshold that is far off, though: it would press the lines of ``rivals``, which may differ in the third
-    decimal, into one.
+    The span excludes a threshold that is far away: otherwise the lines of several candidates, which may differ in the
+    third decimal, would coincide.
     """
     low, high = min(values), max(values)
     if min_score is not None:
-        reach = _FAR * (high - low) if rivals else inf
+        reach = _FAR * (high - low) if several else inf
         if low - reach <= min_score <= high + reach:
             low, high = min(low, min_score), max(high, min_score)
     for step in _STEPS:
@@ -112,17 +112,19 @@ def _ticks(values: Sequence[float], min_score: float | None, *, rivals: bool) ->
     return [step * i for i in range(min(first, last - 2), last + 1)]
 
 
-def _look(rank: int, wins: bool) -> str:
+def _class(rank: int, wins: bool) -> str:
     return f"candidate c{rank}{' winner' if wins else ''}"
 
 
-def _line(rounds: Sequence[Mapping[str, float]], name: str, look: str, at: Callable[[int, float], Point]) -> list[str]:
+def _line(
+    rounds: Sequence[Mapping[str, float]], name: str, class_: str, at: Callable[[int, float], Point]
+) -> list[str]:
     points = [at(view, scores[name]) if name in scores else None for view, scores in enumerate(rounds)]
-    parts = [svg.line(a, b, look) for a, b in pairwise(points) if a and b]
+    parts = [svg.line(a, b, class_) for a, b in pairwise(points) if a and b]
     for view, point in enumerate(points):
         if point:
             words = f"{name} after view {view + 1}: {rounds[view][name]:.3f}"
-            parts.append(svg.circle(point, 4 if "winner" in look else 3, f"{look} dot", svg.title(words)))
+            parts.append(svg.circle(point, 4 if "winner" in class_ else 3, f"{class_} dot", svg.title(words)))
     return parts
 
 
@@ -133,18 +135,18 @@ def _legend(
     truth: str | None,
     at: Callable[[int, float], Point],
 ) -> list[str]:
-    """Names and last scores beside the plot, best first, each tied to the end of its line."""
+    """Draw names and last scores beside the plot, best first, each connected with the end of its line."""
     ends = [at(len(rounds) - 1, rounds[-1][name]) for name in names]
     rows = _spread([y for _, y in ends])
     parts = []
     for rank, (name, end, y) in enumerate(zip(names, ends, rows, strict=True)):
-        look = _look(rank, name == winner)
-        parts.append(svg.path([(end[0] + 5, end[1]), (_RIGHT + 8, end[1]), (_NAME_X - 5, y)], f"{look} leader"))
+        class_ = _class(rank, name == winner)
+        parts.append(svg.path([(end[0] + 5, end[1]), (_RIGHT + 8, end[1]), (_NAME_X - 5, y)], f"{class_} leader"))
         short = name if len(name) <= _NAME_LETTERS else f"{name[: _NAME_LETTERS - 1]}…"
         mark = " ●" if name == truth else ""
         words = f"{rounds[-1][name]:.3f} {short}{mark}"
         parts.append(
-            svg.element("g", svg.title(name), svg.text(words, (_NAME_X, y + 4), f"{look} name", anchor="start"))
+            svg.element("g", svg.title(name), svg.text(words, (_NAME_X, y + 4), f"{class_} name", anchor="start"))
         )
     if truth in names:
         parts.append(svg.text("● on the table", (_NAME_X, _BOTTOM + 38), "small", anchor="start"))
@@ -152,7 +154,7 @@ def _legend(
 
 
 def _spread(wanted: Sequence[float]) -> list[float]:
-    """Rows from top to bottom, near the ``wanted`` (ascending) ones, a line apart, within the plot."""
+    """Return rows close to the ``wanted`` ones (ascending), at least one line apart, within the plot."""
     rows: list[float] = []
     for y in wanted:
         rows.append(max(y, rows[-1] + _LINE_HEIGHT) if rows else max(y, _TOP))

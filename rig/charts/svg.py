@@ -1,6 +1,7 @@
-"""The little of SVG that the charts need: text that is safe to embed, the same bytes for the same numbers.
+"""SVG elements for the charts of a search: escaped text, and equal bytes for equal numbers.
 
-Colours and fonts are the page's: shapes carry classes, the page's style sheet gives them their look, light and dark.
+Shapes carry classes; the page's style sheet sets their colours for light and dark mode. These charts stay hand-written:
+a report has some sixty of them, and Matplotlib would make them larger and slower (docs/decisions).
 """
 
 from collections.abc import Iterable
@@ -28,12 +29,12 @@ def element(tag: str, *content: str, **attributes: str | float) -> str:
 
 
 def text(words: str, at: Point, class_: str, *, anchor: str = "middle") -> str:
-    """Return a line of text (escaped) at its baseline's ``anchor``."""
+    """Return escaped text whose baseline has its ``anchor`` at a point."""
     return element("text", escape(words), x=at[0], y=at[1], class_=class_, text_anchor=anchor)
 
 
 def title(words: str) -> str:
-    """Return the tooltip of the element that it is put into."""
+    """Return a tooltip; put it into the element that it explains."""
     return element("title", escape(words))
 
 
@@ -54,7 +55,7 @@ def circle(at: Point, radius: float, class_: str, *content: str) -> str:
 
 
 def drawing(width: float, height: float, label: str, parts: Iterable[str]) -> str:
-    """Return the whole picture; ``label`` is what a screen reader says of it."""
+    """Return the complete chart; ``label`` is its alternative text."""
     return element(
         "svg", *parts, viewBox=f"0 0 {number(width)} {number(height)}", role="img", aria_label=label, class_="chart"
     )

@@ -1,4 +1,4 @@
-"""Reports that people look at: collected from the event stream, written as one self-contained HTML file."""
+"""Reports: collected from the events of a plan, written as one self-contained HTML file."""
 
 from rig.report.contact_sheet import contact_sheet, thumbnail
 from rig.report.page import Meta, render_report, write_report

@@ -1,4 +1,4 @@
-"""A catalog to look at: contact sheets, and a page that shows them with what is known of each object."""
+"""Contact sheets of a catalog, and an HTML page that shows them with the data of each object."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -31,11 +31,11 @@ class _Shown(NamedTuple):
     stamp: str
     views: int
     enrolled: str
-    facts: list[tuple[str, str]]
+    items_: list[tuple[str, str]]
 
 
 def write_sheets(folder: Path, objects: Collected) -> int:
-    """Write a contact sheet of every object, ``0001-mug-white.jpg``, and return how many there are.
+    """Write a contact sheet of every object, ``0001-mug-white.jpg``, and return their number.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def write_sheets(folder: Path, objects: Collected) -> int:
 
 
 def write_catalog_page(folder: Path, objects: Collected) -> int:
-    """Write ``index.html`` with the contact sheets beside it, and return how many objects there are.
+    """Write ``index.html`` and the contact sheets, and return the number of objects.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def _shown(folder: Path, above: Path, objects: Collected) -> Iterator[_Shown]:
             stamp.relative_to(above).as_posix(),
             len(enrollment.views),
             enrolled,
-            list(_facts(item, enrollment)),
+            list(_items(item, enrollment)),
         )
 
 
@@ -109,7 +109,7 @@ def _write(path: Path, image: Image) -> None:
     path.write_bytes(jpeg.tobytes())
 
 
-def _facts(item: Object, enrollment: Enrollment) -> Iterator[tuple[str, str]]:
+def _items(item: Object, enrollment: Enrollment) -> Iterator[tuple[str, str]]:
     if item.note:
         yield "note", item.note
     yield "views", counted(len(enrollment.views), "view")

@@ -1,4 +1,4 @@
-"""Contact sheets: all views of an object on one picture, each with its azimuth."""
+"""Contact sheets: all views of an object in one image, each with its azimuth."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -25,7 +25,7 @@ _OVERSAMPLING: Final = 4
 def thumbnail(
     image_bgr: Image, size: tuple[int, int], region: Region | None = None, box: Sequence[int] | None = None
 ) -> Image:
-    """Fit an image into ``size`` (width, height) without distortion, centred on the sheet's dark grey.
+    """Fit an image into ``size`` (width, height) without distortion, centred on dark grey.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def thumbnail(
         x, y, w, h = region
         image_bgr = image_bgr[y : y + h, x : x + w]
     if not image_bgr.size:
-        raise ValueError(f"there is nothing to show in region {region}; give one within the image")
+        raise ValueError(f"the region {region} is outside the image; give one within it")
     height, width = image_bgr.shape[:2]
     scale = min(size[0] / width, size[1] / height)
     fitted = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -70,7 +70,7 @@ def thumbnail(
 def contact_sheet(
     images_bgr: Sequence[Image], azimuth_deg: Sequence[float], *, columns: int = 12, tile: tuple[int, int] = (96, 96)
 ) -> Image:
-    """Lay out views row by row, each over its azimuth.
+    """Lay out views row by row, each with its azimuth below.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def contact_sheet(
 
 @lru_cache(maxsize=1024)
 def _caption(number: str, width: int) -> Image:
-    """A number with a degree sign, centred; drawn large and shrunk, for OpenCV's own small letters are not sharp."""
+    """Draw a centred number with a degree sign, large and then shrunk, because small letters of OpenCV are blurred."""
     fine = _OVERSAMPLING
     canvas = np.zeros((CAPTION_PX * fine, width * fine), dtype=np.uint8)
     font = cv2.FONT_HERSHEY_SIMPLEX

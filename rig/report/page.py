@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs nothing but itself."""
+"""The report: one self-contained HTML file."""
 
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
@@ -32,22 +32,22 @@ from rig.events.wording import (
 )
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
-from rig.report.summary import SummaryItem, enrollment_facts, totals
+from rig.report.summary import SummaryItem, enrollment_items, totals
 
 JPEG_QUALITY: Final = 84
 COLUMNS: Final = 12
 _STAMP: Final = (56, 56)
 _FEW: Final = 3
-"""So many retrievals or objects are all unfolded at once; of more, the first and those that went wrong."""
+"""Up to this number of searches or objects are all expanded; of more, only the first and the wrong ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Meta:
-    """What a report says about its run.
+    """Circumstances of a run.
 
-    ``conditions`` determine the run (noise model, seed, versions): the same ones give the same page. ``wall_clock``
-    holds whatever differs between two equal runs (date, duration, host); it stands apart, at the foot. Values may be
-    mappings: they become groups.
+    ``conditions`` determine the run (noise model, seed, versions): equal conditions give equal pages. ``wall_clock``
+    has the values that differ between equal runs (date, duration, host); they are at the foot of the page. A value that
+    is a mapping becomes a group of rows.
     """
 
     conditions: Mapping[str, Any] = field(default_factory=dict)
@@ -62,14 +62,14 @@ def render_report(
     *,
     meta: Meta,
 ) -> str:
-    """Return the page; what there is nothing of is left out.
+    """Return the page; sections without content are left out.
 
     Parameters
     ----------
     title, summary
         The headline and a sentence below it, plain text.
     enrollments, identifications
-        In the order they are to appear.
+        In the order of the page.
     meta
         Conditions and wall-clock times.
     """
@@ -85,14 +85,14 @@ def render_report(
             _object(number, record, unfold=number == 1 or len(enrollments) <= _FEW)
             for number, record in enumerate(enrollments, 1)
         ],
-        judged=any(record.truth is not None for record in identifications),
+        with_truth=any(record.truth is not None for record in identifications),
         conditions=_groups(meta.conditions),
         wall_clock=_groups(meta.wall_clock),
     )
 
 
 def write_report(path: Path, html: str) -> None:
-    """Write the page to ``path``, whole or not at all; missing folders are made.
+    """Write the page to ``path`` completely or not at all; create missing folders.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def write_report(path: Path, html: str) -> None:
             part.unlink(missing_ok=True)
         raise UsageError(
             f"The report cannot be written to {path}.",
-            next_step="Name a folder that you may write to with --out, with space on its disk.",
+            next_step="Choose a folder that you may write to with --out, on a disk with free space.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
 
@@ -131,7 +131,7 @@ class _Frame(NamedTuple):
     number: int
     picture: str
     where: str
-    refused: str
+    rejected: str
     leading: list[tuple[str, str, str]]
     margin: str
     decided: str
@@ -168,7 +168,7 @@ class _Object(NamedTuple):
     retakes: int
     sheet: str
     ring: Markup
-    facts: list[SummaryItem]
+    items_: list[SummaryItem]
     unfold: bool
 
 
@@ -177,9 +177,9 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
     error_deg = record.pose_error_deg
     path = scores = Markup()
     if views:
-        start_deg = _as_drawn(record, views[0].azimuth_deg)
+        start_deg = _report_azimuth_deg(record, views[0].azimuth_deg)
         scale = "azimuth on the table" if record.yaw_deg is None else "azimuth as enrolled"
-        path = Markup(polar_path(start_deg, record.turns, scale=scale))
+        path = Markup(polar_path(start_deg, record.steps, scale=scale))
     if record.ranked:
         rounds = [{c.name: c.score for c in ranked.candidates} for ranked in record.ranked]
         truth = record.truth.name if record.truth else None
@@ -202,7 +202,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         pose_error="–" if error_deg is None else f"{error_deg:.1f}°",
         score=f"{answer.score:.3f}" if answer else "–",
         margin=signed(answer.margin, 3) if answer else "–",
-        words=answer_words(answer) if answer else "The search ended before an answer.",
+        words=answer_words(answer) if answer else "The search ended without an answer.",
         path=path,
         compared=any(event.s_left is not None for event in record.decided),
         scores=scores,
@@ -221,8 +221,8 @@ def _truth(record: IdentificationRecord) -> str:
     return f"{record.truth.description} (never enrolled)" if record.truth.description else "never enrolled"
 
 
-def _as_drawn(record: IdentificationRecord, azimuth_deg: float) -> float:
-    """An azimuth on the scale of the report: the enrolled one where the object was found, else the table's."""
+def _report_azimuth_deg(record: IdentificationRecord, azimuth_deg: float) -> float:
+    """Convert to the azimuth scale of the report: that of the enrollment if the object was found, else the table's."""
     return wrap360(azimuth_deg - (record.yaw_deg or 0.0))
 
 
@@ -231,15 +231,15 @@ def _leading(one: Candidate) -> tuple[str, str, str]:
 
 
 def _decisions(record: IdentificationRecord) -> list[Markup]:
-    """A chart for each turn before which all were weighed."""
-    seen_deg = {view.index: _as_drawn(record, view.azimuth_deg) for view in record.views}
+    """Return a chart for each decision that compared all possible rotations."""
+    seen_deg = {view.index: _report_azimuth_deg(record, view.azimuth_deg) for view in record.views}
     return [
         Markup(
             decision_chart(
                 seen_deg[event.index],
                 event.weighed,
                 event.rotation_deg,
-                rivals=event.rivals,
+                candidates=event.rivals,
                 seen_deg=[azimuth_deg for index, azimuth_deg in seen_deg.items() if index <= event.index],
                 number=event.index + 1,
             )
@@ -260,8 +260,8 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
             _Frame(
                 number=view.index + 1,
                 picture=_data_uri(view.picture_bgr),
-                where=f"{azimuth_words(_as_drawn(record, view.azimuth_deg))}°",
-                refused=listed(view.refused),
+                where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
+                rejected=listed(view.rejected),
                 leading=[_leading(c) for c in thought.candidates[:3]] if thought else [],
                 decided=sentence(thought.verdict) if thought and thought.verdict else "",
                 margin=signed(thought.margin, 3) if thought else "",
@@ -284,14 +284,14 @@ def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> _Object:
             )
         )
         stamp = _data_uri(thumbnail(pictures[0], _STAMP))
-        ring = Markup(azimuth_ring([RingView(v.azimuth_deg, v.evidence.sharpness, len(v.refused)) for v in views]))
+        ring = Markup(azimuth_ring([RingView(v.azimuth_deg, v.evidence.sharpness, len(v.rejected)) for v in views]))
     retakes = record.retakes
     line = counted(len(views), "view")
     if record.result is None:
         line += f" of {record.planned}: not finished"
     if retakes:
         line += f", {counted(retakes, 'retake')}"
-    return _Object(number, stamp, record.name, line, retakes, sheet, ring, enrollment_facts(record), unfold)
+    return _Object(number, stamp, record.name, line, retakes, sheet, ring, enrollment_items(record), unfold)
 
 
 def _data_uri(image_bgr: Image) -> str:
@@ -302,7 +302,7 @@ def _data_uri(image_bgr: Image) -> str:
 
 def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return rows of text in groups: single values first, then each mapping under its name."""
-    plain = [(key, _shown(value)) for key, value in values.items() if not isinstance(value, Mapping)]
+    plain = [(key, _text(value)) for key, value in values.items() if not isinstance(value, Mapping)]
     groups = [("", plain)] if plain else []
     for key, value in values.items():
         if isinstance(value, Mapping):
@@ -310,7 +310,7 @@ def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]
     return groups
 
 
-def _shown(value: Any) -> str:
+def _text(value: Any) -> str:
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -318,5 +318,5 @@ def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list | tuple):
-        return ", ".join(_shown(item) for item in value)
+        return ", ".join(_text(item) for item in value)
     return str(value)

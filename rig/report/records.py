@@ -1,4 +1,7 @@
-"""What a report needs of a plan's event stream, collected while the plan runs: thumbnails instead of frames."""
+"""Records of enrollments and searches for a report, collected from the events of a running plan.
+
+A record has thumbnails instead of images, so that a long run needs little memory.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -6,7 +9,7 @@ from typing import Any, Final
 
 from hbr.core.angles import wrap180
 from rig.catalog import ViewRecord
-from rig.charts.polar_path import Turn
+from rig.charts.polar_path import PathStep
 from rig.events.events import (
     Accepted,
     Decided,
@@ -31,59 +34,59 @@ FRAME: Final = (240, 240)
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """An accepted view: its picture, its evidence, the move that led to it and why frames before it were refused."""
+class ReportView:
+    """An accepted view: its thumbnail, its evidence, the move before it, and why frames before it were rejected."""
 
     index: int
     azimuth_deg: float
     picture_bgr: Image
     evidence: ViewEvidence
     move: Moved | None
-    refused: tuple[str, ...]
+    rejected: tuple[str, ...]
 
 
 @dataclass(slots=True)
-class _Looks:
-    """Turns the events of a view into a `Look`."""
+class _ViewCollector:
+    """Collects the events of a view into a `ReportView`."""
 
     size: tuple[int, int]
     region: Region | None
-    views: list[Look] = field(default_factory=list)
+    views: list[ReportView] = field(default_factory=list)
     _move: Moved | None = None
-    _refused: list[str] = field(default_factory=list)
+    _rejected: list[str] = field(default_factory=list)
 
     def add(self, event: Event) -> None:
         match event:
             case Moved():
                 self._move = event
             case Rejected():
-                self._refused.append(", ".join(event.reasons))
+                self._rejected.append(", ".join(event.reasons))
             case Accepted():
-                refused, self._refused = tuple(self._refused), []
-                look = self.look(event.index, event.azimuth_deg, event.image_bgr, event.evidence, event.segmentation)
-                self.views.append(replace(look, move=self._move, refused=refused))
+                rejected, self._rejected = tuple(self._rejected), []
+                view = self.view(event.index, event.azimuth_deg, event.image_bgr, event.evidence, event.segmentation)
+                self.views.append(replace(view, move=self._move, rejected=rejected))
             case _:
                 pass
 
-    def look(
+    def view(
         self,
         index: int,
         azimuth_deg: float,
         image_bgr: Image,
         evidence: ViewEvidence,
         segmentation: Mapping[str, Any] | None,
-    ) -> Look:
+    ) -> ReportView:
         box = None if segmentation is None else segmentation.get("box_px")
-        return Look(index, azimuth_deg, thumbnail(image_bgr, self.size, self.region, box), evidence, None, ())
+        return ReportView(index, azimuth_deg, thumbnail(image_bgr, self.size, self.region, box), evidence, None, ())
 
 
 class EnrollmentRecord:
-    """One enrollment, event by event.
+    """One enrollment, collected event by event.
 
     Parameters
     ----------
     region
-        The part of the frames to show: x, y, width, height; as `view.roi` of the configuration. None shows all.
+        The part of the images to show: x, y, width, height in pixels (`view.roi` of the configuration); None shows all.
     """
 
     def __init__(self, *, region: Region | None = None) -> None:
@@ -92,21 +95,21 @@ class EnrollmentRecord:
         self.conditions: Mapping[str, Any] = {}
         self.result: Enrolled | None = None
         self.similar: SimilarObjects | None = None
-        self._looks = _Looks(TILE, region)
+        self._collector = _ViewCollector(TILE, region)
 
     @property
-    def views(self) -> list[Look]:
-        """The accepted views, in the order they were taken."""
-        return self._looks.views
+    def views(self) -> list[ReportView]:
+        """The accepted views in the order of capture."""
+        return self._collector.views
 
     @property
     def retakes(self) -> int:
-        """How many frames were refused before a view was accepted, in all views."""
-        return sum(len(view.refused) for view in self.views)
+        """Number of rejected frames, of all views."""
+        return sum(len(view.rejected) for view in self.views)
 
     def add(self, event: Event) -> None:
-        """Take the next event of the stream."""
-        self._looks.add(event)
+        """Add the next event of the plan."""
+        self._collector.add(event)
         if isinstance(event, Started):
             self.name, self.planned, self.conditions = event.name or "", event.views, event.conditions
         elif isinstance(event, Enrolled):
@@ -120,15 +123,15 @@ class EnrollmentRecord:
         for record, image_bgr in stored:
             if record.index not in seen:
                 evidence = built(ViewEvidence, record.evidence)
-                look = self._looks.look(record.index, record.azimuth_deg, image_bgr, evidence, record.segmentation)
-                self._looks.views.append(look)
-        self._looks.views.sort(key=lambda view: view.index)
+                view = self._collector.view(record.index, record.azimuth_deg, image_bgr, evidence, record.segmentation)
+                self._collector.views.append(view)
+        self._collector.views.sort(key=lambda view: view.index)
         self.planned = max(self.planned, len(self.views))
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What really stands on the table.
+    """The object that is really on the table.
 
     ``name`` is None for an object that was never enrolled. ``yaw_deg`` is how far it stands turned counter-clockwise
     against its enrollment, None where nobody knows. ``symmetry_deg`` is the smallest turn after which it looks the
@@ -143,14 +146,14 @@ class Truth:
 
 
 class IdentificationRecord:
-    """One retrieval, event by event.
+    """One search, collected event by event.
 
     Parameters
     ----------
     truth
-        What really stands on the table; None where nobody knows.
+        The object on the table; None if it is not known.
     region
-        The part of the frames to show: x, y, width, height; as `view.roi` of the configuration. None shows all.
+        The part of the images to show: x, y, width, height in pixels (`view.roi` of the configuration); None shows all.
     """
 
     def __init__(self, *, truth: Truth | None = None, region: Region | None = None) -> None:
@@ -160,16 +163,16 @@ class IdentificationRecord:
         self.ranked: list[Ranked] = []
         self.decided: list[Decided] = []
         self.answer: Identified | None = None
-        self._looks = _Looks(FRAME, region)
+        self._collector = _ViewCollector(FRAME, region)
 
     @property
-    def views(self) -> list[Look]:
-        """The accepted views, in the order they were taken."""
-        return self._looks.views
+    def views(self) -> list[ReportView]:
+        """The accepted views in the order of capture."""
+        return self._collector.views
 
     def add(self, event: Event) -> None:
-        """Take the next event of the stream."""
-        self._looks.add(event)
+        """Add the next event of the plan."""
+        self._collector.add(event)
         match event:
             case Started():
                 self.conditions, self.notes = event.conditions, event.notes
@@ -184,7 +187,7 @@ class IdentificationRecord:
 
     @property
     def correct(self) -> bool | None:
-        """Whether the answer is the truth; None while either is missing."""
+        """Whether the answer is correct; None if the answer or the truth is missing."""
         if self.truth is None or self.answer is None:
             return None
         return self.answer.name == self.truth.name
@@ -203,22 +206,22 @@ class IdentificationRecord:
 
     @property
     def yaw_deg(self) -> float | None:
-        """How far the object was found to stand turned against its enrollment; None without an object."""
+        """Rotation of the object relative to its enrollment; None if no object was found."""
         return self.answer.yaw_deg if self.answer is not None and self.answer.name is not None else None
 
     @property
-    def turns(self) -> list[Turn]:
+    def steps(self) -> list[PathStep]:
         """The camera's rotations between the views, as the table made them.
 
         The cable's limits may send the table the long way round: the azimuths tell where a rotation ended, the encoder
         how many times around it went.
         """
-        turns = []
+        steps = []
         for k in range(1, len(self.views)):
             before, after = self.views[k - 1], self.views[k]
             rotation_deg = wrap180(after.azimuth_deg - before.azimuth_deg)
             if after.move is not None:
                 rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
             decided = self.decided[k - 1]  # every view but the last is followed by a decision
-            turns.append(Turn(rotation_deg, decided.s_left, decided.s_right, decided.rivals[:2]))
-        return turns
+            steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.rivals[:2]))
+        return steps

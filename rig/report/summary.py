@@ -1,4 +1,4 @@
-"""The numbers at the top of a report, counted from the records and from nothing else."""
+"""The numbers at the top of a report, counted from its records."""
 
 from collections.abc import Sequence
 from statistics import fmean, median
@@ -10,7 +10,7 @@ from rig.report.records import EnrollmentRecord, IdentificationRecord
 
 
 class SummaryItem(NamedTuple):
-    """A number with its name and a remark."""
+    """A number with its label and a note."""
 
     label: str
     value: str
@@ -20,83 +20,83 @@ class SummaryItem(NamedTuple):
 def totals(
     enrollments: Sequence[EnrollmentRecord], identifications: Sequence[IdentificationRecord]
 ) -> list[SummaryItem]:
-    """Return the headline numbers of a run; a single object's own numbers stand with it, not here."""
-    facts = []
+    """Return the headline numbers of a run; the numbers of a single enrollment are beside its views instead."""
+    items = []
     if len(enrollments) + len(identifications) > 1 and enrollments:
         views = sum(len(record.views) for record in enrollments)
         retakes = sum(record.retakes for record in enrollments)
         finished = sum(record.result is not None for record in enrollments)
-        facts.append(
+        items.append(
             SummaryItem("objects enrolled", f"{finished}", f"{counted(views, 'view')}, {counted(retakes, 'retake')}")
         )
     answered = [record for record in identifications if record.answer is not None]
     if len(identifications) == 1 and not identifications[0].truth:
-        return facts + (_answer_facts(answered[0]) if answered else [])
+        return items + (_answer_items(answered[0]) if answered else [])
     known = [record for record in answered if record.truth and record.truth.name is not None]
     unknown = [record for record in answered if record.truth and record.truth.name is None]
     if known:
         right = sum(record.correct is True for record in known)
-        facts.append(SummaryItem("found", f"{right}/{len(known)}", "enrolled objects named rightly"))
+        items.append(SummaryItem("found", f"{right}/{len(known)}", "enrolled objects identified correctly"))
     if unknown:
         right = sum(record.correct is True for record in unknown)
-        facts.append(SummaryItem("unknown recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
+        items.append(SummaryItem("unknown objects recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
     if answered:
         views_taken = [record.answer.views for record in answered if record.answer]
         travelled = [record.answer.travelled_deg for record in answered if record.answer]
-        facts.append(
+        items.append(
             SummaryItem(
                 "views to an answer", f"{fmean(views_taken):.1f}", f"mean; {min(views_taken)} to {max(views_taken)}"
             )
         )
-        facts.append(
+        items.append(
             SummaryItem("travelled", f"{fmean(travelled):.0f}°", f"mean a retrieval; {sum(travelled):.0f}° in all")
         )
     errors = [record.pose_error_deg for record in answered if record.pose_error_deg is not None]
     if errors:
-        facts.append(
+        items.append(
             SummaryItem("pose error", f"{median(errors):.1f}°", f"median of {len(errors)}; largest {max(errors):.1f}°")
         )
-    return facts
+    return items
 
 
-def enrollment_facts(record: EnrollmentRecord) -> list[SummaryItem]:
-    """Return the evidence of one enrollment."""
+def enrollment_items(record: EnrollmentRecord) -> list[SummaryItem]:
+    """Return the numbers of one enrollment."""
     views = record.views
-    facts = [SummaryItem("views", f"{len(views)}", f"of {record.planned} planned")]
-    reasons = listed(reason for view in views for reason in view.refused)
-    facts.append(SummaryItem("retakes", f"{record.retakes}", reasons))
+    items = [SummaryItem("views", f"{len(views)}", f"of {record.planned} planned")]
+    reasons = listed(reason for view in views for reason in view.rejected)
+    items.append(SummaryItem("retakes", f"{record.retakes}", reasons))
     if views:
         sharpness = [view.evidence.sharpness for view in views]
         levels = [view.evidence.mean_level for view in views]
-        facts.append(
+        items.append(
             SummaryItem(
                 "sharpness", f"{median(sharpness):.0f}", f"median; {min(sharpness):.0f} to {max(sharpness):.0f}"
             )
         )
-        facts.append(
+        items.append(
             SummaryItem("mean level", f"{fmean(levels):.0f}", f"of 255; {min(levels):.0f} to {max(levels):.0f}")
         )
     moves = [view.move for view in views if view.move is not None]
     if moves:
         off = max(abs(move.encoder_deg - move.commanded_deg) for move in moves)
-        facts.append(SummaryItem("off the angle asked", f"{off:.2f}°", "largest, by the encoder"))
+        items.append(SummaryItem("position error", f"{off:.2f}°", "largest, by the encoder"))
     gaps = [
         abs(move.rotation_encoder_deg - move.rotation_imu_deg) for move in moves if move.rotation_imu_deg is not None
     ]
     if gaps:
         agree = sum(move.agrees for move in moves)
-        facts.append(
+        items.append(
             SummaryItem(
                 "encoder against gyro", f"{max(gaps):.2f}°", f"largest difference; {agree} of {len(moves)} moves agree"
             )
         )
     if record.similar:
-        facts.append(_symmetry(record.similar))
+        items.append(_symmetry(record.similar))
         similar = [similar_object_words(one).removeprefix("looks like ") for one in record.similar.lookalikes]
-        facts.append(SummaryItem("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
+        items.append(SummaryItem("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
     if record.result:
-        facts.append(SummaryItem("bench time", f"{record.result.seconds:.0f} s"))
-    return facts
+        items.append(SummaryItem("bench time", f"{record.result.seconds:.0f} s"))
+    return items
 
 
 def _symmetry(similar: SimilarObjects) -> SummaryItem:
@@ -110,7 +110,7 @@ def _symmetry(similar: SimilarObjects) -> SummaryItem:
     )
 
 
-def _answer_facts(record: IdentificationRecord) -> list[SummaryItem]:
+def _answer_items(record: IdentificationRecord) -> list[SummaryItem]:
     answer = record.answer
     if answer is None:
         return []

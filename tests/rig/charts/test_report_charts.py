@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rig.charts.azimuth_ring import RingView, azimuth_ring
 from rig.charts.compass import CENTRE, polar
 from rig.charts.decision_chart import decision_chart
-from rig.charts.polar_path import Turn, polar_path
+from rig.charts.polar_path import PathStep, polar_path
 from rig.charts.score_chart import score_chart
 from rig.charts.svg import number
 from rig.events.events import Weighed
@@ -49,18 +49,16 @@ def words(elements: list[ET.Element]) -> list[str]:
 
 
 class TestPolarPath:
-    def test_left_goes_to_the_left_of_the_page(self) -> None:
+    def test_left_is_on_the_left_of_the_page(self) -> None:
         assert polar(100, 0)[0] == pytest.approx(CENTRE[0])
         assert polar(100, 0)[1] < CENTRE[1]
         assert polar(100, 90)[0] < CENTRE[0]
 
     @settings(max_examples=40)
     @given(start=ANGLE, rotations=st.lists(TURN, max_size=8))
-    def test_views_stand_at_their_azimuths_and_arcs_lead_from_one_to_the_next(
-        self, start: float, rotations: list[float]
-    ) -> None:
-        svg = polar_path(start, [Turn(r) for r in rotations], scale="azimuth")
-        stops, arcs = having(svg, "stop"), having(svg, "turn")
+    def test_views_are_at_their_azimuths_and_arcs_connect_them(self, start: float, rotations: list[float]) -> None:
+        svg = polar_path(start, [PathStep(r) for r in rotations], scale="azimuth")
+        stops, arcs = having(svg, "stop"), having(svg, "step")
         assert len(stops) == len(rotations) + 1
         azimuth = start
         for k, stop in enumerate(stops):
@@ -73,20 +71,20 @@ class TestPolarPath:
 
     @settings(max_examples=40)
     @given(start=ANGLE, rotation=TURN)
-    def test_an_arc_sweeps_the_whole_rotation_on_its_side(self, start: float, rotation: float) -> None:
-        way = [azimuth_of(*p) for p in points(having(polar_path(start, [Turn(rotation)], scale=""), "turn")[0])]
+    def test_arc_covers_the_whole_rotation_in_its_direction(self, start: float, rotation: float) -> None:
+        way = [azimuth_of(*p) for p in points(having(polar_path(start, [PathStep(rotation)], scale=""), "step")[0])]
         swept = sum((b - a + 180) % 360 - 180 for a, b in pairwise(way))
         assert swept == pytest.approx(rotation, abs=0.1)
 
-    def test_the_path_winds_outwards(self) -> None:
-        svg = polar_path(0, [Turn(r) for r in (90, -100, 80, 10, 95, -90, 90)], scale="")
-        radii = [hypot(x - CENTRE[0], y - CENTRE[1]) for arc in having(svg, "turn") for x, y in points(arc)]
+    def test_path_is_a_spiral_outwards(self) -> None:
+        svg = polar_path(0, [PathStep(r) for r in (90, -100, 80, 10, 95, -90, 90)], scale="")
+        radii = [hypot(x - CENTRE[0], y - CENTRE[1]) for arc in having(svg, "step") for x, y in points(arc)]
         assert radii == pytest.approx(sorted(radii), abs=0.02)
 
     @settings(max_examples=40)
     @given(start=ANGLE, rotation=st.floats(30, 300) | st.floats(-300, -30))
-    def test_the_arrow_points_at_the_end_of_the_arc(self, start: float, rotation: float) -> None:
-        svg = polar_path(start, [Turn(rotation)], scale="")
+    def test_arrow_points_at_the_end_of_the_arc(self, start: float, rotation: float) -> None:
+        svg = polar_path(start, [PathStep(rotation)], scale="")
         tip, *tail = points(having(svg, "arrow")[0])
         end = centre(having(svg, "stop", "last")[0])
 
@@ -99,10 +97,12 @@ class TestPolarPath:
         behind = (azimuth_of(*end) - tail_azimuth + 180) % 360 - 180
         assert behind * rotation > 0
 
-    def test_turns_are_labelled_with_degrees_side_and_sums(self) -> None:
-        svg = polar_path(10, [Turn(90), Turn(47.3, 0.41, 0.66), Turn(-120.5, 0.9971, 0.9963)], scale="as enrolled")
-        assert words(having(svg, "turn-label")) == ["90.0°", "47.3°", "120.5°"]
-        assert words(having(svg, "turn-name")) == ["left 90.0°", "left 47.3°", "right 120.5°"]
+    def test_steps_show_degrees_side_and_similarity_sums(self) -> None:
+        svg = polar_path(
+            10, [PathStep(90), PathStep(47.3, 0.41, 0.66), PathStep(-120.5, 0.9971, 0.9963)], scale="as enrolled"
+        )
+        assert words(having(svg, "step-label")) == ["90.0°", "47.3°", "120.5°"]
+        assert words(having(svg, "step-name")) == ["left 90.0°", "left 47.3°", "right 120.5°"]
         # equal at two decimals: as many more as tell them apart
         assert {"as enrolled", "fixed", "S left 0.41, right 0.66", "S left 0.997, right 0.996"} <= set(
             words(having(svg, "small"))
@@ -110,27 +110,27 @@ class TestPolarPath:
         assert words(having(svg, "stop-number")) == ["1", "2", "3", "4"]
 
     def test_labels_do_not_cover_views_or_each_other(self) -> None:
-        svg = polar_path(9.6, [Turn(r) for r in (90.1, -175, -80.1, 10.1, 95, 90.1, 90)], scale="")
-        labels = [(float(e.get("x", "")), float(e.get("y", "")) - 4) for e in having(svg, "turn-label")]
+        svg = polar_path(9.6, [PathStep(r) for r in (90.1, -175, -80.1, 10.1, 95, 90.1, 90)], scale="")
+        labels = [(float(e.get("x", "")), float(e.get("y", "")) - 4) for e in having(svg, "step-label")]
         others = [centre(e) for e in having(svg, "stop")]
         for k, a in enumerate(labels):
             for b in others + labels[:k]:
                 assert abs(a[0] - b[0]) >= 46 or abs(a[1] - b[1]) >= 17
 
-    def test_a_long_search_has_room_for_every_turn(self) -> None:
-        svg = polar_path(0, [Turn(7.0, 1, 2)] * 40, scale="")
+    def test_long_search_has_room_for_every_step(self) -> None:
+        svg = polar_path(0, [PathStep(7.0, 1, 2)] * 40, scale="")
         height = float(ET.fromstring(svg).get("viewBox", "").split()[3])
         assert all(float(e.get("y", "")) < height for e in ET.fromstring(svg).iter("text"))
 
-    def test_screen_readers_hear_the_azimuths(self) -> None:
-        svg = polar_path(350, [Turn(20.0)], scale="")
+    def test_alternative_text_lists_the_azimuths(self) -> None:
+        svg = polar_path(350, [PathStep(20.0)], scale="")
         assert "350.0°, 10.0°" in ET.fromstring(svg).get("aria-label", "")
 
 
 class TestScoreChart:
     ROUNDS = ({"a": 0.9, "b": 0.8}, {"b": 0.85, "c": 0.82, "a": 0.7}, {"a": 0.88, "b": 0.84, "c": 0.81})
 
-    def test_the_winners_line_carries_its_scores(self) -> None:
+    def test_line_of_the_answer_shows_its_scores(self) -> None:
         svg = score_chart(self.ROUNDS, winner="a", min_score=0.75)
         dots = having(svg, "winner", "dot")
         assert words(dots) == ["a after view 1: 0.900", "a after view 2: 0.700", "a after view 3: 0.880"]
@@ -140,27 +140,27 @@ class TestScoreChart:
         assert (y1 - y0) / (y1 - y2) == pytest.approx((0.9 - 0.7) / (0.88 - 0.7), rel=1e-3)
         assert y0 < y2 < y1
 
-    def test_the_threshold_lies_where_its_score_would(self) -> None:
+    def test_threshold_is_at_its_score(self) -> None:
         svg = score_chart(self.ROUNDS, winner="a", min_score=0.75)
         (threshold,) = having(svg, "threshold")
         y = float(threshold.get("y1", ""))
         (_, y_high), (_, y_low), _ = map(centre, having(svg, "winner", "dot"))
         assert y == pytest.approx(y_low + (y_high - y_low) * (0.75 - 0.7) / (0.9 - 0.7), abs=0.05)
-        assert words(having(svg, "threshold-label")) == ["unknown below 0.75"]
+        assert words(having(svg, "threshold-label")) == ["threshold 0.75"]
 
-    def test_a_threshold_far_off_is_said_to_be(self) -> None:
+    def test_distant_threshold_is_marked_as_off_the_scale(self) -> None:
         svg = score_chart([{"a": 0.99, "b": 0.985}, {"a": 0.988, "b": 0.986}], min_score=0.5)
-        assert words(having(svg, "threshold-label")) == ["unknown below 0.5, further down ↓"]
+        assert words(having(svg, "threshold-label")) == ["threshold 0.5, below the scale ↓"]
         svg = score_chart([{"a": 0.49, "b": 0.485}], min_score=0.9)
-        assert words(having(svg, "threshold-label")) == ["unknown below 0.9, further up ↑"]
+        assert words(having(svg, "threshold-label")) == ["threshold 0.9, above the scale ↑"]
 
-    def test_a_candidate_that_was_not_leading_has_a_gap(self) -> None:
+    def test_line_has_a_gap_while_a_candidate_was_not_leading(self) -> None:
         rounds = [{"a": 0.9, "b": 0.8}, {"a": 0.9}, {"a": 0.9, "b": 0.8}]
         svg = score_chart(rounds)
         assert words(having(svg, "c1", "dot")) == ["b after view 1: 0.800", "b after view 3: 0.800"]
         assert [e for e in having(svg, "c1") if e.tag.endswith("line")] == []
 
-    def test_names_stand_best_first_apart_and_the_truth_is_marked(self) -> None:
+    def test_names_are_sorted_spaced_and_the_truth_is_marked(self) -> None:
         rounds = [{f"n{i}": 0.9 - 0.0001 * i for i in range(7)}]
         svg = score_chart(rounds, winner="n0", truth="n1")
         names = having(svg, "name")
@@ -177,7 +177,7 @@ class TestScoreChart:
         ),
         min_score=st.none() | st.floats(0, 1),
     )
-    def test_everything_stays_in_the_picture(self, rounds: list[dict[str, float]], min_score: float | None) -> None:
+    def test_all_elements_are_inside_the_chart(self, rounds: list[dict[str, float]], min_score: float | None) -> None:
         root = ET.fromstring(score_chart(rounds, min_score=min_score))
         _, _, width, height = map(float, root.get("viewBox", "").split())
         for e in root.iter():
@@ -191,7 +191,7 @@ class TestScoreChart:
             ):
                 assert 0 <= float(e.get(key, 0)) <= limit
 
-    def test_names_are_escaped_and_long_ones_shortened(self) -> None:
+    def test_names_are_escaped_and_long_names_shortened(self) -> None:
         long = "x" * 60
         svg = score_chart([{HOSTILE: 0.9, long: 0.8}], winner=HOSTILE, truth=HOSTILE)
         assert "<script" not in svg
@@ -200,14 +200,14 @@ class TestScoreChart:
         assert len(drawn[1]) < 30
         assert long in svg  # whole in the tooltip
 
-    def test_nothing_to_draw_is_refused(self) -> None:
+    def test_score_chart_rejects_empty_rounds(self) -> None:
         for rounds in ([], [{}], [{"a": 1.0}, {}]):
             with pytest.raises(ValueError, match="at least one"):
                 score_chart(rounds)
 
 
 class TestAzimuthRing:
-    def test_bars_stand_at_their_azimuths_as_long_as_the_views_are_sharp(self) -> None:
+    def test_bars_are_at_their_azimuths_with_lengths_by_sharpness(self) -> None:
         views = [RingView(0, 100), RingView(90, 50), RingView(217.3, 25, 2)]
         svg = azimuth_ring(views)
         lengths = []
@@ -218,28 +218,28 @@ class TestAzimuthRing:
         assert lengths[1] / lengths[0] == pytest.approx(0.5, abs=1e-3)
         assert lengths[2] / lengths[0] == pytest.approx(0.25, abs=1e-3)
 
-    def test_retakes_are_marked_where_they_were(self) -> None:
+    def test_retakes_are_marked_at_their_azimuth(self) -> None:
         svg = azimuth_ring([RingView(0, 100), RingView(120, 50, 1), RingView(240, 50, 3)])
         marks = having(svg, "retake")
         assert [round(azimuth_of(*centre(m))) for m in marks] == [120, 240]
         assert words(marks) == ["120.0°: sharpness 50.0, once retaken", "240.0°: sharpness 50.0, 3 times retaken"]
 
-    def test_the_numbers_are_said(self) -> None:
+    def test_ring_shows_its_numbers(self) -> None:
         svg = azimuth_ring([RingView(0, 100), RingView(120, 50), RingView(240, 70)])
         assert words(having(svg, "ring-text")) == ["sharpness", "median 70", "50 to 100"]
         assert "3 views" in ET.fromstring(svg).get("aria-label", "")
 
-    def test_all_black_views_have_no_bars_but_a_ring(self) -> None:
+    def test_black_views_have_bars_of_length_zero(self) -> None:
         svg = azimuth_ring([RingView(0, 0.0), RingView(180, 0.0)])
         assert all(bar.get("x1") == bar.get("x2") for bar in having(svg, "bar"))
 
-    def test_no_views_are_refused(self) -> None:
+    def test_ring_rejects_no_views(self) -> None:
         with pytest.raises(ValueError, match="at least one view"):
             azimuth_ring([])
 
 
 @given(st.floats(-1e6, 1e6))
-def test_numbers_are_short_and_close(value: float) -> None:
+def test_numbers_are_short_and_accurate(value: float) -> None:
     assert float(number(value)) == pytest.approx(value, abs=0.00501)
     assert number(value) != "-0"
     assert "e" not in number(value)
@@ -251,10 +251,10 @@ TURNS = tuple(float(turn) for turn in range(-175, 185, 5) if turn)
 class TestDecisionChart:
     @settings(max_examples=25)
     @given(here=ANGLE, chosen=st.sampled_from(TURNS), seen=st.lists(ANGLE, min_size=1, max_size=4))
-    def test_the_chosen_turn_lies_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
+    def test_chosen_rotation_is_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
         away = tuple(abs(turn - chosen) for turn in TURNS)
         weighed = Weighed(TURNS, tuple(-9 + a for a in away), tuple(abs(t) / 100 for t in TURNS), away)
-        svg = decision_chart(here, weighed, chosen, rivals=("a", HOSTILE), seen_deg=seen, number=len(seen))
+        svg = decision_chart(here, weighed, chosen, candidates=("a", HOSTILE), seen_deg=seen, number=len(seen))
         goal, *others = having(svg, "stop", "last")
         assert not others
         x, y = centre(goal)
@@ -264,14 +264,14 @@ class TestDecisionChart:
         assert len(radii) == len(having(svg, "cost")) == len(TURNS)
         stops = [centre(e) for e in having(svg, "stop") if "last" not in e.get("class", "")]
         assert all(apart(azimuth_of(*at), angle) < 1 for at, angle in zip(stops, seen, strict=True))
-        text = " ".join(words(having(svg, "turn-name")))
+        text = " ".join(words(having(svg, "step-name")))
         assert HOSTILE in text
         assert f"{abs(chosen):.0f}°" in text
 
-    def test_one_object_alone_and_even_values_are_drawn(self) -> None:
+    def test_single_object_and_equal_values_are_drawn(self) -> None:
         for turns in ((5.0,), (-5.0, 5.0), TURNS):
             even = (0.0,) * len(turns)
             svg = decision_chart(0.0, Weighed(turns, even, even), turns[0])
-            assert "no second object is likely" in svg
+            assert "only one object is likely" in svg
             assert not having(svg, "alike")
             assert "nan" not in svg

@@ -23,7 +23,7 @@ def caption(sheet: np.ndarray, k: int, columns: int, size: tuple[int, int]) -> n
     return sheet[y : y + CAPTION_PX, x : x + size[0]]
 
 
-def test_a_full_turn_fills_twelve_by_six_tiles() -> None:
+def test_seventy_two_views_fill_twelve_by_six_tiles() -> None:
     sheet = contact_sheet([flat(k) for k in range(72)], [5.0 * k for k in range(72)])
     assert sheet.shape == (6 * (96 + CAPTION_PX + GAP_PX) + GAP_PX, 12 * (96 + GAP_PX) + GAP_PX, 3)
     assert sheet.dtype == np.uint8
@@ -40,7 +40,7 @@ def test_tile_k_is_image_k(n: int, columns: int) -> None:
         assert (tile(sheet, k, columns, (40, 20))[:, :10] != 100 + k).all()
 
 
-def test_the_caption_depends_on_the_azimuth_and_is_legible() -> None:
+def test_caption_shows_the_azimuth_legibly() -> None:
     sheet = contact_sheet([flat(0)] * 4, [5.0, 355.0, 5.0, 365.0], columns=4)
     first, second, third, fourth = (caption(sheet, k, 4, (96, 96)) for k in range(4))
     assert np.array_equal(first, third)
@@ -50,7 +50,7 @@ def test_the_caption_depends_on_the_azimuth_and_is_legible() -> None:
 
 
 @pytest.mark.parametrize("azimuth_deg", [359.97, -0.02, 0.04])
-def test_no_azimuth_is_written_as_360_or_minus_zero(azimuth_deg: float) -> None:
+def test_azimuth_is_never_written_as_360_or_minus_zero(azimuth_deg: float) -> None:
     sheet = contact_sheet([flat(0)] * 2, [azimuth_deg, 0.0], columns=2)
     assert np.array_equal(caption(sheet, 0, 2, (96, 96)), caption(sheet, 1, 2, (96, 96)))
 
@@ -80,17 +80,17 @@ def test_thumbnails_are_copies() -> None:
 @pytest.mark.parametrize(
     "image", [np.zeros((3, 3), np.uint8), np.zeros((3, 3, 4), np.uint8), np.zeros((3, 3, 3)), np.zeros((0, 3, 3), "u1")]
 )
-def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
+def test_thumbnail_rejects_invalid_images(image: np.ndarray) -> None:
     with pytest.raises(ValueError, match="give"):
         thumbnail(image, (10, 10))
 
 
-def test_a_region_outside_the_image_is_refused() -> None:
-    with pytest.raises(ValueError, match="within the image"):
+def test_thumbnail_rejects_a_region_outside_the_image() -> None:
+    with pytest.raises(ValueError, match="is outside the image"):
         thumbnail(flat(1), (10, 10), (50, 50, 5, 5))
 
 
-def test_sheets_need_an_azimuth_an_image() -> None:
+def test_contact_sheet_needs_one_azimuth_for_each_image() -> None:
     with pytest.raises(ValueError, match="one azimuth an image"):
         contact_sheet([flat(1)], [1.0, 2.0])
     with pytest.raises(ValueError, match="one azimuth an image"):
@@ -99,7 +99,7 @@ def test_sheets_need_an_azimuth_an_image() -> None:
         contact_sheet([flat(1)], [1.0], columns=0)
 
 
-def test_a_box_is_outlined_where_the_object_is():
+def test_box_is_outlined_at_the_object():
     plain = thumbnail(flat(100, (100, 200)), (50, 50), region=(40, 0, 100, 100))
     boxed = thumbnail(flat(100, (100, 200)), (50, 50), region=(40, 0, 100, 100), box=(20, 40, 60, 20))
     rows, columns = np.nonzero((boxed != plain).any(axis=2))

@@ -77,17 +77,17 @@ def demo(title: str = "Demo", names: tuple[str, ...] = NAMES) -> str:
     return render_report(title, "Two objects.", enrollments, identifications, meta=META)
 
 
-def test_the_page_says_what_the_records_say() -> None:
+def test_page_shows_the_content_of_the_records() -> None:
     page = Page(demo())
     results = page.tables[0]
     assert results[0] == [
         "#", "on the table", "found as", "correct?", "views", "travelled", "pose error", "score", "margin"
     ]  # fmt: skip
     assert results[1:] == [
-        ["1", "mug-white", "mug-white", "✓ right", "4", "258°", "2.0°", "0.930", "+0.100"],
+        ["1", "mug-white", "mug-white", "✓ correct", "4", "258°", "2.0°", "0.930", "+0.100"],
         ["2", "mug-star", "mug-white", "✗ wrong", "2", "90°", "–", "0.910", "+0.100"],
-        ["3", "globe (never enrolled)", "unknown", "✓ right", "2", "90°", "–", "0.910", "+0.100"],
-        ["4", "mug-white", "mug-white", "✓ right", "2", "90°", "–", "0.910", "+0.100"],
+        ["3", "globe (never enrolled)", "unknown", "✓ correct", "2", "90°", "–", "0.910", "+0.100"],
+        ["4", "mug-white", "mug-white", "✓ correct", "2", "90°", "–", "0.910", "+0.100"],
     ]
     assert "found 2/3" in page.text
     assert "unknown recognised 1/1" in page.text
@@ -97,7 +97,7 @@ def test_the_page_says_what_the_records_say() -> None:
     assert len([a for a in page.all("svg") if "Ring of 8 views" in a["aria-label"]]) == 2
 
 
-def test_azimuths_are_the_enrolled_ones_where_the_object_was_found() -> None:
+def test_azimuths_are_relative_to_the_enrollment_of_a_found_object() -> None:
     found = Page(render_report("", "", [], [identified("mug-white", (90.0,), yaw_deg=30.0)], meta=Meta()))
     unknown = Page(render_report("", "", [], [identified(None, (90.0,), yaw_deg=30.0)], meta=Meta()))
     assert [a["alt"] for a in found.all("img") if a["alt"]] == [
@@ -110,7 +110,7 @@ def test_azimuths_are_the_enrolled_ones_where_the_object_was_found() -> None:
     assert "azimuth on the table" in unknown.text
 
 
-def test_nothing_is_fetched_and_nothing_runs() -> None:
+def test_page_loads_nothing_and_has_no_scripts() -> None:
     page = Page(demo())
     for _, attributes in page.tags:
         for key in ("src", "href", "xlink:href", "action", "srcset", "poster", "data"):
@@ -124,7 +124,7 @@ def test_nothing_is_fetched_and_nothing_runs() -> None:
     assert "url(" not in style[0]
 
 
-def test_pictures_are_pictures_and_have_words() -> None:
+def test_images_decode_and_have_alternative_text() -> None:
     page = Page(demo())
     images = page.all("img")
     assert len(images) > 10
@@ -138,7 +138,7 @@ def test_pictures_are_pictures_and_have_words() -> None:
     assert all(attributes.get("scope") for attributes in page.all("th"))
 
 
-def test_the_contact_sheet_holds_every_view() -> None:
+def test_contact_sheet_has_every_view() -> None:
     page = Page(render_report("", "", [enrolled(views=26)], [], meta=Meta()))
     (sheet,) = [a for a in page.all("img") if a["alt"].startswith("Contact sheet")]
     pixels = cv2.imdecode(np.frombuffer(b64decode(sheet["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
@@ -146,7 +146,7 @@ def test_the_contact_sheet_holds_every_view() -> None:
     assert pixels.shape[0] == 3 * (96 + CAPTION_PX + GAP_PX) + GAP_PX
 
 
-def test_links_lead_to_their_retrievals() -> None:
+def test_links_lead_to_their_searches() -> None:
     page = Page(demo())
     ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
     assert len(ids) == len(set(ids))
@@ -158,7 +158,7 @@ def test_links_lead_to_their_retrievals() -> None:
 @pytest.mark.parametrize(
     "name", ["<script>alert(1)</script>", "\"'><img src=x onerror=alert(1)>", "{{ 7*7 }}", "&lt;b&gt;"]
 )
-def test_names_are_text(name: str) -> None:
+def test_names_are_escaped(name: str) -> None:
     page = Page(demo(title=name, names=(name, *NAMES[1:])))
     assert not page.all("script")
     assert not any("onerror" in attributes for _, attributes in page.tags)
@@ -167,12 +167,12 @@ def test_names_are_text(name: str) -> None:
     assert any(attributes["alt"].startswith(f"Contact sheet of {name}:") for attributes in page.all("img"))
 
 
-def test_conditions_are_text_too() -> None:
+def test_conditions_are_escaped() -> None:
     page = Page(render_report("", "", [], [], meta=Meta({"<i>": "<script>"}, {"host": "<script>"})))
     assert page.tables == [[["<i>", "<script>"]], [["host", "<script>"]]]
 
 
-def test_conditions_come_as_grouped_rows_and_the_wall_clock_apart() -> None:
+def test_conditions_are_grouped_and_separate_from_the_wall_clock() -> None:
     page = Page(demo())
     assert page.tables[-2] == [
         ["seed", "7"], ["noise"], ["backlash_deg", "0.25"], ["noise camera"], ["gain", "–"]
@@ -180,7 +180,7 @@ def test_conditions_come_as_grouped_rows_and_the_wall_clock_apart() -> None:
     assert page.tables[-1] == [["written", "2026-01-02 03:04"]]
 
 
-def test_equal_runs_give_equal_pages_apart_from_the_wall_clock() -> None:
+def test_equal_runs_give_equal_pages_except_for_the_wall_clock() -> None:
     assert demo() == demo()
     records = [enrolled()], [identified()]
     early = render_report("t", "s", *records, meta=Meta({"seed": 1}, {"written": "early"}))
@@ -189,7 +189,7 @@ def test_equal_runs_give_equal_pages_apart_from_the_wall_clock() -> None:
     assert early.replace("early", "late") == late
 
 
-def test_one_enrollment_makes_a_page_of_its_own() -> None:
+def test_single_enrollment_has_its_own_page() -> None:
     page = Page(render_report("Enrollment of lamp", "", [enrolled("lamp")], [], meta=Meta()))
     assert {attributes.get("id") for attributes in page.all("h2")} == {"objects"}
     assert len(page.all("details")) == 1
@@ -197,7 +197,7 @@ def test_one_enrollment_makes_a_page_of_its_own() -> None:
     assert page.tables == []
 
 
-def test_one_identification_makes_a_page_of_its_own() -> None:
+def test_single_search_has_its_own_page() -> None:
     page = Page(render_report("Identification", "", [], [identified()], meta=Meta()))
     assert {attributes.get("id") for attributes in page.all("h2")} == {"retrievals"}
     assert "outcome" not in {attributes.get("class") for attributes in page.all("span")}
@@ -205,19 +205,19 @@ def test_one_identification_makes_a_page_of_its_own() -> None:
     assert "score 0.930 per view; leads by 0.100" in page.text
 
 
-def test_many_are_folded_but_those_that_went_wrong() -> None:
+def test_many_searches_are_folded_except_wrong_ones() -> None:
     records = [identified("mug-white", (90.0,), truth=Truth("lamp" if k == 5 else "mug-white")) for k in range(7)]
     page = Page(render_report("", "", [], records, meta=Meta()))
     assert [k for k, attributes in enumerate(page.all("details")) if "open" in attributes] == [0, 5]
 
 
-def test_what_ended_early_is_still_reported() -> None:
+def test_interrupted_runs_are_reported() -> None:
     page = Page(render_report("t", "", [EnrollmentRecord()], [IdentificationRecord()], meta=Meta()))
-    assert "The search ended before an answer." in page.text
+    assert "The search ended without an answer." in page.text
     assert "No view was accepted." in page.text
 
 
-def test_a_full_demo_stays_small() -> None:
+def test_page_of_a_full_demo_is_small() -> None:
     """20 objects of 72 views and 20 retrievals of 4 views; textured frames with more noise than the camera's."""
     rng = np.random.default_rng(1)
     y, x = np.mgrid[:480, :640]
@@ -232,7 +232,7 @@ def test_a_full_demo_stays_small() -> None:
     assert 20 * len(html.encode()) < 8e6
 
 
-def test_writing_replaces_the_page_as_a_whole(tmp_path: Path) -> None:
+def test_writing_replaces_the_whole_page(tmp_path: Path) -> None:
     path = tmp_path / "new" / "report.html"
     write_report(path, "first ✓")
     write_report(path, "second ✓")
@@ -240,7 +240,7 @@ def test_writing_replaces_the_page_as_a_whole(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["report.html"]
 
 
-def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
+def test_folder_that_cannot_be_created_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match=r"cannot be written to .*report\.html") as caught:
         write_report(tmp_path / "file" / "report.html", "x")
@@ -248,7 +248,7 @@ def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
     assert caught.value.evidence["reason"]
 
 
-def test_a_failed_write_leaves_the_old_page(tmp_path: Path) -> None:
+def test_failed_write_preserves_the_old_page(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     path.mkdir()
     (path / "kept").write_text("old")
@@ -259,7 +259,7 @@ def test_a_failed_write_leaves_the_old_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pair", [True, False])
-def test_a_dense_search_is_shown_with_all_that_was_weighed(pair: bool) -> None:
+def test_dense_search_shows_its_decisions(pair: bool) -> None:
     record = IdentificationRecord()
     for event in searching_densely(pair=pair):
         record.add(event)
@@ -269,6 +269,6 @@ def test_a_dense_search_is_shown_with_all_that_was_weighed(pair: bool) -> None:
     text = " ".join(page.texts)
     assert "Rehearse them." in text
     assert "Not sure yet: a probability of 60.0%, and 95.0% ends the search." in text
-    assert "What was weighed before each turn" in text
+    assert "Each decision, seen from above" in text
     assert ("mug-white or mug-star" in text) == pair
     assert ["mug-white", "60.0%", "0.900"] in [row for table in page.tables for row in table]

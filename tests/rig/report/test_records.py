@@ -11,7 +11,7 @@ from rig.events.events import Accepted, Decided, Identified, Moved, Rejected, St
 from rig.events.wording import answer_words, decision_words, distinct, move_words, side_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
-from rig.report.summary import enrollment_facts, totals
+from rig.report.summary import enrollment_items, totals
 from tests.rig.report.report_samples import enrolled, enrolling, evidence, identified, identifying, moved
 
 
@@ -20,30 +20,30 @@ def facts(pairs: list) -> dict[str, str]:
 
 
 class TestEnrollment:
-    def test_views_come_in_order_with_their_retakes(self) -> None:
+    def test_views_are_in_order_with_their_retakes(self) -> None:
         record = enrolled("lamp", 8, retaken=(2, 5))
         assert record.name == "lamp"
         assert [view.index for view in record.views] == list(range(8))
-        assert [bool(view.refused) for view in record.views] == [k in (2, 5) for k in range(8)]
-        assert record.views[2].refused == ("blurred (sharpness 2.0 < 3)",)
+        assert [bool(view.rejected) for view in record.views] == [k in (2, 5) for k in range(8)]
+        assert record.views[2].rejected == ("blurred (sharpness 2.0 < 3)",)
         assert record.views[3].move == moved(3, 135.0, 45.0)
         assert record.retakes == 2
         assert record.result is not None
 
-    def test_frames_are_not_kept(self) -> None:
+    def test_record_does_not_store_full_images(self) -> None:
         record = enrolled(views=4, shape=(480, 640))
         for view in record.views:
             assert view.picture_bgr.shape == (TILE[1], TILE[0], 3)
             assert view.picture_bgr.base is None
 
-    def test_the_region_is_shown(self) -> None:
+    def test_thumbnail_shows_the_region(self) -> None:
         image = np.zeros((480, 640, 3), dtype=np.uint8)
         image[:, 80:560] = 200
         record = EnrollmentRecord(region=(80, 0, 480, 480))
         record.add(Accepted(0, 0.0, evidence(), image))
         assert (record.views[0].picture_bgr == 200).all()
 
-    def test_an_interrupted_enrollment_is_no_result(self) -> None:
+    def test_interrupted_enrollment_has_no_result(self) -> None:
         record = EnrollmentRecord()
         for event in list(enrolling(views=8))[:-5]:
             record.add(event)
@@ -51,37 +51,37 @@ class TestEnrollment:
         assert 0 < len(record.views) < record.planned == 8
         assert facts(totals([record, enrolled()], []))["objects enrolled"] == "1"
 
-    def test_the_facts_are_those_of_the_evidence(self) -> None:
+    def test_summary_numbers_come_from_the_evidence(self) -> None:
         record = enrolled(views=8, retaken=(1,))
-        found = {fact.label: (fact.value, fact.note) for fact in enrollment_facts(record)}
+        found = {fact.label: (fact.value, fact.note) for fact in enrollment_items(record)}
         assert found["views"] == ("8", "of 8 planned")
         assert found["retakes"] == ("1", "blurred (sharpness 2.0 < 3)")
         assert found["sharpness"] == ("104", "median; 100 to 107")
-        assert found["off the angle asked"][0] == "0.04°"
+        assert found["position error"][0] == "0.04°"
         assert found["encoder against gyro"] == ("0.10°", "largest difference; 8 of 8 moves agree")
         assert found["bench time"][0] == "12 s"
 
 
 class TestIdentification:
-    def test_turns_are_those_of_the_table(self) -> None:
+    def test_steps_are_the_measured_rotations(self) -> None:
         rotations = (90.0, 47.3, -120.5)
-        turns = identified(rotations_deg=rotations).turns
+        turns = identified(rotations_deg=rotations).steps
         assert [turn.rotation_deg for turn in turns] == pytest.approx(list(rotations))
         assert [(turn.s_left, turn.s_right) for turn in turns] == [(None, None), (0.41, 0.66), (0.66, 0.41)]
 
     @pytest.mark.parametrize("rotation_deg", [-270.0, 250.0, 359.0])
-    def test_the_long_way_round_is_told_from_the_short_one(self, rotation_deg: float) -> None:
-        assert identified(rotations_deg=(rotation_deg,)).turns[0].rotation_deg == pytest.approx(rotation_deg)
+    def test_steps_count_whole_revolutions(self, rotation_deg: float) -> None:
+        assert identified(rotations_deg=(rotation_deg,)).steps[0].rotation_deg == pytest.approx(rotation_deg)
 
-    def test_a_turn_ends_at_the_azimuth_even_where_the_encoder_is_not_believed(self) -> None:
+    def test_step_ends_at_the_azimuth_if_the_encoder_is_wrong(self) -> None:
         record = IdentificationRecord()
         for event in identifying(rotations_deg=(90.0,)):
             if isinstance(event, Moved) and event.index == 1:
                 event = replace(event, rotation_encoder_deg=-120.0, rotation_imu_deg=-90.0, agrees=False)
             record.add(event)
-        assert record.turns[0].rotation_deg == pytest.approx(90.0)
+        assert record.steps[0].rotation_deg == pytest.approx(90.0)
 
-    def test_frames_are_kept_small(self) -> None:
+    def test_thumbnails_of_a_search_are_small(self) -> None:
         assert {view.picture_bgr.shape for view in identified(shape=(480, 640)).views} == {(FRAME[1], FRAME[0], 3)}
 
     @pytest.mark.parametrize(
@@ -95,23 +95,25 @@ class TestIdentification:
             ("mug-white", None, None),
         ],
     )
-    def test_right_is_what_the_truth_says(self, answer: str | None, truth: Truth | None, correct: bool | None) -> None:
+    def test_answer_is_correct_if_it_equals_the_truth(
+        self, answer: str | None, truth: Truth | None, correct: bool | None
+    ) -> None:
         assert identified(answer, truth=truth).correct is correct
 
-    def test_without_an_answer_nothing_is_right_or_wrong(self) -> None:
+    def test_search_without_answer_is_neither_correct_nor_wrong(self) -> None:
         record = IdentificationRecord(truth=Truth("mug-white", 10.0))
         record.add(Started("identify", None, 8, {}))
         assert record.correct is None
         assert record.pose_error_deg is None
-        assert record.turns == []
+        assert record.steps == []
 
     @given(yaw=st.floats(0, 360), error=st.floats(-179, 179))
-    def test_pose_errors_go_the_short_way_round(self, yaw: float, error: float) -> None:
+    def test_pose_error_is_the_smaller_angle(self, yaw: float, error: float) -> None:
         record = identified(yaw_deg=yaw, truth=Truth("mug-white", yaw + error))
         assert record.pose_error_deg == pytest.approx(abs(error), abs=1e-6)
 
     @given(fold=st.integers(2, 12), turns=st.integers(-5, 5), error=st.floats(-0.49, 0.49))
-    def test_pose_errors_are_modulo_the_symmetry(self, fold: int, turns: int, error: float) -> None:
+    def test_pose_error_is_modulo_the_symmetry(self, fold: int, turns: int, error: float) -> None:
         period = 360 / fold
         record = identified(yaw_deg=100.0, truth=Truth("mug-white", 100 + (turns + error) * period, period))
         assert record.pose_error_deg == pytest.approx(abs(error) * period, abs=1e-6)
@@ -125,10 +127,10 @@ class TestIdentification:
             (None, Truth(None, 10.0)),
         ],
     )
-    def test_no_pose_error_where_there_is_no_pose(self, answer: str | None, truth: Truth) -> None:
+    def test_pose_error_is_undefined_without_a_pose(self, answer: str | None, truth: Truth) -> None:
         assert identified(answer, truth=truth).pose_error_deg is None
 
-    def test_totals_count_the_known_and_the_unknown_apart(self) -> None:
+    def test_totals_count_known_and_unknown_objects_separately(self) -> None:
         records = [
             identified("mug-white", (90.0,), yaw_deg=10.0, truth=Truth("mug-white", 13.0)),
             identified("mug-white", (90.0, 30.0), yaw_deg=10.0, truth=Truth("mug-white", 9.0)),
@@ -140,13 +142,13 @@ class TestIdentification:
         assert found == {
             "objects enrolled": "2",
             "found": "2/3",
-            "unknown recognised": "1/2",
+            "unknown objects recognised": "1/2",
             "views to an answer": "2.2",
             "travelled": "96°",
             "pose error": "2.0°",
         }
 
-    def test_a_single_answer_without_truth_speaks_for_itself(self) -> None:
+    def test_single_answer_without_truth_shows_its_numbers(self) -> None:
         found = facts(totals([], [identified(None)]))
         assert found["answer"] == "unknown"
         assert found["views"] == "4"
@@ -174,7 +176,7 @@ class TestWords:
         assert decision_words(drawn) == "right: a turn drawn at random; turning 170.0°."
 
     @given(a=st.floats(0, 45), b=st.floats(0, 45))
-    def test_numbers_that_differ_read_differently(self, a: float, b: float) -> None:
+    def test_different_numbers_have_different_text(self, a: float, b: float) -> None:
         left, right = distinct(a, b)
         assert (left != right) == (a != b) or abs(a - b) < 1e-5
         assert float(left) == pytest.approx(a, abs=0.00501)
@@ -186,7 +188,7 @@ class TestWords:
         assert move_words(slipped).endswith("they differ by more than 0.60°, so the gyro value counts")
         assert move_words(replace(move, rotation_imu_deg=None)).endswith("no gyro value")
 
-    def test_a_lone_candidate_is_not_compared(self) -> None:
+    def test_single_candidate_is_not_compared(self) -> None:
         alone = decided("left", 90.0, 0.0, 0.0, "mug")
         assert decision_words(alone) == "left: no second candidate is in sight to be told apart; turning 90.0°."
 
@@ -205,11 +207,11 @@ class TestWords:
         )
 
 
-def test_refused_frames_belong_to_the_view_that_follows() -> None:
+def test_rejected_frames_belong_to_the_next_view() -> None:
     record = IdentificationRecord()
     record.add(Rejected(0, 1, ("too dark", "blurred"), evidence()))
     record.add(Rejected(0, 2, ("blurred",), evidence()))
     record.add(Accepted(0, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
     record.add(Accepted(1, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
-    assert record.views[0].refused == ("too dark, blurred", "blurred")
-    assert record.views[1].refused == ()
+    assert record.views[0].rejected == ("too dark, blurred", "blurred")
+    assert record.views[1].rejected == ()
