@@ -32,22 +32,6 @@ REPOSITORY_PAGES = {
 }
 """Pages that stand in the repository outside `docs`, and where the site shows them."""
 
-EXIT_CODES = {
-    0: "The command succeeded.",
-    1: "The program itself failed. Report it as a bug.",
-    2: "The command line is wrong: an unknown option, an invalid value.",
-    3: "The configuration cannot be used.",
-    4: "A device is missing, silent or faulty.",
-    5: "A motion failed or is not allowed.",
-    6: "A view, a calibration or a replay is not good enough.",
-    7: "The catalog cannot do what was asked.",
-    8: "`rig identify` found an unknown object.",
-    9: "Another program uses the bench or the catalog.",
-    129: "The terminal was lost (SIGHUP). The torque is off.",
-    130: "Ctrl+C. The torque is off.",
-    141: "The program that read the output closed the pipe.",
-    143: "SIGTERM. The torque is off.",
-}
 NOTE = "*This page is generated from the code.*\n\n"
 
 
@@ -200,6 +184,8 @@ def errors_page() -> str:
 
 def exit_codes_page() -> str:
     """Return a page with the exit codes of `rig`."""
+    from rig.cli.ui.exit_codes import EXIT_CODES
+
     rows = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()]
     more = "\nCodes 2 to 9 are the hundreds of an [error code](errors.md).\n"
     return "\n".join([f"# Exit codes\n\n{NOTE}| code | meaning |", "|---|---|", *rows, more])

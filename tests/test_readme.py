@@ -1,45 +1,125 @@
-"""The README promises nothing that does not run."""
+"""The README shows only what the program does."""
 
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from rig.cli.main import app
+from rig.cli.ui.exit_codes import EXIT_CODES
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = (
+    "enroll mug-white --bench sim --views 24",
+    "enroll mug-star --bench sim --views 24",
+    "identify --bench sim --set bench.sim.object=mug-white --seed 3",
+)
+LEFT_OUT = re.compile(
+    r"view \d+ of|(Picture|Image) of the empty|Empty-table image|  Unwinding|  at |Note|.*views, about"
+)
 
 
-def test_the_library_example_runs_and_finds_the_object(tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def own_folders(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    for kind in ("CONFIG", "DATA", "STATE", "CACHE"):
+        patch.setenv(f"XDG_{kind}_HOME", str(folder))
+
+
+def walk_through() -> str:
+    """Run the commands of the walk-through and return what the README shows: "..." stands for lines left out."""
+    lines = []
+    for command in COMMANDS:
+        lines.append(f"$ rig {command}")
+        done = CliRunner().invoke(app, command.split(), env={"COLUMNS": "200"})
+        assert done.exit_code == 0, done.output
+        for line in done.output.splitlines():
+            if not LEFT_OUT.match(line):
+                lines.append(line)
+            elif lines[-1] != "...":
+                lines.append("...")
+        if lines[-1] == "...":
+            del lines[-1]
+    return "\n".join(lines) + "\n"
+
+
+def test_walk_through_shows_the_real_output(tmp_path, monkeypatch):
+    own_folders(tmp_path, monkeypatch)
+    assert blocks("console") == [walk_through()], "write it again: python tests/test_readme.py"
+
+
+def test_library_example_finds_the_object(tmp_path):
+    (code,) = blocks("python")
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1].startswith("teapot ")
 
 
-def test_every_command_and_option_that_is_shown_exists():
-    shown = re.findall(r"^ {4}rig ([^#\n]+)|`rig ([^`\n]+)`", README, re.MULTILINE)
-    assert len(shown) >= 8
-    for indented, quoted in shown:
-        words = (indented or quoted).split()
-        name = words[:2] if words[0] in ("catalog", "calibrate") else words[:1]
+def test_every_command_and_option_exists():
+    shown = re.findall(r"^ {4}rig ([^#\n]+)|`rig ([^`\n]+)`|^\$ rig ([^\n]+)", README, re.MULTILINE)
+    assert len(shown) >= 20
+    for found in shown:
+        words = next(filter(None, found)).split()
+        groups = ("catalog", "calibrate", "config", "servo")
+        name = words[: 2 if words[0] in groups and len(words) > 1 and not words[1].startswith("-") else 1]
         done = CliRunner().invoke(app, [*name, "--help"], env={"COLUMNS": "200"})
         assert done.exit_code == 0, words
         for option in re.findall(r"--[a-z-]+", " ".join(words)):
             assert option in done.output, words
 
 
-def test_every_file_that_is_linked_is_there():
-    for link in re.findall(r"\]\((?!http)([^)#]+)\)", README):
+def test_tables_list_the_common_options_and_the_exit_codes():
+    options = re.findall(r"^\| `(--[a-z-]+)", README, re.MULTILINE)
+    assert sorted(options) == sorted(["--bench", "--config", "--set", "--seed", "--json", "--no-color"])
+    codes = re.findall(r"^\| ([\d, ]+) \|", README, re.MULTILINE)
+    assert set(EXIT_CODES) <= {int(code) for cell in codes for code in cell.split(",")}
+
+
+def test_every_linked_file_exists():
+    for link in re.findall(r"\]\((?!http)([^)#]+)", README):
         assert (ROOT / link).exists(), link
 
 
-def test_the_toml_example_is_a_valid_configuration(tmp_path):
+def test_toml_example_is_a_valid_configuration(tmp_path):
     from rig.config import load_config
 
-    (toml,) = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
+    (toml,) = blocks("toml")
     (tmp_path / "rig.toml").write_text(re.sub(r"(?m)^   ", "", toml), encoding="utf-8")
     assert load_config(tmp_path / "rig.toml").servo.port == "/dev/ttyUSB0"
+
+
+def test_sample_tray_can_be_read(tmp_path):
+    from rig.plans.tray import read_tray
+
+    (tray,) = blocks("csv")
+    (tmp_path / "tray.csv").write_text(tray, encoding="utf-8")
+    assert [item.name for item in read_tray(tmp_path / "tray.csv")] == ["lamp", "toy-car", "dice"]
+
+
+def test_folders_of_the_data_are_those_of_the_configuration(monkeypatch):
+    import platformdirs
+
+    from rig.config import RigConfig
+
+    monkeypatch.setattr(platformdirs, "user_data_dir", lambda app: f"~/.local/share/{app}")
+    monkeypatch.setattr(platformdirs, "user_state_dir", lambda app: f"~/.local/state/{app}")
+    config = RigConfig()
+    for path in (config.catalog_path("BENCH"), config.calibration_path("BENCH"), config.state_path("BENCH")):
+        assert f"`{path}/`" in README
+
+
+if __name__ == "__main__":
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        own_folders(Path(folder), patch)
+        new = walk_through()
+    (old,) = blocks("console")
+    (ROOT / "README.md").write_text(README.replace(f"```console\n{old}```", f"```console\n{new}```"), encoding="utf-8")
+    print(new)
