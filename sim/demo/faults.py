@@ -1,4 +1,4 @@
-"""`rig faults`: the vocabulary."""
+"""`rig faults`: the list of simulated faults."""
 
 import typer
 
@@ -8,7 +8,7 @@ from rig.cli.ui.settings import Settings
 
 @command
 def faults(settings: Settings) -> None:
-    """List what can go wrong on the simulated bench, with parameters, defaults and units.
+    """List the faults that the simulator can inject, with parameters, defaults and units.
 
     Example: rig faults; then rig demo --fault jam@move3+2s --fault crc_flip:rate=0.2
     """
@@ -30,7 +30,5 @@ def faults(settings: Settings) -> None:
         typer.echo(f"{kind.name:<{width}}  {kind.what}")
         for name, parameter in kind.parameters.items():
             typer.echo(f"{'':<{width}}    {name}={parameter.default:g}  {parameter.meaning}")
-    typer.echo(f"\nrig demo --fault {NOTATION}.")
-    typer.echo(
-        'In a file (rig demo --faults FILE) or rig.toml ([bench.sim]): faults = ["jam@move3+2s", "babble@20s+5s"]'
-    )
+    typer.echo(f"\nTo inject a fault: rig demo --fault {NOTATION}.")
+    typer.echo('In a file (--faults FILE) or in rig.toml ([bench.sim]): faults = ["jam@move3+2s", "babble@20s+5s"]')

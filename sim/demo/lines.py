@@ -1,4 +1,4 @@
-"""A retrieval as a table that grows: one line a move, with what was measured, thought and decided there."""
+"""A search as a growing table: one line for each view, with its measurements, candidates and decision."""
 
 from typing import ClassVar
 
@@ -8,15 +8,15 @@ from rig.events.wording import azimuth_words, distinct, percent_words, signed
 
 
 class MoveLines:
-    """Turns the events of `rig.plans.identify` into lines, each complete when the next move is decided."""
+    """Turns the events of `rig.plans.identify` into lines; a line is complete when the next view is decided."""
 
     HEADING: ClassVar = (
-        "      camera     the table's rotation                    how alike the candidates look\n"
-        "view  azimuth    asked    encoder               IMU      S_left  S_right  next        leading, score a view"
+        "      camera     rotation of the table                   similarity of candidates\n"
+        "view  azimuth    asked    encoder               IMU        left    right  next view   candidates, score"
     )
     DENSE_HEADING: ClassVar = (
-        "      camera     the table's rotation                    how alike the rivals look\n"
-        "view  azimuth    asked    encoder               IMU       there  all round  next       leading, probability"
+        "      camera     rotation of the table                   similarity of candidates\n"
+        "view  azimuth    asked    encoder               IMU     at next    overall next view   candidates, confidence"
     )
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class MoveLines:
         self._leading: tuple[Candidate, ...] = ()
 
     def add(self, event: Event) -> str:
-        """Take an event; return the line that it completes, or nothing."""
+        """Take the next event; return the line that it completes, or an empty string."""
         match event:
             case Moved():
                 self._move = event
@@ -47,12 +47,12 @@ class MoveLines:
         return ""
 
     def _line(self, decided: Decided | None) -> str:
-        assert self._move is not None  # a view follows a move
+        assert self._move is not None  # every view follows a Moved event
         move = self._move
         if self._asked_deg is None:
             turned = f"{'–':>8}{'–':>11}{'–':>18}"
         else:
-            imu = "no answer"
+            imu = "no value"
             if move.rotation_imu_deg is not None and move.imu_sigma_deg is not None:
                 imu = f"{signed(move.rotation_imu_deg, 2)} ± {move.imu_sigma_deg:.2f}°"
             turned = f"{signed(self._asked_deg, 1):>7}°{signed(move.rotation_encoder_deg, 2):>10}°{imu:>18}"
@@ -69,7 +69,7 @@ class MoveLines:
             f"{c.name} {f'{c.score:.3f}' if c.probability is None else percent_words(c.probability)}"
             for c in self._leading
         )
-        note = "" if move.agrees else "  ENCODER AND IMU DISAGREE"
+        note = "" if move.agrees else "  encoder and IMU differ"
         return (
             f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{turned}{similarity}{goes:<11} {leading}{note}"
         )

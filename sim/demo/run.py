@@ -1,6 +1,6 @@
-"""The demonstration: a shelf of objects enrolled and found again, every number out of the simulated chain.
+"""The demo: enroll a shelf of objects on the simulated bench and identify them again.
 
-servo → encoder and IMU → camera → CEDD → votes → decision → servo.
+Every number comes from the simulated chain: servo, encoder and IMU, camera, descriptor, scores, decision, servo.
 """
 
 import statistics
@@ -23,7 +23,7 @@ from rig.config.values import validate
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import UsageError
 from rig.events.events import Accepted, Started
-from rig.events.wording import signed
+from rig.events.wording import duration_words, signed
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
@@ -60,23 +60,23 @@ ENROLLED = (
     "toy-car",
     "nutcracker",
 )
-"""What is enrolled first: two pairs of twins, a round vase, a bowl that looks the same at every eighth of a turn."""
+"""Objects to enroll first: two similar pairs, a vase that is the same from everywhere, a bowl with 8-fold symmetry."""
 
 UNKNOWN_OBJECTS = ("radio", "clock")
-"""What is shown to the bench without having been enrolled."""
+"""Objects that are put on the table but not enrolled."""
 
 COUNT_OF_FOLDER = 20
-"""So many objects of a folder are enrolled where nobody says how many."""
+"""Default number of objects of a folder to enroll."""
 
 GOOD_SHARE = 0.8
-"""Share of right answers below which the demonstration counts as failed; the twins are a matter of luck."""
+"""Share of right answers below which the demo fails; of two very similar objects, an answer can be wrong."""
 
 Thing = Solid | Photographed
 
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """What was measured, and the page that shows it; the wall clock's part stands apart from what a seed determines."""
+    """The result of a demo; everything but ``wall_s`` is determined by the seed."""
 
     enrollments: tuple[EnrollmentRecord, ...]
     trials: tuple[IdentificationRecord, ...]
@@ -125,22 +125,22 @@ def run_demo(
     change: Change | None = None,
     faults: Sequence[Fault] = (),
 ) -> DemoResult:
-    """Enroll a shelf, find each object again and two unknown ones, print what happens, and write ``out/report.html``.
+    """Enroll a shelf, identify each object and two unknown ones, print the events, and write ``out/report.html``.
 
-    Objects are searched by ``strategy``, or as ``identify.strategy`` says. The ``change`` comes about when all are
-    enrolled. The ``faults``, and those of the configuration, happen meanwhile.
+    The search uses ``strategy``, by default ``identify.strategy``. The bench is changed (``change``) after the
+    enrollments. The ``faults`` and those of the configuration are injected meanwhile.
 
     Raises
     ------
     UsageError
-        There are fewer objects than ``count``, or ``out`` cannot be written to.
+        There are fewer objects than ``count``, or ``out`` is not writable.
     ConfigError
         The options of the simulated bench have mistakes.
     """
     if settings.bench not in (None, "sim"):
         raise UsageError(
-            f"The demonstration runs on the simulated bench, not on {settings.bench!r}.",
-            next_step="Leave --bench out; on a real bench use rig enroll and rig identify.",
+            f"The demo runs on the simulated bench only, not on {settings.bench!r}.",
+            next_step="Remove --bench. On a real bench, use rig enroll and rig identify.",
         )
     system = SystemClock()
     wall_ns, begun = system.now_ns(), system.utc()
@@ -195,11 +195,10 @@ def run_demo(
     )
     totals = result.as_dict()
     summary = (
-        f"{totals['enrolled']} objects enrolled, {totals['found']} of {totals['of']} found again, "
-        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognized, "
-        "on the simulated bench."
+        f"{totals['found']} of {totals['of']} enrolled objects found again and "
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognized, on the simulated bench."
     )
-    write_report(result.report, render_report("The rig's demonstration", summary, enrollments, trials, meta=meta))
+    write_report(result.report, render_report("Demo of the rig", summary, enrollments, trials, meta=meta))
     if not settings.json:
         _print_totals(result)
     return result
@@ -218,7 +217,7 @@ def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, Thing]
     wanted = count or min(COUNT_OF_FOLDER if folder else len(ENROLLED), len(names))
     if wanted > len(names):
         raise UsageError(
-            f"There are {len(names)} objects to enroll, not {wanted}.", next_step=f"Give --count {len(names)} or less."
+            f"There are {len(names)} objects to enroll, not {wanted}.", next_step=f"Use --count {len(names)} or less."
         )
     left = names[wanted : wanted + len(UNKNOWN_OBJECTS)]
     unknown = {name: known[name] for name in left} if folder and len(left) == len(UNKNOWN_OBJECTS) else None
@@ -229,20 +228,20 @@ def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, Thing]
 
 
 def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":
-    """Return a folder for the catalog inside ``out``, which is thereby known to take the report."""
+    """Return a temporary folder for the catalog inside ``out``; this also checks that ``out`` is writable."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryDirectory(prefix=".catalog-", dir=out)
     except OSError as error:
         raise UsageError(
-            f"The folder {out} cannot be written to.",
-            next_step="Give another one with --out.",
+            f"The folder {out} is not writable.",
+            next_step="Choose another folder with --out.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
 
 
 def _photograph(bench: Bench, operator: ShelfOperator) -> None:
-    """Take the picture of the empty table, at the start of a day, where the shelf leaves it empty."""
+    """Take the empty-table image, if the operator can clear the table."""
     if operator.clear():
         for _ in photograph_table(bench):
             pass
@@ -274,12 +273,12 @@ def _identify(
     enrolled: bool,
     say: bool,
 ) -> IdentificationRecord:
-    """Put a thing on the table anyhow, and let the bench find out which it is."""
+    """Put an object on the table in a random orientation and identify it."""
     operator.next_object = thing.name
     record = IdentificationRecord(region=bench.config.view.roi)
     moves = MoveLines()
     if say:
-        print(f"\nWhat stands on the table? (it is {thing.name})")
+        print(f"\nIdentifying the object on the table. It is {thing.name}, but the program does not know that.")
     for event in identify(bench, model, strategy=strategy):
         if isinstance(event, Accepted) and record.truth is None:
             record.truth = Truth(
@@ -315,13 +314,13 @@ def _trial(trial: IdentificationRecord) -> dict[str, Any]:
 def _print_totals(result: DemoResult) -> None:
     totals = result.as_dict()
     table = Table("", "on the table", "found as", box=None, pad_edge=False)
-    for heading in ("views", "travelled", "pose error", "score", "margin"):
+    for heading in ("views", "rotation", "pose\nerror", "score", "margin"):
         table.add_column(heading, justify="right")
     for trial in totals["trials"]:
         error = trial["pose_error_deg"]
         table.add_row(
             "✓" if trial["right"] else "✗",
-            trial["object"] if trial["enrolled"] else f"{trial['object']} (never enrolled)",
+            trial["object"] if trial["enrolled"] else f"{trial['object']} (not enrolled)",
             trial["found_as"] or "unknown",
             str(trial["views"]),
             f"{trial['travelled_deg']:.0f}°",
@@ -333,11 +332,11 @@ def _print_totals(result: DemoResult) -> None:
     Console(file=sys.stdout).print(table)
     error = totals["median_pose_error_deg"]
     print(
-        f"\n{totals['enrolled']} objects enrolled with {totals['views_enrolled']} views; "
-        f"{totals['found']} of {totals['of']} found again, "
+        f"\n{totals['found']} of {totals['of']} enrolled objects found again, "
         f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognized.\n"
-        f"{totals['mean_views']:.1f} views an answer, {totals['travelled_deg']:.0f}° travelled, "
+        f"{totals['enrolled']} objects enrolled with {totals['views_enrolled']} views. "
+        f"{totals['mean_views']:.1f} views per search, {totals['travelled_deg']:.0f}° of rotation in all, "
         f"median pose error {'–' if error is None else f'{error:.1f}°'}.\n"
-        f"The bench worked {result.bench_s / 60:.0f} minutes of its own time in {result.wall_s:.0f} s.\n"
+        f"Simulated time: {duration_words(result.bench_s)}. Run time: {duration_words(result.wall_s)}.\n"
         f"Report: {result.report}"
     )

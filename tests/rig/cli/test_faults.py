@@ -1,4 +1,4 @@
-"""`rig faults`, and faults given to `rig demo` and to any simulated bench."""
+"""`rig faults`, and faults injected into `rig demo` and into other commands on the simulated bench."""
 
 import json
 
@@ -15,7 +15,7 @@ def rig(*arguments: str):
     return CliRunner().invoke(app, list(arguments))
 
 
-def test_the_vocabulary_is_listed_with_parameters():
+def test_faults_are_listed_with_parameters():
     text = rig("faults").stdout
     for kind in kinds().values():
         assert f"{kind.name} " in text
@@ -25,7 +25,7 @@ def test_the_vocabulary_is_listed_with_parameters():
     assert "rig demo --fault" in text
 
 
-def test_the_vocabulary_as_json():
+def test_faults_are_listed_as_json():
     listed = [json.loads(line) for line in rig("faults", "--json").stdout.splitlines()]
     assert [entry["fault"] for entry in listed] == list(kinds())
     for entry in listed:
@@ -33,7 +33,7 @@ def test_the_vocabulary_as_json():
         assert Fault.parse(entry["fault"] + given).kind.what == entry["what"]
 
 
-def test_a_fault_ends_the_demo_with_its_code_and_next_step(tmp_path):
+def test_fault_ends_the_demo_with_its_exit_code_and_next_step(tmp_path):
     done = rig("demo", *SMALL, "--fault", "jam@move2", "--out", str(tmp_path))
     assert done.exit_code == 5
     assert "fault begins: jam" in done.stderr
@@ -41,7 +41,7 @@ def test_a_fault_ends_the_demo_with_its_code_and_next_step(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_faults_of_a_file_and_of_the_command_line_come_and_go(tmp_path):
+def test_faults_of_file_command_line_and_configuration_are_injected(tmp_path):
     (tmp_path / "faults.toml").write_text('faults = ["crc_flip@1s+3s"]')
     done = rig(
         *("demo", *SMALL, "--faults", str(tmp_path / "faults.toml"), "--fault", "camera.slow@2s+1s"),
@@ -53,7 +53,7 @@ def test_faults_of_a_file_and_of_the_command_line_come_and_go(tmp_path):
         assert f"fault ends: {name}" in done.stderr
 
 
-def test_any_command_on_a_simulated_bench_meets_the_configurations_faults(tmp_path):
+def test_faults_of_the_configuration_apply_to_every_command(tmp_path):
     done = rig("goto", "10", "--bench", "sim", "--set", 'bench.sim.faults=["unplug"]')
     assert done.exit_code == 4
     assert "Next step:" in done.stderr
@@ -68,7 +68,7 @@ def test_any_command_on_a_simulated_bench_meets_the_configurations_faults(tmp_pa
         (("--set", 'bench.sim.faults=["jamm"]'), "Did you mean jam?"),
     ],
 )
-def test_mistakes_are_told_before_anything_starts(arguments, words, tmp_path):
+def test_wrong_faults_are_rejected_before_the_demo_starts(arguments, words, tmp_path):
     done = rig("demo", *arguments, "--out", str(tmp_path))
     assert done.exit_code in (2, 3)
     assert words in done.stderr
