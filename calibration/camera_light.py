@@ -24,7 +24,7 @@ from rig.calibrations import CalibrationResult, Estimate
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.devices.camera import CameraLocks
 from rig.events.events import plain
-from rig.views.capture import looks
+from rig.views.capture import ImageQuality
 
 NOISE, FLAT_FIELD, DRIFT, SHARPNESS = "camera.noise", "camera.flat_field", "camera.drift", "camera.sharpness"
 VALID_DAYS = 180
@@ -81,7 +81,7 @@ def live_scene(bench: Bench) -> Generator[Ask | Progress | CalibrationResult, No
     yield Progress(1.0, f"{PAIRS} frames of the scene at rest")
     device = bench.apparatus("camera")
     view = bench.config.view
-    yield sharpness([looks(frame, view).sharpness for frame in frames], when_utc=when_utc, device=device)
+    yield sharpness([ImageQuality.of(frame, view).sharpness for frame in frames], when_utc=when_utc, device=device)
     fact = photon_transfer(np.stack(frames), when_utc=when_utc, device=device)
     yield fact
     return fact

@@ -12,7 +12,7 @@ from rig.devices.camera import Camera
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.doctor.case import Case
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.views.capture import looks
+from rig.views.capture import ImageQuality, rejection_text
 
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Frames taken one after the other, which tell the rate, and frames spread over a second, which tell of the light."""
@@ -85,7 +85,7 @@ def _frames(case: Case, source: Camera) -> Iterator[Finding]:
         if number == QUICK - 1:
             rate = QUICK / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
-    seen = [looks(frame, case.config.view) for frame in frames]
+    seen = [ImageQuality.of(frame, case.config.view) for frame in frames]
     levels = [each.mean_level for each in seen]
     text = f"frames are {1e3 * max(ages):.0f} ms old when they come, {rate:.3g} a second"
     evidence: dict[str, Any] = {"frame_age_s": max(ages), "frames_per_s": rate, "mean_levels": levels}
@@ -111,7 +111,8 @@ def _frames(case: Case, source: Camera) -> Iterator[Finding]:
         )
     words = f"mean level {levels[-1]:.0f}, sharpness {seen[-1].sharpness:.0f}, {seen[-1].saturated_share:.1%} saturated"
     if reasons := seen[-1].reasons(case.config.view):
+        texts = "; ".join(rejection_text(reason, seen[-1]) for reason in reasons)
         mend = "Look at light, exposure and focus; an empty table may look blurred: " + case.rig("config show view")
-        yield warning("camera", f"a frame as it is would not be taken: {'; '.join(reasons)}", mend)
+        yield warning("camera", f"a frame as it is would be rejected: {texts}", mend)
     else:
         yield fine("camera", f"a frame as it is would be taken: {words}")

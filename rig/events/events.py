@@ -225,7 +225,7 @@ class EmptyTableImage:
     """The empty table was photographed, and the picture is kept: objects are found by what differs from it.
 
     ``turning_share`` is how much of the picture changed as the table turned a little, ``agreement`` how much of its
-    border did not; None where the table could not turn. ``replaced`` says why the picture was taken anew.
+    border did not; None where the table could not turn. ``replaced`` has the problems of the previous image.
     """
 
     taken_utc: str
@@ -234,7 +234,7 @@ class EmptyTableImage:
     turning_share: float | None
     agreement: float | None
     evidence: ViewEvidence
-    replaced: tuple[str, ...]
+    replaced: tuple[dict[str, Any], ...]
     seconds: float
     image_bgr: NDArray[np.uint8] = field(metadata=_OUTSIDE, repr=False)
 

@@ -1,16 +1,19 @@
-"""The step that both plans share: take one accepted view at the table's present rest."""
+"""The steps that the plans share: rotate the table, capture one accepted view, warn of a changed bench."""
 
 from collections.abc import Generator
 
+from rig.bench import Bench
 from rig.core.errors import ViewRejected
-from rig.events.events import Event, Moved, Rejected, Unwinding
+from rig.events.events import Event, Moved, Rejected, Unwinding, Warned
 from rig.motion.turntable import Move, Turntable
 from rig.safety.gyro_rotation import finite
-from rig.views.capture import Attempt, Viewer
+from rig.views.capture import Attempt, Viewer, rejection_text
+from rig.views.description import DescribedView
+from rig.views.empty_table import COMMAND, store_table_problem
 
 
 def moved(index: int, move: Move) -> Moved:
-    """Return the event that tells of a finished move."""
+    """Return the event of a finished move."""
     gyro = move.gyro
     return Moved(
         index=index,
@@ -28,9 +31,9 @@ def moved(index: int, move: Move) -> Moved:
 def announced(
     index: int, table: Turntable, target_deg: float, *, asked_deg: float | None = None
 ) -> Generator[Event, None, Move]:
-    """Turn the table to ``target_deg``; that it goes the long way round, unwinding its cable, is said before.
+    """Rotate the table to ``target_deg``. Yield an event first if it unwinds the cable by whole revolutions.
 
-    Where ``asked_deg`` is the same angle, the long way is what was asked for.
+    No event is yielded if ``asked_deg`` is the same angle, because the long way was asked for.
 
     Raises
     ------
@@ -43,19 +46,30 @@ def announced(
 
 
 def unwind(index: int, table: Turntable) -> Generator[Event, None, None]:
-    """Leave the table with the same view before the camera and its cable unwound, whoever comes next."""
+    """Unwind the cable by whole revolutions, so that the camera sees the same side as before."""
     target_deg = table.unwound_deg()
     if table.unwound_revolutions(target_deg):
         yield from announced(index, table, target_deg)
 
 
+def warn_of_table(bench: Bench, index: int, view: DescribedView, consequence: str) -> Generator[Event, None, None]:
+    """Store and report that the bench no longer looks like its empty-table image, if this view has shown it."""
+    if view.table_problem is not None:
+        store_table_problem(bench, view.table_problem)
+        yield Warned(
+            index,
+            f"the bench no longer looks like its empty-table image: {view.table_problem.text}",
+            f"{consequence}; then take a new image: {COMMAND}",
+        )
+
+
 def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Generator[Event, None, Attempt]:
-    """Yield the rejected frames and return the accepted one.
+    """Yield an event for each rejected frame and return the accepted frame.
 
     Raises
     ------
     ViewRejected
-        No frame was acceptable; the evidence is that of the last.
+        All frames were rejected. The evidence is that of the last one.
     """
     attempts = viewer.attempts(settled_ns, table.check_still, table.attend)
     for attempt in attempts:
@@ -63,10 +77,12 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
             return attempt
         yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
     evidence = attempt.evidence
+    texts = "; ".join(rejection_text(reason, evidence) for reason in attempt.reasons)
     raise ViewRejected(
-        f"View {index} was not acceptable: {'; '.join(attempt.reasons)}.",
-        next_step="Look at light, focus and what stands before the camera; view.retakes and the limits are in [view].",
+        f"View {index} was rejected: {texts}.",
+        next_step="Check the light, the focus and the scene. The limits and view.retakes are in [view].",
         evidence={
+            "reasons": [reason.value for reason in attempt.reasons],
             "sharpness": round(evidence.sharpness, 1),
             "mean_level": round(evidence.mean_level, 1),
             "dark_share": round(evidence.dark_share, 3),

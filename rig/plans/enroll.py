@@ -13,13 +13,13 @@ from rig.bench import Bench
 from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
-from rig.events.events import Accepted, Enrolled, Event, Started, Warned, plain
+from rig.events.events import Accepted, Enrolled, Event, Started, plain
 from rig.motion.turntable import Move, Turntable
-from rig.plans.capture import announced, capture, moved
+from rig.plans.capture import announced, capture, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
-from rig.views.empty_table import COMMAND, Drift, EmptyTables
+from rig.views.empty_table import empty_table_status
 
 SAME_SIMILARITY = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
@@ -60,7 +60,7 @@ def enroll(
         See `rig.views.capture` and `rig.motion.turntable`; the views stored so far stay.
     """
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
-    standing = EmptyTables.standing(bench)
+    status = empty_table_status(bench)
     provenance = Provenance(
         bench=bench.name,
         devices=bench.devices(),
@@ -68,7 +68,7 @@ def enroll(
             **bench.conditions,
             **bench.config.model_dump(mode="json", include={"table", "imu", "camera", "view"}),
             "findings": list(bench.findings),
-            "empty_table": standing.words,
+            "empty_table": status.as_json(),
         },
     )
     if resume:
@@ -98,7 +98,7 @@ def enroll(
             if not resume:
                 enrollment.discard()  # so that a mistyped name is not left in the catalog
             raise
-        empty_table = None if standing.table is None else standing.table.image_bgr
+        empty_table = None if status.table is None else status.table.image_bgr
         if empty_table is not None:
             enrollment.set_reference_image(empty_table)
         retakes = yield from _take_views(
@@ -115,7 +115,6 @@ def _take_views(
 ) -> Generator[Event, None, int]:
     """Take and store the views at these table angles, return to 0, and return the number of repeated images."""
     viewer = Viewer(bench.camera, bench.config.view)
-    drift = Drift()
     sign = bench.config.table.orientation_sign
     retakes = 0
     imu = _ImuAngle()
@@ -150,13 +149,7 @@ def _take_views(
             )
             enrollment.add(record, attempt.image_bgr)
             yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
-            if drifted := drift.look(described.segmentation):
-                EmptyTables.doubt(bench, drifted)
-                yield Warned(
-                    index,
-                    drifted,
-                    f"Continue: these views are segmented without the image. Then take a new one: {COMMAND}",
-                )
+            yield from warn_of_table(bench, index, described, "Continue: these views do not use the image")
             first = first or (index, angle_deg, attempt.image_bgr)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
         # supply the servo forgets whole revolutions, and a cable that stays wound up is wound further the next time.

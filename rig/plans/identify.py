@@ -10,15 +10,14 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
-from rig.events.events import Accepted, Decided, Event, Identified, Started, Warned
+from rig.events.events import Accepted, Decided, Event, Identified, Started
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, capture, moved, unwind
+from rig.plans.capture import announced, capture, moved, unwind, warn_of_table
 from rig.search.model import Model, empty_table_for
 from rig.search.session import SHOWN, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import ViewDescriber
-from rig.views.empty_table import COMMAND, Drift, EmptyTables
 
 
 def identify(
@@ -72,7 +71,7 @@ def identify(
     if empty_table is None and isinstance(model, Model):
         empty_table, told = empty_table_for(bench, model)
         notes += told
-    describe, drift = ViewDescriber(bench.config.view, (search.descriptor,), empty_table), Drift()
+    describe = ViewDescriber(bench.config.view, (search.descriptor,), empty_table)
     yield Started(
         "identify",
         None,
@@ -98,9 +97,7 @@ def identify(
             azimuth_deg = float(wrap360(orientation_deg))
             seen = describe(shot.image_bgr)
             yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr, seen.segmentation)
-            if drifted := drift.look(seen.segmentation):
-                EmptyTables.doubt(bench, drifted)
-                yield Warned(number, drifted, f"The search goes on without it; then take a new one: {COMMAND}")
+            yield from warn_of_table(bench, number, seen, "The search continues without the image")
             ranked, step = search.look(seen.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
             yield ranked
             if isinstance(step, Finish):

@@ -1,4 +1,4 @@
-"""The plan that takes the picture of the empty table, and sees that it is empty."""
+"""The plan that takes the empty-table image and checks that the table is empty."""
 
 from collections.abc import Generator
 from typing import Final
@@ -14,78 +14,82 @@ from rig.plans.capture import announced, capture
 from rig.plans.enroll import SAME_SIMILARITY
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import within
-from rig.views.empty_table import COMMAND, EmptyTable, EmptyTables
-from rig.views.object_presence import GRID, changed_cells, picture
+from rig.views.empty_table import COMMAND, EmptyTable, empty_table_status, store_empty_table
+from rig.views.object_presence import GRID, changed_cells, shrunk
 
-TURN_DEG: Final = 25.0
-"""So far the table turns between two pictures: what stands on it shows another side, or stands elsewhere."""
-LEAST_TURN_DEG: Final = 5.0
-NOTICED_SHARE: Final = 0.004
-"""Something stands on the table when this share of the picture changes with it: 2 cm on a picture of 24 cm."""
+ROTATION_DEG: Final = 25.0
+"""The table rotates by this angle between two images, so that an object shows another side or moves in the image."""
+MIN_ROTATION_DEG: Final = 5.0
+MAX_CHANGED_SHARE: Final = 0.004
+"""If a larger share of the image changes with the rotation, something is on the table: 2 cm in an image of 24 cm."""
 
 
 def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, None, EmptyTableImage]:
-    """Take the picture of the empty table and keep it beside the bench's state; yields events and returns the last.
+    """Take the empty-table image and store it beside the bench's state. Yields events and returns the last one.
 
-    An operator who can empties the table; otherwise it is empty already. Two frames are taken, the table turned a
-    little between them, and judged as views are: what changes stands on the table. Closing the generator takes the
-    torque off.
+    An operator that can clear the table does so; otherwise the table must be empty already. The plan takes two frames
+    and rotates the table a little between them: what changes is on the table. The frames are checked like those of
+    views. Closing the generator switches the torque off.
 
     Parameters
     ----------
     bench
-        An open one.
+        An open bench.
     anyway
-        Keep the picture although something on the table turns with it: a pattern, or a screw that stays there.
+        Store the image although something rotates with the table: a pattern, or a screw that stays there.
 
     Raises
     ------
     TableNotEmpty
-        Something turns with the table, or the surroundings are not still; the picture before this one stays.
+        Something rotates with the table, or the surroundings moved. The previous image stays.
     UsageError
-        The camera goes around the object: its background is another in every view.
+        The camera moves around the object, so that every view has another background; or the object cannot be removed.
     StateNotStored
-        The picture cannot be kept.
+        The image cannot be stored.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.views.capture` and `rig.motion.turntable`.
     """
     if bench.config.table.carries == "camera":
         raise UsageError(
-            "The camera goes around the object, and its background is another in every view.",
-            next_step="No picture of the empty table is needed; have a plain background.",
+            "The camera moves around the object, so that every view has another background.",
+            next_step="Use a plain background. This bench needs no empty-table image.",
         )
     if isinstance(bench.operator, TableClearer) and not bench.operator.clear():
         raise UsageError(
-            "What stands on this bench cannot be taken away.", next_step="No picture of the empty table is needed."
+            "The object on this bench cannot be taken away.", next_step="Continue without an empty-table image."
         )
     viewer = Viewer(bench.camera, bench.config.view)
     started_ns = bench.clock.now_ns()
-    turned = None
+    rotated = None
     with Turntable(bench) as table:
         move = table.hold()
-        begin_deg = table.rest_deg
+        start_deg = table.rest_deg
         first = yield from capture(0, viewer, table, move.settled_ns)
-        away_deg = _away_deg(begin_deg, table.limits_deg)
-        if abs(away_deg - begin_deg) >= LEAST_TURN_DEG:
-            move = yield from announced(1, table, away_deg)
-            turned = yield from capture(1, viewer, table, move.settled_ns)
-            yield from announced(1, table, begin_deg)
+        target_deg = _rotated_deg(start_deg, table.limits_deg)
+        if abs(target_deg - start_deg) >= MIN_ROTATION_DEG:
+            move = yield from announced(1, table, target_deg)
+            rotated = yield from capture(1, viewer, table, move.settled_ns)
+            yield from announced(1, table, start_deg)
+
+    # Compare the two frames: the table must not have changed, the surroundings must not have moved.
     config = bench.config.view
     share = agreement = None
-    if turned is not None:
-        pictures = [picture(shot.image_bgr, config) for shot in (first, turned)]
-        share = changed_cells(*pictures) / GRID**2
-        parts = [within(shot.image_bgr, config.roi) for shot in (first, turned)]
-        agreement = hbr.segment(parts[1], empty_table=hbr.Background(parts[0])).agreement
+    if rotated is not None:
+        frames = [first.image_bgr, rotated.image_bgr]
+        share = changed_cells(*(shrunk(frame, config) for frame in frames)) / GRID**2
+        before_bgr, after_bgr = (within(frame, config.roi) for frame in frames)
+        agreement = hbr.segment(after_bgr, empty_table=hbr.Background(before_bgr)).agreement
         if not anyway:
             _check(share, agreement)
-    before = EmptyTables.standing(bench)
+
+    # A round object does not change with the rotation, but the image differs from the previous one.
+    before = empty_table_status(bench)
     if before.table is not None and image_similarity(before.table.image_bgr, first.image_bgr, config) < SAME_SIMILARITY:
         yield Warned(
             None,
-            f"the table does not look as it did at {before.table.taken_utc:%Y-%m-%d %H:%M} UTC; what is round turns "
-            "unseen",
-            f"See that it is empty; if it is not, take what is there off and run `{COMMAND}`.",
+            f"The table does not look as it did at {before.table.taken_utc:%Y-%m-%d %H:%M} UTC. A round object would "
+            "not be noticed by the rotation.",
+            f"Check that the table is empty. If it is not, clear it and run `{COMMAND}` again.",
         )
     evidence = first.evidence
     taken = EmptyTable(
@@ -95,7 +99,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         locks=evidence.locks,
         evidence={**plain(evidence), "turning_share": share, "agreement": agreement},
     )
-    EmptyTables.keep(bench, taken)
+    store_empty_table(bench, taken)
     done = EmptyTableImage(
         taken_utc=f"{taken.taken_utc:%Y-%m-%dT%H:%M:%SZ}",
         width=int(first.image_bgr.shape[1]),
@@ -103,7 +107,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         turning_share=share,
         agreement=agreement,
         evidence=evidence,
-        replaced=before.doubts,
+        replaced=tuple(problem.as_json() for problem in before.problems),
         seconds=seconds_between(started_ns, bench.clock.now_ns()),
         image_bgr=first.image_bgr,
     )
@@ -111,25 +115,26 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
     return done
 
 
-def _away_deg(begin_deg: float, limits_deg: tuple[float, float]) -> float:
+def _rotated_deg(start_deg: float, limits_deg: tuple[float, float]) -> float:
+    """Return the table angle of the second frame: in the direction with more room."""
     low, high = limits_deg
-    up_deg, down_deg = min(begin_deg + TURN_DEG, high), max(begin_deg - TURN_DEG, low)
-    return up_deg if up_deg - begin_deg >= begin_deg - down_deg else down_deg
+    up_deg, down_deg = min(start_deg + ROTATION_DEG, high), max(start_deg - ROTATION_DEG, low)
+    return up_deg if up_deg - start_deg >= start_deg - down_deg else down_deg
 
 
 def _check(share: float, agreement: float | None) -> None:
-    numbers = {"turning_share": round(share, 4), "most_turning_share": NOTICED_SHARE}
+    numbers = {"turning_share": round(share, 4), "most_turning_share": MAX_CHANGED_SHARE}
     if agreement is not None and agreement < MIN_AGREEMENT:
         raise TableNotEmpty(
-            "The surroundings of the table are not the same in two pictures: somebody moved in them, or the table "
-            "reaches to the border.",
-            next_step=f"Stand back and take it again; let view.roi show a rim of the background: {COMMAND}",
+            "The surroundings of the table differ between two images: something moved there, or the table reaches the "
+            "border of the image.",
+            next_step=f"Stand back and run `{COMMAND}` again. Choose view.roi with background on all sides.",
             evidence={"agreement": round(agreement, 3), "least_agreement": MIN_AGREEMENT, **numbers},
         )
-    if share > NOTICED_SHARE:
+    if share > MAX_CHANGED_SHARE:
         raise TableNotEmpty(
-            f"Something stands on the table: {share:.1%} of the picture changes as it turns.",
-            next_step=f"Take it off and run `{COMMAND}`; if it stays there always, such as a pattern or a screw: "
-            f"{COMMAND} --anyway",
+            f"Something is on the table: {share:.1%} of the image changes as the table rotates.",
+            next_step=f"Clear the table and run `{COMMAND}` again. If it always stays there, such as a pattern or a "
+            f"screw: {COMMAND} --anyway",
             evidence=numbers,
         )

@@ -24,7 +24,7 @@ from rig.events.events import (
 )
 from rig.report.contact_sheet import Image, Region, thumbnail
 from rig.search.saved_run import built
-from rig.views.capture import ViewEvidence
+from rig.views.capture import ViewEvidence, rejection_text
 
 TILE: Final = (96, 96)
 """Width and height of a view on a contact sheet, pixels."""
@@ -60,7 +60,7 @@ class _ViewCollector:
             case Moved():
                 self._move = event
             case Rejected():
-                self._rejected.append(", ".join(event.reasons))
+                self._rejected.append(", ".join(rejection_text(reason, event.evidence) for reason in event.reasons))
             case Accepted():
                 rejected, self._rejected = tuple(self._rejected), []
                 view = self.view(event.index, event.azimuth_deg, event.image_bgr, event.evidence, event.segmentation)

@@ -13,7 +13,7 @@ from rig.catalog import Catalog
 from rig.core.errors import CatalogError, DescriptorOutdated
 from rig.search.stopping_rules import rules_of
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
-from rig.views.empty_table import COMMAND, EmptyTables
+from rig.views.empty_table import COMMAND, empty_table_status
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,19 +125,19 @@ def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | Non
     """
     if not isinstance(model.index, hbr.DenseIndex):
         return None, ()
-    standing = EmptyTables.standing(bench)
+    status = empty_table_status(bench)
     if model.pictured is False:
-        if standing.table is None:
+        if status.table is None:
             return None, ()
         return None, (
             "most objects were enrolled without a picture of the empty table, and are searched without; "
             "rig enroll --replace takes them anew with it",
         )
-    if standing.table is not None:
-        return standing.table.image_bgr, (f"{standing.words}; {COMMAND} takes one",) if standing.doubts else ()
+    if status.table is not None:
+        return status.table.image_bgr, (f"{status.text}; {COMMAND} takes a new one",) if status.problems else ()
     if model.empty_table is None:
-        return None, (f"{standing.words}; {COMMAND} takes one",)
-    return model.empty_table, (f"{standing.words}: the one of the enrollment is used; {COMMAND} takes one",)
+        return None, (f"{status.text}; {COMMAND} takes one",)
+    return model.empty_table, (f"{status.text}: the image of the enrollment is used; {COMMAND} takes a new one",)
 
 
 def _few(names: Sequence[str]) -> str:

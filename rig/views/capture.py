@@ -1,7 +1,8 @@
-"""A view is a frame with the evidence that it may be trusted; this module takes frames and judges them."""
+"""Captures frames for views and checks them: image quality, camera settings, and whether the table stood still."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 from math import isfinite
 
 import cv2
@@ -14,21 +15,35 @@ from rig.safety.gyro_rotation import Stillness
 from rig.views.description import within
 
 DARK_LEVEL = 8
-"""Grey levels below this carry no detail in an 8-bit frame."""
+"""Pixels below this grey level carry no detail in an 8-bit frame."""
 NOISE_GAIN = 20
-"""What the Laplacian (-4 and four times 1) makes of the variance of independent pixels."""
+"""Factor by which the Laplacian (-4 and four times 1) increases the variance of independent pixels."""
 MAX_NOISE = 0.3
-"""Largest share of such variance in a picture; half a frame of random bytes has more."""
-LIKENESS_PX = 4
+"""Largest share of such variance in an image. Half a frame of random bytes has more."""
+SIMILARITY_PX = 4
 """Side of the squares that `image_similarity` averages over."""
+
+
+class RejectReason(StrEnum):
+    """Why a frame is not accepted as a view. `rejection_text` puts it into words."""
+
+    EXPOSED_EARLY = "exposed-early"
+    GYRO_INCOMPLETE = "gyro-incomplete"
+    TABLE_MOVED = "table-moved"
+    REPEATED_FRAME = "repeated-frame"
+    LOCKS_CHANGED = "locks-changed"
+    TOO_DARK = "too-dark"
+    OVEREXPOSED = "overexposed"
+    BLURRED = "blurred"
+    NOISE = "noise"
 
 
 @dataclass(frozen=True, slots=True)
 class ViewEvidence:
-    """The numbers a frame was judged by.
+    """The measurements that decide whether a frame is accepted.
 
-    ``settled_ns`` and ``exposed_ns`` are times on the bench's clock; ``sharpness`` is the variance of the Laplacian of
-    the grey region, in squared levels; the shares are of the region's pixels.
+    ``settled_ns`` and ``exposed_ns`` are times on the bench's clock. ``sharpness`` is the variance of the Laplacian of
+    the grey region, in squared levels. The shares are shares of the region's pixels.
     """
 
     settled_ns: int
@@ -45,12 +60,12 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One frame, the ``number``-th for this view from 1 on, and why it was not taken (nothing: it was accepted)."""
+    """One frame, the ``number``-th for this view from 1 on, and the reasons to reject it; none if it is accepted."""
 
     number: int
     image_bgr: NDArray[np.uint8]
     evidence: ViewEvidence
-    reasons: tuple[str, ...]
+    reasons: tuple[RejectReason, ...]
 
     @property
     def accepted(self) -> bool:
@@ -58,11 +73,11 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
-    """What the region of a frame looks like; see `ViewEvidence`.
+class ImageQuality:
+    """Quality of the region of interest of a frame; see `ViewEvidence`.
 
-    ``noise_share`` compares neighbouring pixels with distant ones: 1 where they have nothing in common, below 0.05 in
-    pictures.
+    ``noise_share`` compares neighbouring pixels with distant ones: 1 if they have nothing in common, below 0.05 in
+    usual images.
     """
 
     sharpness: float
@@ -71,45 +86,45 @@ class Looks:
     saturated_share: float
     noise_share: float
 
-    def reasons(self, config: ViewConfig) -> list[str]:
-        """Return why a frame that looks so is not taken."""
+    @classmethod
+    def of(cls, image_bgr: NDArray[np.uint8], config: ViewConfig) -> "ImageQuality":
+        """Measure the region of interest of a frame, uint8 (H, W, 3)."""
+        grey = cv2.cvtColor(within(image_bgr, config.roi), cv2.COLOR_BGR2GRAY)
+        sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).var())
+        return cls(
+            sharpness=sharpness,
+            mean_level=float(grey.mean()),
+            dark_share=float(np.count_nonzero(grey < DARK_LEVEL) / grey.size),
+            saturated_share=float(np.count_nonzero(grey == 255) / grey.size),
+            noise_share=sharpness / (NOISE_GAIN * max(float(grey.var()), 1.0)),
+        )
+
+    def reasons(self, config: ViewConfig) -> list[RejectReason]:
+        """Return the reasons to reject a frame of this quality."""
         reasons = []
         if self.mean_level < config.min_mean or self.dark_share > config.max_dark:
-            reasons.append(f"too dark (mean level {self.mean_level:.1f}, {self.dark_share:.0%} black)")
+            reasons.append(RejectReason.TOO_DARK)
         if self.saturated_share > config.max_saturated:
-            reasons.append(f"overexposed ({self.saturated_share:.0%} saturated)")
+            reasons.append(RejectReason.OVEREXPOSED)
         if self.sharpness < config.min_sharpness:
-            reasons.append(f"blurred (sharpness {self.sharpness:.1f} < {config.min_sharpness:g})")
+            reasons.append(RejectReason.BLURRED)
         elif self.noise_share > MAX_NOISE:
-            reasons.append(f"noise instead of a picture ({self.noise_share:.0%} of its variance)")
+            reasons.append(RejectReason.NOISE)
         return reasons
 
 
-def looks(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Looks:
-    """Measure the region of interest of a frame, uint8 (H, W, 3)."""
-    grey = cv2.cvtColor(within(image_bgr, config.roi), cv2.COLOR_BGR2GRAY)
-    sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).var())
-    return Looks(
-        sharpness=sharpness,
-        mean_level=float(grey.mean()),
-        dark_share=float(np.count_nonzero(grey < DARK_LEVEL) / grey.size),
-        saturated_share=float(np.count_nonzero(grey == 255) / grey.size),
-        noise_share=sharpness / (NOISE_GAIN * max(float(grey.var()), 1.0)),
-    )
-
-
 def image_similarity(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8], config: ViewConfig) -> float:
-    """Return how much two frames show the same in their region of interest: 1 for the same, whatever the light.
+    """Return how similar two frames are in their region of interest: 1 for equal frames in any illumination.
 
-    It is the correlation of their grey levels, averaged over a few pixels: noise and a tenth of a degree cost less
-    than 0.01, an object that was taken away leaves less than 0.7.
+    The similarity is the correlation of grey levels, averaged over a few pixels. Noise and a rotation of 0.1° reduce it
+    by less than 0.01. If the object was taken away, it is below 0.7.
     """
     small = [
         cv2.resize(
             cv2.cvtColor(within(image, config.roi), cv2.COLOR_BGR2GRAY),
             None,
-            fx=1 / LIKENESS_PX,
-            fy=1 / LIKENESS_PX,
+            fx=1 / SIMILARITY_PX,
+            fy=1 / SIMILARITY_PX,
             interpolation=cv2.INTER_AREA,
         )
         for image in (image_bgr, other_bgr)
@@ -118,7 +133,7 @@ def image_similarity(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8],
 
 
 class Viewer:
-    """Takes views with one camera, whose locks must stay as they were when the viewer was made."""
+    """Captures views with one camera, whose locked settings must not change after the viewer was made."""
 
     def __init__(self, camera: Camera, config: ViewConfig) -> None:
         self._camera = camera
@@ -132,38 +147,37 @@ class Viewer:
         check_still: Callable[[int], Stillness],
         meanwhile: Callable[[], object] | None = None,
     ) -> Iterator[Attempt]:
-        """Capture until a frame is accepted or the retakes are used up; the last attempt tells which.
+        """Capture frames until one is accepted or ``retakes`` is used up.
 
         Parameters
         ----------
         settled_ns
-            When the table came to rest: no older exposure counts.
+            Time at which the table came to rest. Frames exposed before it are rejected.
         check_still
-            Looks at encoder and gyro again, after the exposure, from a given time on.
+            Checks encoder and gyro from a given time on, after the exposure.
         meanwhile
-            Called several times a second while a slow camera is waited for.
+            Called several times a second while the program waits for a slow camera.
         """
         after_ns = settled_ns
         for number in range(1, 2 + self._config.retakes):
             frame = self._camera.capture(after_ns, meanwhile)
-            attempt = self._judge(number, frame, settled_ns, check_still(after_ns))
+            attempt = self._check(number, frame, settled_ns, check_still(after_ns))
             self._last = frame.image_bgr
             yield attempt
             if attempt.accepted:
                 return
             after_ns = frame.exposed_ns + 1
 
-    def _judge(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:
-        config = self._config
-        seen = looks(frame.image_bgr, config)
+    def _check(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:
+        quality = ImageQuality.of(frame.image_bgr, self._config)
         locks = self._camera.read_locks()
         evidence = ViewEvidence(
             settled_ns=settled_ns,
             exposed_ns=frame.exposed_ns,
-            sharpness=seen.sharpness,
-            mean_level=seen.mean_level,
-            dark_share=seen.dark_share,
-            saturated_share=seen.saturated_share,
+            sharpness=quality.sharpness,
+            mean_level=quality.mean_level,
+            dark_share=quality.dark_share,
+            saturated_share=quality.saturated_share,
             repeated=self._last is not None and np.array_equal(frame.image_bgr, self._last),
             locks=locks,
             locks_hold=locks == self._locks,
@@ -171,17 +185,46 @@ class Viewer:
         )
         reasons = []
         if frame.exposed_ns < settled_ns:
-            reasons.append("exposed before the table was at rest")
+            reasons.append(RejectReason.EXPOSED_EARLY)
         if not isfinite(stillness.peak_rate_dps):
-            reasons.append("the gyro's samples are not complete: whether the table stood still is unknown")
+            reasons.append(RejectReason.GYRO_INCOMPLETE)
         elif not stillness.still:
-            reasons.append(
-                f"the table moved ({stillness.peak_rate_dps:.2f} °/s, shaft {stillness.encoder_change_deg:.2f}°, "
-                f"platter {stillness.platter_change_deg:+.2f}°)"
-            )
+            reasons.append(RejectReason.TABLE_MOVED)
         if evidence.repeated:
-            reasons.append("the camera repeated its last frame")
+            reasons.append(RejectReason.REPEATED_FRAME)
         if not evidence.locks_hold:
-            reasons.append("exposure or white balance is not as locked")
-        reasons += seen.reasons(config)
+            reasons.append(RejectReason.LOCKS_CHANGED)
+        reasons += quality.reasons(self._config)
         return Attempt(number, frame.image_bgr, evidence, tuple(reasons))
+
+
+def rejection_text(reason: str, evidence: ViewEvidence | ImageQuality) -> str:
+    """Return the text of a `RejectReason`, with the numbers of the evidence; any other text as it is.
+
+    Version 0.1 saved the text itself.
+    """
+    match reason:
+        case RejectReason.EXPOSED_EARLY:
+            return "exposed before the table stood still"
+        case RejectReason.GYRO_INCOMPLETE:
+            return "the gyro's samples are incomplete: it is unknown whether the table stood still"
+        case RejectReason.TABLE_MOVED if isinstance(evidence, ViewEvidence):
+            still = evidence.stillness
+            return (
+                f"the table moved ({still.peak_rate_dps:.2f} °/s, shaft {still.encoder_change_deg:.2f}°, "
+                f"platter {still.platter_change_deg:+.2f}°)"
+            )
+        case RejectReason.REPEATED_FRAME:
+            return "the camera repeated its last frame"
+        case RejectReason.LOCKS_CHANGED:
+            return "exposure or white balance has changed"
+        case RejectReason.TOO_DARK:
+            return f"too dark (mean level {evidence.mean_level:.1f}, {evidence.dark_share:.0%} black)"
+        case RejectReason.OVEREXPOSED:
+            return f"overexposed ({evidence.saturated_share:.0%} saturated)"
+        case RejectReason.BLURRED:
+            return f"blurred (sharpness {evidence.sharpness:.1f})"
+        case RejectReason.NOISE:
+            return "noise instead of an image"
+        case _:
+            return str(reason)

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.segmentation import Issue, IssueCode
+from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
+from rig.views.table_problems import TableProblem, TableProblemCode
 
 PAPER_DESCRIPTOR: Final = "cedd"
 """The paper's descriptor. It describes the whole region of interest, with the background."""
@@ -18,6 +19,8 @@ BENCH_DESCRIPTOR: Final = "edges+colours"
 """The rig's own descriptor. It describes only the object, with corrected illumination."""
 DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
+IN_A_ROW: Final = 3
+"""So many frames must differ from the empty-table image: one or two can show an arm that reached into the frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,10 +33,13 @@ class DescribedView:
         Levels of each descriptor.
     segmentation
         `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made.
+    table_problem
+        Set for the view after which it is clear that the bench no longer looks like its empty-table image.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
     segmentation: dict[str, Any] | None
+    table_problem: TableProblem | None = None
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -86,6 +92,8 @@ class ViewDescriber:
         self._segments = any(not one.whole_image for one in self._descriptors)
         self._table = empty_table if self._segments else None
         self._background: hbr.Background | None = None
+        self._low: list[float] = []
+        self._reported = False
 
     def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
         """Describe a frame, uint8 (H, W, 3).
@@ -99,10 +107,23 @@ class ViewDescriber:
         """
         part = within(image_bgr, self.region)
         found = self._segment(image_bgr, part) if self._segments else None
-        return DescribedView(
-            {one.name: one.describe(part if found is None or one.whole_image else found) for one in self._descriptors},
-            None if found is None else found.evidence(),
-        )
+        levels = {
+            one.name: one.describe(part if found is None or one.whole_image else found) for one in self._descriptors
+        }
+        if found is None:
+            return DescribedView(levels, None)
+        return DescribedView(levels, found.evidence(), self._table_problem(found.agreement))
+
+    def _table_problem(self, agreement: float | None) -> TableProblem | None:
+        """Return a problem after `IN_A_ROW` frames that differ from the empty-table image, but only once."""
+        if agreement is None or self._reported:
+            return None
+        self._low = [*self._low, agreement] if agreement < MIN_AGREEMENT else []
+        if len(self._low) < IN_A_ROW:
+            return None
+        self._reported = True
+        parameters = {"frames": IN_A_ROW, "agreement": round(max(self._low), 3)}
+        return TableProblem(TableProblemCode.SURROUNDINGS, parameters)
 
     def _segment(self, image_bgr: NDArray[np.uint8], part: NDArray[np.uint8]) -> hbr.Segmentation:
         if self._table is None:

@@ -1,6 +1,7 @@
-"""The bench without an object: a picture that its operator takes once a day, and what it is good for today."""
+"""The empty-table image of a bench: stored beside the bench's state, and checked before it is used."""
 
 import hashlib
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -11,38 +12,37 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
-from hbr.segmentation import MIN_AGREEMENT
 from rig.bench import Bench
 from rig.core.errors import StateNotStored
 from rig.devices.camera import CameraIdentity, CameraLocks
 from rig.views import image_files as images
+from rig.views.table_problems import TableProblem, TableProblemCode
 
 COMMAND: Final = "rig empty-table"
-HOLDS_H: Final = 12.0
-"""A working day: the light of another one is another."""
-IN_A_ROW: Final = 3
-"""So many frames that look like another bench are not an arm that reached into the picture."""
+MAX_AGE_H: Final = 12.0
+"""A working day. On another day the illumination is different."""
 
-_FACTS: Final = "empty-table.json"
-_VERSION: Final = 1
+_FILE: Final = "empty-table.json"
+_VERSION: Final = 2
+_OLD_WARNING: Final = re.compile(r"(\d+) frames in a row look like the picture of the empty table over (\d+)% of .*")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EmptyTable:
-    """A picture of the empty table, and how it was taken.
+    """An empty-table image, and how it was taken.
 
     Attributes
     ----------
     image_bgr : uint8 array (H, W, 3)
         A whole frame.
     taken_utc
-        When.
+        Date and time.
     camera, locks
-        By which camera, with which settings.
+        The camera and its settings.
     evidence
-        What it was judged by.
-    doubt
-        What was seen since that speaks against it; empty where nothing was.
+        The measurements that the image was accepted with.
+    noticed
+        A problem that a search or an enrollment has noticed since.
     """
 
     image_bgr: NDArray[np.uint8]
@@ -50,129 +50,100 @@ class EmptyTable:
     camera: CameraIdentity
     locks: CameraLocks
     evidence: Mapping[str, Any]
-    doubt: str = ""
-
-    def useless_on(self, bench: Bench) -> str:
-        """Return why the picture says nothing of this bench's frames; empty where it does."""
-        now = bench.camera.identity
-        if (now.width, now.height) != (self.image_bgr.shape[1], self.image_bgr.shape[0]):
-            return (
-                f"it has {self.image_bgr.shape[1]} x {self.image_bgr.shape[0]} pixels, "
-                f"the camera's frames have {now.width} x {now.height}"
-            )
-        if now.name != self.camera.name:
-            return f"it was taken by another camera, {self.camera.name}; this is {now.name}"
-        return ""
-
-    def doubts_on(self, bench: Bench) -> tuple[str, ...]:
-        """Return why the picture should be taken anew, though it is better than none."""
-        hours = (bench.clock.utc() - self.taken_utc).total_seconds() / 3600
-        found = [f"it is {_age_words(hours)} old"] if hours > HOLDS_H else []
-        found += ["it is dated in the future: see to the computer's clock"] if hours < -1 else []
-        before, now = asdict(self.locks), asdict(bench.camera.read_locks())
-        found += [
-            f"{name} was {_setting(value)}, is {_setting(now[name])}"
-            for name, value in before.items()
-            if value is not None and now[name] is not None and value != now[name]
-        ]
-        return (*found, *([self.doubt] if self.doubt else []))
+    noticed: TableProblem | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class TableStanding:
-    """The picture that a bench has, if it is of use, and what speaks against it, in words."""
+class EmptyTableStatus:
+    """A bench's empty-table image if it is usable, and the reasons to take a new one."""
 
     table: EmptyTable | None
-    doubts: tuple[str, ...] = ()
+    problems: tuple[TableProblem, ...] = ()
 
     @property
-    def words(self) -> str:
-        """Return how the bench stands with its picture, in a line."""
+    def text(self) -> str:
+        """The date of the image and its problems, in one line."""
+        problems = [problem.text for problem in self.problems]
         if self.table is None:
-            return "; ".join(self.doubts)
-        taken = f"the picture of the empty table is of {self.table.taken_utc:%Y-%m-%d %H:%M} UTC"
-        return "; ".join([taken, *self.doubts])
+            return "; ".join(problems)
+        return "; ".join([f"the empty-table image is of {self.table.taken_utc:%Y-%m-%d %H:%M} UTC", *problems])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the date of the image and its problems as JSON values."""
+        taken = None if self.table is None else f"{self.table.taken_utc:%Y-%m-%dT%H:%M:%SZ}"
+        return {"taken_utc": taken, "problems": [problem.as_json() for problem in self.problems]}
 
 
-class EmptyTables:
-    """The picture of the empty table that is kept beside a bench's state."""
-
-    @staticmethod
-    def standing(bench: Bench) -> TableStanding:
-        """Return the bench's picture, and whether it should be taken anew: then ``doubts`` say why."""
-        if bench.config.table.carries == "camera":
-            return TableStanding(None, ("the camera goes around the object, and its background with it",))
-        try:
-            table = _read(bench)
-        except _Damaged as error:
-            return TableStanding(None, (f"the picture of the empty table is of no use: {error}",))
-        if table is None:
-            return TableStanding(None, ("no picture of the empty table was taken yet",))
-        if useless := table.useless_on(bench):
-            return TableStanding(None, (f"the picture of the empty table is of no use: {useless}",))
-        return TableStanding(table, table.doubts_on(bench))
-
-    @staticmethod
-    def keep(bench: Bench, table: EmptyTable) -> None:
-        """Keep a picture in the place of the one before, which stays until this one is whole on the disk.
-
-        Raises
-        ------
-        StateNotStored
-            The disk is full, or may not be written to.
-        """
-        png = images.encode(table.image_bgr)
-        kept = _Kept.of(table, png)
-        before = _facts(bench, quiet=True)
-        bench.state.store_file(kept.image, png)
-        bench.state.store_file(_FACTS, kept.model_dump_json(indent=1).encode())
-        if before is not None and before.image != kept.image:
-            bench.state.remove_file(before.image)
-
-    @staticmethod
-    def doubt(bench: Bench, why: str) -> None:
-        """Remember what was seen that speaks against the bench's picture, so that the next program asks for another."""
-        before = _facts(bench, quiet=True)
-        if before is not None:
-            with suppress(StateNotStored):  # it was told; a full disk will be told by what needs it more
-                bench.state.store_file(
-                    _FACTS, before.model_copy(update={"doubt": why}).model_dump_json(indent=1).encode()
-                )
+def empty_table_status(bench: Bench) -> EmptyTableStatus:
+    """Return the bench's empty-table image and its problems."""
+    if bench.config.table.carries == "camera":
+        return EmptyTableStatus(None, (TableProblem(TableProblemCode.CAMERA_MOVES),))
+    try:
+        table = _read(bench)
+    except _Unreadable as error:
+        return EmptyTableStatus(None, (TableProblem(TableProblemCode.UNREADABLE, {"detail": str(error)}),))
+    if table is None:
+        return EmptyTableStatus(None, (TableProblem(TableProblemCode.MISSING),))
+    if unusable := _unusable(table, bench):
+        return EmptyTableStatus(None, (unusable,))
+    return EmptyTableStatus(table, _reasons_for_new_image(table, bench))
 
 
-class Drift:
-    """Notices when frames have ceased to look like the picture of the empty table.
+def store_empty_table(bench: Bench, table: EmptyTable) -> None:
+    """Store an image instead of the previous one, which stays until the new one is completely on the disk.
 
-    The front end leaves such a picture alone, frame by frame; that the table was changed, or the camera moved, is for
-    the person at the bench to know.
+    Raises
+    ------
+    StateNotStored
+        The disk is full or not writable.
     """
-
-    def __init__(self) -> None:
-        self._low: list[float] = []
-        self._told = False
-
-    def look(self, segmentation: Mapping[str, Any] | None) -> str:
-        """Add the segmentation of the next frame; return a warning once, else an empty string."""
-        agreement = None if segmentation is None else segmentation.get("agreement")
-        if agreement is None:
-            return ""
-        self._low = [*self._low, agreement] if agreement < MIN_AGREEMENT else []
-        if self._told or len(self._low) < IN_A_ROW:
-            return ""
-        self._told = True
-        return (
-            f"{IN_A_ROW} frames in a row look like the picture of the empty table over "
-            f"{max(self._low):.0%} of their border at most: the table or its surroundings have changed, the camera was "
-            "moved, or the object reaches to the border"
-        )
+    png = images.encode(table.image_bgr)
+    stored = _Stored.of(table, png)
+    before = _metadata(bench, quiet=True)
+    bench.state.store_file(stored.image, png)
+    bench.state.store_file(_FILE, stored.model_dump_json(indent=1).encode())
+    if before is not None and before.image != stored.image:
+        bench.state.remove_file(before.image)
 
 
-class _Damaged(Exception):
+def store_table_problem(bench: Bench, problem: TableProblem) -> None:
+    """Store a problem with the bench's image, so that the next command asks for a new image."""
+    before = _metadata(bench, quiet=True)
+    if before is not None:
+        changed = before.model_copy(update={"noticed": problem.as_json()})
+        with suppress(StateNotStored):  # the warning was shown; writes that matter report a full disk themselves
+            bench.state.store_file(_FILE, changed.model_dump_json(indent=1).encode())
+
+
+def _unusable(table: EmptyTable, bench: Bench) -> TableProblem | None:
+    now, before = bench.camera.identity, table.image_bgr.shape
+    if (now.height, now.width) != before[:2]:
+        sizes = {"image_px": (before[1], before[0]), "frame_px": (now.width, now.height)}
+        return TableProblem(TableProblemCode.OTHER_SIZE, sizes)
+    if now.name != table.camera.name:
+        return TableProblem(TableProblemCode.OTHER_CAMERA, {"image_camera": table.camera.name, "camera": now.name})
+    return None
+
+
+def _reasons_for_new_image(table: EmptyTable, bench: Bench) -> tuple[TableProblem, ...]:
+    hours = round((bench.clock.utc() - table.taken_utc).total_seconds() / 3600, 2)
+    problems = [TableProblem(TableProblemCode.OLD, {"hours": hours})] if hours > MAX_AGE_H else []
+    problems += [TableProblem(TableProblemCode.FUTURE, {"hours": -hours})] if hours < -1 else []
+    now = asdict(bench.camera.read_locks())
+    problems += [
+        TableProblem(TableProblemCode.SETTING, {"name": name, "before": before, "now": now[name]})
+        for name, before in asdict(table.locks).items()
+        if before is not None and now[name] is not None and before != now[name]
+    ]
+    return (*problems, *([table.noticed] if table.noticed else []))
+
+
+class _Unreadable(Exception):
     pass
 
 
-class _Kept(BaseModel):
-    """The file beside the picture."""
+class _Stored(BaseModel):
+    """Content of the JSON file beside the image."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -183,7 +154,9 @@ class _Kept(BaseModel):
     evidence: dict[str, Any]
     image: str = Field(pattern=r"^empty-table-[0-9TZ.]+\.png$")
     sha256: str
-    doubt: str = ""
+    noticed: dict[str, Any] | None = None
+    doubt: str = Field("", exclude=True)
+    """The problem in words, in version 1."""
 
     @classmethod
     def of(cls, table: EmptyTable, png: bytes) -> Self:
@@ -194,49 +167,62 @@ class _Kept(BaseModel):
             evidence=dict(table.evidence),
             image=f"empty-table-{table.taken_utc:%Y%m%dT%H%M%S.%fZ}.png",
             sha256=hashlib.sha256(png).hexdigest(),
-            doubt=table.doubt,
+            noticed=None if table.noticed is None else table.noticed.as_json(),
         )
 
+    def upgraded(self) -> Self:
+        """Return it in the present version."""
+        if self.version != 1:
+            return self
+        noticed = None
+        if found := _OLD_WARNING.fullmatch(self.doubt):
+            parameters = {"frames": int(found[1]), "agreement": int(found[2]) / 100}
+            noticed = TableProblem(TableProblemCode.SURROUNDINGS, parameters).as_json()
+        elif self.doubt:
+            noticed = TableProblem(TableProblemCode.OTHER, {"text": self.doubt}).as_json()
+        return self.model_copy(update={"version": _VERSION, "noticed": noticed})
 
-def _facts(bench: Bench, *, quiet: bool = False) -> _Kept | None:
+    def problem(self) -> TableProblem | None:
+        if self.noticed is None:
+            return None
+        parameters = {name: value for name, value in self.noticed.items() if name != "code"}
+        try:
+            return TableProblem(TableProblemCode(str(self.noticed.get("code"))), parameters)
+        except ValueError:
+            return TableProblem(TableProblemCode.OTHER, {"text": str(self.noticed)})
+
+
+def _metadata(bench: Bench, *, quiet: bool = False) -> _Stored | None:
     try:
-        text = bench.state.read_file(_FACTS)
-        kept = None if text is None else _Kept.model_validate_json(text)
+        text = bench.state.read_file(_FILE)
+        stored = None if text is None else _Stored.model_validate_json(text).upgraded()
     except StateNotStored as error:
-        why = error.what
+        detail = error.what
     except ValidationError as error:
-        why = f"{_FACTS} is damaged ({error.errors(include_url=False)[0]['msg']})"
+        detail = f"{_FILE} is damaged ({error.errors(include_url=False)[0]['msg']})"
     else:
-        if kept is None or kept.version == _VERSION:
-            return kept
-        why = f"{_FACTS} is of version {kept.version}, this program knows {_VERSION}"
+        if stored is None or stored.version == _VERSION:
+            return stored
+        detail = f"{_FILE} has version {stored.version}, this program reads versions up to {_VERSION}"
     if quiet:
         return None
-    raise _Damaged(why)
+    raise _Unreadable(detail)
 
 
 def _read(bench: Bench) -> EmptyTable | None:
-    kept = _facts(bench)
-    if kept is None:
+    stored = _metadata(bench)
+    if stored is None:
         return None
     try:
-        png = bench.state.read_file(kept.image)
+        png = bench.state.read_file(stored.image)
     except StateNotStored as error:
-        raise _Damaged(error.what) from error
+        raise _Unreadable(error.what) from error
     if png is None:
-        raise _Damaged(f"{kept.image} is missing")
-    if hashlib.sha256(png).hexdigest() != kept.sha256:
-        raise _Damaged(f"{kept.image} is damaged")
+        raise _Unreadable(f"{stored.image} is missing")
+    if hashlib.sha256(png).hexdigest() != stored.sha256:
+        raise _Unreadable(f"{stored.image} is damaged")
     try:
         image = images.decode(png)
     except images.BadImage as error:
-        raise _Damaged(f"{kept.image} cannot be read: {error}") from error
-    return EmptyTable(image, kept.taken_utc, kept.camera, kept.locks, kept.evidence, kept.doubt)
-
-
-def _age_words(hours: float) -> str:
-    return f"{hours:.0f} hours" if hours < 48 else f"{hours / 24:.0f} days"
-
-
-def _setting(value: float | bool) -> str:
-    return ("on" if value else "off") if isinstance(value, bool) else f"{value:g}"
+        raise _Unreadable(f"{stored.image} is not readable: {error}") from error
+    return EmptyTable(image, stored.taken_utc, stored.camera, stored.locks, stored.evidence, stored.problem())

@@ -1,4 +1,4 @@
-"""Sees by the camera when the next object stands on the table: for benches where nobody presses a key."""
+"""Detects by the camera that the next object is on the table, for benches without an operator at the keyboard."""
 
 from typing import Final
 
@@ -12,40 +12,40 @@ from rig.core.clock import seconds_between
 from rig.views.description import within
 
 GRID: Final = 48
-"""Cells along each side of the picture that is compared."""
+"""Number of cells along each side of the images that are compared."""
 STEP_LEVELS: Final = 8.0
-"""A cell has changed when its level did by more than this, beyond what the whole picture did (a cloud, a lamp)."""
+"""A cell has changed if its level changed by more than this, after the change of the whole image is subtracted."""
 CELLS: Final = 6
-"""So many changed cells, of `GRID`², are something: an object of 2 cm on a picture of 40 cm."""
+"""So many changed cells of `GRID`² are an object: for example 2 cm in an image of 40 cm."""
 
-Picture = NDArray[np.float32]
+Cells = NDArray[np.float32]
 
 
 class TableWatcher:
-    """An operator who waits until somebody has put the next object on the table and taken the hands away.
+    """An operator that waits until the next object is on the table and nothing moves.
 
-    The first time it is asked the table must be empty: that is what an empty table looks like. From then on an object
-    is a new one when the picture is at rest, is not that of the empty table, and is another one than when the waiting
-    began or the table was empty meanwhile. The table must stand at the same angle each time.
+    At the first call the table must be empty, because that image is compared with later. An object is new if the image
+    is still, differs from the empty table, and either differs from the image at the start of the wait or follows an
+    empty table. The table must be at the same angle each time.
 
     Parameters
     ----------
     bench
-        An open one.
+        An open bench.
     still_s
-        How long the picture must be at rest.
+        How long the image must be still.
     poll_s
-        Time between two looks.
+        Time between two frames.
     """
 
     def __init__(self, bench: Bench, *, still_s: float = 1.5, poll_s: float = 0.25) -> None:
         self._bench = bench
         self._still_s = still_s
         self._poll_s = poll_s
-        self._empty: Picture | None = None
+        self._empty: Cells | None = None
 
     def place(self, name: str | None) -> None:
-        """Return when the next object stands there; one that is to be enrolled (``name``) stands there already.
+        """Return when the next object is on the table. An object to be enrolled (``name``) is there already.
 
         Raises
         ------
@@ -55,46 +55,46 @@ class TableWatcher:
         if name is not None:
             return
         clock = self._bench.clock
-        before = self._look()
-        old: Picture | None = None
+        before = self._capture()
+        old: Cells | None = None
         if self._empty is None:
             self._empty = before
         else:
             old = before
-        rest_ns = clock.now_ns()
+        still_since_ns = clock.now_ns()
         while True:
             clock.sleep(self._poll_s)
-            now = self._look()
+            now = self._capture()
             if changed(before, now):
-                rest_ns = clock.now_ns()
-            elif seconds_between(rest_ns, clock.now_ns()) >= self._still_s:
+                still_since_ns = clock.now_ns()
+            elif seconds_between(still_since_ns, clock.now_ns()) >= self._still_s:
                 if not changed(self._empty, now):
-                    self._empty, old = now, None  # follows the light of the day
+                    self._empty, old = now, None  # follow slow changes of the daylight
                 elif old is None or changed(old, now):
                     return
             before = now
 
     def clear(self) -> bool:
-        """Whether nothing stands on the table: so it does by agreement, until the first object was waited for."""
+        """Return whether the table is empty: by agreement, until `place` has waited for the first object."""
         return self._empty is None
 
-    def _look(self) -> Picture:
+    def _capture(self) -> Cells:
         frame = self._bench.camera.capture(self._bench.clock.now_ns())
-        return picture(frame.image_bgr, self._bench.config.view)
+        return shrunk(frame.image_bgr, self._bench.config.view)
 
 
-def picture(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Picture:
-    """Return the region of a frame as it is compared, float32 (`GRID`, `GRID`, 3)."""
+def shrunk(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Cells:
+    """Return the region of interest of a frame as cells, float32 (`GRID`, `GRID`, 3)."""
     return cv2.resize(within(image_bgr, config.roi), (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def changed_cells(a: Picture, b: Picture) -> int:
-    """Return how many of the cells of two pictures are another, beyond other light."""
+def changed_cells(a: Cells, b: Cells) -> int:
+    """Return how many cells differ, apart from a change of the illumination."""
     difference = b - a
     difference -= np.median(difference, axis=(0, 1))
     return int(np.count_nonzero(np.abs(difference).max(axis=2) > STEP_LEVELS))
 
 
-def changed(a: Picture, b: Picture) -> bool:
-    """Return whether something in the picture, float32 (`GRID`, `GRID`, 3), is another; other light alone is not."""
+def changed(a: Cells, b: Cells) -> bool:
+    """Return whether the scene differs, float32 (`GRID`, `GRID`, 3) each, apart from a change of the illumination."""
     return changed_cells(a, b) >= CELLS

@@ -59,10 +59,10 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
     from rig.bench import ObjectAlreadyPlaced, TableClearer
     from rig.core.errors import TableNotEmpty, ViewRejected
     from rig.events.wording import sentence
-    from rig.views.empty_table import COMMAND, EmptyTables
+    from rig.views.empty_table import COMMAND, empty_table_status
 
-    standing = EmptyTables.standing(bench)
-    if (standing.table is not None and not standing.doubts) or bench.config.table.carries == "camera":
+    status = empty_table_status(bench)
+    if (status.table is not None and not status.problems) or bench.config.table.carries == "camera":
         return
     if isinstance(bench.operator, TableClearer):
         if bench.operator.clear():
@@ -71,36 +71,33 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
             except (TableNotEmpty, ViewRejected) as error:  # enrollment can continue without the image
                 print(f"Note: {error.what} {error.next_step}", file=sys.stderr)
         return
-    consequence = WITHOUT_IMAGE if standing.table is None else OLD_IMAGE
+    consequence = WITHOUT_IMAGE if status.table is None else OLD_IMAGE
     if isinstance(bench.operator, ObjectAlreadyPlaced) and ask and not settings.json and is_interactive():
-        question = f"{sentence(standing.words)} Take everything off the table."
+        question = f"{sentence(status.text)} Take everything off the table."
         if _take_with_operator(settings, bench, question, consequence) and then:
             _answer(f"Put {then} on the table and take your hands away.\n  Enter: continue ")
         return
-    print(f"Note: {standing.words}; {consequence}. To take a new one: {COMMAND}", file=sys.stderr)
+    print(f"Note: {status.text}; {consequence}. To take a new one: {COMMAND}", file=sys.stderr)
 
 
 def _show(settings: Settings, bench: "Bench", path: Path) -> None:
     from rig.core.errors import UsageError
     from rig.core.files import write
     from rig.views import image_files as images
-    from rig.views.empty_table import EmptyTables
+    from rig.views.empty_table import empty_table_status
 
-    standing = EmptyTables.standing(bench)
-    if standing.table is None:
-        raise UsageError(
-            f"There is no image to show: {standing.words}.", next_step="Take the image with rig empty-table."
-        )
+    status = empty_table_status(bench)
+    if status.table is None:
+        raise UsageError(f"There is no image to show: {status.text}.", next_step="Take the image with rig empty-table.")
     try:
-        write(path, images.encode(standing.table.image_bgr))
+        write(path, images.encode(status.table.image_bgr))
     except OSError as error:
         raise UsageError(
             f"{path} cannot be written.",
             next_step="Choose another file with --show.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
-    taken = standing.table.taken_utc.isoformat()
-    settings.say(f"{path}: {standing.words}", {"file": str(path), "taken_utc": taken, "doubts": list(standing.doubts)})
+    settings.say(f"{path}: {status.text}", {"file": str(path), **status.as_json()})
 
 
 def _take_with_operator(settings: Settings, bench: "Bench", question: str, consequence: str) -> bool:

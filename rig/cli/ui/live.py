@@ -39,7 +39,7 @@ from rig.events.wording import (
 )
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
-from rig.views.capture import ViewEvidence
+from rig.views.capture import ViewEvidence, rejection_text
 
 ROWS: Final = 12
 """Views that the table shows at once."""
@@ -163,7 +163,8 @@ class EnrollView(LiveView):
                 if not event.agrees:
                     self.note(f"  {move_words(event)}")
             case Rejected():
-                self._add(event.evidence, f"taken again: {'; '.join(event.reasons)}", accepted=False)
+                texts = "; ".join(rejection_text(reason, event.evidence) for reason in event.reasons)
+                self._add(event.evidence, f"taken again: {texts}", accepted=False)
             case Accepted():
                 self._taken += 1
                 self._add(event.evidence, "accepted", accepted=True)

@@ -43,6 +43,7 @@ from rig.events.wording import (
     unwinding_words,
 )
 from rig.plans.estimate import DryRun, Obstacle
+from rig.views.capture import rejection_text
 
 SHOWN = 3
 
@@ -70,7 +71,8 @@ def line(event: Event) -> str:
         case Unwinding():
             return f"  {unwinding_words(event)}"
         case Rejected():
-            return f"view {event.index + 1}, attempt {event.attempt}: not taken, {'; '.join(event.reasons)}"
+            texts = "; ".join(rejection_text(reason, event.evidence) for reason in event.reasons)
+            return f"view {event.index + 1}, attempt {event.attempt}: rejected, {texts}"
         case Accepted():
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():

@@ -14,7 +14,7 @@ from rig.bench import ObjectAlreadyPlaced
 from rig.cli.main import app
 from rig.cli.objects.empty_table import ensure_empty_table_image
 from rig.cli.ui.settings import Settings
-from rig.views.empty_table import EmptyTables
+from rig.views.empty_table import empty_table_status
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 
@@ -33,11 +33,11 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 def test_it_is_taken_told_and_shown(rig: Callable[..., Any]) -> None:
     nothing = rig("empty-table", "--show", "empty.png")
     assert nothing.exit_code == 2
-    assert "no picture of the empty table was taken yet" in nothing.stderr
+    assert "there is no empty-table image yet" in nothing.stderr
     taken = json.loads(rig("empty-table", "--json").stdout)
     assert (taken["event"], taken["width"], taken["height"]) == ("empty_table_image", 640, 480)
     shown = rig("empty-table", "--show", "empty.png", "--json")
-    assert json.loads(shown.stdout)["doubts"] == []
+    assert json.loads(shown.stdout)["problems"] == []
     assert cv2.imread("empty.png").shape == (480, 640, 3)
     assert rig("empty-table", "--show", "nowhere/empty.png").exit_code == 2
     assert rig("empty-table", "--show", "empty.png", "--anyway").exit_code == 2
@@ -51,9 +51,9 @@ def test_an_enrollment_takes_it_once_a_day_and_says_what_came_of_it(rig: Callabl
     assert rig("empty-table", *small).exit_code == 0
     assert "photographed the empty table" in rig("log").stdout
     shown = rig("catalog", "show", "dice")
-    assert "object found in 4 of 4 views, light normalised in 4" in shown.stdout
+    assert "object found in 4 of 4 views, illumination corrected in 4" in shown.stdout
     told = json.loads(rig("catalog", "show", "lamp", "--json").stdout)
-    assert told["sightings"]["found"] == 4
+    assert told["segmentation"]["found"] == 4
     assert told["views"][0]["record"]["segmentation"]["agreement"] > 0.65
 
 
@@ -89,7 +89,7 @@ def asked(
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
         monkeypatch.setattr("sys.stdin", answers)
         ensure_empty_table_image(Settings(json=as_json), s.bench, ask=ask, then="toy-car")
-        return EmptyTables.standing(s.bench).table, capsys.readouterr().err
+        return empty_table_status(s.bench).table, capsys.readouterr().err
 
     return run
 
@@ -97,8 +97,8 @@ def asked(
 def test_a_person_is_asked_again_when_the_object_was_forgotten(asked: Callable[..., tuple[Any, str]]) -> None:
     table, said = asked(Answers("\n\n\n"))
     assert table is not None
-    assert "No picture of the empty table was taken yet. Take everything off the table." in said
-    assert "Something stands on the table" in said
+    assert "There is no empty-table image yet. Take everything off the table." in said
+    assert "Something is on the table" in said
     assert said.count("Enter: take the image") == 2
     assert "Put toy-car on the table" in said
 
@@ -125,7 +125,7 @@ def test_a_person_may_go_on_without_and_knows_what_that_means(
 def test_automation_is_never_asked(asked: Callable[..., tuple[Any, str]], options: dict[str, bool]) -> None:
     table, said = asked(Answers("\n\n\n"), **options)
     assert table is None
-    assert said.startswith("Note: no picture of the empty table was taken yet;")
+    assert said.startswith("Note: there is no empty-table image yet;")
     assert "To take a new one: rig empty-table" in said
 
 

@@ -331,7 +331,7 @@ FOUND = {
     "i2c_stuck": ("imu", "does not move"),
     "camera.off": ("camera", "no camera"),
     "camera.stuck": ("camera", "no frame"),
-    "camera.garbage": ("camera", "noise instead of a picture"),
+    "camera.garbage": ("camera", "noise instead of an image"),
     "camera.wrong": ("camera", "320x240"),
     "camera.slow": ("camera", "2 a second"),
     "camera.delayed": ("camera", "old"),

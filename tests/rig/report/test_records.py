@@ -12,6 +12,7 @@ from rig.events.wording import answer_words, decision_words, distinct, move_word
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
 from rig.report.summary import enrollment_items, totals
+from rig.views.capture import RejectReason
 from tests.rig.report.report_samples import enrolled, enrolling, evidence, identified, identifying, moved
 
 
@@ -209,9 +210,12 @@ class TestWords:
 
 def test_rejected_frames_belong_to_the_next_view() -> None:
     record = IdentificationRecord()
-    record.add(Rejected(0, 1, ("too dark", "blurred"), evidence()))
-    record.add(Rejected(0, 2, ("blurred",), evidence()))
+    record.add(Rejected(0, 1, (RejectReason.TOO_DARK, RejectReason.BLURRED), evidence()))
+    record.add(Rejected(0, 2, (RejectReason.BLURRED,), evidence()))
     record.add(Accepted(0, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
     record.add(Accepted(1, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
-    assert record.views[0].rejected == ("too dark, blurred", "blurred")
+    assert record.views[0].rejected == (
+        "too dark (mean level 90.0, 0% black), blurred (sharpness 100.0)",
+        "blurred (sharpness 100.0)",
+    )
     assert record.views[1].rejected == ()

@@ -66,7 +66,7 @@ def test_objects_enrolled_with_a_picture_are_searched_by_todays_or_else_by_their
         assert answer.name == "lamp"
         another = simulated(*SMALL, seed=5)
         events, answer = search(another, model, "teapot")
-        assert "no picture of the empty table was taken yet: the one of the enrollment is used" in events[0].notes[-1]
+        assert "there is no empty-table image yet: the image of the enrollment is used" in events[0].notes[-1]
         assert answer.name == "teapot"
         assert all(e.segmentation["agreement"] > 0.9 for e in events if isinstance(e, Accepted))
         list(enroll(another.bench, catalog, "mug-dots", views=3))

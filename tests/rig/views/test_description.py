@@ -72,3 +72,14 @@ def test_empty_table_image_of_another_size_is_not_used_and_reported() -> None:
 def test_region_outside_the_frame_is_rejected() -> None:
     with pytest.raises(UsageError, match="does not lie within"):
         ViewDescriber(ViewConfig(roi=(100, 0, 100, 100)))(_table())
+
+
+def test_three_frames_in_a_row_that_differ_are_reported_once() -> None:
+    table = _table()
+    good, bad = _with_object(table), _with_object(table[::-1, ::-1].copy())
+    describe = ViewDescriber(WHOLE, (BENCH_DESCRIPTOR,), table)
+    problems = [describe(frame).table_problem for frame in (bad, bad, good, bad, bad, bad, bad)]
+    assert [problem is not None for problem in problems] == [False] * 5 + [True, False]
+    assert problems[5] is not None
+    assert problems[5].parameters["frames"] == 3
+    assert problems[5].parameters["agreement"] < 0.65

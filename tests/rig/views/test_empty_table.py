@@ -1,4 +1,4 @@
-"""The picture of the empty table: taken, judged, kept, doubted, and what an enrollment makes of it."""
+"""The empty-table image: taken, checked, stored, its problems, and its use by an enrollment."""
 
 import json
 from collections.abc import Callable
@@ -21,9 +21,10 @@ from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
 from rig.views.description import BENCH_DESCRIPTOR
-from rig.views.empty_table import HOLDS_H, Drift, EmptyTables
+from rig.views.empty_table import MAX_AGE_H, empty_table_status
 from rig.views.object_presence import TableWatcher
 from rig.views.segmentation_evidence import SegmentationSummary
+from rig.views.table_problems import TableProblem, TableProblemCode
 from sim import disk
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES
@@ -41,31 +42,31 @@ def photographed(bench: Bench, **options: Any) -> EmptyTableImage:
     return taken
 
 
-def test_the_table_is_cleared_photographed_and_turned_back(simulated: Open) -> None:
+def test_table_is_cleared_photographed_and_rotated_back(simulated: Open) -> None:
     s = simulated(*SMALL)
     s.operator.place("dice")
-    assert EmptyTables.standing(s.bench).words == "no picture of the empty table was taken yet"
+    assert empty_table_status(s.bench).problems == (TableProblem(TableProblemCode.MISSING),)
     taken = photographed(s.bench)
-    kept = EmptyTables.standing(s.bench).table
+    kept = empty_table_status(s.bench).table
     assert kept is not None
     assert np.array_equal(kept.image_bgr, taken.image_bgr)
     assert s.world.scene.thing is None
     assert taken.turning_share == 0
     assert abs(s.world.table_deg()) < 1
-    assert EmptyTables.standing(s.bench).doubts == ()
+    assert empty_table_status(s.bench).problems == ()
 
 
 @pytest.mark.parametrize("limits", [(0, 400), (-400, 3)])
-def test_the_cable_decides_where_it_turns_to(simulated: Open, limits: tuple[int, int]) -> None:
+def test_rotation_stays_within_the_cable_limits(simulated: Open, limits: tuple[int, int]) -> None:
     s = simulated(*SMALL, f"table.limits_deg={list(limits)}")
     s.operator.clear = lambda: True  # type: ignore[method-assign]
     s.operator.place("toy-house")
-    with pytest.raises(TableNotEmpty, match="Something stands on the table") as caught:
+    with pytest.raises(TableNotEmpty, match="Something is on the table") as caught:
         photographed(s.bench)
     assert "--anyway" in caught.value.next_step
 
 
-def test_a_forgotten_object_is_refused_and_the_picture_before_stays(simulated: Open) -> None:
+def test_forgotten_object_is_rejected_and_the_previous_image_stays(simulated: Open) -> None:
     s = simulated(*SMALL)
     before = photographed(s.bench)
     s.operator.clear = lambda: True
@@ -73,14 +74,14 @@ def test_a_forgotten_object_is_refused_and_the_picture_before_stays(simulated: O
         s.operator.place(name)
         with pytest.raises(TableNotEmpty):
             photographed(s.bench)
-    kept = EmptyTables.standing(s.bench).table
+    kept = empty_table_status(s.bench).table
     assert kept is not None
     assert np.array_equal(kept.image_bgr, before.image_bgr)
     assert abs(s.world.table_deg()) < 1
     assert photographed(s.bench, anyway=True).turning_share > 0.004
 
 
-def test_a_round_object_turns_unseen_and_is_told_by_the_picture_before(simulated: Open) -> None:
+def test_round_object_is_noticed_by_the_previous_image(simulated: Open) -> None:
     s = simulated(*SMALL)
     photographed(s.bench)
     s.operator.clear = lambda: True
@@ -90,62 +91,65 @@ def test_a_round_object_turns_unseen_and_is_told_by_the_picture_before(simulated
     assert "does not look as it did" in events[-2].what
 
 
-def test_a_dark_table_is_refused_as_a_view_is(simulated: Open) -> None:
+def test_dark_table_is_rejected_like_a_view(simulated: Open) -> None:
     s = simulated(*SMALL)
     s.world.change(light=(0.0, 0.0, 0.0))
     with pytest.raises(ViewRejected, match="too dark"):
         photographed(s.bench)
-    assert EmptyTables.standing(s.bench).table is None
+    assert empty_table_status(s.bench).table is None
 
 
-def test_a_camera_that_goes_around_has_no_empty_table(simulated: Open) -> None:
+def test_bench_that_rotates_its_camera_has_no_empty_table_image(simulated: Open) -> None:
     s = simulated(*SMALL, 'table.carries="camera"')
-    with pytest.raises(UsageError, match="goes around"):
+    with pytest.raises(UsageError, match="moves around"):
         photographed(s.bench)
 
 
-def test_age_and_settings_are_doubts_and_another_size_makes_it_useless(simulated: Open) -> None:
+def test_age_and_settings_are_problems_and_another_size_is_not_usable(simulated: Open) -> None:
     s = simulated(*SMALL)
     photographed(s.bench)
     s.operator.parts.camera.drift(kelvin=6000.0)
-    assert EmptyTables.standing(s.bench).doubts == ("white_balance_k was 5000, is 6000",)
-    s.world.clock.sleep(timedelta(hours=HOLDS_H + 1).total_seconds())
-    standing = EmptyTables.standing(s.bench)
-    assert standing.table is not None
-    assert standing.doubts[0] == "it is 13 hours old"
+    parameters = {"name": "white_balance_k", "before": 5000.0, "now": 6000.0}
+    assert empty_table_status(s.bench).problems == (TableProblem(TableProblemCode.SETTING, parameters),)
+    assert "white_balance_k was 5000, is 6000" in empty_table_status(s.bench).text
+    s.world.clock.sleep(timedelta(hours=MAX_AGE_H + 1).total_seconds())
+    status = empty_table_status(s.bench)
+    assert status.table is not None
+    assert status.problems[0] == TableProblem(TableProblemCode.OLD, {"hours": 13.0})
     other = simulated()
     other.bench.state = s.bench.state
-    standing = EmptyTables.standing(other.bench)
-    assert standing.table is None
-    assert "320 x 240 pixels, the camera's frames have 640 x 480" in standing.words
+    status = empty_table_status(other.bench)
+    assert status.table is None
+    sizes = {"image_px": (320, 240), "frame_px": (640, 480)}
+    assert status.problems == (TableProblem(TableProblemCode.OTHER_SIZE, sizes),)
 
 
-def test_on_disk_damage_is_told_and_a_new_picture_mends_it(simulated: Open, tmp_path: Path) -> None:
+def test_damage_on_disk_is_reported_and_fixed_by_a_new_image(simulated: Open, tmp_path: Path) -> None:
     s = simulated(*SMALL)
     s.bench.state = FileStore(tmp_path)
     photographed(s.bench)
     (png,) = tmp_path.glob("*.png")
-    facts = tmp_path / "empty-table.json"
-    whole = facts.read_bytes()
+    metadata = tmp_path / "empty-table.json"
+    whole = metadata.read_bytes()
     for spoil, said in (
         (lambda: png.write_bytes(png.read_bytes()[:-9]), "is damaged"),
         (png.unlink, "is missing"),
-        (lambda: facts.write_bytes(whole[:50]), "empty-table.json is damaged"),
-        (lambda: facts.write_text(json.dumps({**json.loads(whole), "version": 9})), "of version 9"),
+        (lambda: metadata.write_bytes(whole[:50]), "empty-table.json is damaged"),
+        (lambda: metadata.write_text(json.dumps({**json.loads(whole), "version": 9})), "has version 9"),
     ):
         spoil()
-        standing = EmptyTables.standing(s.bench)
-        assert standing.table is None
-        assert said in standing.words
+        status = empty_table_status(s.bench)
+        assert status.table is None
+        assert said in status.text
     photographed(s.bench)
-    assert EmptyTables.standing(s.bench).table is not None
+    assert empty_table_status(s.bench).table is not None
     photographed(s.bench)
-    assert len(list(tmp_path.glob("*.png"))) == 1  # the one before is let go of
+    assert len(list(tmp_path.glob("*.png"))) == 1  # the previous one was removed
 
 
 @pytest.fixture(scope="module")
-def facts() -> bytes:
-    """What a bench keeps beside a picture."""
+def metadata() -> bytes:
+    """Return the JSON file that a bench stores beside an image."""
     world = World()
     with open_sim_bench(load_config(None, SMALL), ShelfOperator(world, shelf())) as bench:
         photographed(bench)
@@ -153,9 +157,9 @@ def facts() -> bytes:
 
 
 @given(data=st.data())
-def test_whatever_is_in_the_files_is_a_picture_or_a_reason(facts: bytes, data: st.DataObject) -> None:
+def test_any_file_content_gives_an_image_or_a_problem(metadata: bytes, data: st.DataObject) -> None:
     state = MemoryStore()
-    known = json.loads(facts)
+    known = json.loads(metadata)
     garbage = st.recursive(
         st.none() | st.integers() | st.text() | st.just(1e999), lambda some: st.lists(some), max_leaves=3
     )
@@ -165,19 +169,19 @@ def test_whatever_is_in_the_files_is_a_picture_or_a_reason(facts: bytes, data: s
     state.files["empty-table.json"] = data.draw(spoilt | st.binary(max_size=40))
     state.files[known["image"]] = data.draw(st.binary(max_size=40))
     bench = SimpleNamespace(state=state, config=RigConfig())
-    standing = EmptyTables.standing(bench)  # type: ignore[arg-type]
-    assert standing.table is None
-    assert "of no use" in standing.words
+    status = empty_table_status(bench)  # type: ignore[arg-type]
+    assert status.table is None
+    assert [problem.code for problem in status.problems] == [TableProblemCode.UNREADABLE]
 
 
-def test_a_clock_that_was_set_back_is_told(simulated: Open) -> None:
+def test_date_in_the_future_is_reported(simulated: Open) -> None:
     s = simulated(*SMALL)
     photographed(s.bench)
     s.world.clock.set_civil(-7200.0)
-    assert "dated in the future" in EmptyTables.standing(s.bench).words
+    assert empty_table_status(s.bench).problems == (TableProblem(TableProblemCode.FUTURE, {"hours": 2.0}),)
 
 
-def test_a_bench_that_watches_its_table_photographs_it_before_the_first_object(simulated: Open) -> None:
+def test_watching_bench_takes_the_image_before_the_first_object(simulated: Open) -> None:
     s = simulated(*SMALL)
     s.bench.operator = TableWatcher(s.bench)
     assert photographed(s.bench).turning_share == 0
@@ -187,7 +191,7 @@ def test_a_bench_that_watches_its_table_photographs_it_before_the_first_object(s
         photographed(s.bench)
 
 
-def test_a_full_disk_is_told_and_the_picture_before_stays(simulated: Open, tmp_path: Path) -> None:
+def test_full_disk_is_reported_and_the_previous_image_stays(simulated: Open, tmp_path: Path) -> None:
     s = simulated(*SMALL)
     s.bench.state = FileStore(tmp_path)
     before = photographed(s.bench)
@@ -195,7 +199,7 @@ def test_a_full_disk_is_told_and_the_picture_before_stays(simulated: Open, tmp_p
     store = s.bench.state
 
     class Full(FileStore):
-        """Full where pictures go; the table's turns were kept before."""
+        """A disk that is full when the image is stored."""
 
         def store_file(self, name: str, content: bytes) -> None:
             free = disk.fill()
@@ -209,15 +213,13 @@ def test_a_full_disk_is_told_and_the_picture_before_stays(simulated: Open, tmp_p
         photographed(s.bench)
     assert "Make room" in caught.value.next_step
     s.bench.state = store
-    table = EmptyTables.standing(s.bench).table
+    table = empty_table_status(s.bench).table
     assert table is not None
     assert np.array_equal(table.image_bgr, before.image_bgr)
     assert sorted(path.name for path in tmp_path.iterdir()) == kept
 
 
-def test_every_enrolled_view_has_both_descriptors_its_evidence_and_the_empty_table(
-    simulated: Open, tmp_path: Path
-) -> None:
+def test_enrolled_views_have_both_descriptors_evidence_and_the_image(simulated: Open, tmp_path: Path) -> None:
     s = simulated(*SMALL)
     taken = photographed(s.bench)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
@@ -232,11 +234,11 @@ def test_every_enrolled_view_has_both_descriptors_its_evidence_and_the_empty_tab
     summary = SegmentationSummary.of(view.record.segmentation for view in details.views)
     assert (summary.views, summary.found, summary.guessed, summary.corrected) == (4, 4, 0, 4)
     assert summary.text.startswith("object found in 4 of 4 views, illumination corrected in 4")
-    assert f"{taken.taken_utc:.10}" in sitting.provenance.conditions["empty_table"]
+    assert f"{taken.taken_utc:.10}" in sitting.provenance.conditions["empty_table"]["taken_utc"]
     assert not any(isinstance(event, Warned) for event in events)
 
 
-def test_another_wall_is_noticed_told_once_and_remembered(simulated: Open, tmp_path: Path) -> None:
+def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_path: Path) -> None:
     s = simulated(*SMALL, seed=2)
     photographed(s.bench)
     s.operator.another_day(CHANGES["bench"])
@@ -246,15 +248,45 @@ def test_another_wall_is_noticed_told_once_and_remembered(simulated: Open, tmp_p
     assert [event.index for event in warned] == [2]
     assert "rig empty-table" in warned[0].next_step
     assert all(view.record.segmentation["issues"][0]["code"] == "empty-table-differs" for view in views)
-    assert any("3 frames in a row" in doubt for doubt in EmptyTables.standing(s.bench).doubts)
+    *_, problem = empty_table_status(s.bench).problems
+    assert (problem.code, problem.parameters["frames"]) == (TableProblemCode.SURROUNDINGS, 3)
+    assert "3 frames in a row" in warned[0].what
     photographed(s.bench)
-    assert EmptyTables.standing(s.bench).doubts == ()
+    assert empty_table_status(s.bench).problems == ()
 
 
-def test_two_bad_frames_are_no_drift() -> None:
-    drift = Drift()
-    low, high = {"agreement": 0.2}, {"agreement": 0.9}
-    assert [bool(drift.look(seen)) for seen in (low, low, high, low, None, low, low, low)] == [False] * 6 + [
-        True,
-        False,
-    ]
+def test_images_of_version_1_are_read(simulated: Open) -> None:
+    s = simulated(*SMALL)
+    photographed(s.bench)
+    stored = json.loads(s.bench.state.read_file("empty-table.json"))
+    assert stored.pop("noticed") is None
+    warning = (
+        "3 frames in a row look like the picture of the empty table over 42% of their border at most: the table or its "
+        "surroundings have changed, the camera was moved, or the object reaches to the border"
+    )
+    for doubt, expected in (
+        (warning, (TableProblem(TableProblemCode.SURROUNDINGS, {"frames": 3, "agreement": 0.42}),)),
+        ("a scratch", (TableProblem(TableProblemCode.OTHER, {"text": "a scratch"}),)),
+        ("", ()),
+    ):
+        old = {**stored, "version": 1, "doubt": doubt}
+        s.bench.state.store_file("empty-table.json", json.dumps(old).encode())
+        status = empty_table_status(s.bench)
+        assert status.table is not None
+        assert status.problems == expected
+
+
+@pytest.mark.parametrize("code", TableProblemCode)
+def test_every_problem_has_a_text(code: TableProblemCode) -> None:
+    parameters = {
+        TableProblemCode.UNREADABLE: {"detail": "it is damaged"},
+        TableProblemCode.OTHER_SIZE: {"image_px": (320, 240), "frame_px": [640, 480]},
+        TableProblemCode.OTHER_CAMERA: {"image_camera": "A", "camera": "B"},
+        TableProblemCode.OLD: {"hours": 100.0},
+        TableProblemCode.SETTING: {"name": "autofocus", "before": True, "now": False},
+        TableProblemCode.SURROUNDINGS: {"frames": 3, "agreement": 0.4},
+        TableProblemCode.OTHER: {"text": "a scratch"},
+    }
+    text = TableProblem(code, parameters.get(code, {})).text
+    assert text != code
+    assert "{" not in text

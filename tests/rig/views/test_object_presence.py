@@ -1,4 +1,4 @@
-"""Waiting for the next object by camera, on a bench without hands."""
+"""Waiting for the next object with the camera."""
 
 import pytest
 
@@ -23,13 +23,13 @@ def put(s, name, yaw_deg=0.0):
 
 
 def seconds(s, watcher):
-    """Return how long the watcher waits."""
+    """Return how long the watcher waits, in seconds."""
     start_ns = s.world.clock.now_ns()
     watcher.place(None)
     return (s.world.clock.now_ns() - start_ns) * 1e-9
 
 
-def test_it_waits_until_an_object_stands_still(simulated):
+def test_watcher_waits_until_the_object_is_still(simulated):
     s = simulated(*SMALL)
     watcher = TableWatcher(s.bench)
     at(s, 5.0, put(s, "lamp"))
@@ -38,7 +38,7 @@ def test_it_waits_until_an_object_stands_still(simulated):
     assert 8.5 <= seconds(s, watcher) <= 10.5
 
 
-def test_an_object_that_stays_is_no_new_one_and_another_or_the_same_put_again_is(simulated):
+def test_object_is_new_if_it_is_another_one_or_follows_an_empty_table(simulated):
     s = simulated(*SMALL)
     watcher = TableWatcher(s.bench)
     at(s, 1.0, put(s, "toy-car"))
@@ -50,7 +50,7 @@ def test_an_object_that_stays_is_no_new_one_and_another_or_the_same_put_again_is
     assert 16.0 <= seconds(s, watcher) <= 18.5
 
 
-def test_neither_an_emptied_table_nor_other_light_is_an_object(simulated):
+def test_empty_table_and_changing_illumination_are_not_an_object(simulated):
     s = simulated(*SMALL)
     watcher = TableWatcher(s.bench)
     at(s, 1.0, put(s, "radio"))
@@ -63,7 +63,7 @@ def test_neither_an_emptied_table_nor_other_light_is_an_object(simulated):
     assert 61.0 <= seconds(s, watcher) <= 63.5
 
 
-def test_the_smallest_object_is_seen(simulated):
+def test_smallest_objects_are_detected(simulated):
     for name in ("dice", "candle"):
         s = simulated(*SMALL)
         watcher = TableWatcher(s.bench)
@@ -71,21 +71,21 @@ def test_the_smallest_object_is_seen(simulated):
         assert seconds(s, watcher) <= 6.0
 
 
-def test_an_object_to_be_enrolled_is_not_waited_for(simulated):
+def test_object_to_be_enrolled_is_there_already(simulated):
     s = simulated(*SMALL)
     start_ns = s.world.clock.now_ns()
     TableWatcher(s.bench).place("lamp")
     assert s.world.clock.now_ns() == start_ns
 
 
-def test_a_camera_that_is_pulled_while_nobody_comes_ends_the_waiting(simulated):
+def test_unplugged_camera_ends_the_waiting(simulated):
     s = simulated(*SMALL)
     at(s, 5.0, s.operator.parts.camera.unplug)
     with pytest.raises(DeviceSilent):
         TableWatcher(s.bench).place(None)
 
 
-def test_one_object_after_the_other_is_identified_and_a_dark_one_does_not_end_it(simulated, tmp_path):
+def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_path):
     s = simulated(*SMALL, "identify.max_views=4", seed=4)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("toy-car", "book-night"):
@@ -93,18 +93,20 @@ def test_one_object_after_the_other_is_identified_and_a_dark_one_does_not_end_it
         index = hbr.ViewIndex(catalog.views().views)
     s.world.put(None)
     s.bench.operator = TableWatcher(s.bench)
-    coming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]
-    told = []
+    upcoming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]
+    answers = []
     for event in watch(s.bench, lambda: index):
         if isinstance(event, Waiting):
-            assert s.world.shaft()[0] == pytest.approx(0.0, abs=1.0)  # where the empty table was seen, and unwound
-            name, yaw_deg = coming.pop(0)
+            assert s.world.shaft()[0] == pytest.approx(
+                0.0, abs=1.0
+            )  # the angle of the empty-table frame, with the cable unwound
+            name, yaw_deg = upcoming.pop(0)
             s.world.change(light=(1.0, 1.0, 1.0))
             at(s, 4.0, put(s, name, yaw_deg))
-            if name == "radio":  # and when it was seen, somebody puts the light out
+            if name == "radio":  # the light goes out after the object was detected
                 at(s, 6.2, lambda: s.world.change(light=(0.0, 0.0, 0.0)))
         if isinstance(event, Failed | Identified):
-            told.append(event.code if isinstance(event, Failed) else event.name)
-            if not coming:
+            answers.append(event.code if isinstance(event, Failed) else event.name)
+            if not upcoming:
                 break
-    assert told == ["toy-car", 600, "book-night"]
+    assert answers == ["toy-car", 600, "book-night"]

@@ -255,13 +255,13 @@ def test_a_person_is_asked_whether_an_interrupted_object_was_moved():
 
 
 def test_a_person_decides_what_becomes_of_an_object_that_failed():
-    error = ViewRejected("View 3 was not acceptable: too dark.", next_step="Look at the light.")
+    error = ViewRejected("View 3 was rejected: too dark.", next_step="Check the light.")
     for said, expected in (("\n", TrayDecision.PROCEED), ("s\n", TrayDecision.SKIP), ("q\n", TrayDecision.STOP)):
         questions = io.StringIO()
         person = OperatorPrompts(questions=questions, answers=io.StringIO(said))
         assert person.decide_after_error(TrayItem(2, "mug"), error) is expected
         assert "too dark" in questions.getvalue()
-        assert "Look at the light" in questions.getvalue()
+        assert "Check the light" in questions.getvalue()
 
 
 def test_where_nobody_can_be_asked_that_is_said():

@@ -1,0 +1,81 @@
+"""Problems of an empty-table image: codes with parameters, and their texts."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+
+class TableProblemCode(StrEnum):
+    """Problems of an empty-table image. The parameters are listed with each code."""
+
+    CAMERA_MOVES = "camera-moves"
+    """The bench rotates its camera, and no image is needed."""
+    MISSING = "missing"
+    UNREADABLE = "unreadable"
+    """``detail``: the message of the error."""
+    OTHER_SIZE = "other-size"
+    """``image_px`` and ``frame_px``, (width, height)."""
+    OTHER_CAMERA = "other-camera"
+    """``image_camera`` and ``camera``, their names."""
+    OLD = "old"
+    """``hours`` since the image was taken."""
+    FUTURE = "future"
+    """``hours`` until the date of the image."""
+    SETTING = "setting"
+    """A camera setting has changed: ``name``, ``before``, ``now``."""
+    SURROUNDINGS = "surroundings"
+    """The border of ``frames`` frames in a row had at most this ``agreement`` with the image, 0..1."""
+    OTHER = "other"
+    """``text``, stored by version 0.1."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableProblem:
+    """A reason not to use an empty-table image, or to take a new one."""
+
+    code: TableProblemCode
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the code and the parameters in one flat mapping."""
+        return {"code": self.code.value, **self.parameters}
+
+    @property
+    def text(self) -> str:
+        """The problem in words."""
+        return _text(self.as_json())
+
+
+def _text(problem: Mapping[str, Any]) -> str:
+    match problem:
+        case {"code": "camera-moves"}:
+            return "the camera moves around the object, so that every view has another background"
+        case {"code": "missing"}:
+            return "there is no empty-table image yet"
+        case {"code": "unreadable", "detail": detail}:
+            return f"the empty-table image is not usable: {detail}"
+        case {"code": "other-size", "image_px": (width, height), "frame_px": (now_width, now_height)}:
+            return (
+                f"the empty-table image has {width} x {height} pixels, "
+                f"but the camera's frames have {now_width} x {now_height}"
+            )
+        case {"code": "other-camera", "image_camera": before, "camera": now}:
+            return f"the empty-table image is from another camera: {before}, not {now}"
+        case {"code": "old", "hours": hours}:
+            return f"it is {hours:.0f} hours old" if hours < 48 else f"it is {hours / 24:.0f} days old"
+        case {"code": "future"}:
+            return "its date is in the future: check the computer's clock"
+        case {"code": "setting", "name": name, "before": before, "now": now}:
+            return f"{name} was {_setting(before)}, is {_setting(now)}"
+        case {"code": "surroundings", "frames": frames, "agreement": agreement}:
+            return (
+                f"{frames} frames in a row agree with it over at most {agreement:.0%} of their border. The table or "
+                "its surroundings have changed, the camera was moved, or the object reaches the border"
+            )
+        case _:
+            return str(problem.get("text", problem["code"]))
+
+
+def _setting(value: float | bool) -> str:
+    return ("on" if value else "off") if isinstance(value, bool) else f"{value:g}"
