@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.config import ImuConfig
-from rig.motion.turntable import Move
+from rig.motion.move import Move
 
 COVERAGE = 4.0
 """Residuals beyond this many standard uncertainties are no chance (1 in 16 000)."""

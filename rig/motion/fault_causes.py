@@ -1,4 +1,4 @@
-"""Why a motion did not come to its end: the servo, asked for its condition, often knows better than its symptoms."""
+"""Finds why a motion failed: the servo's condition often shows the cause behind a symptom."""
 
 from math import isfinite
 
@@ -10,18 +10,19 @@ from rig.safety.motion_checks import find_servo_fault
 
 
 def find_cause(symptom: RigError, servo: Servo, config: SafetyConfig) -> RigError:
-    """Return why the servo does not do what it was told, where it knows; else ``symptom`` itself."""
+    """Return the cause of a failed motion if the servo's condition shows it, else ``symptom``."""
     try:
         condition = servo.read_condition()
         if condition.watchdog_tripped:
             return WatchdogTripped(
-                "The servo heard nothing from the computer for too long, and stopped the table by itself.",
-                next_step="Was the computer asleep, or too busy? Start again; an enrollment goes on with --resume.",
+                "The servo received nothing from the computer for too long, and its watchdog stopped the table.",
+                next_step="Check whether the computer slept or was too busy, then start again; continue an enrollment "
+                "with --resume.",
                 evidence=symptom.evidence,
             )
         if condition.power_lost:
             return SupplyLost(
-                "The servo was without supply for a moment: its torque is off, and it forgot its turns.",
+                "The servo lost its supply for a moment: its torque is off, and its count of revolutions is lost.",
                 next_step="Check the supply, its plug and its cable.",
                 evidence=symptom.evidence,
             )
@@ -41,22 +42,22 @@ def explain_unsettled(
     peak_dps: float,
     cruise_dps: float,
 ) -> RigError:
-    """Return why a table does not come to rest: it has not arrived, it shakes, or the gyro does not tell.
+    """Return why a table does not come to rest: it has not arrived, it shakes, or the gyro fails.
 
     Parameters
     ----------
     goal_deg, angle_deg
-        Of the table: where it should be, and where it is by the encoder.
+        The table's goal, and its angle by the encoder.
     allowed_s
-        How long that has been waited for.
+        How long the table had time to come to rest.
     state
-        The servo's last.
+        The servo's last reading.
     arrived
         Whether the servo is in position.
     peak_dps
-        Largest rate by the gyro of late; infinite where its samples are not complete.
+        Largest recent rate by the gyro; infinite if samples are missing.
     cruise_dps
-        The table's fastest.
+        Highest speed of the table.
     """
     evidence = {
         "goal_deg": round(goal_deg, 2),
@@ -70,23 +71,23 @@ def explain_unsettled(
     if not arrived:
         return MotionTimeout(
             f"The table did not arrive at {goal_deg:.1f}° within {allowed_s:.1f} s.",
-            next_step="Look for what slows the table down, and for a cable at its end.",
+            next_step="Look for what slows the table down, and check that its cable is not taut.",
             evidence=evidence,
         )
     if not isfinite(peak_dps):
         return DeviceFault(
-            f"The table has arrived at {goal_deg:.1f}°, but samples of the gyro are missing: is it at rest?",
+            f"The table arrived at {goal_deg:.1f}°, but samples of the gyro are missing: its rest cannot be checked.",
             next_step="Check the IMU's cable and supply.",
             evidence=evidence,
         )
     if peak_dps > cruise_dps:
         return DeviceFault(
-            f"The table has arrived at {goal_deg:.1f}°, but the gyro tells of {peak_dps:.0f} °/s.",
-            next_step="Check the IMU: no table that stands turns like that.",
+            f"The table arrived at {goal_deg:.1f}°, but the gyro measures {peak_dps:.0f} °/s.",
+            next_step="Check the IMU: a table at rest cannot rotate that fast.",
             evidence=evidence,
         )
     return MotionTimeout(
-        f"The table has arrived at {goal_deg:.1f}° but does not come to rest within {allowed_s:.1f} s.",
-        next_step="Look for what shakes the bench; table.quiet_dps says how much is too much.",
+        f"The table arrived at {goal_deg:.1f}° but did not come to rest within {allowed_s:.1f} s.",
+        next_step="Look for what shakes the bench; table.quiet_dps is the limit.",
         evidence=evidence,
     )

@@ -1,4 +1,4 @@
-"""How long moves and views take."""
+"""Duration of moves and views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,20 +7,21 @@ from typing import Final
 
 from rig.config import RigConfig
 from rig.devices.servo import MotionProfile
-from rig.motion.turntable import FIRST_REST_S, motion_seconds
+from rig.motion.move import motion_seconds
+from rig.motion.turntable import FIRST_REST_S
 
 FRAMES: Final = 1.5
-"""Frames that pass until one was exposed whole after the table came to rest."""
+"""Frames from the table's rest until one was exposed completely."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """The time that moves and views take, from the table's profile and the camera's frame rate."""
+    """The duration of moves and views, from the table's motion profile and the camera's frame rate."""
 
     config: RigConfig
 
     def move_s(self, distance_deg: float) -> float:
-        """Return the time of a move by ``distance_deg`` until the table is at rest; downwards it goes a bit below."""
+        """Return the duration of a move until the table is at rest; downwards it includes the approach from below."""
         table = self.config.table
         profile = MotionProfile(table.velocity_dps, table.acceleration_dps2)
         seconds = table.settle_s + motion_seconds(distance_deg, profile)
@@ -30,11 +31,11 @@ class MotionModel:
 
     @property
     def view_s(self) -> float:
-        """The time until a frame is there."""
+        """The duration of a view: the time until a frame arrives."""
         return FRAMES / self.config.camera.fps
 
     def enrollment_s(self, start_deg: float, angles_deg: Sequence[float]) -> float:
-        """Return the time of views at these table angles, begun at ``start_deg``, and of the way back to 0."""
+        """Return the duration of views at these table angles, from ``start_deg`` and back home."""
         if not angles_deg:
             return 0.0
         stops = [start_deg, *angles_deg]

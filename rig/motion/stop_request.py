@@ -1,4 +1,4 @@
-"""Stops a bench from outside: the program that holds it, or, if none does, the servo itself."""
+"""Stops a bench from another process: through the program that uses it or, if there is none, at the servo."""
 
 import os
 import signal
@@ -12,20 +12,20 @@ from rig.core.clock import Clock, seconds_between
 from rig.core.errors import BenchBusy, StateNotStored
 from rig.safety.saved_state import FileStore, Holder, holder
 
-HEED_S = 2.0
-"""How long a program may take to see the request: many rounds of its control loop, and a long exposure."""
+REACTION_S = 2.0
+"""How long a program may take to notice the request: many rounds of its control loop, and a long exposure."""
 END_S = 5.0
-"""How long it may then take to close its devices."""
+"""How long it may take afterwards to close its devices."""
 POLL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
-    """What was stopped.
+class StopReport:
+    """Result of a stop.
 
-    ``holder`` is the program that held the bench, ``signalled`` whether it took a signal, ``ended`` whether it is gone
-    or still holds the bench, at rest; ``torque_was_on`` what the servo was found in afterwards, None where it could not
-    be asked because the bench is still held.
+    ``holder`` is the program that used the bench, ``signalled`` says whether it needed a signal, ``ended`` whether it
+    ended (else it still uses the bench, at rest). ``torque_was_on`` says whether the servo's torque was on afterwards;
+    None if the servo could not be asked because the bench is still in use.
     """
 
     holder: Holder | None
@@ -34,40 +34,40 @@ class Stop:
     torque_was_on: bool | None
 
 
-def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None) -> Stop:
-    """Stop the table of the bench ``name`` and take its torque off, whoever drives it.
+def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None) -> StopReport:
+    """Stop the table of the bench ``name`` and switch its torque off, whichever program moves it.
 
     Raises
     ------
     BenchBusy
-        The program that holds the bench does not react.
+        The program that uses the bench does not react.
     DeviceNotFound, DeviceMismatch, DeviceSilent
-        Nobody holds it, and the servo cannot be reached.
+        No program uses the bench, and the servo cannot be reached.
     """
     path = config.state_path(name)
     who, signalled = holder(path), False
     if who is not None:
         store = FileStore(path)
-        with suppress(StateNotStored):  # a full disk: the signal is left
+        with suppress(StateNotStored):  # full disk: the signal remains
             store.request_stop()
         if not store.stop_requested() or not _wait(
-            clock, HEED_S, lambda: not store.stop_requested() or holder(path) is None
+            clock, REACTION_S, lambda: not store.stop_requested() or holder(path) is None
         ):
-            # It is not in its control loop: asking for its next object, computing, or hanging.
+            # It is not in its control loop: it waits for its next object, computes, or hangs.
             signalled = who.pid > 0 and _signal(who)
         if not _wait(clock, END_S, lambda: holder(path) is None) and (store.stop_requested() or signalled):
-            raise _deaf(who, config)
+            raise _not_reacting(who, config)
         if holder(path) is not None:
-            return Stop(who, signalled, ended=False, torque_was_on=None)
+            return StopReport(who, signalled, ended=False, torque_was_on=None)
     with open_servo(name, config, seed=seed) as servo:
         torque = servo.read_condition().torque
         servo.torque_off()
-    return Stop(who, signalled, ended=True, torque_was_on=torque)
+    return StopReport(who, signalled, ended=True, torque_was_on=torque)
 
 
 def _signal(who: Holder) -> bool:
     with suppress(ProcessLookupError, PermissionError):
-        # Python's own answer to SIGINT unwinds the stack; to SIGTERM it does nothing of the kind unless told to.
+        # By default Python unwinds the stack on SIGINT, but not on SIGTERM.
         os.kill(who.pid, signal.SIGTERM if who.terminates else signal.SIGINT)
         return True
     return False
@@ -82,11 +82,11 @@ def _wait(clock: Clock, seconds: float, done: Callable[[], bool]) -> bool:
     return True
 
 
-def _deaf(who: Holder, config: RigConfig) -> BenchBusy:
-    end_it = f"`kill -9 {who.pid}`" if who.pid else "the program, whichever it is"
+def _not_reacting(who: Holder, config: RigConfig) -> BenchBusy:
+    end_it = f"End it with `kill -9 {who.pid}`" if who.pid else "End that program"
     return BenchBusy(
-        "The program that holds the bench does not react.",
-        next_step=f"End {end_it}: a moving table then stops by its watchdog within {config.table.watchdog_s:g} s. "
-        "Then `rig stop` again, for the torque.",
+        "The program that uses the bench does not react.",
+        next_step=f"{end_it}; a moving table then stops by its watchdog within {config.table.watchdog_s:g} s. "
+        "Then run `rig stop` again to switch the torque off.",
         evidence={"pid": who.pid, "command": who.command, "since_utc": who.since_utc},
     )

@@ -5,7 +5,8 @@ from collections.abc import Generator
 from rig.bench import Bench
 from rig.core.errors import ViewRejected
 from rig.events.events import Event, Moved, Rejected, Unwinding, Warned
-from rig.motion.turntable import Move, Turntable
+from rig.motion.move import Move
+from rig.motion.turntable import Turntable
 from rig.safety.gyro_rotation import finite
 from rig.views.capture import Attempt, Viewer, rejection_text
 from rig.views.description import DescribedView
@@ -71,7 +72,7 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
     ViewRejected
         All frames were rejected. The evidence is that of the last one.
     """
-    attempts = viewer.attempts(settled_ns, table.check_still, table.attend)
+    attempts = viewer.attempts(settled_ns, table.check_still, table.collect_gyro)
     for attempt in attempts:
         if attempt.accepted:
             return attempt

@@ -14,7 +14,8 @@ from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
 from rig.events.events import Accepted, Enrolled, Event, Started, plain
-from rig.motion.turntable import Move, Turntable
+from rig.motion.move import Move
+from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Viewer, image_similarity

@@ -1,7 +1,13 @@
-"""Where the table stands: the servo counts its own turns, but only as long as it has its supply."""
+"""The table's angle from the servo's position, and whether it can still be trusted after a pause.
 
+The servo counts its own revolutions, but only as long as it has its supply.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from math import cos, radians, sin
+from typing import Final
 
 from hbr.core.angles import wrap180
 from rig.config import TableConfig
@@ -9,28 +15,103 @@ from rig.devices.servo import ServoCondition, ServoIdentity
 from rig.safety.saved_state import SavedTable
 
 TOLERANCE_DEG = 2.0
-"""How far a shaft may relax when its torque goes, and the encoder's noise."""
+"""How far a shaft may relax when its torque goes off, including the encoder's noise."""
 HAND_DEG = 180.0
-"""How far a hand turns a table without thinking of its cable; more is rather a servo that lost count."""
+"""Largest rotation by hand that is taken for one; a larger change is probably a servo that lost its count."""
 OVERSHOOT_DEG = 5.0
-"""How far beyond its way a motion may have come that was broken off."""
+"""How far an interrupted motion may overshoot its path."""
+
+
+class AngleFinding(StrEnum):
+    """Result of comparing the servo's position with the stored one."""
+
+    UNCHANGED = "unchanged"
+    ROTATED_BY_HAND = "rotated-by-hand"
+    REVOLUTIONS_RESTORED = "revolutions-restored"
+    MOTION_INTERRUPTED = "motion-interrupted"
+    NEVER_REFERENCED = "never-referenced"
+    OTHER_SERVO = "other-servo"
+    OTHER_FIRMWARE = "other-firmware"
+    POWER_LOST_IN_MOTION = "power-lost-in-motion"
+    NOT_ON_PATH = "not-on-path"
+    ROTATED_WITHOUT_POWER = "rotated-without-power"
+    POSITION_CHANGED = "position-changed"
+
+
+_CERTAIN: Final = frozenset(
+    {
+        AngleFinding.UNCHANGED,
+        AngleFinding.ROTATED_BY_HAND,
+        AngleFinding.REVOLUTIONS_RESTORED,
+        AngleFinding.MOTION_INTERRUPTED,
+    }
+)
+_TEXTS: Final[Mapping[AngleFinding, str]] = {
+    AngleFinding.UNCHANGED: "the table is where it was",
+    AngleFinding.ROTATED_BY_HAND: "the table was rotated by hand while the servo counted (now {now:.1f}°, before "
+    "{before:.1f}°)",
+    AngleFinding.REVOLUTIONS_RESTORED: "the servo lost its supply and {lost} of its revolutions; they were restored "
+    "from the stored state",
+    AngleFinding.MOTION_INTERRUPTED: "the last program was interrupted during a motion; the servo kept its count "
+    "(now {now:.1f}°)",
+    AngleFinding.NEVER_REFERENCED: "it was never set on this bench",
+    AngleFinding.OTHER_SERVO: "another servo is connected than last time",
+    AngleFinding.OTHER_FIRMWARE: "the servo's firmware changed from {before_firmware} to {firmware}",
+    AngleFinding.POWER_LOST_IN_MOTION: "the servo lost its supply during a motion",
+    AngleFinding.NOT_ON_PATH: "a motion was interrupted, and the servo is at {now:.1f}°, which is not on its path",
+    AngleFinding.ROTATED_WITHOUT_POWER: "the table was rotated while the servo had no supply (now {now:.1f}°, before "
+    "{before:.1f}°)",
+    AngleFinding.POSITION_CHANGED: "the servo is at {now:.1f}°, but it was left at {before:.1f}°",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class SavedAngleCheck:
-    """What is to be added to the servo's positions, or why that is in ``doubt``; ``findings`` for the operator."""
+    """Result of `check_saved_angle`.
 
+    Attributes
+    ----------
+    finding
+        What the comparison showed.
+    shift_deg
+        What must be added to the servo's positions.
+    position_deg, saved_position_deg
+        The servo's position now and when it was stored.
+    firmware, saved_firmware
+        The servo's firmware now and when it was stored.
+    lost_revolutions
+        Revolutions that the servo no longer counts.
+    """
+
+    finding: AngleFinding
     shift_deg: float
-    doubt: str = ""
-    findings: tuple[str, ...] = ()
+    position_deg: float
+    saved_position_deg: float = 0.0
+    firmware: int = 0
+    saved_firmware: int = 0
+    lost_revolutions: int = 0
+
+    @property
+    def certain(self) -> bool:
+        """Whether the angle can be trusted; otherwise the operator must look at the cable."""
+        return self.finding in _CERTAIN
+
+    def __str__(self) -> str:
+        return _TEXTS[self.finding].format(
+            now=self.position_deg,
+            before=self.saved_position_deg,
+            firmware=self.firmware,
+            before_firmware=self.saved_firmware,
+            lost=self.lost_revolutions,
+        )
 
 
 class AngleReference:
     """Converts between the servo's positions and the table's angles.
 
-    The table's angle is ``direction · (position − error + shift − zero)``, degrees, unwrapped; the error is what the
-    encoder reads too much at that position of its turn, by calibration, the shift what the servo forgot (whole turns)
-    or a person declared (`declare`). ``turn_deg`` is the table's angle of one turn of the encoder.
+    The table's angle is ``direction · (position − error + shift − zero)``, degrees, unwrapped. The error is the
+    encoder's error at that position, from calibration. The shift is what the servo lost (whole revolutions) or the
+    operator set (`set_angle`). ``turn_deg`` is the table's rotation for one revolution of the encoder.
     """
 
     def __init__(self, config: TableConfig, shift_deg: float = 0.0, turn_deg: float = 360.0) -> None:
@@ -39,7 +120,7 @@ class AngleReference:
         self.shift_deg = shift_deg
 
     def calibrate(self, config: TableConfig) -> None:
-        """Take over what a calibration says about the encoder; what a person declared stays."""
+        """Use the encoder's calibration in ``config``; the shift stays."""
         self._config = self._config.model_copy(update={"encoder_harmonics_deg": config.encoder_harmonics_deg})
 
     def to_table(self, position_deg: float) -> float:
@@ -49,7 +130,7 @@ class AngleReference:
     def to_servo(self, table_deg: float) -> float:
         true_deg = self._config.direction * table_deg + self._config.zero_deg - self.shift_deg
         position_deg = true_deg
-        for _ in range(3):  # the error changes by a hundredth of the angle at most
+        for _ in range(3):  # converges quickly: the error changes by at most a hundredth of the angle
             position_deg = true_deg + self._error_deg(position_deg)
         return position_deg
 
@@ -58,13 +139,13 @@ class AngleReference:
         turn = radians(position_deg * 360.0 / self._turn_deg)
         return a1 * cos(turn) + b1 * sin(turn) + a2 * cos(2 * turn) + b2 * sin(2 * turn)
 
-    def declare(self, position_deg: float, table_deg: float) -> None:
-        """Take it from a person that the table stands at ``table_deg`` where the servo reads ``position_deg``."""
+    def set_angle(self, position_deg: float, table_deg: float) -> None:
+        """Set the shift so that the servo's ``position_deg`` is the table angle ``table_deg``."""
         self.shift_deg += self._config.direction * (table_deg - self.to_table(position_deg))
 
-    def with_turns(self, position_deg: float, turns: int) -> float:
-        """Return the table's angle at ``position_deg`` with the cable wound up by ``turns`` whole turns."""
-        return float(wrap180(self.to_table(position_deg))) + 360.0 * turns
+    def with_revolutions(self, position_deg: float, revolutions: int) -> float:
+        """Return the table angle at ``position_deg`` if the cable is wound up by ``revolutions``."""
+        return float(wrap180(self.to_table(position_deg))) + 360.0 * revolutions
 
 
 def check_saved_angle(
@@ -74,48 +155,46 @@ def check_saved_angle(
     condition: ServoCondition,
     turn_deg: float = 360.0,
 ) -> SavedAngleCheck:
-    """Compare what a servo says after a pause with what was written down before.
+    """Compare the servo's position after a pause with the stored one.
 
-    ``turn_deg`` is the angle after which its encoder reads the same again.
-
-    As long as the servo keeps its supply, it counts its turns itself, and a hand that turned the table meanwhile is
-    counted too. Without supply only the angle within the turn remains: where it is the one written down, so are the
-    turns. All else is in doubt, and only a person who looks at the cable can tell.
+    As long as the servo has its supply, it counts its revolutions itself, also if the table is rotated by hand. Without
+    supply only the angle within the revolution remains: if it is the stored one, the stored revolutions hold as well.
+    In all other cases the operator must look at the cable. ``turn_deg`` is the angle after which the encoder repeats.
     """
     if saved is None:
-        return SavedAngleCheck(0.0, "nobody has told yet how its cable lies")
-    shift_deg = saved.shift_deg
-    found, written = f"{position_deg:.1f}°", f"{saved.position_deg:.1f}°"
+        return SavedAngleCheck(AngleFinding.NEVER_REFERENCED, 0.0, position_deg)
+    moved_deg = position_deg - saved.position_deg
+    revolutions = round(moved_deg / turn_deg)
+    same_within_turn = abs(moved_deg - turn_deg * revolutions) <= TOLERANCE_DEG
+    lost = 0
+    finding = AngleFinding.UNCHANGED
     if (identity.model_number, identity.bus_id) != (saved.model_number, saved.bus_id):
-        return SavedAngleCheck(shift_deg, "another servo is connected than the last time")
-    if identity.firmware != saved.firmware:
-        return SavedAngleCheck(shift_deg, f"the servo's firmware was {saved.firmware} and is {identity.firmware} now")
-    turned_deg = position_deg - saved.position_deg
-    turns = round(turned_deg / turn_deg)
-    same_within_turn = abs(turned_deg - turn_deg * turns) <= TOLERANCE_DEG
-    if saved.path_deg is not None:
+        finding = AngleFinding.OTHER_SERVO
+    elif identity.firmware != saved.firmware:
+        finding = AngleFinding.OTHER_FIRMWARE
+    elif saved.path_deg is not None:
+        # The last program ended during a motion: the servo may be anywhere on the path.
         low_deg, high_deg = saved.path_deg
+        on_path = low_deg - OVERSHOOT_DEG <= position_deg <= high_deg + OVERSHOOT_DEG
         if condition.power_lost:
-            return SavedAngleCheck(shift_deg, "the servo lost its supply in the middle of a motion")
-        if not low_deg - OVERSHOOT_DEG <= position_deg <= high_deg + OVERSHOOT_DEG:
-            return SavedAngleCheck(
-                shift_deg, f"a motion was cut off, and the servo stands at {found}, which was not on its way"
-            )
-        finding = f"the last program was cut off in the middle of a motion; the servo kept its turns (at {found})"
-        return SavedAngleCheck(shift_deg, findings=(finding,))
-    if condition.power_lost:
+            finding = AngleFinding.POWER_LOST_IN_MOTION
+        else:
+            finding = AngleFinding.MOTION_INTERRUPTED if on_path else AngleFinding.NOT_ON_PATH
+    elif condition.power_lost:
         if not same_within_turn:
-            return SavedAngleCheck(
-                shift_deg,
-                f"the servo was without supply and the table was turned meanwhile (at {found}, left at {written})",
-            )
-        if turns:
-            finding = f"the servo was without supply and forgot {abs(turns)} of its turns; they were written down"
-            return SavedAngleCheck(shift_deg - turn_deg * turns, findings=(finding,))
-        return SavedAngleCheck(shift_deg)
-    if abs(turned_deg) > min(HAND_DEG, turn_deg / 2):
-        return SavedAngleCheck(shift_deg, f"the servo stands at {found}, it was left at {written}")
-    if abs(turned_deg) > TOLERANCE_DEG:
-        finding = f"the table was turned by hand, with the servo counting (at {found}, left at {written})"
-        return SavedAngleCheck(shift_deg, findings=(finding,))
-    return SavedAngleCheck(shift_deg)
+            finding = AngleFinding.ROTATED_WITHOUT_POWER
+        elif revolutions:
+            finding, lost = AngleFinding.REVOLUTIONS_RESTORED, revolutions
+    elif abs(moved_deg) > min(HAND_DEG, turn_deg / 2):
+        finding = AngleFinding.POSITION_CHANGED
+    elif abs(moved_deg) > TOLERANCE_DEG:
+        finding = AngleFinding.ROTATED_BY_HAND
+    return SavedAngleCheck(
+        finding,
+        saved.shift_deg - turn_deg * lost,
+        position_deg,
+        saved.position_deg,
+        identity.firmware,
+        saved.firmware,
+        abs(lost),
+    )

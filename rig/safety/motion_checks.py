@@ -1,6 +1,7 @@
-"""What a servo's readings say about a motion: judged in every round of the control loop, and before a fault is let go.
+"""Checks of a servo's readings: in each round of the control loop, and before a fault is acknowledged.
 
-Each limit lies before the servo's own shutdown, so that the table is stopped in order, and the cause is told.
+Each limit is reached before the servo's own shutdown, so that the table stops in a controlled way and the cause is
+reported.
 """
 
 from collections import deque
@@ -22,15 +23,15 @@ from rig.devices.servo import ServoLimits, ServoState
 from rig.safety.gyro_rotation import Rotation
 
 STANDING_DPS = 3.0
-"""A shaft slower than this stands: two units of the servo's own velocity reading."""
+"""A slower shaft counts as standing still: two units of the servo's velocity reading."""
 VOLTAGE_S = 0.1
-"""How long a voltage must last: starting motors make it dip."""
+"""How long a bad voltage must last: starting motors make it dip."""
 COOLER_C = 5.0
 """How much cooler than its limit a servo must be before it may work again."""
 
 
 def implausible_readings(state: ServoState) -> list[str]:
-    """Return the readings that no servo can have; such a reading is no ground for any command."""
+    """Return the readings that are impossible for any servo; no command may be based on them."""
     ranges = {
         "position": (state.position_deg, "°", MAX_LIMIT_DEG),
         "speed": (state.velocity_dps, "°/s", 3000.0),
@@ -44,12 +45,12 @@ def implausible_readings(state: ServoState) -> list[str]:
 def find_servo_fault(
     state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again: bool = False
 ) -> RigError | None:
-    """Return why a servo must not work, whether it turns or not: hardware errors, heat, supply; None if it may.
+    """Return why a servo must not work, moving or not (hardware error, temperature, supply); None if it may.
 
     Parameters
     ----------
     again
-        It was found find_servo_fault before: it must have cooled down, not just ceased to be too hot.
+        The servo had a fault before: it must also have cooled down by `COOLER_C`.
     """
     evidence = {
         "temperature_c": state.temperature_c,
@@ -60,21 +61,21 @@ def find_servo_fault(
     }
     if nonsense := implausible_readings(state):
         return DeviceFault(
-            f"The servo's readings cannot be true: {nonsense[0]}.",
-            next_step="Check its cable, then `rig acknowledge --reboot`; a servo that goes on like this is broken.",
+            f"The servo's readings are impossible: {nonsense[0]}.",
+            next_step="Check its cable. If this repeats, replace the servo.",
             evidence={"readings": nonsense},
-        )
+        ).ask_to_acknowledge(reboot=True)
     if state.hardware_errors:
         return DeviceFault(
             f"The servo reports a hardware error: {', '.join(state.hardware_errors)}.",
-            next_step="Remove the cause (jam, heat, supply), then `rig acknowledge --reboot`.",
+            next_step="Remove the cause (jam, heat, supply).",
             evidence={"hardware_errors": list(state.hardware_errors), **evidence},
-        )
+        ).ask_to_acknowledge(reboot=True)
     hottest_c = limits.temperature_c - config.temperature_margin_c
     if state.temperature_c >= hottest_c - (COOLER_C if again else 0.0):
         return Overheated(
             f"The servo is too hot: {state.temperature_c:.0f} °C, its own limit is {limits.temperature_c:.0f} °C.",
-            next_step=f"Let it cool down below {hottest_c - COOLER_C:.0f} °C; look for what makes it work so hard.",
+            next_step=f"Let it cool down below {hottest_c - COOLER_C:.0f} °C; look for what overloads it.",
             evidence=evidence,
         )
     low_v, high_v = (limits.voltage_v[0] + config.voltage_margin_v, limits.voltage_v[1] - config.voltage_margin_v)
@@ -88,20 +89,20 @@ def find_servo_fault(
 
 
 class MotionMonitor:
-    """Judges the readings of one motion, the latest after all others.
+    """Checks the servo's readings during one motion.
 
     Parameters
     ----------
     config
-        The limits.
+        The limits of the rig.
     limits
-        The servo's own.
+        The limits at which the servo shuts down.
     start_deg, goal_deg
-        Of the table: where the motion began and where it is to end.
+        Table angles at which the motion begins and ends.
     tolerance_deg
-        So close to the goal it has arrived.
+        Distance from the goal that counts as arrived.
     cruise_dps
-        How fast the table turns at most.
+        Highest speed of the table.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class MotionMonitor:
     ) -> None:
         self._config = config
         self._limits = limits
-        self._way_deg = (min(start_deg, goal_deg), max(start_deg, goal_deg))
+        self._path_deg = (min(start_deg, goal_deg), max(start_deg, goal_deg))
         self._goal_deg = goal_deg
         self._tolerance_deg = tolerance_deg
         self._standing_dps = min(STANDING_DPS, cruise_dps / 2)
@@ -124,17 +125,17 @@ class MotionMonitor:
         self._since_ns: dict[str, int] = {}
         self._stood: deque[tuple[int, float]] = deque()
 
-    def look(self, state: ServoState, angle_deg: float, lag_deg: float | None) -> None:
-        """Judge one reading.
+    def check(self, state: ServoState, angle_deg: float, lag_deg: float | None) -> None:
+        """Check one reading.
 
         Parameters
         ----------
         state
-            The servo's.
+            The servo's reading.
         angle_deg
-            Of the table, by it.
+            The table's angle from this reading.
         lag_deg
-            How far the table is behind the servo's profile; None where that is not known.
+            How far the table is behind the servo's profile; None if that is not known.
 
         Raises
         ------
@@ -142,7 +143,7 @@ class MotionMonitor:
             The motion must be stopped.
         """
         config = self._config
-        self._stay_fit(state)
+        self._check_servo(state)
         evidence = {
             "goal_deg": round(self._goal_deg, 2),
             "encoder_deg": round(angle_deg, 2),
@@ -156,38 +157,38 @@ class MotionMonitor:
         pushing = abs(state.load_percent) >= config.max_load_percent
         if self._lasts("stall", pushing and standing, state.time_ns, config.stall_s):
             raise Stalled(
-                f"The table is blocked at {angle_deg:.1f}°: the servo pushes and nothing turns.",
-                next_step="Remove what blocks it; look at the cable, too.",
+                f"The table is blocked at {angle_deg:.1f}°: the servo pushes, but the table does not rotate.",
+                next_step="Remove what blocks the table; check the cable, too.",
                 evidence=evidence,
             )
         if self._lasts("overload", pushing, state.time_ns, config.overload_s):
             raise Overloaded(
-                f"The table is hard to turn: {abs(state.load_percent):.0f} % of what the servo can.",
-                next_step="Look for what rubs or pulls (the cable, the bearing) and for too heavy an object.",
+                f"The table is hard to rotate: {abs(state.load_percent):.0f} % of the servo's torque.",
+                next_step="Look for friction (cable, bearing) and for an object that is too heavy.",
                 evidence=evidence,
             )
         lagging = lag_deg is not None and abs(lag_deg) > config.following_error_deg
         if self._lasts("lag", lagging, state.time_ns, config.overload_s / 2):
             raise FollowingError(
-                f"The table is {abs(lag_deg or 0.0):.1f}° from where the servo's profile wants it.",
-                next_step="Look for what slows the table down; a weak supply does, too.",
+                f"The table is {abs(lag_deg or 0.0):.1f}° away from the servo's motion profile.",
+                next_step="Look for what slows the table down; a weak supply is a possible cause.",
                 evidence=evidence,
             )
-        beyond_deg = max(self._way_deg[0] - angle_deg, angle_deg - self._way_deg[1])
+        beyond_deg = max(self._path_deg[0] - angle_deg, angle_deg - self._path_deg[1])
         if beyond_deg > config.following_error_deg:
             raise FollowingError(
-                f"The table is at {angle_deg:.1f}°, which is not on its way to {self._goal_deg:.1f}°.",
-                next_step="Look for what turned it, and at the angle that `rig status` tells.",
+                f"The table is at {angle_deg:.1f}°, which is not on its path to {self._goal_deg:.1f}°.",
+                next_step="Find out what rotated the table, and check its angle with `rig status`.",
                 evidence=evidence,
             )
         if abs(angle_deg - self._goal_deg) > self._tolerance_deg and self._stands_still(state.time_ns, angle_deg):
             raise NoProgress(
-                f"The table stands at {angle_deg:.1f}°, and was told to go to {self._goal_deg:.1f}°.",
-                next_step="Look at the servo's cable and supply, and turn the table by hand: is it free?",
+                f"The table stands still at {angle_deg:.1f}° on its way to {self._goal_deg:.1f}°.",
+                next_step="Check the servo's cable and supply, and check that the table rotates freely by hand.",
                 evidence=evidence,
             )
 
-    def _stay_fit(self, state: ServoState) -> None:
+    def _check_servo(self, state: ServoState) -> None:
         cause = find_servo_fault(state, self._config, self._limits)
         dip = isinstance(cause, SupplyOutOfRange)
         if cause is not None and (not dip or self._lasts("supply", True, state.time_ns, VOLTAGE_S)):
@@ -195,9 +196,9 @@ class MotionMonitor:
         if not dip:
             self._lasts("supply", False, state.time_ns, VOLTAGE_S)
 
-    def _lasts(self, name: str, true: bool, time_ns: int, seconds: float) -> bool:
-        """Return whether something has been true in every reading for so long."""
-        if not true:
+    def _lasts(self, name: str, holds: bool, time_ns: int, seconds: float) -> bool:
+        """Return whether a condition has been true in all readings for so long."""
+        if not holds:
             self._since_ns.pop(name, None)
             return False
         return seconds_between(self._since_ns.setdefault(name, time_ns), time_ns) >= seconds
@@ -212,9 +213,9 @@ class MotionMonitor:
 
 
 class SlipMonitor:
-    """Compares the platter's rotation, by the gyro, with the shaft's, by the encoder, while the table turns.
+    """Compares the platter's rotation (gyro) with the shaft's rotation (encoder) during a motion.
 
-    The gyro's samples come in lots and late; so its rotation is compared with the encoder's of the same moment.
+    The gyro's samples arrive late and in groups, so each is compared with the encoder reading of the same time.
     """
 
     def __init__(self, config: SafetyConfig, start_deg: float) -> None:
@@ -222,24 +223,24 @@ class SlipMonitor:
         self._start_deg = start_deg
         self._readings: deque[tuple[int, float]] = deque(maxlen=100)
 
-    def note(self, time_ns: int, angle_deg: float) -> None:
-        """Take a reading of the encoder."""
+    def add_reading(self, time_ns: int, angle_deg: float) -> None:
+        """Add a reading of the encoder."""
         self._readings.append((time_ns, angle_deg))
 
     def encoder_deg(self, until_ns: int) -> tuple[int, float] | None:
-        """Return time and rotation of the newest reading not later than ``until_ns``; None where there is none."""
+        """Return time and rotation of the newest reading not later than ``until_ns``; None if there is none."""
         for time_ns, angle_deg in reversed(self._readings):
             if time_ns <= until_ns:
                 return time_ns, angle_deg - self._start_deg
         return None
 
     def compare(self, encoder_deg: float, gyro: Rotation) -> None:
-        """Raise `RotationDisagreement` where the two differ by more than a slip that can be lived with."""
+        """Raise `RotationDisagreement` if the two differ by more than an acceptable slip."""
         difference_deg = encoder_deg - gyro.angle_deg
         bound_deg = self._config.slip_deg + 4 * gyro.sigma_deg
         if gyro.valid and abs(difference_deg) > bound_deg:
             raise RotationDisagreement(
-                f"The servo turned {encoder_deg:.1f}° so far, the platter {gyro.angle_deg:.1f}°.",
-                next_step="Tighten the platter. If it is tight: check imu.axis, imu.sign and table.direction.",
+                f"The servo rotated by {encoder_deg:.1f}° so far, but the platter by {gyro.angle_deg:.1f}°.",
+                next_step="Tighten the platter. If it is tight, check imu.axis, imu.sign and table.direction.",
                 evidence={"difference_deg": round(difference_deg, 2), "bound_deg": round(bound_deg, 2)},
             )

@@ -1,4 +1,4 @@
-"""What a bench must not forget when its program ends: how far the cable is wound up, a latched fault, who holds it."""
+"""State of a bench that survives its program: how far the cable is wound up, a latched fault, who uses the bench."""
 
 import errno
 import fcntl
@@ -25,10 +25,10 @@ class _Saved(BaseModel):
 
 
 class SavedTable(_Saved):
-    """The table at its last rest; positions are the servo's own, in degrees, as it counts since its last power-up.
+    """The table at its last rest; positions are the servo's own, in degrees, counted since its last power-up.
 
-    ``shift_deg`` is what must be added to them (turns that the servo forgot, a zero that was declared), ``path_deg``
-    the reach of a motion that had not ended when this was written.
+    ``shift_deg`` must be added to them (revolutions that the servo lost, an angle that the operator set). ``path_deg``
+    is the range of a motion that had not ended when this was stored.
     """
 
     model_number: int
@@ -40,7 +40,7 @@ class SavedTable(_Saved):
 
 
 class LatchedFault(_Saved):
-    """A latched fault: what `rig.core.errors` said, and when."""
+    """A latched fault: the error and its time."""
 
     code: int
     title: str
@@ -51,7 +51,7 @@ class LatchedFault(_Saved):
 
     @classmethod
     def of(cls, error: RigError, utc: str) -> "LatchedFault":
-        """Return the fault that ``error`` tells of, as it can be kept in a file."""
+        """Return ``error`` as a fault that can be stored."""
         evidence = json.loads(json.dumps(error.evidence, default=str))
         return cls(
             code=error.code, title=error.title, what=error.what, next_step=error.next_step, evidence=evidence, utc=utc
@@ -59,7 +59,7 @@ class LatchedFault(_Saved):
 
 
 class BenchState(_Saved):
-    """All of it; ``damage`` says why an earlier state could not be read, and is not kept."""
+    """The whole stored state; ``damage`` (not stored) says why an earlier state could not be read."""
 
     version: int = VERSION
     table: SavedTable | None = None
@@ -68,7 +68,7 @@ class BenchState(_Saved):
 
 
 class Holder(_Saved):
-    """The program that holds a bench; ``terminates`` says that SIGTERM ends it in an orderly way."""
+    """The program that uses a bench; ``terminates`` says whether it handles SIGTERM and ends in an orderly way."""
 
     pid: int
     command: str
@@ -77,12 +77,12 @@ class Holder(_Saved):
 
 
 class StateStore(Protocol):
-    """Where the state of one bench is kept."""
+    """Stores the state of one bench."""
 
     def load(self) -> BenchState: ...
 
     def save(self, state: BenchState) -> None:
-        """Keep ``state``; on return it outlives a power cut.
+        """Store ``state``; on return it survives a power cut.
 
         Raises
         ------
@@ -92,25 +92,25 @@ class StateStore(Protocol):
         ...
 
     def stop_requested(self) -> bool:
-        """Return whether somebody asked for a stop; asked in every round of the control loop."""
+        """Return whether the operator requested a stop; called in each round of the control loop."""
         ...
 
     def clear_stop(self) -> None:
-        """Take the request back: it was heeded, or came from a time before."""
+        """Remove the request: it was carried out, or it is old."""
         ...
 
     def read_file(self, name: str) -> bytes | None:
-        """Return what was kept beside the state under ``name``; None where nothing was.
+        """Return the file ``name`` that was stored beside the state; None if there is none.
 
         Raises
         ------
         StateNotStored
-            It is there and cannot be read.
+            The file exists but cannot be read.
         """
         ...
 
     def store_file(self, name: str, content: bytes) -> None:
-        """Keep something beside the state; on return it outlives a power cut.
+        """Store a file beside the state; on return it survives a power cut.
 
         Raises
         ------
@@ -120,12 +120,12 @@ class StateStore(Protocol):
         ...
 
     def remove_file(self, name: str) -> None:
-        """Let go of what was kept under ``name``, if anything was."""
+        """Delete the file ``name`` if it exists."""
         ...
 
 
 class MemoryStore:
-    """A state that ends with its program: a simulated bench's."""
+    """State that ends with its program, for a simulated bench."""
 
     def __init__(self) -> None:
         self.state = BenchState()
@@ -155,7 +155,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """A state in the folder ``path``: ``state.json``, and the ``stop`` that `request_stop` leaves there."""
+    """State in the folder ``path``: ``state.json``, and the file ``stop`` that `request_stop` creates."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -163,7 +163,7 @@ class FileStore:
         self._stop = path / "stop"
 
     def load(self) -> BenchState:
-        """Return what was kept; of a file that cannot be read nothing, and why."""
+        """Return the stored state; if the file cannot be read, an empty state that says why."""
         try:
             text = self._file.read_bytes()
         except FileNotFoundError:
@@ -175,7 +175,9 @@ class FileStore:
         except ValidationError as error:
             return BenchState(damage=f"{self._file} is damaged: {error.errors(include_url=False)[0]['msg']}")
         if state.version != VERSION:
-            return BenchState(damage=f"{self._file} is of version {state.version}, this program knows {VERSION}")
+            return BenchState(
+                damage=f"{self._file} has version {state.version}, but this program reads version {VERSION}"
+            )
         return state
 
     def save(self, state: BenchState) -> None:
@@ -183,7 +185,7 @@ class FileStore:
             _make_folder(self.path)
             files.write(self._file, state.model_dump_json(indent=1, exclude={"damage"}).encode())
         except OSError as error:
-            raise _not_kept(self._file, error) from error
+            raise _not_stored(self._file, error) from error
 
     def stop_requested(self) -> bool:
         return self._stop.exists()
@@ -192,12 +194,12 @@ class FileStore:
         self._stop.unlink(missing_ok=True)
 
     def request_stop(self) -> None:
-        """Ask whoever holds the bench to stop."""
+        """Request a stop from the program that uses the bench."""
         try:
             _make_folder(self.path)
             self._stop.touch()
         except OSError as error:
-            raise _not_kept(self._stop, error) from error
+            raise _not_stored(self._stop, error) from error
 
     def read_file(self, name: str) -> bytes | None:
         try:
@@ -207,7 +209,7 @@ class FileStore:
         except OSError as error:
             raise StateNotStored(
                 f"{self.path / name} cannot be read.",
-                next_step="Give yourself the right to read it, or remove it.",
+                next_step="Give yourself permission to read the file, or delete it.",
                 evidence={"reason": error.strerror or str(error)},
             ) from error
 
@@ -217,7 +219,7 @@ class FileStore:
             files.write(self.path / name, content)
         except OSError as error:
             raise StateNotStored(
-                f"{name} cannot be kept in {self.path}.",
+                f"{name} cannot be stored in {self.path}.",
                 next_step="Make room on the disk, or set state_dir to a folder that you may write to.",
                 evidence={"reason": error.strerror or str(error)},
             ) from error
@@ -228,14 +230,14 @@ class FileStore:
 
 
 class BenchLock:
-    """Holds a bench for this process alone, as long as it is open; the kernel lets go of it when the process dies.
+    """Reserves a bench for this process until it is closed; the kernel releases it when the process dies.
 
     Raises
     ------
     BenchBusy
-        Another process holds it; the evidence says which.
+        Another process uses the bench; the message says which.
     StateNotStored
-        The folder cannot be made.
+        The folder cannot be created.
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:
@@ -243,22 +245,22 @@ class BenchLock:
             _make_folder(path)
             self._file: TextIO = (path / "lock").open("a+", encoding="utf-8")
         except OSError as error:
-            raise _not_kept(path / "lock", error) from error
+            raise _not_stored(path / "lock", error) from error
         for attempt in range(LOCK_ATTEMPTS):
             if _try_lock(self._file):
                 break
             if attempt + 1 == LOCK_ATTEMPTS:
                 self._file.close()
                 raise busy(path, holder(path))
-            clock.sleep(0.02)  # somebody may only be looking who holds it
-        FileStore(path).clear_stop()  # meant for whoever held the bench before
+            clock.sleep(0.02)  # another program may be reading who holds the lock
+        FileStore(path).clear_stop()  # an old request, meant for an earlier program
         mine = Holder(
             pid=os.getpid(),
             command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
             since_utc=clock.utc().isoformat(timespec="seconds"),
             terminates=callable(signal.getsignal(signal.SIGTERM)),
         )
-        with suppress(OSError):  # a full disk: the lock holds, only its holder's name is missing
+        with suppress(OSError):  # full disk: the lock works, only the holder's name is missing
             self._file.truncate(0)
             self._file.write(mine.model_dump_json())
             self._file.flush()
@@ -270,17 +272,16 @@ class BenchLock:
 
 
 def holder(path: Path) -> Holder | None:
-    """Return who holds the bench with the state folder ``path``: None if nobody does.
+    """Return the program that uses the bench with the state folder ``path``; None if there is none.
 
-    A name that a killed program left behind counts for nothing: its lock went with it. A holder whose name is not known
-    has the pid 0.
+    The name of a killed program does not count, because its lock is gone. A holder whose name is not known has pid 0.
     """
     try:
         with (path / "lock").open("r", encoding="utf-8") as file:
             if _try_lock(file):
                 return None
             text = file.read()
-    except OSError:  # nobody ever held it; or who did, is not for this user to know
+    except OSError:  # never locked, or not readable for this user
         return None
     try:
         return Holder.model_validate_json(text)
@@ -299,12 +300,12 @@ def _try_lock(file: TextIO) -> bool:
 
 
 def busy(path: Path, who: Holder | None) -> BenchBusy:
-    """Return the error that the bench with the state folder ``path`` is held by ``who``."""
+    """Return the error that ``who`` uses the bench with the state folder ``path``."""
     name = f"process {who.pid} (`{who.command}`, since {who.since_utc})" if who and who.pid else "another process"
     return BenchBusy(
         f"The bench is in use by {name}.",
-        next_step="Wait until it is done, or end it with `rig stop` (table stopped, torque off). "
-        "Another bench on this computer needs a state_dir of its own.",
+        next_step="Wait until it ends, or run `rig stop` (stops the table, torque off). "
+        "A second bench on this computer needs its own state_dir.",
         evidence={"state": str(path)},
     )
 
@@ -314,9 +315,9 @@ def _make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
-def _not_kept(path: Path, error: OSError) -> StateNotStored:
+def _not_stored(path: Path, error: OSError) -> StateNotStored:
     return StateNotStored(
-        f"The bench's state cannot be written to {path}, so nothing may move.",
+        f"The bench's state cannot be written to {path}; the table may not move without it.",
         next_step="Make room on the disk, or set state_dir to a folder that you may write to.",
         evidence={"reason": error.strerror or str(error)},
     )

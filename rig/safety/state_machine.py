@@ -1,4 +1,4 @@
-"""The states of a bench's table, and what accepts it from one to another.
+"""The states of a bench's table, and the events that change them.
 
     DISCONNECTED ──connect──▶ CONNECTED ──refer──▶ READY ──start──▶ MOVING ──arrive──▶ READY
                                   │                  ▲                 └──────stop───▶ STOPPED ──recheck──▶ CONNECTED
@@ -6,7 +6,7 @@
 
     any state ──lose──▶ DISCONNECTED;   any state ──latch──▶ FAULT ──acknowledge──▶ CONNECTED
 
-There is no way to set a state: each is reached by what happened, through the table of transitions alone.
+A state cannot be set: it changes only by an event in the table of transitions.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 
 class TableState(StrEnum):
-    """Of a bench's table."""
+    """State of a bench's table."""
 
     DISCONNECTED = "disconnected"
     CONNECTED = "connected"
@@ -27,7 +27,7 @@ class TableState(StrEnum):
 
 
 class StateEvent(Enum):
-    """What accepts the machine from one state to another."""
+    """Event that takes the machine from one state to another."""
 
     CONNECT = auto()
     REFER = auto()
@@ -41,25 +41,25 @@ class StateEvent(Enum):
     LOSE = auto()
 
 
-_S, _H = TableState, StateEvent
-_ALWAYS = {_H.LATCH: _S.FAULT, _H.LOSE: _S.DISCONNECTED}
-_JUDGED = {_H.REFER: _S.READY, _H.DOUBT: _S.UNREFERENCED}
+_S, _E = TableState, StateEvent
+_ALWAYS = {_E.LATCH: _S.FAULT, _E.LOSE: _S.DISCONNECTED}
+_REFERENCE = {_E.REFER: _S.READY, _E.DOUBT: _S.UNREFERENCED}
 TRANSITIONS: Mapping[TableState, Mapping[StateEvent, TableState]] = MappingProxyType(
     {
-        _S.DISCONNECTED: {**_ALWAYS, _H.CONNECT: _S.CONNECTED},
-        _S.CONNECTED: {**_ALWAYS, **_JUDGED},
-        _S.UNREFERENCED: {**_ALWAYS, **_JUDGED},
-        _S.READY: {**_ALWAYS, **_JUDGED, _H.START: _S.MOVING},
-        _S.MOVING: {**_ALWAYS, _H.ARRIVE: _S.READY, _H.STOP: _S.STOPPED},
-        _S.STOPPED: {**_ALWAYS, _H.RECHECK: _S.CONNECTED},
-        # A fault stays while the cable is pulled and put in again.
-        _S.FAULT: {_H.LATCH: _S.FAULT, _H.LOSE: _S.FAULT, _H.CONNECT: _S.FAULT, _H.ACKNOWLEDGE: _S.CONNECTED},
+        _S.DISCONNECTED: {**_ALWAYS, _E.CONNECT: _S.CONNECTED},
+        _S.CONNECTED: {**_ALWAYS, **_REFERENCE},
+        _S.UNREFERENCED: {**_ALWAYS, **_REFERENCE},
+        _S.READY: {**_ALWAYS, **_REFERENCE, _E.START: _S.MOVING},
+        _S.MOVING: {**_ALWAYS, _E.ARRIVE: _S.READY, _E.STOP: _S.STOPPED},
+        _S.STOPPED: {**_ALWAYS, _E.RECHECK: _S.CONNECTED},
+        # A fault stays when the cable is unplugged and plugged in again.
+        _S.FAULT: {_E.LATCH: _S.FAULT, _E.LOSE: _S.FAULT, _E.CONNECT: _S.FAULT, _E.ACKNOWLEDGE: _S.CONNECTED},
     }
 )
 
 
 class StateMachine:
-    """One table's state."""
+    """The state of one table."""
 
     def __init__(self, *, faulty: bool) -> None:
         self._state = TableState.FAULT if faulty else TableState.DISCONNECTED
@@ -69,9 +69,9 @@ class StateMachine:
         return self._state
 
     def accepts(self, event: StateEvent) -> bool:
-        """Return whether ``event`` can happen in this state."""
+        """Return whether ``event`` is possible in this state."""
         return event in TRANSITIONS[self._state]
 
     def apply(self, event: StateEvent) -> None:
-        """Take note of what happened; KeyError where it cannot happen in this state."""
+        """Change the state by ``event``; raises KeyError if the event is not possible in this state."""
         self._state = TRANSITIONS[self._state][event]

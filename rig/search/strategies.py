@@ -22,7 +22,7 @@ from rig.core.errors import UsageError
 from rig.events.events import Weighed
 from rig.events.wording import separation_words, side_words
 from rig.motion.motion_model import MotionModel
-from rig.motion.turntable import equivalent_within
+from rig.motion.move import equivalent_within
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 
 GROUP: Final = "rig.strategies"

@@ -44,5 +44,9 @@ def acknowledge(
         fault = bench.safety.fault
         state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
     words = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
-    report = {"acknowledged": fault.model_dump() if fault else None, "state": str(state), "doubt": doubt or None}
+    report = {
+        "acknowledged": fault.model_dump() if fault else None,
+        "state": str(state),
+        "doubt": str(doubt) if doubt else None,
+    }
     settings.say(f"{words}\nThe table is {state}{f': {doubt}' if doubt else ''}.", report)

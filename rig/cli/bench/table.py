@@ -94,7 +94,7 @@ def status(settings: Settings) -> None:
             "bench": bench.name,
             "state": str(safety.state),
             "fault": safety.fault.model_dump() if safety.fault else None,
-            "doubt": safety.doubt or None,
+            "doubt": str(safety.doubt) if safety.doubt else None,
             "table_deg": table_deg,
             "limits_deg": list(config.limits_deg),
             "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.bus_statistics)},

@@ -271,24 +271,23 @@ class RigHead:
         if HeadFault.ESTOP in faults:
             return EmergencyStop(
                 "The e-stop is pressed, or its loop is open: light and servo power are off.",
-                next_step="Look at the bench; release the e-stop (or mend its cable), then: rig acknowledge.",
+                next_step="Look at the bench, then release the e-stop or repair its cable.",
                 evidence=evidence,
-            )
+            ).ask_to_acknowledge()
         if self._restarted is not None or faults & (HeadFault.BROWN_OUT | HeadFault.WATCHDOG):
             cause = Reset(self._who.reset_cause) if self._restarted is None else self._restarted
             return HeadRestarted(
                 f"The rig head at {self._link.name} restarted {_RESTARTS[cause]}: light and servo power went off.",
-                next_step="Check its supply and USB cable, then: rig acknowledge.",
+                next_step="Check its supply and USB cable.",
                 evidence={**evidence, "reset_cause": cause.name.lower()},
-            )
+            ).ask_to_acknowledge()
         if HeadFault.DEADMAN in faults:
             return HeartbeatLost(
-                f"The rig head heard nothing from this computer for {self._deadman_ms} ms: light and servo power "
+                f"The rig head received nothing from this computer for {self._deadman_ms} ms: light and servo power "
                 "are off.",
-                next_step="If a program was killed or a cable pulled, that is the reason; else a computer that stalls "
-                "needs a longer head.deadman_s. Then: rig acknowledge.",
+                next_step="Check whether a program was killed or a cable unplugged. If not, increase head.deadman_s.",
                 evidence={**evidence, "deadman_ms": self._deadman_ms},
-            )
+            ).ask_to_acknowledge()
         return None
 
     def check(self) -> None:

@@ -72,7 +72,7 @@ def test_the_table_is_where_the_last_program_left_it(rig):
     told = json.loads(rig("status", "--json").stdout)
     assert told["state"] == "ready"
     assert told["table_deg"] == pytest.approx(370, abs=0.3)
-    assert "forgot 1 of its turns" in " ".join(told["findings"])
+    assert "lost its supply and 1 of its revolutions" in " ".join(told["findings"])
     done = rig("home", "--json")
     unwinding, moved = (json.loads(line) for line in done.stdout.splitlines())
     assert unwinding["event"] == "unwinding"

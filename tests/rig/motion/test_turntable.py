@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NotReady, Stalled
 from rig.devices.servo import MotionProfile
-from rig.motion.turntable import Turntable, motion_seconds
+from rig.motion.move import motion_seconds
+from rig.motion.turntable import Turntable
 from rig.safety.supervisor import TableState
 from sim.noise import NoiseModel
 from sim.servo import Frame
@@ -270,7 +271,7 @@ def test_a_time_out_can_be_told_in_json_although_the_gyro_knows_nothing():
         wires.device.jam()
         wires.device.memory["Shutdown"] = 0
         with Turntable(bench) as table:
-            table._heading.bias = None
+            table._gyro.bias = None
             table._wait_for_rest(60.0, 0.1, 0.5)
     told = json.loads(json.dumps(caught.value.as_dict(), allow_nan=False))
     assert told["evidence"]["peak_rate_dps"] is None

@@ -80,6 +80,6 @@ def test_a_target_beyond_the_budget_is_refused_with_from_to_and_limits(simulated
     s = simulated(*SMALL)
     with Turntable(s.bench) as table:
         table.goto(20.0)
-        with pytest.raises(LimitExceeded, match=r"from 20\.0° to 401\.0°.*-1\.11 to \+1\.11 turns"):
+        with pytest.raises(LimitExceeded, match=r"from 20\.0° to 401\.0°.*-1\.11 to \+1\.11 revolutions"):
             table.goto(401.0)
         assert table.goto(25.0).agrees  # a refusal is no fault

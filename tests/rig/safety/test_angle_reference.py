@@ -1,4 +1,6 @@
-"""Where the table stands after a pause: what the servo says, against what was written down."""
+"""The table's angle after a pause: the servo's position compared with the stored one."""
+
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from hbr.core.angles import wrap180
 from rig.config import TableConfig
 from rig.devices.servo import ServoCondition, ServoIdentity
-from rig.safety.angle_reference import AngleReference, check_saved_angle
+from rig.safety.angle_reference import AngleFinding, AngleReference, check_saved_angle
 from rig.safety.saved_state import SavedTable
 
 IDENTITY = ServoIdentity("xl430_w250", 1060, 1, 46)
@@ -26,68 +28,88 @@ def test_servo_and_table_convert_both_ways(direction, zero_deg, shift_deg, table
 
 
 @given(st.sampled_from([1, -1]), st.floats(-720, 720), st.floats(-720, 720), st.integers(-3, 3))
-def test_what_a_person_declares_holds(direction, position_deg, table_deg, turns):
+def test_set_angle_sets_the_table_angle_at_a_position(direction, position_deg, table_deg, turns):
     reference = AngleReference(TableConfig(direction=direction))
     before_deg = reference.to_table(position_deg)
-    wound_deg = reference.with_turns(position_deg, turns)
+    wound_deg = reference.with_revolutions(position_deg, turns)
     assert wrap180(wound_deg - before_deg) == pytest.approx(0, abs=1e-6)
     assert abs(wound_deg - 360 * turns) <= 180
-    reference.declare(position_deg, table_deg)
+    reference.set_angle(position_deg, table_deg)
     assert reference.to_table(position_deg) == pytest.approx(table_deg, abs=1e-9)
 
 
 @given(st.floats(-4000, 4000), st.floats(-720, 720), st.sampled_from([360.0, 120.0, 72.0]))
-def test_turns_that_were_lost_with_the_supply_are_restored_where_the_angle_fits(position_deg, shift_deg, turn_deg):
+def test_revolutions_lost_with_the_supply_are_restored_if_the_angle_matches(position_deg, shift_deg, turn_deg):
     found_deg = position_deg % turn_deg
     check = check_saved_angle(saved(position_deg, shift_deg), IDENTITY, found_deg, LOST, turn_deg)
-    assert not check.doubt
+    assert check.certain
     assert found_deg + check.shift_deg == pytest.approx(position_deg + shift_deg, abs=1e-6)
-    assert bool(check.findings) == (abs(position_deg - found_deg) > turn_deg / 2)
+    restored = check.finding is AngleFinding.REVOLUTIONS_RESTORED
+    assert restored == (abs(position_deg - found_deg) > turn_deg / 2)
+    assert restored or check.finding is AngleFinding.UNCHANGED
 
 
 @given(st.floats(-4000, 4000), st.floats(2.1, 357.9))
-def test_a_table_that_was_turned_without_supply_is_in_doubt(position_deg, turned_deg):
-    assert (
-        "turned meanwhile"
-        in check_saved_angle(saved(position_deg), IDENTITY, (position_deg + turned_deg) % 360, LOST).doubt
-    )
+def test_rotation_without_supply_makes_the_angle_uncertain(position_deg, turned_deg):
+    check = check_saved_angle(saved(position_deg), IDENTITY, (position_deg + turned_deg) % 360, LOST)
+    assert check.finding is AngleFinding.ROTATED_WITHOUT_POWER
+    assert not check.certain
 
 
 @given(st.floats(-4000, 4000), st.floats(-175, 175))
-def test_a_servo_with_supply_counts_what_a_hand_does(position_deg, turned_deg):
+def test_servo_with_supply_counts_rotation_by_hand(position_deg, turned_deg):
     check = check_saved_angle(saved(position_deg, 7.0), IDENTITY, position_deg + turned_deg, KEPT)
-    assert (check.doubt, check.shift_deg) == ("", 7.0)
-    assert bool(check.findings) == (abs(turned_deg) > 2)
+    by_hand = abs(turned_deg) > 2
+    assert check.finding is (AngleFinding.ROTATED_BY_HAND if by_hand else AngleFinding.UNCHANGED)
+    assert check.shift_deg == 7.0
 
 
 @pytest.mark.parametrize("turns", [-2, -1, 1, 3])
-def test_whole_turns_that_nobody_wrote_down_are_in_doubt(turns):
-    assert check_saved_angle(saved(200.0), IDENTITY, 200.0 + 360 * turns, KEPT).doubt
-
-
-def test_a_motion_that_was_cut_off_is_believed_on_its_way_and_with_its_supply_alone():
-    cut = saved(180.0, path_deg=(180.0, 500.0))
-    on_its_way = check_saved_angle(cut, IDENTITY, 430.0, KEPT)
-    assert not on_its_way.doubt
-    assert "cut off" in on_its_way.findings[0]
-    assert not check_saved_angle(cut, IDENTITY, 504.0, KEPT).doubt  # a stop takes a little room
-    assert "not on its way" in check_saved_angle(cut, IDENTITY, 506.0, KEPT).doubt
-    assert "not on its way" in check_saved_angle(cut, IDENTITY, 174.0, KEPT).doubt
-    # It would fit: 300° may be 300° or, a turn of them forgotten, no place on its way.
-    assert "supply" in check_saved_angle(cut, IDENTITY, 300.0, LOST).doubt
+def test_unrecorded_revolutions_make_the_angle_uncertain(turns):
+    check = check_saved_angle(saved(200.0), IDENTITY, 200.0 + 360 * turns, KEPT)
+    assert check.finding is AngleFinding.POSITION_CHANGED
+    assert not check.certain
 
 
 @pytest.mark.parametrize(
-    ("values", "words"),
+    ("position_deg", "condition", "finding"),
     [
-        ({"model_number": 1020}, "another servo"),
-        ({"bus_id": 2}, "another servo"),
-        ({"firmware": 45}, "firmware was 45"),
+        (430.0, KEPT, AngleFinding.MOTION_INTERRUPTED),
+        (504.0, KEPT, AngleFinding.MOTION_INTERRUPTED),  # a stop needs a little room
+        (506.0, KEPT, AngleFinding.NOT_ON_PATH),
+        (174.0, KEPT, AngleFinding.NOT_ON_PATH),
+        # 300° would fit, but it may also be a revolution that the servo lost.
+        (300.0, LOST, AngleFinding.POWER_LOST_IN_MOTION),
     ],
 )
-def test_another_servo_is_in_doubt(values, words):
-    assert words in check_saved_angle(saved(200.0, **values), IDENTITY, 200.0, KEPT).doubt
+def test_interrupted_motion_is_certain_on_its_path_with_supply_only(position_deg, condition, finding):
+    check = check_saved_angle(saved(180.0, path_deg=(180.0, 500.0)), IDENTITY, position_deg, condition)
+    assert check.finding is finding
+    assert check.certain == (finding is AngleFinding.MOTION_INTERRUPTED)
 
 
-def test_a_bench_that_was_never_told_is_in_doubt():
-    assert "nobody has told" in check_saved_angle(None, IDENTITY, 180.0, KEPT).doubt
+@pytest.mark.parametrize(
+    ("values", "finding"),
+    [
+        ({"model_number": 1020}, AngleFinding.OTHER_SERVO),
+        ({"bus_id": 2}, AngleFinding.OTHER_SERVO),
+        ({"firmware": 45}, AngleFinding.OTHER_FIRMWARE),
+    ],
+)
+def test_another_servo_makes_the_angle_uncertain(values, finding):
+    check = check_saved_angle(saved(200.0, **values), IDENTITY, 200.0, KEPT)
+    assert check.finding is finding
+    assert not check.certain
+
+
+def test_new_bench_is_uncertain():
+    check = check_saved_angle(None, IDENTITY, 180.0, KEPT)
+    assert check.finding is AngleFinding.NEVER_REFERENCED
+    assert not check.certain
+
+
+@pytest.mark.parametrize("finding", AngleFinding)
+def test_each_finding_has_a_text(finding):
+    check = check_saved_angle(saved(200.0, firmware=45), IDENTITY, 210.0, KEPT)
+    assert str(check) == "the servo's firmware changed from 45 to 46"
+    assert str(replace(check, finding=finding))

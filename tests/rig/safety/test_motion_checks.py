@@ -18,7 +18,7 @@ from rig.core.errors import (
 )
 from rig.devices.servo import ServoLimits, ServoState
 from rig.motion.turntable import Turntable
-from rig.safety.gyro_rotation import Rotation
+from rig.safety.gyro_rotation import GyroIssue, Rotation
 from rig.safety.motion_checks import MotionMonitor, SlipMonitor, find_servo_fault
 from rig.safety.supervisor import TableState
 from sim.servo import motor
@@ -163,7 +163,7 @@ def test_a_supply_out_of_range_is_told_with_the_range(volts):
 def test_a_dip_of_the_voltage_while_a_motor_starts_is_no_fault():
     watch = a_watch()
     for k in range(30):
-        watch.look(at(k, voltage_v=6.1 if k % 3 == 0 else 12.0), 3.6 * k, 0.0)
+        watch.check(at(k, voltage_v=6.1 if k % 3 == 0 else 12.0), 3.6 * k, 0.0)
 
 
 def test_a_platter_that_slips_less_than_the_bound_is_left_to_the_end_of_the_move():
@@ -211,7 +211,7 @@ def readings_until(error, watch: MotionMonitor, state, angle_deg, lag_deg) -> fl
     """Return after how many seconds of such readings the watch raises ``error``."""
     for k in range(200):
         try:
-            watch.look(at(k, **state), angle_deg(k), lag_deg)
+            watch.check(at(k, **state), angle_deg(k), lag_deg)
         except error:
             return k * PERIOD_S
     return float("inf")
@@ -244,7 +244,7 @@ def test_a_table_that_stands_at_its_goal_makes_no_progress_and_need_not():
 def test_a_push_that_ends_is_forgotten():
     watch = a_watch()
     for k in range(70):
-        watch.look(at(k, load_percent=90.0 if k % 18 else 5.0), turning(k), 0.0)
+        watch.check(at(k, load_percent=90.0 if k % 18 else 5.0), turning(k), 0.0)
 
 
 def test_hardware_errors_come_first_and_a_servo_that_was_hot_must_be_cool():
@@ -259,10 +259,10 @@ def test_hardware_errors_come_first_and_a_servo_that_was_hot_must_be_cool():
 def test_a_slip_is_judged_at_the_same_moment_and_by_what_the_gyro_is_sure_of():
     slip = SlipMonitor(CONFIG, start_deg=5.0)
     for k in range(10):
-        slip.note(k * 40, 5.0 + k)
+        slip.add_reading(k * 40, 5.0 + k)
     assert slip.encoder_deg(-1) is None
     assert slip.encoder_deg(165) == (160, 4.0)
-    slip.compare(100.0, Rotation(89.0, 0.3, 1.0, True))
-    slip.compare(100.0, Rotation(20.0, 0.3, 1.0, False, "lost"))
+    slip.compare(100.0, Rotation(89.0, 0.3, 1.0))
+    slip.compare(100.0, Rotation(20.0, 0.3, 1.0, GyroIssue.LOST_SAMPLES, 5))
     with pytest.raises(RotationDisagreement):
-        slip.compare(100.0, Rotation(88.0, 0.3, 1.0, True))
+        slip.compare(100.0, Rotation(88.0, 0.3, 1.0))

@@ -19,6 +19,7 @@ from rig.core.errors import (
     WatchdogTripped,
 )
 from rig.motion.turntable import Turntable
+from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import FileStore
 from rig.safety.supervisor import TableState
 from sim.servo import XSeriesServo
@@ -88,7 +89,7 @@ def test_after_sigkill_the_servo_stops_by_itself_and_the_next_program_says_so_be
     with start() as bench:
         told = " ".join(bench.findings)
         assert "torque was on" in told
-        assert "watchdog had stopped it" in told
+        assert "watchdog stopped it" in told
         assert "cut off in the middle of a motion" in told
         assert bench.safety.state is TableState.READY  # it kept its supply: it has counted its turns
         assert all(frame[7] != 3 for frame in wires.instructions[sent:])  # no write, so nothing moved
@@ -110,7 +111,7 @@ def test_after_sigkill_and_a_power_cut_the_turns_are_in_doubt_and_a_person_tells
     assert stands_deg > 200  # 200° read as 20° would wind the cable up by a turn
     with start() as bench:
         assert bench.safety.state is TableState.UNREFERENCED
-        assert "in the middle of a motion" in bench.safety.doubt
+        assert bench.safety.doubt.finding is AngleFinding.POWER_LOST_IN_MOTION
         with pytest.raises(Unreferenced), Turntable(bench):
             pass
         assert wires.device.memory["Torque Enable"] == 0
@@ -129,7 +130,7 @@ def test_a_power_cut_between_programs_costs_no_turn(bench_of):
     wires.world.clock.sleep(1.0)
     with start() as bench:
         assert bench.servo.read_state().position_deg == pytest.approx(170.0, abs=0.3)
-        assert "forgot 1 of its turns" in bench.findings[0]
+        assert "lost its supply and 1 of its revolutions" in bench.findings[0]
         with Turntable(bench) as table:
             assert table.rest_deg == pytest.approx(-370.0, abs=0.3)
             table.goto(-360.0)
@@ -163,7 +164,7 @@ def test_a_table_that_was_turned_while_the_supply_was_off_is_in_doubt(bench_of):
     wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
     wires.device.power_cycle()
     wires.world.clock.sleep(1.0)
-    with start() as bench, pytest.raises(Unreferenced, match="turned meanwhile"), Turntable(bench):
+    with start() as bench, pytest.raises(Unreferenced, match="rotated while the servo had no supply"), Turntable(bench):
         pass
 
 
@@ -341,7 +342,7 @@ def test_an_adapter_that_is_plugged_in_again_is_opened_anew_and_who_answers_is_l
             table.goto(60.0)
             adapter.unplug()
             table.goto(90.0)
-    assert ("did not hear the stop" in "".join(getattr(caught.value, "__notes__", ()))) == (when == "in a motion")
+    assert ("did not receive the stop" in "".join(getattr(caught.value, "__notes__", ()))) == (when == "in a motion")
     s.world.clock.sleep(1.0)
     stands = s.world.shaft()
     assert stands[1] == 0

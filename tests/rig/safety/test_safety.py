@@ -23,9 +23,10 @@ from rig.core.errors import (
     UsageError,
 )
 from rig.devices.servo import ServoCondition, ServoIdentity, ServoLimits, ServoState
+from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import BenchState, MemoryStore
 from rig.safety.state_machine import TRANSITIONS, StateEvent
-from rig.safety.supervisor import LATCHING, Safety, TableState
+from rig.safety.supervisor import Safety, TableState
 from sim.clock import VirtualClock
 from tests.fuzzing import fuzz_settings
 
@@ -155,7 +156,7 @@ class Bench(RuleBasedStateMachine):
         error = ENDS.get(end)
         if error is None and end == "arrives":
             assert safety.state is TableState.READY
-        elif isinstance(error, LATCHING) or end == "supply lost":
+        elif (isinstance(error, RigError) and error.latches) or end == "supply lost":
             assert safety.state is TableState.FAULT
         else:
             assert safety.state is (TableState.STOPPED if shaft.there else TableState.DISCONNECTED)
@@ -212,7 +213,7 @@ class Bench(RuleBasedStateMachine):
                 self.safety.set_angle(0.0)
                 self.shaft.count_deg += self.shaft.cable_deg
                 self.shaft.cable_deg = 0.0
-            elif self.safety.doubt and "nobody" not in self.safety.doubt:
+            elif self.safety.doubt and self.safety.doubt.finding is not AngleFinding.NEVER_REFERENCED:
                 within_deg = float(wrap180(self.shaft.cable_deg))
                 self.safety.set_revolutions(round((self.shaft.cable_deg - within_deg) / 360.0))
             else:
@@ -297,7 +298,7 @@ def test_a_state_that_cannot_be_written_down_lets_nothing_move():
     stalled = Stalled("Blocked.", next_step="Free it.")
     safety.latch(stalled)  # a fault is a fault, whether the disk is full or not
     assert safety.state is TableState.FAULT
-    assert "in this program alone" in stalled.__notes__[0]
+    assert "in this program only" in stalled.__notes__[0]
 
 
 def test_a_motion_that_nobody_said_to_have_arrived_was_broken_off():

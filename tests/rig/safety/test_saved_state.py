@@ -85,7 +85,7 @@ def test_another_version_or_shape_is_not_guessed_at(tmp_path, text):
 
 def test_a_folder_that_cannot_be_written_to_is_told_with_what_to_do(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StateNotStored, match="nothing may move") as caught:
+    with pytest.raises(StateNotStored, match="may not move without it") as caught:
         FileStore(tmp_path / "file" / "bench").save(BenchState(table=TABLE))
     assert "state_dir" in caught.value.next_step
     with pytest.raises(StateNotStored):

@@ -137,7 +137,7 @@ def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
     assert not parts.head.relay_closed
     with open_sim_bench(config, operator, parts=parts) as second:
         assert second.safety.state is TableState.FAULT
-        with pytest.raises(FaultLatched, match="heard nothing"), Turntable(second):
+        with pytest.raises(FaultLatched, match="received nothing"), Turntable(second):
             pass
         assert parts.head.relay_closed  # the servo can be asked how it is; it has no torque
         second.safety.acknowledge()

@@ -1,0 +1,88 @@
+"""What is stored about one bench's table: its angle, how its cable is wound up, and the latched fault."""
+
+from rig.config import TableConfig
+from rig.devices.servo import Servo
+from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck, check_saved_angle
+from rig.safety.saved_state import BenchState, LatchedFault, SavedTable, StateStore
+
+
+class TableRecord:
+    """The stored state of a table, compared with its servo and kept up to date.
+
+    Parameters
+    ----------
+    servo
+        Only read.
+    config
+        Direction, zero and encoder calibration of the table.
+    store
+        Where the state survives the process.
+    """
+
+    def __init__(self, servo: Servo, config: TableConfig, store: StateStore) -> None:
+        self._servo = servo
+        self._store = store
+        self._state = store.load()
+        shift_deg = self._state.table.shift_deg if self._state.table else 0.0
+        self.angle_reference = AngleReference(config, shift_deg, servo.turn_deg)
+        self.doubt: SavedAngleCheck | None = None
+        """Why the table's angle is uncertain; None if it is certain."""
+        self.findings: list[str] = []
+        """What the comparisons showed, for the operator."""
+
+    @property
+    def fault(self) -> LatchedFault | None:
+        return self._state.fault
+
+    @property
+    def damage(self) -> str:
+        """Why the stored state could not be read; empty if it could."""
+        return self._state.damage
+
+    def check_angle(self) -> bool:
+        """Compare the servo's position with the stored one; return whether the table's angle is certain."""
+        state, condition = self._servo.read_state(), self._servo.read_condition()
+        check = check_saved_angle(
+            self._state.table, self._servo.identity, state.position_deg, condition, self._servo.turn_deg
+        )
+        self.angle_reference.shift_deg = check.shift_deg
+        self.doubt = None if check.certain else check
+        if check.certain and check.finding is not AngleFinding.UNCHANGED and str(check) not in self.findings:
+            self.findings.append(str(check))
+        return check.certain
+
+    def set_angle(self, table_deg: float) -> None:
+        """Take ``table_deg`` for the table's present angle, and store it."""
+        position_deg = self._servo.read_state().position_deg
+        self.angle_reference.set_angle(position_deg, table_deg)
+        self.save_position(position_deg)
+        self.doubt = None
+
+    def save_position(self, position_deg: float | None = None, path_deg: tuple[float, float] | None = None) -> None:
+        """Store the servo's position (by default the present one), and the range of a motion that begins."""
+        if position_deg is None:
+            position_deg = self._servo.read_state().position_deg
+        identity = self._servo.identity
+        table = SavedTable(
+            model_number=identity.model_number,
+            bus_id=identity.bus_id,
+            firmware=identity.firmware,
+            position_deg=position_deg,
+            shift_deg=self.angle_reference.shift_deg,
+            path_deg=path_deg,
+        )
+        self._save(self._state.model_copy(update={"table": table, "damage": ""}))
+
+    def save_fault(self, fault: LatchedFault | None) -> None:
+        """Store the latched fault; it holds in this process even if the disk cannot be written."""
+        state = self._state.model_copy(update={"fault": fault, "damage": ""})
+        try:
+            self._save(state)
+        finally:
+            if fault is not None:
+                self._state = state
+
+    def _save(self, state: BenchState) -> None:
+        if state != self._state:
+            self._store.save(state)
+            self._state = state
