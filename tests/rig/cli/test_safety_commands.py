@@ -85,7 +85,7 @@ def test_a_move_beyond_the_budget_is_refused_with_from_to_and_limits(rig):
     done = rig("goto", "401")
     assert done.exit_code == 5
     assert "from 30.0° to 401.0°" in done.stderr
-    assert "-400° to 400° (-1.11 to +1.11 turns)" in done.stderr
+    assert "-400° to 400° (-1.11 to +1.11 revolutions)" in done.stderr
 
 
 def test_doubt_is_told_and_resolved_by_a_person(rig):
@@ -211,7 +211,7 @@ finally:
 
 
 def test_a_program_that_does_not_react_is_told_how_to_end(tmp_path, monkeypatch):
-    monkeypatch.setattr("rig.motion.stop_request.HEED_S", 0.1)
+    monkeypatch.setattr("rig.motion.stop_request.REACTION_S", 0.1)
     monkeypatch.setattr("rig.motion.stop_request.END_S", 0.3)
     code = f"""
 import signal, time

@@ -90,7 +90,7 @@ def test_after_sigkill_the_servo_stops_by_itself_and_the_next_program_says_so_be
         told = " ".join(bench.findings)
         assert "torque was on" in told
         assert "watchdog stopped it" in told
-        assert "cut off in the middle of a motion" in told
+        assert "interrupted during a motion" in told
         assert bench.safety.state is TableState.READY  # it kept its supply: it has counted its turns
         assert all(frame[7] != 3 for frame in wires.instructions[sent:])  # no write, so nothing moved
         with Turntable(bench) as table:
