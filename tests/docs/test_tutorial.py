@@ -1,0 +1,27 @@
+"""docs/tutorial.md: every command runs and ends as the page says."""
+
+import re
+import shlex
+
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+from tests.docs.pages import DOCS
+
+EXIT_CODES = {"identify --set bench.sim.object=camera": 8, "goto 90": 5}
+
+
+def test_commands_of_the_tutorial_end_as_it_says(tmp_path, monkeypatch):
+    page = (DOCS / "tutorial.md").read_text(encoding="utf-8")
+    (toml,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "rig.toml").write_text(toml, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    outputs = {}
+    for command in re.findall(r"^rig (.*)$", page, re.MULTILINE):
+        done = CliRunner().invoke(app, shlex.split(command))
+        expected = next((code for start, code in EXIT_CODES.items() if command.startswith(start)), 0)
+        assert done.exit_code == expected, f"rig {command}\n{done.output}"
+        outputs[command] = done.output
+    assert "mug-white" in outputs["enroll mug-star --views 24"]  # similar objects
+    assert "\nmug-star, rotated" in outputs["identify --set bench.sim.object=mug-star --save-run run"]
+    assert "\nUnknown object" in outputs["identify --set bench.sim.object=camera"]
