@@ -14,8 +14,8 @@ from rig.cli.ui.exit_codes import EXIT_CODES
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = (
-    "enroll mug-white --bench sim --views 24",
-    "enroll mug-star --bench sim --views 24",
+    "enroll mug-white --bench sim --views 12",
+    "enroll mug-star --bench sim --views 12",
     "identify --bench sim --set bench.sim.object=mug-white --seed 3",
 )
 LEFT_OUT = re.compile(
