@@ -15,7 +15,7 @@ the angles of the views are from the true ones.
 
 import argparse
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import hbr
-from calibration import backlash, camera_model, encoder, gyro_scale, motion_model, repeatability, table_axis
+from calibration.procedures import Backlash, CameraModel, Encoder, GyroScale, MotionModel, Repeatability, TableAxis
 from hbr.evaluation.statistics import wilson
 from rig.bench import Bench, calibrate
 from rig.calibrations import CalibrationResult, CalibrationStore
@@ -54,35 +54,19 @@ OBJECTS, UNKNOWN, TRIALS, VIEWS = 10, 5, 2, 24
 OTHER_BENCH = 1000
 """The seed of the bench on which objects are found is so much above that of the one on which they were enrolled."""
 
-PROCEDURES: tuple[Callable[[Bench], Iterator[Any]], ...] = (
-    backlash.live,
-    encoder.live,
-    motion_model.live,
-    gyro_scale.live,
-)
-
 Told = dict[str, list[float]]
 
 
 def calibrated_on(bench: Bench, store: CalibrationStore, told: Told, thing: str) -> None:
     """Calibrate the bench and put in force what passes."""
-    camera: list[CalibrationResult] = []
-
-    def lens(bench: Bench) -> Iterator[Any]:
-        for event in camera_model.live(bench):
-            camera.extend([event] if isinstance(event, CalibrationResult) else [])
-            yield event
-
-    for procedure in (
-        *PROCEDURES,
-        lens,
-        lambda bench: table_axis.live(bench, camera[0]),
-        lambda bench: repeatability.live(bench, thing),
-    ):
-        *_, fact = procedure(bench)
-        assert isinstance(fact, CalibrationResult)
-        store.keep(fact)
-        told[f"refused {fact.name}"].append(not fact.passed)
+    found: dict[str, CalibrationResult] = {}
+    procedures = (Backlash(), Encoder(), MotionModel(), GyroScale(), CameraModel(), TableAxis(), Repeatability(thing))
+    for procedure in procedures:
+        *_, result = procedure.live(bench, *(found[name] for name in procedure.requires))
+        assert isinstance(result, CalibrationResult)
+        found[result.name] = result
+        store.add(result)
+        told[f"refused {result.name}"].append(not result.passed)
         calibrate(bench, store)
 
 
@@ -108,7 +92,7 @@ def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder
         operator = ShelfOperator(World(noise=noise, seed=bench_seed), things)
         with open_sim_bench(config, operator) as bench:
             if calibrated:
-                calibrated_on(bench, CalibrationStore(folder / f"facts {bench_seed}"), told, names[0])
+                calibrated_on(bench, CalibrationStore(folder / f"results {bench_seed}"), told, names[0])
             with Catalog.open(folder / "catalog", clock=bench.clock, create=bench_seed == seed) as catalog:
                 if bench_seed == seed:
                     for name in names[:OBJECTS]:

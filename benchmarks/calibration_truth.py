@@ -16,16 +16,18 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration import (
-    backlash,
-    camera_light,
-    camera_model,
-    encoder,
-    gyro_noise,
-    gyro_scale,
-    imu_mounting,
-    motion_model,
-    table_axis,
+from calibration import camera_light, camera_model, table_axis
+from calibration.procedures import (
+    Backlash,
+    CameraCard,
+    CameraModel,
+    CameraNoise,
+    Encoder,
+    GyroNoise,
+    GyroScale,
+    ImuMounting,
+    MotionModel,
+    TableAxis,
 )
 from rig.calibrations import CalibrationResult
 from rig.config import load_config
@@ -38,7 +40,7 @@ from sim.objects.shelf import shelf
 from sim.world import World
 
 Truth = Mapping[str, tuple[float, str]]
-"""The true value of each quantity of a fact, and the unit it is printed in."""
+"""The true value of each quantity of a result, and the unit it is printed in."""
 
 
 @contextmanager
@@ -49,15 +51,15 @@ def opened(seed: int, noise: NoiseModel | None = None, *settings: str) -> Iterat
 
 
 def last(events: Iterator[Any]) -> CalibrationResult:
-    *_, fact = events
-    assert isinstance(fact, CalibrationResult)
-    return fact
+    *_, result = events
+    assert isinstance(result, CalibrationResult)
+    return result
 
 
 def imu_scale(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed) as (bench, parts):
         part = parts.imu.inertial
-        return last(gyro_scale.live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
+        return last(GyroScale().live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
 
 
 def imu_noise(seed: int) -> tuple[CalibrationResult, Truth]:
@@ -72,7 +74,7 @@ def imu_noise(seed: int) -> tuple[CalibrationResult, Truth]:
             "rate_random_walk": (noise.gyro_bias_walk_dps_rts, "°/s/√s"),
             "bias_slope": (slope, "°/s/°C"),
         }
-        return last(gyro_noise.live(bench)), truth
+        return last(GyroNoise().live(bench)), truth
 
 
 def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
@@ -81,32 +83,32 @@ def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
         truth = {f"tilt_{name}": (degrees(float(part.up[i])), "°") for i, name in enumerate("xy")}
         truth |= {f"accel_zero_{name}": (float(part.accel_bias_g[i]), "g") for i, name in enumerate("xyz")}
         truth |= {"axis_x": (0.0, "°"), "axis_y": (0.0, "°")}
-        return last(imu_mounting.live(bench)), truth
+        return last(ImuMounting().live(bench)), truth
 
 
-def play(seed: int) -> tuple[CalibrationResult, Truth]:
-    play_deg = float(np.random.default_rng(seed).uniform(0.05, 1.0))
-    with opened(seed, NoiseModel(backlash_deg=play_deg)) as (bench, _):
-        return last(backlash.live(bench)), {"backlash": (play_deg, "°")}
+def backlash(seed: int) -> tuple[CalibrationResult, Truth]:
+    backlash_deg = float(np.random.default_rng(seed).uniform(0.05, 1.0))
+    with opened(seed, NoiseModel(backlash_deg=backlash_deg)) as (bench, _):
+        return last(Backlash().live(bench)), {"backlash": (backlash_deg, "°")}
 
 
 def over_the_turn(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed, NoiseModel(encoder_harmonic_deg=0.2)) as (bench, parts):
-        fact = last(encoder.live(bench))
+        result = last(Encoder().live(bench))
         (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
         # The servo's own angle 0 is half a turn from the shaft's: odd harmonics change their sign.
-        return fact, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
+        return result, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
 
 
 def motion(seed: int) -> tuple[CalibrationResult, Truth]:
     rng = np.random.default_rng(seed)
     speed, ramp = rng.uniform(40, 120), rng.uniform(100, 500)
     with opened(seed, None, f"table.velocity_dps={speed}", f"table.acceleration_dps2={ramp}") as (bench, _):
-        fact = last(motion_model.live(bench))
+        result = last(MotionModel().live(bench))
         with Turntable(bench) as table:
             profile = table._profile
         assert profile is not None
-        return fact, {
+        return result, {
             "pace": (1 / profile.velocity_dps, "s/°"),
             "wind_up": (profile.velocity_dps / profile.acceleration_dps2, "s"),
         }
@@ -125,13 +127,13 @@ def light(seed: int) -> NoiseModel:
 def photons(seed: int) -> tuple[CalibrationResult, Truth]:
     noise = light(seed)
     with opened(seed, noise) as (bench, _):
-        fact = last(camera_light.live_scene(bench))
-    return fact, {"full_well_e": (noise.full_well_e, "electrons"), "read_noise_e": (noise.read_noise_e, "electrons")}
+        result = last(CameraNoise().live(bench))
+    return result, {"full_well_e": (noise.full_well_e, "electrons"), "read_noise_e": (noise.read_noise_e, "electrons")}
 
 
 def card(seed: int, name: str, truth: Truth) -> tuple[CalibrationResult, Truth]:
     with opened(seed, light(seed)) as (bench, _):
-        events = [*camera_light.live_card(bench)]
+        events = [*CameraCard().live(bench)]
     return next(event for event in events if isinstance(event, CalibrationResult) and event.name == name), truth
 
 
@@ -146,16 +148,16 @@ def steadiness(seed: int) -> tuple[CalibrationResult, Truth]:
 def lens(seed: int) -> tuple[CalibrationResult, Truth]:
     operator = ShelfOperator(World(noise=NoiseModel(camera_mount=1.0), seed=seed), shelf())
     with open_sim_bench(load_config(None, ()), operator) as bench:
-        fact = last(camera_model.live(bench))
+        result = last(CameraModel().live(bench))
     optics = operator.optics
     values = (*optics.focal_px, *optics.centre_px, *optics.distortion[:4])
-    return fact, {name: (value, unit) for (name, unit), value in zip(camera_model.PARAMETERS, values, strict=True)}
+    return result, {name: (value, unit) for (name, unit), value in zip(camera_model.PARAMETERS, values, strict=True)}
 
 
 def axis(seed: int) -> tuple[CalibrationResult, Truth]:
     operator = ShelfOperator(World(noise=NoiseModel(camera_mount=1.0), seed=seed), shelf())
     with open_sim_bench(load_config(None, ()), operator) as bench:
-        fact = last(table_axis.live(bench, last(camera_model.live(bench))))
+        result = last(TableAxis().live(bench, last(CameraModel().live(bench))))
     optics = operator.optics
     up, origin = np.array(optics.rotation).reshape(3, 3)[:, 2], np.array(optics.translation_mm)
     rotation, translation = boards(optics)[table_axis.STANDS[0]].pose(0.0)
@@ -164,14 +166,14 @@ def axis(seed: int) -> tuple[CalibrationResult, Truth]:
     seen = cv2.projectPoints(beside[None], np.zeros(3), np.zeros(3), optics.matrix, np.array(optics.distortion))[0]
     names = ("x", "y", "z", "ux", "uy", "uz", "px", "py")
     units = ("mm", "mm", "mm", "", "", "", "px", "px")
-    return fact, {
+    return result, {
         name: (float(value), unit)
         for name, value, unit in zip(names, [*beside, *up, *seen.ravel()], units, strict=True)
     }
 
 
 PROCEDURES: dict[str, Callable[[int], tuple[CalibrationResult, Truth]]] = {
-    "servo.backlash": play,
+    "servo.backlash": backlash,
     "servo.encoder": over_the_turn,
     "servo.motion": motion,
     "imu.scale": imu_scale,
@@ -201,11 +203,11 @@ def main() -> None:
         errors: dict[str, list[tuple[float, float]]] = defaultdict(list)
         units, refused = {}, 0
         for seed in range(given.first_seed, given.first_seed + given.seeds):
-            fact, truth = procedure(seed)
-            refused += not fact.passed
-            print(f"{name}, seed {seed}: {' '.join(fact.refusals) or 'passed'}", file=sys.stderr)
+            result, truth = procedure(seed)
+            refused += not result.passed
+            print(f"{name}, seed {seed}: {' '.join(map(str, result.refusals)) or 'passed'}", file=sys.stderr)
             for key, (true, unit) in truth.items():
-                estimate = fact.estimates[key]
+                estimate = result.estimates[key]
                 errors[key].append((estimate.value - true, estimate.uncertainty))
                 units[key] = unit
                 print(f"  {key} {errors[key][-1][0] / estimate.uncertainty:+.2f}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Views of the calibration board on the turning table: it is the manipulator, a person only changes the stand."""
+"""Views of the calibration board on the table: the table moves the board, the operator only changes its position."""
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import pictures
-from calibration.events import Ask, Progress
+from calibration.procedure import Ask, Evaluation, Progress
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult
+from rig.calibrations import CalibrationResult, RefusalCode
 from rig.charts.xy import LIMIT, MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.events.events import Event
 from rig.motion.turntable import Turntable
@@ -21,22 +21,22 @@ from rig.views.capture import Viewer
 from rig.views.charuco_board import Board, BoardDetection, detect_board
 
 MIN_CORNERS = 12
-"""Corners that a view needs to say where the board is."""
+"""Corners that a view needs to determine the board's pose."""
 MIN_MARKERS = 6
-"""Markers by which the board is known to be there, whether its corners are found or not."""
+"""Markers that show that a board is there, even if its corners are not found."""
 GRID = (4, 4)
 """Columns and rows of the frame, for the coverage."""
 LOOSE_DEG = 1.5
-"""The board and the encoder may differ by so much about a move; beyond it the board is loose, or the table moved."""
+"""Largest difference of a rotation between board and encoder; beyond it the board is loose, or the table moved."""
 
 STANDS = {
     "calibration-board upright": "upright in the middle of the platter, facing the camera",
     "calibration-board back": "leaning back by about 30°, facing the camera",
-    "calibration-board left": "upright at the left edge of the platter, facing the camera, turned a little in its "
+    "calibration-board left": "upright at the left edge of the platter, facing the camera, rotated a little in its "
     "plane",
-    "calibration-board right": "leaning back by about 15° at the right edge, turned in its plane the other way",
+    "calibration-board right": "leaning back by about 15° at the right edge, rotated in its plane the other way",
 }
-"""How the board is to stand, by the name under which a simulated bench knows it."""
+"""The positions of the board, by the names that a simulated bench knows."""
 
 PICTURES = {
     "calibration-board upright": pictures.BOARD_UPRIGHT,
@@ -48,7 +48,7 @@ PICTURES = {
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """The board at one rest: which stand, the table's angle by the encoder (°), and its corners."""
+    """The board at one rest: the number of its position, the table's angle by the encoder (°), and its corners."""
 
     stand: int
     table_deg: float
@@ -56,13 +56,12 @@ class BoardView:
     corners_px: NDArray[np.float64]
 
 
-def look(
-    bench: Bench, board: Board, stands: Mapping[str, str], angles_deg: Sequence[float]
-) -> Generator[Event | Ask | Progress, None, tuple[list[BoardView], list[str]]]:
-    """Have the board put on each of the ``stands``, go to each of the ``angles_deg``, and find its corners.
+def take_views(
+    bench: Bench, board: Board, stands: Mapping[str, str], angles_deg: Sequence[float], found: Evaluation
+) -> Generator[Event | Ask | Progress, None, list[BoardView]]:
+    """Ask for the board in each of the ``stands``, rotate to each of the ``angles_deg``, and return the views.
 
-    The stands come with how the board is to stand, as in `STANDS`. Returns the views, and what was odd about what was
-    seen.
+    ``stands`` maps names to descriptions, as in `STANDS`. A wrong board becomes a refusal of ``found``.
 
     Raises
     ------
@@ -77,7 +76,7 @@ def look(
     viewer = Viewer(bench.camera, bench.config.view)
     for number, (stand, words) in enumerate(stands.items()):
         yield Ask(
-            f"Put the calibration board {words}; fix it there, and take your hands off. Its squares are "
+            f"Put the calibration board {words}. Fix it there, and take your hands off. Its squares are "
             f"{board.square_mm:g} mm wide, as measured on the print (--square-mm).",
             PICTURES[stand],
         )
@@ -95,18 +94,14 @@ def look(
                 index += 1
                 yield Progress(index / planned, _words(seen, board, views, bench))
             table.goto(angles_deg[0])
-    layout = f"a board of {board.columns} columns and {board.rows} rows"
-    remedy = "give the board's own --columns and --rows, or print it anew with --print-board."
-    troubles = []
-    if foreign:
-        troubles.append(f"Markers were seen that are not on {layout} ({sorted(foreign)}): {remedy}")
-    if elsewhere > planned // 4:
-        troubles.append(f"In {elsewhere} views markers were seen, but not where {layout} has them: {remedy}")
-    return views, troubles
+    layout = {"columns": board.columns, "rows": board.rows}
+    found.refuse_if(foreign, RefusalCode.FOREIGN_MARKERS, markers=sorted(foreign), **layout)
+    found.refuse_if(elsewhere > planned // 4, RefusalCode.WRONG_BOARD_LAYOUT, views=elsewhere, **layout)
+    return views
 
 
 def coverage(views: Sequence[BoardView], size: tuple[int, int]) -> NDArray[np.int64]:
-    """Return how many corners lie in each cell of the frame, int (rows, columns); ``size`` is (width, height)."""
+    """Return the number of corners in each cell of the frame, int (rows, columns); ``size`` is (width, height)."""
     columns, rows = GRID
     cells = np.zeros((rows, columns), dtype=np.int64)
     for view in views:
@@ -116,10 +111,10 @@ def coverage(views: Sequence[BoardView], size: tuple[int, int]) -> NDArray[np.in
     return cells
 
 
-def turned_otherwise(
-    views: Sequence[BoardView], poses: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
-) -> tuple[float, str]:
-    """Return the largest disagreement of board and encoder about a turn, in degrees, and what it says; "" if small.
+def refuse_loose_board(
+    found: Evaluation, views: Sequence[BoardView], poses: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+) -> None:
+    """Refuse views between which board and encoder rotated by different angles.
 
     Parameters
     ----------
@@ -137,16 +132,16 @@ def turned_otherwise(
         between = cv2.Rodrigues(rotation_b)[0] @ cv2.Rodrigues(rotation_a)[0].T
         seen_deg = degrees(float(np.linalg.norm(cv2.Rodrigues(between)[0])))
         worst = max(worst, abs(seen_deg - abs(b.table_deg - a.table_deg)))
-    if worst <= LOOSE_DEG:
-        return worst, ""
-    return worst, (
-        f"Between two views the board turned by {worst:.1f}° more or less than the table: it is loose on its stand, "
-        "the table moves while it is looked at, or servo.gear_ratio is wrong. Fix the board, and calibrate again."
-    )
+    found.refuse_if(worst > LOOSE_DEG, RefusalCode.BOARD_LOOSE, difference_deg=worst)
+
+
+def span_deg(views: Sequence[BoardView]) -> float:
+    """Return the range of the table's angles in ``views``."""
+    return max((v.table_deg for v in views), default=0.0) - min((v.table_deg for v in views), default=0.0)
 
 
 def points(board: Board, view: BoardView) -> NDArray[np.float64]:
-    """Return the board's points that a view shows, float64 (n, 3), mm."""
+    """Return the points of the board in a view, float64 (n, 3), mm."""
     return board.points_mm()[view.ids]
 
 
@@ -164,7 +159,7 @@ def as_json(views: Sequence[BoardView]) -> list[dict[str, Any]]:
 
 
 def by_stand(views: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[Mapping[str, Any]]]]:
-    """Return the views of each stand, as in the evidence, with its name and colour in every chart."""
+    """Return the views of each position of the board, as in the evidence, with its name and colour in charts."""
     numbers = sorted({view["stand"] for view in views})
     return [
         (f"stand {number + 1}", colour, [view for view in views if view["stand"] == number])
@@ -172,9 +167,9 @@ def by_stand(views: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[Ma
     ]
 
 
-def plot_views(fact: CalibrationResult, limit_px: float) -> Chart | None:
-    """Return how far the corners of each view are off the fit (RMS); the title names the worst."""
-    views, rms = fact.evidence["views"], fact.evidence.get("view_rms_px")
+def plot_views(result: CalibrationResult, limit_px: float) -> Chart | None:
+    """Return the deviation of the corners of each view from the fit (RMS); the title names the worst views."""
+    views, rms = result.evidence["views"], result.evidence.get("view_rms_px")
     if not rms:
         return None
     numbered = [{**view, "number": i + 1, "rms": value} for i, (view, value) in enumerate(zip(views, rms, strict=True))]
@@ -186,7 +181,7 @@ def plot_views(fact: CalibrationResult, limit_px: float) -> Chart | None:
     return Chart(
         f"Worst views: {named}",
         Axis("view", whole=True),
-        Axis("corners off the fit, px (RMS)", span=(0.0, limit_px)),
+        Axis("deviation of the corners, px (RMS)", span=(0.0, limit_px)),
         [
             *(
                 Series(name, [view["number"] for view in of_stand], [view["rms"] for view in of_stand], colour)

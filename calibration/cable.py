@@ -1,85 +1,52 @@
-"""How far the cable lets the table turn, taught by hand with the torque off.
+"""Measure how far the cable lets the table rotate: the operator shows both ends by hand, with the torque off.
 
-A person turns the table to either end of the cable's reach; the servo, under supply, counts the turns itself.
+The servo counts the revolutions itself while its supply is on.
 """
 
-from collections.abc import Generator, Mapping
-from datetime import datetime
-from typing import Any
+from dataclasses import dataclass
 
 from calibration import pictures
-from calibration.events import Ask
+from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate
+from rig.calibrations import CalibrationResult, RefusalCode
 
 NAME = "servo.cable"
-VALID_DAYS = 365
 
 MARGIN_DEG = 15.0
-"""Kept from either end: a motion that is stopped runs on, and a hand feels a taut cable late."""
+"""Left at either end: a stopped motion overruns, and a hand feels a taut cable late."""
 HAND_DEG = 5.0
-"""Standard uncertainty of where a person finds the cable taut."""
-TURN_DEG = 360.0
+"""Standard uncertainty of the angle at which an operator finds the cable taut."""
 
 
-def live(bench: Bench) -> Generator[Ask | CalibrationResult, None, CalibrationResult]:
-    """Have both ends of the cable shown; yields what to do, then the fact. The servo moves nothing.
+@dataclass(frozen=True)
+class Cable(Procedure):
+    """Ask the operator to show both ends of the cable. The servo moves nothing."""
 
-    Raises
-    ------
-    DeviceFault, DeviceSilent
-        The servo fails.
-    """
-    when_utc = bench.clock.utc()
-    bench.servo.torque_off()
-    ends_deg = []
-    for direction, picture in (("counter-clockwise", pictures.TURN_LEFT), ("clockwise", pictures.TURN_RIGHT)):
-        yield Ask(f"Turn the table by hand {direction}, seen from above, until its cable is just not taut.", picture)
-        ends_deg.append(bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg))
-    yield Ask("Turn the table back by hand until its cable hangs free.", pictures.CABLE_FREE)
-    fact = from_data(
-        ends_deg[0],
-        ends_deg[1],
-        pan=bench.config.table.mode == "pan",
-        when_utc=when_utc,
-        device=bench.apparatus("servo"),
-    )
-    yield fact
-    return fact
+    names, title, devices, valid_days = (NAME,), "ends of the cable", ("servo",), 365
+
+    def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
+        bench.servo.torque_off()
+        ends_deg = []
+        for direction, picture in (("counter-clockwise", pictures.ROTATE_LEFT), ("clockwise", pictures.ROTATE_RIGHT)):
+            yield Ask(
+                f"Rotate the table by hand {direction}, seen from above, until the cable is almost taut.", picture
+            )
+            ends_deg.append(bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg))
+        yield Ask("Rotate the table back by hand until the cable hangs free.", pictures.CABLE_FREE)
+        yield evaluate(*ends_deg, pan=bench.config.table.mode == "pan")
 
 
-def from_data(
-    high_deg: float, low_deg: float, *, pan: bool, when_utc: datetime, device: Mapping[str, Any]
-) -> CalibrationResult:
-    """Judge the two ends of the cable, table angles in degrees; ``pan`` tables need no whole turn."""
-    limits = [round(low_deg + MARGIN_DEG, 1), round(high_deg - MARGIN_DEG, 1)]
-    span_deg = limits[1] - limits[0]
-    refusals = []
+def evaluate(high_deg: float, low_deg: float, *, pan: bool) -> Evaluation:
+    """Check the two ends of the cable, table angles in degrees; a ``pan`` table needs no whole revolution."""
+    found = Evaluation(name=NAME, residual_unit="°", evidence={"margin_deg": MARGIN_DEG})
+    found.estimate("lowest", low_deg, HAND_DEG, "°")
+    found.estimate("highest", high_deg, HAND_DEG, "°")
+    low, high = limits = [round(low_deg + MARGIN_DEG, 1), round(high_deg - MARGIN_DEG, 1)]
+    found.proposed = {"table.limits_deg": limits}
     if high_deg < low_deg:
-        refusals.append(
-            f"The counter-clockwise end ({high_deg:.0f}°) lies below the clockwise one ({low_deg:.0f}°): the ends were "
-            "shown the other way round, or table.direction has the wrong sign. Check it with `rig calibrate servo`."
-        )
-    elif not pan and span_deg < TURN_DEG:
-        refusals.append(
-            f"Between the ends, less {MARGIN_DEG:g}° at each, the cable leaves {span_deg:.0f}°: less than a turn. Give "
-            'it more slack, lead it up along the axis, or set table.mode = "pan".'
-        )
-    elif not limits[0] <= 0.0 <= limits[1]:
-        refusals.append(
-            f"The table's zero does not lie between {limits[0]:.0f}° and {limits[1]:.0f}°: turn the table to where "
-            "the cable hangs free, tell the rig with `rig home --set`, and teach the ends again."
-        )
-    return CalibrationResult(
-        name=NAME,
-        estimates={"lowest": Estimate(low_deg, HAND_DEG, "°"), "highest": Estimate(high_deg, HAND_DEG, "°")},
-        residual=None,
-        limit=None,
-        residual_unit="°",
-        refusals=tuple(refusals),
-        settings={} if refusals else {"table.limits_deg": limits},
-        valid_days=VALID_DAYS,
-        when_utc=when_utc,
-        device=device,
-        evidence={"margin_deg": MARGIN_DEG},
-    )
+        found.refuse_if(True, RefusalCode.CABLE_ENDS_SWAPPED, high_deg=high_deg, low_deg=low_deg)
+    elif not pan and high - low < 360.0:
+        found.refuse_if(True, RefusalCode.CABLE_TOO_SHORT, margin_deg=MARGIN_DEG, span_deg=high - low)
+    else:
+        found.refuse_if(not low <= 0.0 <= high, RefusalCode.HOME_OUTSIDE_CABLE, low_deg=low, high_deg=high)
+    return found

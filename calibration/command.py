@@ -1,8 +1,7 @@
 """`rig calibrate ...`."""
 
 import sys
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,27 +11,29 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
-    from calibration.events import Ask
+    from calibration.procedure import Ask, Procedure
     from rig.bench import Bench
     from rig.calibrations import CalibrationResult
+    from rig.views.charuco_board import Board
 
 EXIT_QUALITY = 6
 
 MARKER_SHARE = 11 / 15
-"""Side of a marker over that of its square, on every board that is printed."""
+"""Side of a marker over that of its square, on every printed board."""
 
+Minutes = Annotated[float, typer.Option(min=3.0, help="Minutes of recording the gyro at rest.")]
 BoardColumns = Annotated[int, typer.Option(min=3, max=20, help="Squares across the board.")]
 BoardRows = Annotated[int, typer.Option(min=3, max=20, help="Squares down the board.")]
-SquareMm = Annotated[float, typer.Option(min=2, max=100, help="Side of a square, as measured on the print, in mm.")]
+SquareMm = Annotated[float, typer.Option(min=2, max=100, help="Side of a square in mm, measured on the print.")]
 
 RadiusMm = Annotated[float, typer.Option(min=5, max=1000, help="Radius of the largest object about the axis, in mm.")]
 HeightMm = Annotated[float, typer.Option(min=5, max=2000, help="Height of the tallest object, in mm.")]
 MiddleMm = Annotated[
-    float, typer.Option(min=0, max=1000, help="Height of the board's middle above the platter, upright, in mm.")
+    float, typer.Option(min=0, max=1000, help="Height of the upright board's middle above the platter, in mm.")
 ]
 LensMm = Annotated[
     float | None,
-    typer.Option(min=20, max=10_000, help="Distance from lens to axis, if measured: a board of wrong size is noticed."),
+    typer.Option(min=20, max=10_000, help="Distance from lens to axis in mm, if measured: checks the board's size."),
 ]
 
 app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
@@ -42,76 +43,62 @@ app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 @command
 def servo(
     settings: Settings,
-    reversals: Annotated[int, typer.Option(min=6, help="Reversals by which the play is measured.")] = 24,
-    turns: Annotated[int, typer.Option(min=1, help="Turns over which the encoder is compared.")] = 2,
-    rounds: Annotated[int, typer.Option(min=2, help="Rounds of timed moves.")] = 3,
+    reversals: Annotated[int, typer.Option(min=6, help="Reversals for the backlash.")] = 24,
+    turns: Annotated[int, typer.Option(min=1, help="Revolutions for the encoder.")] = 2,
+    rounds: Annotated[int, typer.Option(min=2, help="Rounds of timed rotations.")] = 3,
 ) -> None:
-    """Calibrate sense and ratio, play, encoder and motion of the servo; some minutes, exit code 6 if one fails.
+    """Calibrate direction, gear ratio, backlash, encoder and motion of the servo.
+
+    Takes some minutes. Exit code 6 if a calibration does not pass.
 
     Example: rig calibrate servo --bench sim
     """
-    from calibration import backlash, encoder, motion_model
+    from calibration.procedures import Backlash, Encoder, MotionModel
 
-    run(
-        settings,
-        lambda bench: backlash.live(bench, reversals=reversals),
-        lambda bench: encoder.live(bench, turns=turns),
-        lambda bench: motion_model.live(bench, rounds=rounds),
-    )
+    run(settings, Backlash(reversals), Encoder(turns), MotionModel(rounds))
 
 
 @app.command("cable")
 @command
 def cable(settings: Settings) -> None:
-    """Teach the table's limits by hand, torque off: turn it to either end of the cable's reach.
+    """Measure the cable budget: rotate the table by hand to both ends of the cable. The torque is off.
 
     Example: rig calibrate cable
     """
-    from calibration.cable import live
+    from calibration.procedures import Cable
 
-    run(settings, live)
+    run(settings, Cable())
 
 
 @app.command("imu")
 @command
 def imu(
     settings: Settings,
-    turns: Annotated[int, typer.Option(min=4, help="Whole turns at least, both ways together.")] = 8,
-    minutes: Annotated[float, typer.Option(min=3.0, help="How long the gyro is listened to at rest.")] = 20.0,
-    repeats: Annotated[int, typer.Option(min=4, help="Repeated moves at each speed, by which σ is verified.")] = 10,
+    turns: Annotated[int, typer.Option(min=4, help="Least number of revolutions, both directions together.")] = 8,
+    minutes: Minutes = 20.0,
+    repeats: Annotated[int, typer.Option(min=4, help="Repeated rotations at each speed, to verify σ.")] = 10,
 ) -> None:
-    """Calibrate the gyro's scale, mounting and noise, and verify its σ; half an hour, exit code 6 if one fails.
+    """Calibrate scale, mounting and noise of the gyro, and verify the uncertainty of rotations.
+
+    Takes half an hour. Exit code 6 if a calibration does not pass.
 
     Example: rig calibrate imu --bench sim --turns 12
     """
-    from calibration import gyro_noise, gyro_rotation, gyro_scale, imu_mounting
+    from calibration.procedures import GyroNoise, GyroRotation, GyroScale, ImuMounting
 
-    run(
-        settings,
-        lambda bench: gyro_scale.live(bench, turns=turns),
-        imu_mounting.live,
-        lambda bench: gyro_noise.live(bench, minutes=minutes),
-        lambda bench: gyro_rotation.live(bench, repeats=repeats),
-    )
+    run(settings, GyroScale(turns), ImuMounting(), GyroNoise(minutes), GyroRotation(repeats))
 
 
 @app.command("camera")
 @command
-def camera(
-    settings: Settings,
-    columns: BoardColumns = 8,
-    rows: BoardRows = 6,
-    square_mm: SquareMm = 15.0,
-) -> None:
-    """Calibrate the camera: lens with the board on the turning table, sharpness, noise, flat field and drift.
+def camera(settings: Settings, columns: BoardColumns = 8, rows: BoardRows = 6, square_mm: SquareMm = 15.0) -> None:
+    """Calibrate sharpness, noise, flat field, drift and lens of the camera, with a grey card and the printed board.
 
     Example: rig calibrate camera --bench sim
     """
-    from calibration import camera_light, camera_model
-    from rig.views.charuco_board import Board
+    from calibration.procedures import CameraCard, CameraModel, CameraNoise
 
-    board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
-    run(settings, camera_light.live_scene, camera_light.live_card, lambda bench: camera_model.live(bench, board))
+    run(settings, CameraNoise(), CameraCard(), CameraModel(_board(columns, rows, square_mm)))
 
 
 @app.command("table")
@@ -127,55 +114,51 @@ def table(
     lens_mm: LensMm = None,
     print_board: Annotated[
         Path | None,
-        typer.Option(
-            "--print-board", metavar="FILE", help="Only write the board to print, .pdf or .png, true to scale."
-        ),
+        typer.Option("--print-board", metavar="FILE", help="Write the board as .pdf or .png to print, and stop."),
     ] = None,
 ) -> None:
-    """Calibrate where the table's axis is in the camera's frame, and how truly it turns; the camera comes first.
+    """Calibrate the position and the wobble of the table's axis in the camera's frame. Calibrate the camera first.
 
-    From then on the region of interest (view.roi) is where objects of that radius and height are seen.
+    The result sets the region of interest (view.roi) for objects of the given radius and height.
 
     Example: rig calibrate table --print-board board.pdf
     """
-    from calibration import table_axis
-    from calibration.table_axis import Room
-    from rig.views.charuco_board import Board
+    from calibration.procedures import TableAxis
+    from calibration.table_axis import ObjectSpace
 
-    board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
+    board = _board(columns, rows, square_mm)
     if print_board is not None:
         from calibration.print_board import write_board
 
         print(write_board(board, print_board))
         return
-    room = Room(radius_mm, height_mm, middle_mm, lens_mm)
-    run(settings, lambda bench: table_axis.live(bench, _in_force(bench, "camera.intrinsics"), board, room))
+    run(settings, TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)))
 
 
 @app.command("noise")
 @command
 def noise(
     settings: Settings,
-    name: Annotated[str, typer.Argument(help="What is put on the table, e.g. the name of an enrolled object.")],
-    placements: Annotated[int, typer.Option(min=2, help="How often it is placed anew, at the same mark.")] = 5,
+    name: Annotated[str, typer.Argument(help="Object to put on the table, for example an enrolled one.")],
+    placements: Annotated[int, typer.Option(min=2, help="Number of placements at the same mark.")] = 5,
     error_rate: Annotated[
         float, typer.Option(min=0.001, max=0.2, help="Share of known objects that may be taken for unknown.")
     ] = 0.02,
 ) -> None:
-    """Calibrate how alike repeated views are, and from it margin and threshold of identification.
+    """Calibrate the similarity of repeated views; it sets margin and threshold of identification.
 
     Example: rig calibrate noise mug-star --bench sim --placements 5
     """
-    from calibration import repeatability
+    from calibration.procedures import Repeatability
 
-    run(settings, lambda bench: repeatability.live(bench, name, placements=placements, error_rate=error_rate))
+    run(settings, Repeatability(name, placements, error_rate))
 
 
 @app.command("all")
 @command
 def everything(
     settings: Settings,
-    minutes: Annotated[float, typer.Option(min=3.0, help="How long the gyro is listened to at rest.")] = 20.0,
+    minutes: Minutes = 20.0,
     columns: BoardColumns = 8,
     rows: BoardRows = 6,
     square_mm: SquareMm = 15.0,
@@ -185,62 +168,58 @@ def everything(
     lens_mm: LensMm = None,
     thing: Annotated[
         str | None,
-        typer.Option("--object", metavar="NAME", help="An object by which repeated views are compared last."),
+        typer.Option("--object", metavar="NAME", help="Object for the similarity of repeated views, measured last."),
     ] = None,
 ) -> None:
-    """Calibrate all: servo and IMU, which need no hands, then camera and table, with card and board; about an hour.
+    """Calibrate servo and IMU, which need no operator, then camera and table, with card and board.
 
-    The first that does not pass ends it. The cable is taught before, with `rig calibrate cable`.
+    Takes about an hour, and stops at the first calibration that does not pass. Calibrate the cable before.
 
     Example: rig calibrate all --bench sim --object mug-star
     """
-    from calibration import (
-        backlash,
-        camera_light,
-        camera_model,
-        encoder,
-        gyro_noise,
-        gyro_rotation,
-        gyro_scale,
-        imu_mounting,
-        motion_model,
-        repeatability,
-        table_axis,
+    from calibration.procedures import (
+        Backlash,
+        CameraCard,
+        CameraModel,
+        CameraNoise,
+        Encoder,
+        GyroNoise,
+        GyroRotation,
+        GyroScale,
+        ImuMounting,
+        MotionModel,
+        Repeatability,
+        TableAxis,
     )
-    from calibration.table_axis import Room
-    from rig.views.charuco_board import Board
+    from calibration.table_axis import ObjectSpace
 
-    board = Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
-    room = Room(radius_mm, height_mm, middle_mm, lens_mm)
-    last = [] if thing is None else [lambda bench: repeatability.live(bench, thing)]
+    board = _board(columns, rows, square_mm)
     run(
         settings,
-        backlash.live,
-        encoder.live,
-        motion_model.live,
-        gyro_scale.live,
-        imu_mounting.live,
-        lambda bench: gyro_noise.live(bench, minutes=minutes),
-        gyro_rotation.live,
-        camera_light.live_scene,
-        camera_light.live_card,
-        lambda bench: camera_model.live(bench, board),
-        lambda bench: table_axis.live(bench, _in_force(bench, camera_model.NAME), board, room),
-        *last,
+        Backlash(),
+        Encoder(),
+        MotionModel(),
+        GyroScale(),
+        ImuMounting(),
+        GyroNoise(minutes),
+        GyroRotation(),
+        CameraNoise(),
+        CameraCard(),
+        CameraModel(board),
+        TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)),
+        *([] if thing is None else [Repeatability(thing)]),
     )
     if thing is None:
-        print("Still to do: `rig calibrate noise NAME`, with an object at hand.", file=sys.stderr)
+        print("Next: run `rig calibrate noise NAME` with an object.", file=sys.stderr)
 
 
 @app.command("report")
 @command
 def report(
     settings: Settings,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.html", help="Where the page is written.")] = Path(
-        "calibration.html"
-    ),
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.html", help="File to write.")] = Path("calibration.html"),
 ) -> None:
-    """Write one page with all calibrations of the bench and their plots; nothing moves.
+    """Write a page with all calibrations of the bench and their plots. Nothing moves.
 
     Example: rig calibrate report --bench sim --out calibration.html
     """
@@ -252,9 +231,9 @@ def report(
         now_utc = bench.clock.utc()
         standings = store.standings(bench.apparatus(), now_utc)
         unreadable = [error.what for error in store.unreadable]
-        write_page(out, standings, store.history(), bench=bench.name, now_utc=now_utc, findings=unreadable)
+        write_page(out, standings, store.history(), bench=bench.name, now_utc=now_utc, notes=unreadable)
     if settings.json:
-        settings.print_json({"file": str(out), "calibrations": [s.fact.name for s in standings]})
+        settings.print_json({"file": str(out), "calibrations": [s.result.name for s in standings]})
     else:
         print(out)
 
@@ -262,73 +241,68 @@ def report(
 @app.command("show")
 @command
 def show(settings: Settings) -> None:
-    """Show what is in force on the bench, what has expired, and what belongs to other devices; nothing moves.
+    """Show which calibrations are in force, have expired, or belong to other devices. Nothing moves.
 
     Example: rig calibrate show --bench sim
     """
-    from rig.calibrations import CalibrationStore, State
+    from rig.calibrations import CalibrationStatus, CalibrationStore
     from rig.events.events import plain
 
     with settings.open_bench(tell=False) as bench:
         store = CalibrationStore(bench.config.calibration_path(bench.name))
         standings = store.standings(bench.apparatus(), bench.clock.utc())
         if settings.json:
-            settings.print_json(
-                {
-                    "folder": str(store.folder),
-                    "calibrations": [{"state": s.state, "words": s.words, **plain(s.fact)} for s in standings],
-                }
-            )
+            rows = [{"state": s.status, "words": s.text, **_json(s.result)} for s in standings]
+            settings.print_json({"folder": str(store.folder), "calibrations": plain(rows)})
             return
         for finding in bench.findings:
             print(f"! {finding}")
         for standing in standings:
-            if standing.state is State.IN_FORCE:
-                print(f"✓ {standing.words}")
-                print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.fact.estimates.items()))
-                for key, value in standing.fact.settings.items():
+            if standing.status is CalibrationStatus.IN_FORCE:
+                print(f"✓ {standing.text}")
+                print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.result.estimates.items()))
+                for key, value in standing.result.settings.items():
                     print(f"    sets {key} = {_plain(value)}")
         if not standings:
-            print(f"Nothing is calibrated yet in {store.folder}: run `rig calibrate all`.")
+            print(f"No calibrations in {store.folder} yet: run `rig calibrate all`.")
 
 
 @app.command("history")
 @command
 def history(
     settings: Settings,
-    name: Annotated[str | None, typer.Argument(help="One kind, e.g. imu.scale; all where none is given.")] = None,
+    name: Annotated[str | None, typer.Argument(help="One kind, for example imu.scale; default: all.")] = None,
 ) -> None:
-    """List every calibration that was kept, oldest first, passed or not.
+    """List all stored calibrations, passed or not, oldest first.
 
     Example: rig calibrate history servo.backlash --bench sim
     """
     from rig.calibrations import CalibrationStore
-    from rig.events.events import plain
 
     store = CalibrationStore(settings.load().calibration_path(settings.bench_name))
-    facts = store.history(name)
+    results = store.history(name)
     for error in store.unreadable:
         print(f"! {error.what}", file=sys.stderr)
     if settings.json:
-        settings.print_json({"folder": str(store.folder), "calibrations": [plain(fact) for fact in facts]})
+        settings.print_json({"folder": str(store.folder), "calibrations": [_json(result) for result in results]})
         return
-    for fact in facts:
-        values = ", ".join(f"{key} {estimate}" for key, estimate in fact.estimates.items())
-        told = values if fact.passed else f"FAIL: {fact.refusals[0]}"
-        print(f"{fact.when_utc:%Y-%m-%d %H:%M}  {fact.name:<16} {told}")
-    if not facts:
-        print(f"No calibration{f' of {name}' if name else ''} was kept in {store.folder}.")
+    for result in results:
+        values = ", ".join(f"{key} {estimate}" for key, estimate in result.estimates.items())
+        outcome = values if result.passed else f"FAIL: {result.refusals[0]}"
+        print(f"{result.when_utc:%Y-%m-%d %H:%M}  {result.name:<16} {outcome}")
+    if not results:
+        print(f"No calibrations{f' of {name}' if name else ''} in {store.folder}.")
 
 
-def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None, CalibrationResult]]") -> None:
-    """Run calibrations on the bench one after the other, keep each fact, passed or not, and say how it went.
+def run(settings: Settings, *procedures: "Procedure") -> None:
+    """Run procedures on the bench one after the other, store and report each result, and apply those that passed.
 
-    What passed is in force for the next one. The first that does not pass ends the row.
+    A result that passed is in force for the next procedure. The first that does not pass ends the series.
 
     Raises
     ------
     typer.Exit
-        With code 6 when a calibration did not pass.
+        With code 6 if a calibration did not pass.
     """
     from rig.bench import calibrate
     from rig.calibrations import CalibrationStore
@@ -337,53 +311,64 @@ def run(settings: Settings, *procedures: "Callable[[Bench], Generator[Any, None,
     with settings.open_bench() as bench:
         store = CalibrationStore(bench.config.calibration_path(bench.name))
         for procedure in procedures:
-            for fact in _told(settings, procedure(bench)):
-                path = store.keep(fact)
+            for result in _results(settings, bench, procedure):
+                path = store.add(result)
                 if settings.json:
-                    _print_json(settings, fact, path)
+                    outcome = {"event": "calibrated", "passed": result.passed, "id": result.id, "file": str(path)}
+                    settings.print_json({**outcome, **_json(result)})
                 else:
-                    then = ", in force from now on." if fact.passed else "; what was in force stays so."
-                    print(f"{outcome_text(fact)}\nKept in {path}{then}")
-                if not fact.passed:
+                    then = ", in force from now on." if result.passed else "; earlier results stay in force."
+                    print(f"{outcome_text(result)}\nStored in {path}{then}")
+                if not result.passed:
                     raise typer.Exit(EXIT_QUALITY)
-            told, region = bench.calibration_findings, bench.config.view.roi
+            reported, region = bench.calibration_findings, bench.config.view.roi
             calibrate(bench, store)
             for finding in bench.calibration_findings:
-                if finding not in told:  # what a person wrote into the configuration wins
+                if finding not in reported:  # a setting in the configuration takes precedence
                     print(f"Note: {finding}.", file=sys.stderr)
             if bench.config.view.roi != region and (catalog := settings.catalog_there()):
                 with catalog:
                     tell_other_regions(settings, catalog, bench)
 
 
+def _board(columns: int, rows: int, square_mm: float) -> "Board":
+    from rig.views.charuco_board import Board
+
+    return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
+
+
 def _in_force(bench: "Bench", name: str) -> "CalibrationResult":
-    """Return the calibration of that name in force on the bench, which another one needs.
+    """Return the result called ``name`` that is in force on the bench.
 
     Raises
     ------
     UsageError
         There is none.
     """
-    from rig.calibrations import CalibrationStore, State
+    from rig.calibrations import CalibrationStatus, CalibrationStore
     from rig.core.errors import UsageError
 
     store = CalibrationStore(bench.config.calibration_path(bench.name))
     for standing in store.standings(bench.apparatus(), bench.clock.utc()):
-        if standing.fact.name == name and standing.state is State.IN_FORCE:
-            return standing.fact
+        if standing.result.name == name and standing.status is CalibrationStatus.IN_FORCE:
+            return standing.result
     raise UsageError(
         f"{name} is not calibrated on this bench.", next_step=f"Run `rig calibrate {name.partition('.')[0]}` first."
     )
 
 
-def _told(settings: Settings, events: "Generator[Any, None, CalibrationResult]") -> "Iterator[CalibrationResult]":
-    """Tell the events of a procedure as they come, and yield its facts."""
-    from calibration.events import Ask, Progress
+def _results(settings: Settings, bench: "Bench", procedure: "Procedure") -> "Iterator[CalibrationResult]":
+    """Report the events of a procedure as they come, and yield its results."""
+    from contextlib import closing
+
+    from calibration.procedure import Ask, Progress
     from rig.calibrations import CalibrationResult
     from rig.cli.ui.present import line
     from rig.events.events import event_dict
 
-    with closing(events):
+    required = [_in_force(bench, name) for name in procedure.requires]
+    with closing(procedure.live(bench, *required)) as events:
+        event: Any
         for event in events:
             if isinstance(event, CalibrationResult):
                 yield event
@@ -395,29 +380,31 @@ def _told(settings: Settings, events: "Generator[Any, None, CalibrationResult]")
                 print(event.words if isinstance(event, Progress) else line(event), flush=True)
 
 
-def _ask(what: "Ask", *, with_picture: bool) -> None:
-    """Say what a person is to do, and wait until it is done; where nobody sits before it, go on."""
-    print(f"{what.words}{what.picture if with_picture else ''}", file=sys.stderr)
+def _ask(request: "Ask", *, with_picture: bool) -> None:
+    """Print a request to the operator; at a terminal, wait for Enter."""
+    print(f"{request.words}{request.picture if with_picture else ''}", file=sys.stderr)
     if sys.stdin.isatty():
         typer.prompt("Then press Enter", default="", show_default=False, err=True)
 
 
-def _print_json(settings: Settings, fact: "CalibrationResult", path: "Path") -> None:
+def _json(result: "CalibrationResult") -> dict[str, Any]:
+    """Return a result as JSON; each refusal also in words."""
     from rig.events.events import plain
 
-    settings.print_json({"event": "calibrated", "passed": fact.passed, "id": fact.id, "file": str(path), **plain(fact)})
+    refusals = [{**plain(refusal), "text": str(refusal)} for refusal in result.refusals]
+    return {**plain(result), "refusals": refusals}
 
 
-def outcome_text(fact: "CalibrationResult") -> str:
-    """Return in words what a calibration found, or why it was refused and what to do."""
-    judged = ""
-    if fact.residual is not None and fact.limit is not None:
-        unit = fact.residual_unit
-        judged = f" (worst residual {fact.residual:.3g} {unit}, limit {fact.limit:.3g} {unit})"
-    lines = [f"{'PASS' if fact.passed else 'FAIL'} {fact.name}{judged}"]
-    lines += [f"  {name} = {estimate}" for name, estimate in fact.estimates.items()]
-    lines += [f"  sets {key} = {_plain(value)}" for key, value in fact.settings.items()]
-    return "\n".join([*lines, *(f"  {reason}" for reason in fact.refusals)])
+def outcome_text(result: "CalibrationResult") -> str:
+    """Return the outcome of a calibration: its values, or why it did not pass and the next step."""
+    residual = ""
+    if result.residual is not None and result.limit is not None:
+        unit = result.residual_unit
+        residual = f" (worst residual {result.residual:.3g} {unit}, limit {result.limit:.3g} {unit})"
+    lines = [f"{'PASS' if result.passed else 'FAIL'} {result.name}{residual}"]
+    lines += [f"  {name} = {estimate}" for name, estimate in result.estimates.items()]
+    lines += [f"  sets {key} = {_plain(value)}" for key, value in result.settings.items()]
+    return "\n".join([*lines, *(f"  {refusal}" for refusal in result.refusals)])
 
 
 def _plain(value: Any) -> str:

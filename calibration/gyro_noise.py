@@ -1,55 +1,51 @@
-"""What the gyro shows while nothing moves: its zero, how that follows temperature, its noise, and how it wanders.
+"""Measure the gyro at rest: its zero, the zero's slope over temperature, its noise, and the random walk of its rate.
 
 The Allan variance of the rate over the time τ, overlapping, from the integrated angle θ (IEEE Std 952, annex C):
 
     σ²(τ) = Σ (θ(t + 2τ) − 2θ(t + τ) + θ(t))² / (2τ²·n)
 
-White noise of the angle random walk N gives N²/τ, a random walk K of the rate K²·τ/3. Both are fitted together; where
+White noise of the angle random walk N gives N²/τ, a random walk K of the rate K²·τ/3. Both are fitted together. Where
 they are equal lies the lowest value of the curve, which divided by 0.664 is called the bias instability. Samples of an
-Allan variance over many τ share their data, so that the uncertainties come from a parametric bootstrap: the fit is
-repeated on series drawn with the fitted N and K.
+Allan variance over many τ share their data, so the uncertainties come from a parametric bootstrap: the fit is repeated
+on series drawn with the fitted N and K.
 """
 
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from dataclasses import dataclass
-from datetime import datetime
 from math import sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from calibration.events import Progress
+from calibration.procedure import Evaluation, Measured, Procedure, Progress, require_at_least
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate
+from rig.calibrations import CalibrationResult, RefusalCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
-from rig.core.errors import UsageError
 
 NAME = "imu.noise"
-VALID_DAYS = 365
 
 BLOCK_S = 1.0
-"""Samples are averaged over this first: so long that what the sensor's low-pass remembers of the last is below 1 %."""
+"""Samples are first averaged over this time: the memory of the sensor's low-pass filter is then below 1 %."""
 MIN_MINUTES = 3.0
 BOOTSTRAPS = 100
 MIN_WARMTH_C = 1.0
-"""Over a smaller change of temperature nothing can be said about the slope."""
+"""A smaller change of temperature does not determine the slope."""
 MAX_ARW_DEG_RTS = 0.02
-"""Six times the sensor's datasheet: beyond it something shakes, or the sensor is broken."""
+"""Six times the sensor's datasheet: beyond it the bench shakes, or the sensor is broken."""
 MAX_STEP_SIGMA = 7.0
-"""Largest deviation of one block from its neighbours: of 10⁶ blocks of noise none is further off."""
+"""Largest deviation of one block from its neighbours: of 10⁶ blocks of noise none deviates more."""
 INSTABILITY = sqrt(2 * np.log(2) / np.pi)
 """0.664, the Allan deviation of flicker noise over its coefficient."""
 _DRAIN_S = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
-    """What the sensor delivered at rest, averaged over blocks.
+class RestRecord:
+    """The sensor's data at rest, averaged over blocks.
 
-    ``gyro_dps`` float64 (n, 3), about the sensor's axes; ``temperature_c`` float64 (n,); ``lost`` samples that are
-    missing between blocks.
+    ``gyro_dps`` float64 (n, 3), about the sensor's axes; ``temperature_c`` float64 (n,); ``lost`` is the number of
+    samples that are missing between blocks.
     """
 
     gyro_dps: NDArray[np.float64]
@@ -58,126 +54,99 @@ class Rest:
     lost: int = 0
 
 
-def live(bench: Bench, *, minutes: float = 20.0) -> Generator[Progress | CalibrationResult, None, CalibrationResult]:
-    """Listen to the sensor for some ``minutes`` while the table stands without torque; yields progress, then the fact.
-
-    Soon after power-on the sensor warms up: only then the slope over temperature can be told.
-
-    Raises
-    ------
-    UsageError
-        Fewer than `MIN_MINUTES`.
-    DeviceFault, DeviceSilent
-        The sensor fails.
-    """
-    if minutes < MIN_MINUTES:
-        raise UsageError(
-            f"{minutes:g} minutes are too few to see the gyro's zero wander.",
-            next_step=f"Give at least {MIN_MINUTES:g}; 20 are usual.",
-        )
-    imu, clock = bench.imu, bench.clock
-    when_utc = clock.utc()
-    per_block = round(BLOCK_S * imu.rate_hz)
-    waiting = np.empty((0, 3))
-    blocks: list[NDArray[np.float64]] = []
-    temperatures: list[float] = []
-    lost = 0
-    imu.read_samples()  # what waited since the bench was opened
-    needed = round(minutes * 60 / BLOCK_S)
-    told = 0
-    while len(blocks) < needed:
-        clock.sleep(_DRAIN_S)
-        new = imu.read_samples()
-        lost += new.lost
-        waiting = np.concatenate([waiting, new.gyro_dps])
-        temperature_c = imu.temperature_c()
-        while len(waiting) >= per_block:
-            blocks.append(waiting[:per_block].mean(axis=0))
-            temperatures.append(temperature_c)
-            waiting = waiting[per_block:]
-        if (share := len(blocks) / needed) * 20 >= told + 1:
-            told = int(share * 20)
-            yield Progress(min(share, 1.0), f"{share:.0%} of {minutes:g} minutes, {temperature_c:.1f} °C")
-    rest = Rest(np.array(blocks), np.array(temperatures), per_block / imu.rate_hz, lost)
-    fact = from_data(
-        rest,
-        column="xyz".index(bench.config.imu.axis),
-        when_utc=when_utc,
-        device=bench.apparatus("imu"),
+def plot(result: CalibrationResult) -> Chart | None:
+    """Return the Allan deviation over the averaging time, measured and fitted."""
+    taus, model = result.evidence["tau_s"], result.evidence["allan_deviation_model_dps"]
+    return Chart(
+        "Allan deviation of the gyro at rest",
+        Axis("averaged over, s", log=True),
+        Axis("°/s", log=True),
+        [
+            Series("angle and rate random walk", taus, model, MODEL, dots=False, curve=True),
+            Series("measured", taus, result.evidence["allan_deviation_dps"]),
+        ],
     )
-    yield fact
-    return fact
 
 
-def from_data(
-    rest: Rest, *, column: int, when_utc: datetime, device: Mapping[str, Any], seed: int = 0
-) -> CalibrationResult:
-    """Fit the noise of the vertical gyro (``column`` of the sensor's axes) and judge it.
+@dataclass(frozen=True)
+class GyroNoise(Procedure):
+    """Record the sensor for some ``minutes`` while the table stands without torque.
 
-    Parameters
-    ----------
-    rest
-        What was heard.
-    when_utc, device
-        Kept with the fact.
-    seed
-        Of the bootstrap.
+    The slope over temperature can be determined only while the sensor warms up, soon after power-on.
     """
+
+    names, title, devices, valid_days, plots = (NAME,), "noise of the gyro", ("imu",), 365, (plot,)
+    minutes: float = 20.0
+
+    def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
+        require_at_least(MIN_MINUTES, self.minutes, "minutes")
+        imu, clock = bench.imu, bench.clock
+        per_block = round(BLOCK_S * imu.rate_hz)
+        waiting = np.empty((0, 3))
+        blocks: list[NDArray[np.float64]] = []
+        temperatures: list[float] = []
+        lost = reported = 0
+        imu.read_samples()  # discard the samples since the bench was opened
+        needed = round(self.minutes * 60 / BLOCK_S)
+        while len(blocks) < needed:
+            clock.sleep(_DRAIN_S)
+            new = imu.read_samples()
+            lost += new.lost
+            waiting = np.concatenate([waiting, new.gyro_dps])
+            temperature_c = imu.temperature_c()
+            while len(waiting) >= per_block:
+                blocks.append(waiting[:per_block].mean(axis=0))
+                temperatures.append(temperature_c)
+                waiting = waiting[per_block:]
+            if (share := len(blocks) / needed) * 20 >= reported + 1:
+                reported = int(share * 20)
+                words = f"{share:.0%} of {self.minutes:g} minutes, {temperature_c:.1f} °C"
+                yield Progress(min(share, 1.0), words)
+        rest = RestRecord(np.array(blocks), np.array(temperatures), per_block / imu.rate_hz, lost)
+        yield evaluate(rest, column="xyz".index(bench.config.imu.axis))
+
+
+def evaluate(rest: RestRecord, *, column: int, seed: int = 0) -> Evaluation:
+    """Fit the noise of the vertical gyro, ``column`` of the sensor's axes; ``seed`` is that of the bootstrap."""
+    found = Evaluation(name=NAME, residual_unit="σ")
     rate = rest.gyro_dps[:, column]
-    refusals = _disturbances(rest, column)
+    seconds = rate.size * rest.block_s
+    _check_rest(found, rest, column)
     warmed = float(np.ptp(rest.temperature_c)) >= MIN_WARMTH_C
     trend = rest.temperature_c if warmed else np.zeros(rate.size)
     fitted = np.array(_fit(rate, rest.block_s, trend))
     drawn = np.array(
         [_fit(series, rest.block_s, trend) for series in _bootstrap(fitted, rest.block_s, rate.size, seed)]
     )
-    # Taking out the trend takes some of the wandering with it: what the bootstrap lacks of what it was drawn with, the
-    # fit lacks too.
+    # Removing the trend also removes some of the random walk. The bootstrap shows how much: correct the fit by it.
     lack = np.divide(fitted, drawn.mean(axis=0), out=np.ones(2), where=fitted > 0)
     arw, walk = (fitted * lack).tolist()
     drawn *= lack**2
     arw_sigma, walk_sigma = drawn.std(axis=0, ddof=1).tolist()
-    longest_s = rate.size * rest.block_s / 4
+    longest_s = seconds / 4
     instability = _instability(arw, walk, longest_s)
     instability_sigma = float(np.std([_instability(n, k, longest_s) for n, k in drawn.tolist()], ddof=1))
-    if arw > MAX_ARW_DEG_RTS:
-        refusals.append(
-            f"The angle random walk is {arw:.4f} °/√s, above {MAX_ARW_DEG_RTS:g}: the bench shakes, or the sensor is "
-            "broken. Keep people and fans off the bench and calibrate again."
-        )
-    bias_sigma = sqrt(arw**2 / (rate.size * rest.block_s) + walk**2 * rate.size * rest.block_s / 3)
-    estimates = {
-        "angle_random_walk": Estimate(arw, arw_sigma, "°/√s"),
-        "rate_random_walk": Estimate(walk, walk_sigma, "°/s/√s"),
-        "bias_instability": Estimate(instability, instability_sigma, "°/s"),
-        "bias": Estimate(float(rate.mean()), bias_sigma, "°/s"),
-    }
+    found.refuse_if(arw > MAX_ARW_DEG_RTS, RefusalCode.GYRO_NOISY, arw=arw, limit=MAX_ARW_DEG_RTS)
+    found.estimate("angle_random_walk", arw, arw_sigma, "°/√s")
+    found.estimate("rate_random_walk", walk, walk_sigma, "°/s/√s")
+    found.estimate("bias_instability", instability, instability_sigma, "°/s")
+    found.estimate("bias", rate.mean(), sqrt(arw**2 / seconds + walk**2 * rate.size * rest.block_s / 3), "°/s")
     if warmed:
-        slope, slope_sigma = _slope(rate, rest.temperature_c, arw, walk, rest.block_s)
-        estimates["bias_slope"] = Estimate(slope, slope_sigma, "°/s/°C")
+        found.estimate("bias_slope", *_slope(rate, rest.temperature_c, arw, walk, rest.block_s), "°/s/°C")
     steady = rate - _slope(rate, trend)[0] * trend
     taus, deviation, freedom = allan(steady, rest.block_s)
     model = np.sqrt(arw**2 / taus + walk**2 * taus / 3)
-    return CalibrationResult(
-        name=NAME,
-        estimates=estimates,
-        residual=float(np.max(np.abs(np.log(deviation / model)) * np.sqrt(freedom / 2))),
-        limit=None,
-        residual_unit="σ",
-        refusals=tuple(refusals),
-        valid_days=VALID_DAYS,
-        when_utc=when_utc,
-        device=device,
-        evidence={
-            "minutes": rate.size * rest.block_s / 60,
-            "temperature_c": [float(rest.temperature_c.min()), float(rest.temperature_c.max())],
-            "lost_samples": rest.lost,
-            "bias_dps": rest.gyro_dps.mean(axis=0).tolist(),
-            "tau_s": taus.tolist(),
-            "allan_deviation_dps": deviation.tolist(),
-            "allan_deviation_model_dps": model.tolist(),
-        },
-    )
+    found.residual = float(np.max(np.abs(np.log(deviation / model)) * np.sqrt(freedom / 2)))
+    found.evidence = {
+        "minutes": seconds / 60,
+        "temperature_c": [float(rest.temperature_c.min()), float(rest.temperature_c.max())],
+        "lost_samples": rest.lost,
+        "bias_dps": rest.gyro_dps.mean(axis=0).tolist(),
+        "tau_s": taus.tolist(),
+        "allan_deviation_dps": deviation.tolist(),
+        "allan_deviation_model_dps": model.tolist(),
+    }
+    return found
 
 
 def allan(
@@ -201,40 +170,19 @@ def allan(
     return taus, np.sqrt(variance), np.maximum(freedom, 1.0)
 
 
-def rotation_sigma_deg(fact: CalibrationResult, seconds: float) -> float:
-    """Return the standard uncertainty that noise and wandering give a rotation measured over ``seconds``.
+def rotation_sigma_deg(result: CalibrationResult, seconds: float) -> float:
+    """Return the standard uncertainty of a rotation measured over ``seconds`` due to noise and random walk.
 
-    The zero is taken to be known exactly when the rotation begins: σ² = N²·t + K²·t³/3.
+    The zero is assumed to be known exactly at the start of the rotation: σ² = N²·t + K²·t³/3.
     """
-    arw, walk = fact.estimates["angle_random_walk"].value, fact.estimates["rate_random_walk"].value
+    arw, walk = result.estimates["angle_random_walk"].value, result.estimates["rate_random_walk"].value
     return sqrt(arw**2 * seconds + walk**2 * seconds**3 / 3)
-
-
-def plot(fact: CalibrationResult) -> Chart | None:
-    """Return the Allan deviation over the time that is averaged, measured and fitted."""
-    taus = fact.evidence["tau_s"]
-    return Chart(
-        "Allan deviation of the gyro at rest",
-        Axis("averaged over, s", log=True),
-        Axis("°/s", log=True),
-        [
-            Series(
-                "angle and rate random walk",
-                taus,
-                fact.evidence["allan_deviation_model_dps"],
-                MODEL,
-                dots=False,
-                curve=True,
-            ),
-            Series("measured", taus, fact.evidence["allan_deviation_dps"]),
-        ],
-    )
 
 
 def _fit(rate: NDArray[np.float64], period_s: float, trend: NDArray[np.float64]) -> tuple[float, float]:
     """Return angle random walk and rate random walk by weighted, non-negative least squares on the Allan variance.
 
-    What follows ``trend`` is taken out first.
+    The part of the rate that follows ``trend`` is removed first.
     """
     slope, _ = _slope(rate, trend)
     rate = rate - slope * trend
@@ -269,8 +217,8 @@ def _slope(
 ) -> tuple[float, float]:
     """Return the slope of the zero over temperature, °/s/°C, and its standard uncertainty.
 
-    Generalised least squares: over spans of the length where white noise and wandering are equally strong, the
-    differences of neighbouring means are nearly independent.
+    Generalised least squares: over spans in which white noise and random walk are equally strong, the differences of
+    neighbouring means are nearly independent.
     """
     tau = sqrt(3) * arw / walk if walk else np.inf
     span = int(np.clip(tau / block_s, 1, rate.size // 8))
@@ -285,21 +233,12 @@ def _slope(
     return slope, sqrt((2 * arw**2 / seconds + 2 * walk**2 * seconds / 3) / norm)
 
 
-def _disturbances(rest: Rest, column: int) -> list[str]:
-    """Return why the table did not rest, or the record is not whole."""
-    refusals = []
+def _check_rest(found: Evaluation, rest: RestRecord, column: int) -> None:
+    """Refuse a record with jumps of the rate, or with lost samples."""
     steps = np.diff(rest.gyro_dps[:, column])
     typical = 1.4826 * float(np.median(np.abs(steps)))
     jumps = np.flatnonzero(np.abs(steps) > MAX_STEP_SIGMA * max(typical, 1e-9))
     if jumps.size:
         at_s = (int(jumps[0]) + 1) * rest.block_s
-        refusals.append(
-            f"After {at_s:.0f} s the rate jumped by {abs(steps[jumps[0]]):.3f} °/s: the table was touched or shaken. "
-            "Keep hands off and calibrate again."
-        )
-    if rest.lost:
-        refusals.append(
-            f"The sensor lost {rest.lost} samples: another program used the bus, or the computer was busy. Close what "
-            "runs beside this and calibrate again."
-        )
-    return refusals
+        found.refuse_if(True, RefusalCode.RATE_JUMPED, at_s=at_s, jump_dps=abs(steps[jumps[0]]))
+    found.refuse_if(rest.lost, RefusalCode.SAMPLES_LOST, lost=rest.lost)

@@ -1,54 +1,51 @@
-"""How the IMU sits on the platter: its tilt against the table's axis, its levels, and how late it tells.
+"""Measure the mounting of the IMU on the platter: its tilt against the table's axis, its level, and its delay.
 
-While the table turns, the rate is along its axis: the direction of the integrated rate in the sensor's frame is the
-axis, whatever gravity says. At rest the accelerometer shows gravity: what of its mean over a turn is not along the axis
-is its own zero error, and what goes round with the table is the table's axis out of the vertical. On a move whose play
-is taken up, the encoder is ahead of the gyro by the rate times the delay.
+While the table rotates, the rate is along its axis: the direction of the integrated rate in the sensor's frame is the
+axis, whatever the direction of gravity. At rest the accelerometer shows gravity. The part of its mean over a revolution
+that is not along the axis is its own zero error; the part that rotates with the table is the deviation of the table's
+axis from the vertical. During a rotation with the backlash taken up, the encoder is ahead of the gyro by the rate times
+the delay.
 """
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from math import degrees, hypot, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.procedure import Evaluation, Measured, Procedure, returning, too_little_room
 from calibration.recording import Recording, recording
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate
+from rig.calibrations import CalibrationResult, Estimate, RefusalCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
-from rig.core.errors import LimitExceeded
-from rig.events.events import Moved
 from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
 
 NAME = "imu.mounting"
-VALID_DAYS = 180
 
 STEPS = 8
 READINGS = 60
 SPACING_S = 0.025
-"""Between readings of the accelerometer: what its low-pass of some 40 Hz remembers of the last is gone."""
+"""Between readings of the accelerometer: the memory of its low-pass filter of about 40 Hz has decayed."""
 MAX_TILT_DEG = 10.0
 """The cosine of more costs 1.5 % of the rate: more than the gyro's own scale error."""
 MAX_LEVEL_DEG = 5.0
 AXIS_GAIN_SIGMA = 0.015
-"""How much the scales of two of the gyro's axes differ, from part to part."""
+"""Difference of the scales of two of the gyro's axes, from part to part."""
 MIN_RATE_DPS = 5.0
-"""Readings on the way count from this rate on: the play is taken up long before."""
+"""Readings during a rotation count from this rate on: the backlash is taken up long before."""
 
-REST_IN_PLAY_DEG = 0.04
+REST_IN_BACKLASH_DEG = 0.04
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
-    """One move upwards, play taken up.
+class RecordedMove:
+    """One rotation upwards with the backlash taken up.
 
     ``rotation_deg`` float64 (3,): the integrated rate about the sensor's axes, without the zero; ``sigma_deg`` of each
-    of them; ``encoder_deg`` the table's rotation; ``lead_deg`` and ``rate_dps`` float64 (n,): by how much encoder
-    readings on the way were ahead of the gyro, and the table's rate then.
+    of them; ``encoder_deg`` the table's rotation; ``lead_deg`` and ``rate_dps`` float64 (n,): the lead of the encoder
+    over the gyro at readings during the rotation, and the table's rate there.
     """
 
     encoder_deg: float
@@ -59,7 +56,7 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class GravityReading:
     """The accelerometer at rest: the table's angle, mean (3,) in g, and the standard uncertainty of each component."""
 
     table_deg: float
@@ -67,135 +64,10 @@ class Level:
     sigma_g: float
 
 
-def live(bench: Bench) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
-    """Turn the table once, in eight steps, and listen at each stop; yields each move, then the fact.
-
-    Raises
-    ------
-    LimitExceeded
-        The cable leaves less than a turn; before anything moves.
-    MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.motion.turntable`.
-    """
-    when_utc, config = bench.clock.utc(), bench.config
-    low, high = config.table.limits_deg
-    first_deg = max(low + config.table.approach_deg, min(0.0, high - 360.0))
-    if first_deg + 360.0 > high:
-        raise LimitExceeded(
-            f"The cable leaves {high - low:.0f}°, the procedure needs a whole turn and table.approach_deg.",
-            next_step="Where the cable allows it, widen table.limits_deg.",
-            evidence={"limits_deg": [low, high]},
-        )
-    column = "xyz".index(config.imu.axis)
-    turns: list[Turn] = []
-    levels: list[Level] = []
-    with recording(bench) as kept, Turntable(bench) as table:
-        start_deg, may_return = table.rest_deg, True
-        try:
-            for index in range(STEPS + 1):
-                may_return = False
-                if index == 0:
-                    yield moved(0, table.goto(first_deg))
-                    may_return = True
-                else:
-                    kept.clear()
-                    _listen(bench, table)
-                    before_ns = bench.clock.now_ns()
-                    move = table.goto(first_deg + index * 360.0 / STEPS)
-                    may_return = True
-                    turn = _turn(kept, before_ns, column, config.imu.sign, config.table.direction)
-                    if turn is not None:
-                        turns.append(turn)
-                    yield moved(index, move)
-                if index < STEPS:
-                    readings = np.array([bench.imu.read_gravity_g() for _ in _paced(bench, table)])
-                    sigma = float(readings.std(axis=0, ddof=1).max()) / sqrt(READINGS)
-                    levels.append(Level(table.rest_deg, readings.mean(axis=0), sigma))
-        finally:
-            if may_return:
-                table.goto(start_deg)
-    fact = from_data(
-        turns,
-        levels,
-        column=column,
-        sign=config.imu.sign,
-        when_utc=when_utc,
-        device=bench.apparatus("servo", "imu"),
-    )
-    yield fact
-    return fact
-
-
-def from_data(
-    turns: Sequence[Turn],
-    levels: Sequence[Level],
-    *,
-    column: int,
-    sign: int,
-    when_utc: datetime,
-    device: Mapping[str, Any],
-) -> CalibrationResult:
-    """Find tilt, levels and delay, and judge them.
-
-    Parameters
-    ----------
-    turns, levels
-        What was measured, over a whole turn.
-    column, sign
-        Which of the sensor's axes is along the table's, and +1 where it points up.
-    when_utc, device
-        Kept with the fact.
-    """
-    refusals: list[str] = []
-    estimates: dict[str, Estimate] = {}
-    residual = limit = None
-    if len(turns) < STEPS // 2:
-        refusals.append(
-            f"Only {len(turns)} of {STEPS} moves can be used: the sensor lost samples. Close what runs beside this and "
-            "calibrate again."
-        )
-    else:
-        total = np.sum([turn.rotation_deg for turn in turns], axis=0)
-        length = float(np.linalg.norm(total))
-        axis = total / length  # of a counter-clockwise turn: upwards
-        sigma = sqrt(sum(turn.sigma_deg**2 for turn in turns)) / length
-        others = [i for i in range(3) if i != column]
-        tilt_sigma = {i: hypot(sigma, AXIS_GAIN_SIGMA * float(axis[i])) for i in others}
-        for i in others:
-            estimates[f"tilt_{'xyz'[i]}"] = Estimate(degrees(float(axis[i])), degrees(tilt_sigma[i]), "°")
-        tilt_deg = degrees(float(np.arccos(np.clip(sign * axis[column], -1.0, 1.0))))
-        residual, limit = tilt_deg, MAX_TILT_DEG
-        refusals += _judge_tilt(tilt_deg, axis, column)
-        estimates |= _levels(levels, axis, column, tilt_sigma)
-        estimates["delay"] = _delay(turns)
-        level_deg = hypot(estimates["axis_x"].value, estimates["axis_y"].value)
-        if level_deg > MAX_LEVEL_DEG:
-            refusals.append(
-                f"The table's axis is {level_deg:.1f}° off the vertical, more than {MAX_LEVEL_DEG:g}°: put something "
-                "under the base, or does the accelerometer's range not fit?"
-            )
-    return CalibrationResult(
-        name=NAME,
-        estimates=estimates,
-        residual=residual,
-        limit=limit,
-        residual_unit="° of tilt",
-        refusals=tuple(refusals),
-        valid_days=VALID_DAYS,
-        when_utc=when_utc,
-        device=device,
-        evidence={
-            "rotations_deg": [turn.rotation_deg.tolist() for turn in turns],
-            "encoder_deg": [turn.encoder_deg for turn in turns],
-            "levels": [{"table_deg": level.table_deg, "mean_g": level.mean_g.tolist()} for level in levels],
-        },
-    )
-
-
-def plot(fact: CalibrationResult) -> Chart | None:
-    """Return what the accelerometer reads across the axis over the turn: a tilt and an offset make a circle of it."""
-    levels = fact.evidence["levels"]
-    if not levels or not fact.estimates:
+def plot(result: CalibrationResult) -> Chart | None:
+    """Return the accelerometer across the axis over the revolution: a tilt and an offset make it a circle."""
+    levels = result.evidence["levels"]
+    if not levels or not result.estimates:
         return None
     mean_g = np.array([level["mean_g"] for level in levels])
     angles = [level["table_deg"] for level in levels]
@@ -208,23 +80,87 @@ def plot(fact: CalibrationResult) -> Chart | None:
     )
 
 
-def _judge_tilt(tilt_deg: float, axis: NDArray[np.float64], column: int) -> list[str]:
-    if tilt_deg <= MAX_TILT_DEG:
-        return []
-    nearest = int(np.argmax(np.abs(axis)))
-    wanted = f'imu.axis = "{"xyz"[nearest]}" and imu.sign = {1 if axis[nearest] > 0 else -1}'
-    if nearest != column or tilt_deg > 90.0:
-        return [f"The table turns about the sensor's {'xyz'[nearest]} axis: set {wanted}."]
-    return [
-        f"The sensor is tilted by {tilt_deg:.1f}° against the table's axis, more than {MAX_TILT_DEG:g}°: mount it "
-        "flat on the platter."
-    ]
+@dataclass(frozen=True)
+class ImuMounting(Procedure):
+    """Rotate the table once, in eight steps, and read the sensor at each stop."""
+
+    names, title, devices, valid_days, plots = (NAME,), "mounting of the IMU", ("servo", "imu"), 180, (plot,)
+
+    def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
+        config = bench.config
+        low, high = config.table.limits_deg
+        first_deg = max(low + config.table.approach_deg, min(0.0, high - 360.0))
+        if first_deg + 360.0 > high:
+            raise too_little_room(bench, "a whole revolution and table.approach_deg")
+        column, sign = "xyz".index(config.imu.axis), config.imu.sign
+        moves: list[RecordedMove] = []
+        levels: list[GravityReading] = []
+        with recording(bench) as kept, Turntable(bench) as table, returning(table) as goto:
+            for index in range(STEPS + 1):
+                if index == 0:
+                    yield moved(0, goto(first_deg))
+                else:
+                    kept.clear()
+                    _observe_rest(bench, table)
+                    before_ns = bench.clock.now_ns()
+                    move = goto(first_deg + index * 360.0 / STEPS)
+                    recorded = _recorded_move(kept, before_ns, column, sign, config.table.direction)
+                    if recorded is not None:
+                        moves.append(recorded)
+                    yield moved(index, move)
+                if index < STEPS:
+                    readings = np.array([bench.imu.read_gravity_g() for _ in _paced(bench, table)])
+                    sigma = float(readings.std(axis=0, ddof=1).max()) / sqrt(READINGS)
+                    levels.append(GravityReading(table.rest_deg, readings.mean(axis=0), sigma))
+        yield evaluate(moves, levels, column=column, sign=sign)
+
+
+def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *, column: int, sign: int) -> Evaluation:
+    """Find tilt, levels and delay.
+
+    Parameters
+    ----------
+    moves, levels
+        The measurements over a whole revolution.
+    column, sign
+        The sensor's axis that is along the table's axis, and +1 if it points up.
+    """
+    found = Evaluation(name=NAME, residual_unit="° of tilt")
+    found.evidence = {
+        "rotations_deg": [move.rotation_deg.tolist() for move in moves],
+        "encoder_deg": [move.encoder_deg for move in moves],
+        "levels": [{"table_deg": level.table_deg, "mean_g": level.mean_g.tolist()} for level in levels],
+    }
+    if len(moves) < STEPS // 2:
+        found.refuse_if(True, RefusalCode.TOO_FEW_RECORDED_MOVES, used=len(moves), planned=STEPS)
+        return found
+    total = np.sum([move.rotation_deg for move in moves], axis=0)
+    length = float(np.linalg.norm(total))
+    axis = total / length  # of a counter-clockwise rotation: upwards
+    sigma = sqrt(sum(move.sigma_deg**2 for move in moves)) / length
+    others = [i for i in range(3) if i != column]
+    tilt_sigma = {i: hypot(sigma, AXIS_GAIN_SIGMA * float(axis[i])) for i in others}
+    for i in others:
+        found.estimate(f"tilt_{'xyz'[i]}", degrees(float(axis[i])), degrees(tilt_sigma[i]), "°")
+    tilt_deg = degrees(float(np.arccos(np.clip(sign * axis[column], -1.0, 1.0))))
+    found.residual, found.limit = tilt_deg, MAX_TILT_DEG
+    if tilt_deg > MAX_TILT_DEG:
+        nearest = int(np.argmax(np.abs(axis)))
+        wrong = nearest != column or tilt_deg > 90.0
+        right_sign = 1 if axis[nearest] > 0 else -1
+        found.refuse_if(wrong, RefusalCode.WRONG_AXIS, axis="xyz"[nearest], sign=right_sign)
+        found.refuse_if(not wrong, RefusalCode.TILT_TOO_LARGE, tilt_deg=tilt_deg, limit_deg=MAX_TILT_DEG)
+    found.estimates |= _levels(levels, axis, column, tilt_sigma)
+    found.estimates["delay"] = _delay(moves)
+    level_deg = hypot(found.estimates["axis_x"].value, found.estimates["axis_y"].value)
+    found.refuse_if(level_deg > MAX_LEVEL_DEG, RefusalCode.NOT_LEVEL, level_deg=level_deg, limit_deg=MAX_LEVEL_DEG)
+    return found
 
 
 def _levels(
-    levels: Sequence[Level], axis: NDArray[np.float64], column: int, tilt_sigma: Mapping[int, float]
+    levels: Sequence[GravityReading], axis: NDArray[np.float64], column: int, tilt_sigma: Mapping[int, float]
 ) -> dict[str, Estimate]:
-    """Return the accelerometer's zero errors (g), and the table's axis out of the vertical (°)."""
+    """Return the accelerometer's zero errors (g), and the deviation of the table's axis from the vertical (°)."""
     turn = np.radians([level.table_deg for level in levels])
     readings = np.array([level.mean_g for level in levels])
     design = np.column_stack([np.ones(turn.size), np.cos(turn), np.sin(turn)])
@@ -234,7 +170,7 @@ def _levels(
     for i, name in enumerate("xyz"):
         sigma = hypot(noise, tilt_sigma.get(i, 0.0))
         estimates[f"accel_zero_{name}"] = Estimate(float(mean[i] - axis[i]), sigma, "g")
-    # Gravity's horizontal part goes round in the platter's frame: two axes a quarter turn apart show it.
+    # Gravity's horizontal part rotates in the platter's frame: two axes 90° apart show it.
     a, b = (column + 1) % 3, (column + 2) % 3
     if axis[column] < 0:
         a, b = b, a
@@ -244,30 +180,30 @@ def _levels(
     return estimates
 
 
-def _delay(turns: Sequence[Turn]) -> Estimate:
-    """Return by how much the gyro's samples are dated later than the encoder's readings."""
-    lead = np.concatenate([turn.lead_deg for turn in turns])
-    rate = np.concatenate([turn.rate_dps for turn in turns])
+def _delay(moves: Sequence[RecordedMove]) -> Estimate:
+    """Return the delay of the gyro's time stamps relative to the encoder's readings."""
+    lead = np.concatenate([move.lead_deg for move in moves])
+    rate = np.concatenate([move.rate_dps for move in moves])
     norm = float((rate**2).sum())
     delay = float((rate * lead).sum()) / norm
     each = [
-        float((turn.rate_dps * turn.lead_deg).sum() / (turn.rate_dps**2).sum()) for turn in turns if turn.rate_dps.size
+        float((move.rate_dps * move.lead_deg).sum() / (move.rate_dps**2).sum()) for move in moves if move.rate_dps.size
     ]
-    # Readings of one move share what the encoder read at its rest: the moves are what is independent. A platter that
-    # rings comes to rest somewhat inside the play, always on the same side.
+    # Readings of one rotation share the encoder's error at its rest, so the rotations are the independent data. A
+    # platter that rings comes to rest a little inside the backlash, always on the same side.
     scatter = float(np.std(each, ddof=1)) / sqrt(len(each))
-    return Estimate(delay, hypot(scatter, REST_IN_PLAY_DEG / float(np.median(rate))), "s")
+    return Estimate(delay, hypot(scatter, REST_IN_BACKLASH_DEG / float(np.median(rate))), "s")
 
 
-def _listen(bench: Bench, table: Turntable) -> None:
-    """Let the gyro see a rest, from which its zero is taken."""
+def _observe_rest(bench: Bench, table: Turntable) -> None:
+    """Let the gyro see a rest, from which it learns its zero."""
     for _ in range(5):
         bench.clock.sleep(0.2)
         table.check_still()
 
 
 def _paced(bench: Bench, table: Turntable) -> Generator[None, None, None]:
-    """Pace readings of the accelerometer; meanwhile the gyro's samples must not overflow."""
+    """Pace readings of the accelerometer, and read the gyro's samples so that they do not overflow."""
     for index in range(READINGS):
         yield
         bench.clock.sleep(SPACING_S)
@@ -275,8 +211,8 @@ def _paced(bench: Bench, table: Turntable) -> Generator[None, None, None]:
             table.check_still()
 
 
-def _turn(kept: Recording, before_ns: int, column: int, sign: int, direction: int) -> Turn | None:
-    """Return what was recorded of a move that began after ``before_ns``; None where samples were lost."""
+def _recorded_move(kept: Recording, before_ns: int, column: int, sign: int, direction: int) -> RecordedMove | None:
+    """Return the record of a rotation that began after ``before_ns``; None if samples were lost."""
     times, rates, lost = kept.gyro()
     if lost or not len(kept.states):
         return None
@@ -297,12 +233,12 @@ def _turn(kept: Recording, before_ns: int, column: int, sign: int, direction: in
     rate_dps = np.interp(state_ns, times, (rates[:, column] - zero[column]) * sign)
     start = np.mean([direction * state.position_deg for state in kept.states if state.time_ns < before_ns])
     rotation = float(position[-1] - start)
-    # Scale of gyro against encoder, from the whole move: what is left on the way is the delay.
+    # Scale of gyro against encoder, from the whole rotation: what remains during it is the delay.
     scale = rotation / float(angle[-1]) if angle[-1] else 1.0
     cruising = np.abs(rate_dps) > MIN_RATE_DPS
     span_s = float(moving.sum()) * step_s
     sigma = float(noise) * sqrt(step_s * span_s + (step_s * span_s**2) / (float(at_rest.sum()) * step_s))
-    return Turn(
+    return RecordedMove(
         rotation,
         net.sum(axis=0),
         sigma,

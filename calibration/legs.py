@@ -1,8 +1,9 @@
-"""Legs: what encoder and gyro measured between two rests, from which several calibrations are fitted."""
+"""Legs: rotations between two rests by encoder and gyro, from which several calibrations are fitted."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,32 +12,43 @@ from rig.config import ImuConfig
 from rig.motion.move import Move
 
 COVERAGE = 4.0
-"""Residuals beyond this many standard uncertainties are no chance (1 in 16 000)."""
+"""A residual of more standard uncertainties is not chance (1 in 16 000)."""
 
 STATED_WEIGHT = 4.0
-"""As many degrees of freedom as the scatter of the legs has to outweigh what was stated of it."""
+"""The stated noise weighs as much as this many degrees of freedom of the legs' scatter."""
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
     """A rotation between two rests, in degrees: by the encoder, and by the gyro as it reads (scale 1).
 
-    ``sigma_deg`` is the gyro's, of noise and bias alone; ``trouble`` why the gyro's rotation is not valid.
+    ``sigma_deg`` is the gyro's standard uncertainty from noise and bias alone; ``invalid`` says why the gyro's rotation
+    is not valid, and is empty if it is.
     """
 
     encoder_deg: float
     gyro_deg: float
     sigma_deg: float
-    trouble: str = ""
+    invalid: str = ""
 
     @classmethod
     def of(cls, move: Move, imu: ImuConfig) -> "Leg":
-        """Return what ``move`` measured, without the scale in force and without its uncertainty."""
+        """Return the leg of a move, without the scale in force and without the uncertainty of that scale."""
         gyro = move.gyro
         noise = gyro.sigma_deg**2 - (imu.scale_uncertainty * gyro.angle_deg) ** 2
         return cls(
             move.rotation_encoder_deg, gyro.angle_deg / imu.scale, sqrt(max(noise, 0.0)) / imu.scale, gyro.reason
         )
+
+
+def stored_valid(leg: Mapping[str, Any]) -> bool:
+    """Return whether a leg in the evidence of a result is valid; version 1.x called the reason ``trouble``."""
+    return not leg.get("invalid", leg.get("trouble"))
+
+
+def reasons(legs: Sequence[Leg]) -> list[str]:
+    """Return why legs are not valid, each reason once."""
+    return list(dict.fromkeys(leg.invalid for leg in legs if leg.invalid))
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,22 +62,22 @@ class LinearFit:
 
     @property
     def worst(self) -> int:
-        """Index of the leg that is furthest off, by its own uncertainty."""
+        """The index of the leg with the largest residual in units of its uncertainty."""
         return int(np.argmax(np.abs(self.residuals_deg) / self.residual_sigma_deg))
 
 
 def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float) -> LinearFit:
     """Fit the encoder's rotations by a linear model, by generalised least squares.
 
-    Every rest lies anywhere within an encoder count, and consecutive legs share one with opposite signs, so that their
-    errors are correlated. What the legs scatter counts beside what is stated of it: see `scatter`.
+    A rest lies anywhere within an encoder count. Consecutive legs share a rest with opposite signs, so their errors are
+    correlated. The uncertainties combine the stated noise with the scatter of the legs: see `scatter`.
 
     Parameters
     ----------
     legs
-        Each from the rest where the one before ended.
+        Each begins at the rest where the previous one ended.
     design
-        Float64 (n, p): what each leg's rotation by the encoder is per unit of each parameter.
+        Float64 (n, p): each leg's rotation by the encoder per unit of each parameter.
     resolution_deg
         Angle of one encoder count.
     """
@@ -83,9 +95,9 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
 
 
 def scatter(chi_square: float, freedom: int) -> float:
-    """Return by how much the variance of legs is larger, or smaller, than stated: the square of the Birge ratio.
+    """Return the factor by which the variance of legs differs from the stated one: the square of the Birge ratio.
 
-    A bench may state its noise with too much caution, or too little. A few legs prove neither: what was stated weighs
-    as much as `STATED_WEIGHT` of them (the mean of an inverse-gamma posterior about 1).
+    A bench may state its noise too high or too low, and a few legs prove neither. The stated noise weighs as much as
+    `STATED_WEIGHT` legs: the mean of an inverse-gamma posterior about 1.
     """
     return (chi_square + STATED_WEIGHT) / (freedom + STATED_WEIGHT)

@@ -1,114 +1,113 @@
-"""How long the table takes: pace, wind-up and delay, from moves over many distances.
+"""Measure how long a rotation takes: pace, wind-up and delay, from rotations over many distances.
 
-A move by Δ until the table is at rest takes, with the cruise speed v, the ramp a and the delay d (the servo's answer,
-the ringing, and being sure that it is over)
+A rotation by Δ until the table stands still takes, with the cruise speed v, the ramp a and the delay d (the servo's
+answer, the ringing, and the settling time)
 
-    t = |Δ|/v + v/a + d        where |Δ| ≥ v²/a,        else        t = 2·√(|Δ|/a) + d
+    t = |Δ|/v + v/a + d    if |Δ| ≥ v²/a,    otherwise    t = 2·√(|Δ|/a) + d
 
 so that the pace is 1/v and the wind-up v/a.
 """
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from math import sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from calibration.backlash import plain_approach
+from calibration.procedure import (
+    Evaluation,
+    Measured,
+    Procedure,
+    lower_end,
+    require_at_least,
+    returning,
+    table_settings,
+)
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate
+from rig.calibrations import CalibrationResult, RefusalCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
-from rig.core.errors import LimitExceeded, UsageError
 from rig.devices.servo import MotionProfile
-from rig.events.events import Moved, plain
+from rig.events.events import plain
 from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
 
 NAME = "servo.motion"
-VALID_DAYS = 180
 
 DISTANCES_DEG = (2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 180.0)
 MIN_ROUNDS = 2
 TYPICAL_S = 0.04
-"""Scatter of a settle time: the period of the control loop."""
+"""Scatter of a settling time: the period of the control loop."""
 NOMINAL_TRUST = 0.3
 MAX_RESIDUAL_S = 0.25
-"""A move that is off by more was hindered: six periods of the control loop."""
+"""A rotation with a larger residual was hindered: six periods of the control loop."""
+PARAMETERS = {"pace": "s/°", "wind_up": "s", "delay": "s"}
 
 
 @dataclass(frozen=True, slots=True)
-class Timed:
-    """A move: its length, and the time until the table was at rest."""
+class TimedMove:
+    """A rotation: its length, and the time until the table stood still."""
 
     distance_deg: float
     seconds: float
 
 
-def live(bench: Bench, *, rounds: int = 3) -> Generator[Moved | CalibrationResult, None, CalibrationResult]:
-    """Time moves over seven distances, both ways, ``rounds`` times; yields each move, then the fact.
-
-    Raises
-    ------
-    UsageError
-        Too few rounds.
-    LimitExceeded
-        The cable leaves no room; before anything moves.
-    MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.motion.turntable`.
-    """
-    if rounds < MIN_ROUNDS:
-        raise UsageError(f"{rounds} rounds are too few.", next_step=f"Give at least {MIN_ROUNDS}.")
-    when_utc = bench.clock.utc()
-    low, high = bench.config.table.limits_deg
-    moves: list[Timed] = []
-    with plain_approach(bench), Turntable(bench) as table:
-        start_deg = table.rest_deg
-        base_deg = start_deg if start_deg + DISTANCES_DEG[-1] <= high else start_deg - DISTANCES_DEG[-1]
-        if base_deg < low:
-            raise LimitExceeded(
-                f"The cable leaves {high - low:.0f}°, the procedure needs {DISTANCES_DEG[-1]:g}°.",
-                next_step="Where the cable allows it, widen table.limits_deg.",
-                evidence={"limits_deg": [low, high]},
-            )
-        may_return = True
-        try:
-            for index, goal_deg in enumerate(
-                goal for _ in range(rounds) for distance in DISTANCES_DEG for goal in (base_deg + distance, base_deg)
-            ):
-                may_return = False
-                before_deg = table.rest_deg
-                move = table.goto(goal_deg)
-                may_return = True
-                if abs(goal_deg - before_deg) > 1.0:
-                    moves.append(Timed(goal_deg - before_deg, move.seconds))
-                yield moved(index, move)
-        finally:
-            if may_return:
-                table.goto(start_deg)
-    nominal = MotionProfile(bench.config.table.velocity_dps, bench.config.table.acceleration_dps2)
-    fact = from_data(moves, nominal, when_utc=when_utc, device=bench.apparatus("servo"))
-    yield fact
-    return fact
+def plot(result: CalibrationResult) -> Chart | None:
+    """Return the time of each rotation over its length, and the model."""
+    if not result.estimates:
+        return None
+    moves = result.evidence["moves"]
+    model = np.array([result.estimates[name].value for name in PARAMETERS])
+    lengths = [abs(move["distance_deg"]) for move in moves]
+    distance = np.linspace(0.5, max(lengths), 121)
+    return Chart(
+        "Time until the table stands still",
+        Axis("length of the rotation, °", span=(0.0,)),
+        Axis("seconds", span=(0.0,)),
+        [
+            Series("model", distance.tolist(), _seconds(model, distance).tolist(), MODEL, dots=False, curve=True),
+            Series("measured", lengths, [move["seconds"] for move in moves]),
+        ],
+    )
 
 
-def predicted_s(fact: CalibrationResult, distance_deg: float) -> float:
-    """Return the time that a move by ``distance_deg`` takes until the table is at rest."""
-    model = np.array([fact.estimates[name].value for name in ("pace", "wind_up", "delay")])
+@dataclass(frozen=True)
+class MotionModel(Procedure):
+    """Time rotations over seven distances in both directions, ``rounds`` times."""
+
+    names, title, devices, valid_days, plots = (NAME,), "duration of rotations", ("servo",), 180, (plot,)
+    rounds: int = 3
+
+    def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
+        require_at_least(MIN_ROUNDS, self.rounds, "rounds")
+        moves: list[TimedMove] = []
+        with table_settings(bench, approach_deg=0.0), Turntable(bench) as table:
+            base_deg = lower_end(bench, table.rest_deg, DISTANCES_DEG[-1])
+            with returning(table) as goto:
+                ends = (goal for distance in DISTANCES_DEG * self.rounds for goal in (base_deg + distance, base_deg))
+                for index, goal_deg in enumerate(ends):
+                    before_deg = table.rest_deg
+                    move = goto(goal_deg)
+                    if abs(goal_deg - before_deg) > 1.0:
+                        moves.append(TimedMove(goal_deg - before_deg, move.seconds))
+                    yield moved(index, move)
+        yield evaluate(moves, MotionProfile(bench.config.table.velocity_dps, bench.config.table.acceleration_dps2))
+
+
+def predicted_s(result: CalibrationResult, distance_deg: float) -> float:
+    """Return the time that a rotation by ``distance_deg`` takes until the table stands still."""
+    model = np.array([result.estimates[name].value for name in PARAMETERS])
     return float(_seconds(model, np.array([abs(distance_deg)]))[0])
 
 
-def from_data(
-    moves: Sequence[Timed], nominal: MotionProfile, *, when_utc: datetime, device: Mapping[str, Any]
-) -> CalibrationResult:
-    """Fit the model to ``moves`` robustly and judge it.
+def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
+    """Fit the model to ``moves`` robustly.
 
-    Steep ramps are over before they can be timed, and wind-up and delay told apart: the ``nominal`` profile says what
-    the wind-up may be, to 30 %.
+    Steep ramps end before they can be timed and told from the delay: the wind-up of the ``nominal`` profile enters the
+    fit as known to 30 %.
     """
+    found = Evaluation(name=NAME, residual_unit="s", limit=MAX_RESIDUAL_S)
     wind_up_s = nominal.velocity_dps / nominal.acceleration_dps2
     distance = np.abs([move.distance_deg for move in moves])
     seconds = np.array([move.seconds for move in moves])
@@ -125,52 +124,20 @@ def from_data(
     residuals = seconds - _seconds(fit.x, distance)
     scatter = sqrt(float((residuals**2).sum()) / (len(moves) - 3))
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * scatter**2
-    estimates = {
-        name: Estimate(float(value), sqrt(float(variance)), unit)
-        for name, value, variance, unit in zip(
-            ("pace", "wind_up", "delay"), fit.x, np.diag(covariance), ("s/°", "s", "s"), strict=True
-        )
-    }
+    for (name, unit), value, variance in zip(PARAMETERS.items(), fit.x, np.diag(covariance), strict=True):
+        found.estimate(name, value, sqrt(float(variance)), unit)
+    found.proposed = {"table.settle_s": round(found.estimates["delay"].value, 3)}
+    found.evidence = {"moves": plain(list(moves)), "scatter_s": scatter}
     worst = int(np.argmax(np.abs(residuals)))
-    residual = abs(float(residuals[worst]))
-    refusals = []
-    if residual > MAX_RESIDUAL_S:
-        refusals.append(
-            f"The move by {moves[worst].distance_deg:.0f}° took {seconds[worst]:.2f} s, {residual:.2f} s off the "
-            "others: something hindered it, or shook the bench. Look at cable and platter, and calibrate again."
-        )
-    return CalibrationResult(
-        name=NAME,
-        estimates=estimates,
-        residual=residual,
-        limit=MAX_RESIDUAL_S,
-        residual_unit="s",
-        refusals=tuple(refusals),
-        settings={} if refusals else {"table.settle_s": round(estimates["delay"].value, 3)},
-        valid_days=VALID_DAYS,
-        when_utc=when_utc,
-        device=device,
-        evidence={"moves": plain(list(moves)), "scatter_s": scatter},
+    found.residual = abs(float(residuals[worst]))
+    found.refuse_if(
+        found.residual > MAX_RESIDUAL_S,
+        RefusalCode.MOVE_HINDERED,
+        distance_deg=moves[worst].distance_deg,
+        seconds=seconds[worst],
+        residual_s=found.residual,
     )
-
-
-def plot(fact: CalibrationResult) -> Chart | None:
-    """Return the time of each move over its length, and the model."""
-    if not fact.estimates:
-        return None
-    moves = fact.evidence["moves"]
-    model = np.array([fact.estimates[name].value for name in ("pace", "wind_up", "delay")])
-    lengths = [abs(move["distance_deg"]) for move in moves]
-    distance = np.linspace(0.5, max(lengths), 121)
-    return Chart(
-        "Time until the table is at rest",
-        Axis("length of the move, °", span=(0.0,)),
-        Axis("seconds", span=(0.0,)),
-        [
-            Series("model", distance.tolist(), _seconds(model, distance).tolist(), MODEL, dots=False, curve=True),
-            Series("measured", lengths, [move["seconds"] for move in moves]),
-        ],
-    )
+    return found
 
 
 def _seconds(p: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What a person is to do, drawn for a terminal: letters of plain ASCII, at most 60 wide."""
+"""Pictures of what the operator must do, for a terminal: plain ASCII, at most 60 columns."""
 
 BOARD_UPRIGHT = r"""
   from the side                 from above
@@ -55,8 +55,8 @@ CARD = r"""
         |_platter___|
 """
 
-TURN_LEFT = r"""
-  from above: counter-clockwise, by hand, until just not taut
+ROTATE_LEFT = r"""
+  from above: counter-clockwise, by hand, until almost taut
 
           .--<--.
          /       \
@@ -65,8 +65,8 @@ TURN_LEFT = r"""
           '-->--'
 """
 
-TURN_RIGHT = r"""
-  from above: clockwise, by hand, until just not taut
+ROTATE_RIGHT = r"""
+  from above: clockwise, by hand, until almost taut
 
           .-->--.
          /       \

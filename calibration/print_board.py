@@ -1,4 +1,4 @@
-"""The calibration board on paper, true to scale: a PDF of vector squares, or a PNG that knows its resolution."""
+"""Print the calibration board true to scale: as a PDF of vector squares, or a PNG with its resolution."""
 
 import struct
 import zlib
@@ -21,7 +21,7 @@ RULER_MM: Final = 100.0
 
 
 def write_board(board: Board, path: Path) -> str:
-    """Write the board, and return in words what to do with it.
+    """Write the board to a file, and return instructions for the operator.
 
     Raises
     ------
@@ -40,7 +40,9 @@ def write_board(board: Board, path: Path) -> str:
     elif suffix == ".png":
         content = _png(board)
     else:
-        raise UsageError(f"{path.name} is neither .pdf nor .png.", next_step="Give a file that ends in one of them.")
+        raise UsageError(
+            f"{path.name} is neither .pdf nor .png.", next_step="Give a file name that ends in .pdf or .png."
+        )
     try:
         write(path, content)
     except OSError as error:
@@ -52,14 +54,14 @@ def write_board(board: Board, path: Path) -> str:
     return (
         f"{path}: {board.columns} x {board.rows} squares of {board.square_mm:g} mm. Print it at 100 % (not fitted to "
         f"the page), glue it to something stiff and flat, and measure: {board.columns} squares must be "
-        f"{board.size_mm[0]:g} mm. If they are not, give --square-mm what you measured: no camera can see the scale."
+        f"{board.size_mm[0]:g} mm. If not, measure one square and give --square-mm: the camera cannot see the scale."
     )
 
 
 def _modules(board: Board) -> tuple[NDArray[np.bool_], float]:
-    """Return which cells of the finest grid of the print are black, and the side of a cell in mm.
+    """Return the black cells of the finest grid of the print, bool (rows, columns), and the side of a cell in mm.
 
-    The grid is so fine that squares and the markers' bits (six a marker, with their border) fall on it.
+    The grid is fine enough for the squares and for the bits of the markers (six per side, with the border).
     """
     cells = 6 * 15
     picture = board.layout().generateImage((board.columns * cells, board.rows * cells), marginSize=0, borderBits=1)
@@ -67,7 +69,7 @@ def _modules(board: Board) -> tuple[NDArray[np.bool_], float]:
 
 
 def _rectangles(black: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
-    """Return disjoint rectangles (column, row, width, height) that cover what is black: runs of equal rows, merged."""
+    """Return disjoint rectangles (column, row, width, height) that cover the black cells, merged over equal rows."""
     found: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}
     padded = np.pad(black, ((0, 1), (1, 1))).astype(np.int8)
@@ -83,7 +85,7 @@ def _rectangles(black: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
 
 
 def _pdf(board: Board) -> bytes:
-    """Return one page, A4 across, with the board in its middle and a ruler of 100 mm below it."""
+    """Return one A4 page in landscape, with the board in its middle and a ruler of 100 mm below it."""
     black, cell_mm = _modules(board)
     left = (PAGE_MM[0] - board.size_mm[0]) / 2
     top = (PAGE_MM[1] + board.size_mm[1]) / 2 + 5

@@ -1,4 +1,4 @@
-"""What the devices of a bench deliver while a procedure moves it, kept for the fit."""
+"""Record the readings of servo and IMU while a procedure moves the table."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ from rig.devices.servo import Servo, ServoState
 
 @dataclass(slots=True)
 class Recording:
-    """Everything that was read, in order."""
+    """All readings, in order."""
 
     states: list[ServoState] = field(default_factory=list)
     samples: list[ImuSamples] = field(default_factory=list)
@@ -25,7 +25,7 @@ class Recording:
         self.samples.clear()
 
     def gyro(self) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
-        """Return the samples' times (n,), the rates (n, 3) in °/s, and how many samples were lost between them."""
+        """Return the samples' times (n,), the rates (n, 3) in °/s, and the number of lost samples."""
         if not self.samples:
             return np.empty(0, np.int64), np.empty((0, 3)), 0
         return (
@@ -36,7 +36,7 @@ class Recording:
 
 
 class _Tapped:
-    """A device that keeps what one of its readings returns."""
+    """A device that records the values of one of its readings."""
 
     def __init__(self, device: Any, reading: str, kept: list[Any]) -> None:
         self._device, self._reading, self._kept = device, reading, kept
@@ -56,7 +56,7 @@ class _Tapped:
 
 @contextmanager
 def recording(bench: Bench) -> Generator[Recording, None, None]:
-    """Keep what servo and IMU deliver for the length of a ``with`` block; enter it before the table is taken."""
+    """Record servo and IMU for the length of a ``with`` block; enter it before a `Turntable` is created."""
     kept = Recording()
     servo, imu = bench.servo, bench.imu
     bench.servo = cast(Servo, _Tapped(servo, "read_state", kept.states))

@@ -1,42 +1,39 @@
-"""How well the bench repeats a view: what similarity the same view keeps, and what may be made of it.
+"""Measure how well the bench repeats a view: the similarity of repeated views, and the settings that follow from it.
 
-An object is placed several times at the same mark; each time the table goes round twice and takes the same views. Two
-views of the same azimuth differ by the camera's noise and the table's repeatability where they are of one placing, and
-by the hand and the light besides where they are of two. From the latter follow
+An object is placed several times at the same mark; each time the table makes two revolutions and takes the same views.
+Two views of the same azimuth differ by the camera's noise and the table's repeatability within one placement, and also
+by the hand and the light between two placements. The latter determine
 
-- ``identify.repeatability``: the similarity a view that a known object falls below with the stated error rate α when
-  it is decided about: the conformal quantile ⌊α(n+1)⌋ of the n comparisons, each averaged over the N views of the
-  shortest decision. A single view falls much lower, and by its quantile strangers would be taken for known; and
-- ``identify.margin``: how far two scores of equal truth are apart by chance in a decision of N views,
-  z(1−α)·√2·σ/√N, with σ the scatter about the mean of the azimuth.
+- ``identify.repeatability``: the similarity per view below which a known object falls with the stated error rate α in a
+  decision: the conformal quantile ⌊α(n+1)⌋ of the n comparisons, each averaged over the N views of the shortest
+  decision. A single view falls much lower; with its quantile, unknown objects would be taken for known ones.
+- ``identify.margin``: the difference by chance of two equally true scores in a decision of N views, z(1−α)·√2·σ/√N,
+  with σ the scatter about the mean of the azimuth.
 """
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from itertools import combinations
 from math import ceil, floor, sqrt
 from statistics import NormalDist
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hbr
 from calibration import pictures
-from calibration.events import Ask
+from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate
+from rig.calibrations import CalibrationResult, RefusalCode
 from rig.charts.xy import LIMIT, OTHER, Axis, Chart, Series
 from rig.core.errors import UsageError
-from rig.events.events import Accepted, Event
+from rig.events.events import Accepted
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
 from rig.views.capture import Viewer
 from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
 
 NAME = "noise.repeatability"
-VALID_DAYS = 180
 
 AZIMUTHS = 12
 ROUNDS = 2
@@ -44,134 +41,129 @@ MIN_PLACEMENTS = 2
 ERROR_RATE = 0.02
 BOOTSTRAPS = 200
 MAX_DRIFT = 0.02
-"""By how much less the first placing and the last may be alike than placings that follow each other, in similarity."""
+"""Largest loss of similarity between the first and the last placement, compared with consecutive placements."""
 MIN_SIMILARITY = 0.7
-"""Views of the same azimuth that are less alike are not of the same object, or not of the same azimuth."""
+"""Less similar views of the same azimuth are not of the same object, or not of the same azimuth."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sitting:
-    """One placing: the descriptors of its rounds, uint8 (rounds, azimuths, levels)."""
+class Placement:
+    """One placement: the descriptors of its rounds, uint8 (rounds, azimuths, levels)."""
 
     descriptors: NDArray[np.uint8]
 
 
-def live(
-    bench: Bench, name: str, *, placements: int = 5, error_rate: float = ERROR_RATE
-) -> Generator[Event | Ask | CalibrationResult, None, CalibrationResult]:
-    """Have ``name`` placed several times at its mark, and look at it from all sides; yields events, then the fact.
-
-    Raises
-    ------
-    UsageError
-        Too few placements to be sure of the error rate.
-    ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.views.capture` and `rig.motion.turntable`.
-    """
-    needed = needed_placements(error_rate)
-    if placements < needed:
-        raise UsageError(
-            f"{placements} placements are too few for an error rate of {error_rate:.1%}.",
-            next_step=f"Place the object {needed} times (--placements {needed}), or ask for a larger --error-rate.",
-        )
-    when_utc = bench.clock.utc()
-    viewer = Viewer(bench.camera, bench.config.view)
-    describe = ViewDescriber(bench.config.view, (PAPER_DESCRIPTOR,))
-    sittings: list[Sitting] = []
-    index = 0
-    for placing in range(1, placements + 1):
-        again = "again, taken off and put back" if placing > 1 else "as it stands when it is enrolled"
-        yield Ask(
-            f"Put {name} at its mark on the platter, {again} (placing {placing} of {placements}); take your hands off.",
-            pictures.OBJECT_AT_MARK,
-        )
-        bench.operator.place(name)
-        rounds = []
-        with Turntable(bench) as table:
-            for _ in range(ROUNDS):
-                views = []
-                for step in range(AZIMUTHS):
-                    move = table.goto(step * 360.0 / AZIMUTHS)
-                    yield moved(index, move)
-                    shot = yield from capture(index, viewer, table, move.settled_ns)
-                    yield Accepted(index, (-move.encoder_deg) % 360.0, shot.evidence, shot.image_bgr)
-                    views.append(describe(shot.image_bgr).levels[PAPER_DESCRIPTOR])
-                    index += 1
-                rounds.append(views)
-            table.goto(0.0)
-        sittings.append(Sitting(np.array(rounds)))
-    fact = from_data(
-        sittings,
-        error_rate=error_rate,
-        views=bench.config.identify.min_views,
-        first_step_deg=bench.config.identify.first_step_deg,
-        when_utc=when_utc,
-        device=bench.apparatus("camera"),
-        name=name,
+def plot(result: CalibrationResult) -> Chart | None:
+    """Return the similarity of views over the rotation of the table between them."""
+    rows, threshold = result.evidence["by_step"], result.estimates["repeatability"].value
+    steps, limit = [row["step_deg"] for row in rows], f"unknown below {threshold:.3f}"
+    return Chart(
+        "Similarity of repeated views",
+        Axis("rotation of the table, °"),
+        Axis("Tanimoto similarity", span=(1.0,)),
+        [
+            Series("median", steps, [row["median"] for row in rows], curve=True),
+            Series("tenth percentile", steps, [row["tenth"] for row in rows], OTHER, curve=True),
+            Series(limit, [steps[0], steps[-1]], [threshold] * 2, LIMIT, False, True, dashed=True),
+        ],
     )
-    yield fact
-    return fact
+
+
+@dataclass(frozen=True)
+class Repeatability(Procedure):
+    """Ask for the object ``name`` at its mark several times, and take views from all sides."""
+
+    names, title, devices, valid_days, plots = (NAME,), "repeatability of views", ("camera",), 180, (plot,)
+    name: str
+    placements: int = 5
+    error_rate: float = ERROR_RATE
+
+    def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
+        needed = needed_placements(self.error_rate)
+        if self.placements < needed:
+            raise UsageError(
+                f"{self.placements} placements are too few for an error rate of {self.error_rate:.1%}.",
+                next_step=f"Place the object {needed} times (--placements {needed}), or give a larger --error-rate.",
+            )
+        viewer = Viewer(bench.camera, bench.config.view)
+        describe = ViewDescriber(bench.config.view, (PAPER_DESCRIPTOR,))
+        placements: list[Placement] = []
+        index = 0
+        for number in range(1, self.placements + 1):
+            again = "again: take it off and put it back" if number > 1 else "as it stands when you enroll it"
+            yield Ask(
+                f"Put {self.name} at its mark on the platter, {again} (placement {number} of {self.placements}). Take "
+                "your hands off.",
+                pictures.OBJECT_AT_MARK,
+            )
+            bench.operator.place(self.name)
+            rounds = []
+            with Turntable(bench) as table:
+                for _round in range(ROUNDS):
+                    views = []
+                    for step in range(AZIMUTHS):
+                        move = table.goto(step * 360.0 / AZIMUTHS)
+                        yield moved(index, move)
+                        shot = yield from capture(index, viewer, table, move.settled_ns)
+                        yield Accepted(index, (-move.encoder_deg) % 360.0, shot.evidence, shot.image_bgr)
+                        views.append(describe(shot.image_bgr).levels[PAPER_DESCRIPTOR])
+                        index += 1
+                    rounds.append(views)
+                table.goto(0.0)
+            placements.append(Placement(np.array(rounds)))
+        identify = bench.config.identify
+        found = evaluate(
+            placements,
+            error_rate=self.error_rate,
+            views=identify.min_views,
+            first_step_deg=identify.first_step_deg,
+        )
+        found.evidence["object"] = self.name
+        yield found
 
 
 def needed_placements(error_rate: float) -> int:
-    """Return how many placements give enough comparisons between placings to state the error rate."""
+    """Return the number of placements with enough comparisons between them to state the error rate."""
     pairs = ceil(1 / error_rate) - 1
     return max(MIN_PLACEMENTS, ceil((1 + sqrt(1 + 8 * pairs / AZIMUTHS)) / 2))
 
 
-def from_data(
-    sittings: Sequence[Sitting],
-    *,
-    error_rate: float,
-    views: int,
-    first_step_deg: float = 90.0,
-    when_utc: datetime,
-    device: Mapping[str, Any],
-    name: str = "",
-    seed: int = 0,
-) -> CalibrationResult:
-    """Find the similarity that repeats keep, and judge it.
+def evaluate(
+    placements: Sequence[Placement], *, error_rate: float, views: int, first_step_deg: float = 90.0, seed: int = 0
+) -> Evaluation:
+    """Find the similarity of repeated views.
 
     Parameters
     ----------
-    sittings
-        Placings of the same object at the same mark.
+    placements
+        Of the same object at the same mark.
     error_rate
         Share of known objects that may fall below ``identify.repeatability``.
     views, first_step_deg
-        Of the shortest decision, and the turn between them.
-    when_utc, device
-        Kept with the fact.
-    name
-        The object's.
+        Number of views of the shortest decision, and the rotation between them.
     seed
         Of the bootstrap over azimuths.
     """
-    within = np.array([_similar(s.descriptors[0], s.descriptors[1]) for s in sittings])
-    between = np.array([_similar(a.descriptors[0], b.descriptors[0]) for a, b in combinations(sittings, 2)])
-    refusals: list[str] = []
-    if len(sittings) < needed_placements(error_rate):
-        refusals.append(
-            f"{len(sittings)} placements are too few to promise an error rate of {error_rate:.1%}: "
-            f"{needed_placements(error_rate)} are needed. Give --placements, or a larger --error-rate."
-        )
-    turn = round(first_step_deg * AZIMUTHS / 360.0)
-    decided = np.mean([np.roll(between, -turn * view, axis=1) for view in range(views)], axis=0)
+    found = Evaluation(name=NAME, residual_unit="of similarity", limit=1.0 - MIN_SIMILARITY)
+    within = np.array([_similar(s.descriptors[0], s.descriptors[1]) for s in placements])
+    between = np.array([_similar(a.descriptors[0], b.descriptors[0]) for a, b in combinations(placements, 2)])
+    needed = needed_placements(error_rate)
+    found.refuse_if(
+        len(placements) < needed,
+        RefusalCode.TOO_FEW_PLACEMENTS,
+        placements=len(placements),
+        error_rate=error_rate,
+        needed=needed,
+    )
+    shift = round(first_step_deg * AZIMUTHS / 360.0)
+    decided = np.mean([np.roll(between, -shift * view, axis=1) for view in range(views)], axis=0)
     low = float(np.median(between))
-    if low < MIN_SIMILARITY:
-        refusals.append(
-            f"Views of the same azimuth keep a similarity of only {low:.2f}, below {MIN_SIMILARITY:g}: the object was "
-            "not put back at its mark, or the light changed. Fix a mark on the platter and calibrate again."
-        )
-    last = len(sittings) - 1
-    apart = {(i, j): row for (i, j), row in zip(combinations(range(len(sittings)), 2), between, strict=True)}
+    found.refuse_if(low < MIN_SIMILARITY, RefusalCode.SIMILARITY_TOO_LOW, similarity=low, needed=MIN_SIMILARITY)
+    last = len(placements) - 1
+    apart = {(i, j): row for (i, j), row in zip(combinations(range(len(placements)), 2), between, strict=True)}
     neighbours = float(np.median([apart[i, i + 1] for i in range(last)]))
     drift = neighbours - float(np.median(apart[0, last]))
-    if last > 1 and drift > MAX_DRIFT:
-        refusals.append(
-            f"The first placing and the last are less alike than their neighbours, by {drift:.3f}: the light drifts. "
-            "Let the lamps warm up, lock the camera, and calibrate again."
-        )
+    found.refuse_if(last > 1 and drift > MAX_DRIFT, RefusalCode.LIGHT_DRIFTS_BETWEEN_PLACEMENTS, drift=drift)
 
     def figures(chosen: NDArray[np.int64]) -> tuple[float, float, float, float]:
         some_within, some_between = within[:, chosen], between[:, chosen]
@@ -181,61 +173,23 @@ def from_data(
         scatter = float(np.sqrt(some_between.var(axis=0, ddof=min(1, len(between) - 1)).mean()))
         return float(np.median(some_within)), float(np.median(some_between)), quantile, scatter
 
-    found = figures(np.arange(AZIMUTHS))
+    values = figures(np.arange(AZIMUTHS))
     rng = np.random.default_rng(seed)
     drawn = np.array([figures(rng.integers(0, AZIMUTHS, AZIMUTHS)) for _ in range(BOOTSTRAPS)])
-    sigma = drawn.std(axis=0, ddof=1)
     names = ("repeat", "placed_again", "repeatability", "scatter")
-    estimates = {
-        key: Estimate(value, float(s), "of similarity") for key, value, s in zip(names, found, sigma, strict=True)
+    for name, value, sigma in zip(names, values, drawn.std(axis=0, ddof=1), strict=True):
+        found.estimate(name, value, sigma, "of similarity")
+    margin = NormalDist().inv_cdf(1 - error_rate) * sqrt(2 / views) * values[3]
+    found.residual = 1.0 - low
+    found.proposed = {"identify.repeatability": round(values[2], 4), "identify.margin": round(min(margin, 1.0), 4)}
+    found.evidence = {
+        "error_rate": error_rate,
+        "views_of_a_decision": views,
+        "within": within.round(4).tolist(),
+        "between": between.round(4).tolist(),
+        "by_step": _by_step(placements),
     }
-    margin = NormalDist().inv_cdf(1 - error_rate) * sqrt(2 / views) * found[3]
-    return CalibrationResult(
-        name=NAME,
-        estimates=estimates,
-        residual=1.0 - low,
-        limit=1.0 - MIN_SIMILARITY,
-        residual_unit="of similarity",
-        refusals=tuple(refusals),
-        settings={}
-        if refusals
-        else {"identify.repeatability": round(found[2], 4), "identify.margin": round(min(margin, 1.0), 4)},
-        valid_days=VALID_DAYS,
-        when_utc=when_utc,
-        device=device,
-        evidence={
-            "object": name,
-            "error_rate": error_rate,
-            "views_of_a_decision": views,
-            "within": within.round(4).tolist(),
-            "between": between.round(4).tolist(),
-            "by_step": _by_step(sittings),
-        },
-    )
-
-
-def plot(fact: CalibrationResult) -> Chart | None:
-    """Return how alike views are that lie some degrees of the table apart."""
-    steps = [step["step_deg"] for step in fact.evidence["by_step"]]
-    threshold = fact.estimates["repeatability"].value
-    return Chart(
-        "Similarity of repeated views",
-        Axis("apart, ° of the table"),
-        Axis("Tanimoto similarity", span=(1.0,)),
-        [
-            Series("median", steps, [step["median"] for step in fact.evidence["by_step"]], curve=True),
-            Series("tenth percentile", steps, [step["tenth"] for step in fact.evidence["by_step"]], OTHER, curve=True),
-            Series(
-                f"unknown below {threshold:.3f}",
-                [steps[0], steps[-1]],
-                [threshold] * 2,
-                LIMIT,
-                False,
-                True,
-                dashed=True,
-            ),
-        ],
-    )
+    return found
 
 
 def _similar(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -243,11 +197,13 @@ def _similar(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.array([float(hbr.tanimoto(x[None], y[None])[0, 0]) for x, y in zip(a, b, strict=True)])
 
 
-def _by_step(sittings: Sequence[Sitting]) -> list[dict[str, float]]:
-    """Return how alike views are that lie one, two, ... steps of the table apart: median and tenth percentile."""
+def _by_step(placements: Sequence[Placement]) -> list[dict[str, float]]:
+    """Return median and tenth percentile of the similarity of views that are 0, 1, 2, ... steps apart."""
     curve = []
     for step in range(AZIMUTHS // 2 + 1):
-        values = np.concatenate([_similar(s.descriptors[0], np.roll(s.descriptors[1], step, axis=0)) for s in sittings])
+        values = np.concatenate(
+            [_similar(s.descriptors[0], np.roll(s.descriptors[1], step, axis=0)) for s in placements]
+        )
         curve.append(
             {
                 "step_deg": step * 360.0 / AZIMUTHS,

@@ -1,6 +1,6 @@
-"""All calibrations of a bench on one self-contained page, each with its plot."""
+"""Write all calibrations of a bench to one self-contained page, each with its plots."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,91 +8,54 @@ from typing import Any, NamedTuple
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from calibration import (
-    backlash,
-    camera_light,
-    camera_model,
-    encoder,
-    gyro_noise,
-    gyro_rotation,
-    gyro_scale,
-    imu_mounting,
-    motion_model,
-    repeatability,
-    table_axis,
-)
-from rig.calibrations import CalibrationResult, Standing, State
+from calibration.procedures import PROCEDURES
+from rig.calibrations import CalibrationResult, CalibrationStanding, CalibrationStatus
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError
 from rig.core.files import write
 
-PLOTS: Mapping[str, Callable[[CalibrationResult], Chart | None]] = {
-    **{
-        module.NAME: module.plot
-        for module in (
-            backlash,
-            encoder,
-            motion_model,
-            gyro_scale,
-            imu_mounting,
-            gyro_noise,
-            gyro_rotation,
-            camera_model,
-            table_axis,
-            repeatability,
-        )
-    },
-    **dict.fromkeys(
-        (camera_light.SHARPNESS, camera_light.NOISE, camera_light.FLAT_FIELD, camera_light.DRIFT), camera_light.plot
-    ),
-}
-
-FURTHER: Mapping[str, Sequence[Callable[[CalibrationResult], Chart | None]]] = {
-    camera_model.NAME: (camera_model.plot_views, camera_model.plot_residuals),
-    table_axis.NAME: (table_axis.plot_views,),
-}
+PLOTS = {name: procedure.plots for procedure in PROCEDURES for name in procedure.names}
 
 
 class _Shown(NamedTuple):
-    fact: CalibrationResult
+    result: CalibrationResult
     good: bool
-    state: str
-    words: str
+    status: str
+    text: str
     command: str
     refusals: Sequence[str]
     pictures: Sequence[Markup]
     devices: Sequence[tuple[str, str]]
 
 
-def plots(fact: CalibrationResult) -> list[Chart]:
-    """Return the plots of a fact, the main one first; none where its kind has none, or nothing could be estimated."""
-    draw = [*([PLOTS[fact.name]] if fact.name in PLOTS else []), *FURTHER.get(fact.name, ())]
-    return [figure for figure in (one(fact) for one in draw) if figure]
+def plots(result: CalibrationResult) -> list[Chart]:
+    """Return the plots of a result, the main one first; none if there is nothing to draw."""
+    return [figure for figure in (draw(result) for draw in PLOTS.get(result.name, ())) if figure]
 
 
 def write_page(
     path: Path,
-    standings: Sequence[Standing],
+    standings: Sequence[CalibrationStanding],
     history: Sequence[CalibrationResult],
     *,
     bench: str,
     now_utc: datetime,
-    findings: Sequence[str] = (),
+    notes: Sequence[str] = (),
 ) -> None:
-    """Write the page: how the bench stands with each calibration, and what came of those that were refused since.
+    """Write the page: the standing of each calibration, and the refusals of newer attempts.
 
     Parameters
     ----------
     path
-        Where to.
+        The file.
     standings
         See `rig.calibrations.CalibrationStore.standings`.
     history
-        All facts that were kept, oldest first.
+        All stored results, oldest first.
     bench, now_utc
         For the title.
-    findings
-        What else a person should know.
+    notes
+        Further notes for the reader.
 
     Raises
     ------
@@ -100,7 +63,7 @@ def write_page(
         The file cannot be written.
     """
     shown = [_shown(standing, history) for standing in standings]
-    count = {state: sum(standing.state is state for standing in standings) for state in State}
+    count = {status: sum(standing.status is status for standing in standings) for status in CalibrationStatus}
     environment = Environment(
         loader=ChoiceLoader([PackageLoader("calibration", "."), PackageLoader("rig.report", ".")]),
         autoescape=True,
@@ -112,8 +75,12 @@ def write_page(
     page = environment.get_template("report.html.j2").render(
         bench=bench,
         when=f"{now_utc:%Y-%m-%d %H:%M}",
-        totals=[{"label": str(state), "value": n} for state, n in count.items() if n or state is State.IN_FORCE],
-        findings=findings,
+        totals=[
+            {"label": str(status), "value": n}
+            for status, n in count.items()
+            if n or status is CalibrationStatus.IN_FORCE
+        ],
+        notes=notes,
         shown=shown,
     )
     try:
@@ -126,22 +93,19 @@ def write_page(
         ) from error
 
 
-def _shown(standing: Standing, history: Sequence[CalibrationResult]) -> _Shown:
-    fact = standing.fact
-    latest = [kept for kept in history if kept.name == fact.name][-1]
-    refused = (
-        [] if latest.passed else [f"Refused on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {r}" for r in latest.refusals]
-    )
+def _shown(standing: CalibrationStanding, history: Sequence[CalibrationResult]) -> _Shown:
+    result = standing.result
+    latest = [stored for stored in history if stored.name == result.name][-1]
     return _Shown(
-        fact,
-        standing.state is State.IN_FORCE,
-        str(standing.state),
-        standing.words,
+        result,
+        standing.status is CalibrationStatus.IN_FORCE,
+        str(standing.status),
+        standing.text,
         standing.command,
-        refused,
-        # Markup of our own making: its words are escaped where it is made.
-        [Markup(figure.svg(themed=True)) for figure in plots(fact)],
-        [(part, _words(identity)) for part, identity in fact.device.items() if part in ("servo", "imu", "camera")],
+        [f"Refused on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {refusal}" for refusal in latest.refusals],
+        # Trusted markup: the SVG escapes its texts.
+        [Markup(figure.svg(themed=True)) for figure in plots(result)],
+        [(part, _words(identity)) for part, identity in result.device.items() if part in ("servo", "imu", "camera")],
     )
 
 

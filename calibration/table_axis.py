@@ -1,19 +1,19 @@
-"""Where the table's axis is in the camera's frame, and how truly it turns, from a board that rides on the table.
+"""Measure the table's axis in the camera's frame, and its wobble, with a board that rides on the table.
 
-The board's poses lie on circles about the axis: the axes of the rotations between them give its direction, a linear
-fit to their centres a point on it. From there one fit of all corners, with the encoder's angles θ taken as they are:
+The board's poses lie on circles about the axis: the axes of the rotations between them give its direction, a linear fit
+to their centres a point on it. Starting from there, one fit uses all corners, with the encoder's angles θ as they are:
 
     x = project(a + L(θ)·R(u, θ)·(X₀ − a)),    X₀ the board's points at θ = 0
 
-by `least_squares(loss="soft_l1")`, with L the lean of a bearing out of true, to a side that goes round twice a turn.
+by `least_squares(loss="soft_l1")`, with L the lean of a bearing that is out of true; its direction rotates twice per
+revolution.
 
-In force it sets ``view.roi``: the part of the frame in which the objects stay while they turn, wherever the camera
+The result sets ``view.roi``: the part of the frame in which the objects stay while they rotate, wherever the camera
 stands.
 """
 
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from datetime import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from math import degrees, hypot, radians, sqrt
 from typing import Any
 
@@ -22,19 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from calibration import camera_model
 from calibration.board_views import STANDS as ALL_STANDS
-from calibration.board_views import BoardView, as_json, look, points, turned_otherwise
+from calibration.board_views import BoardView, as_json, points, refuse_loose_board, span_deg, take_views
 from calibration.board_views import plot_views as plot_views_of
 from calibration.camera_model import PARAMETERS, matrix_of
-from calibration.events import Ask, Progress
+from calibration.procedure import Evaluation, Measured, Procedure, Progress
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate
+from rig.calibrations import CalibrationResult, Estimate, RefusalCode
 from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
-from rig.events.events import Event
 from rig.views.charuco_board import Board
 
 NAME = "table.axis"
-VALID_DAYS = 365
 
 STANDS = ("calibration-board upright", "calibration-board back")
 ANGLES_DEG = tuple(float(angle) for angle in range(-60, 61, 10))
@@ -44,16 +43,16 @@ MAX_RMS_PX = 0.4
 MAX_WOBBLE_DEG = 0.5
 MAX_UNCERTAINTY_PX = 0.3
 MAX_LENS_OFF = 0.06
-"""By how much, relative, a hand may be off that measures the distance from lens to axis."""
+"""Relative error of a distance from lens to axis that is measured by hand."""
 MAX_CUT = 0.1
-"""Share of the room's height or width that the frame may cut off on a side: objects seldom fill its corners."""
+"""Share of the object space's height or width that the frame may cut off on a side: objects seldom fill its corners."""
 ROBUST_PX = 0.3
 CORNER_PX = 0.1
-"""How well a corner is found: what is known of the camera weighs against the corners by it."""
+"""Uncertainty of a corner: it weighs the corners against the known camera parameters."""
 PIVOT_MM = 80.0
-"""The bearing is about as far as this below the board's middle."""
+"""Typical distance of the bearing below the board's middle."""
 BIAS_PX = 0.02
-"""What OpenCV's corners are off by together, whatever their number."""
+"""Common error of OpenCV's corners, whatever their number."""
 FIRST_POSE = 15
 """Parameters before the poses of the board: direction, point and lean (two each), the pivot, and the camera."""
 
@@ -61,17 +60,17 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
-    """The cylinder about the axis that holds the objects, and where the board stands in it.
+class ObjectSpace:
+    """The cylinder about the axis that holds the objects, and the board's place in it.
 
     Attributes
     ----------
     radius_mm, height_mm
         Of the cylinder, which stands on the platter.
     board_mm
-        How far the board's middle is above the platter on the first stand.
+        Height of the board's middle above the platter in the first position.
     lens_mm
-        How far the lens is from the axis at that height, as somebody measured it; None where nobody did.
+        Distance from the lens to the axis at that height, measured by hand; None if it was not measured.
     """
 
     radius_mm: float = 80.0
@@ -80,168 +79,44 @@ class Room:
     lens_mm: float | None = None
 
 
-def live(
-    bench: Bench, intrinsics: CalibrationResult, board: Board | None = None, room: Room | None = None
-) -> Generator[Event | Ask | Progress | CalibrationResult, None, CalibrationResult]:
-    """Have the board put on two stands, look at it from thirteen sides each, and find the axis.
-
-    Parameters
-    ----------
-    bench
-        An open one.
-    intrinsics
-        The camera's calibration.
-    board
-        Its layout, as printed.
-    room
-        What the region of interest is to hold.
-
-    Raises
-    ------
-    ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.views.capture` and `rig.motion.turntable`.
-    """
-    board = board or Board()
-    room = room or Room()
-    when_utc = bench.clock.utc()
-    stands = {stand: ALL_STANDS[stand] for stand in STANDS}
-    stands[STANDS[0]] += f", its middle {room.board_mm:g} mm above the platter"
-    views, troubles = yield from look(bench, board, stands, ANGLES_DEG)
-    fact = from_data(
-        views,
-        board,
-        intrinsics,
-        room=room,
-        troubles=troubles,
-        when_utc=when_utc,
-        device=bench.apparatus("camera", "servo"),
-    )
-    if fact.passed:
-        cut = ", ".join(fact.evidence["cut_off"])
-        words = (
-            f"The lens is {_from_lens(fact.estimates):.0f} mm from the axis: if it is not, the board's squares are not "
-            f"{board.square_mm:g} mm. Objects are seen within {fact.settings['view.roi']} (x, y, width, height)"
-        )
-        yield Progress(1.0, f"{words}; the frame cuts off {cut} of the room for them" if cut else words)
-    yield fact
-    return fact
-
-
-def from_data(
-    views: Sequence[BoardView],
-    board: Board,
-    intrinsics: CalibrationResult,
-    *,
-    room: Room = Room(),
-    troubles: Sequence[str] = (),
-    when_utc: datetime,
-    device: Mapping[str, Any],
-) -> CalibrationResult:
-    """Fit the axis to ``views`` of the board and judge it; see `calibration.camera_model.from_data`."""
-    refusals = list(troubles)
-    estimates: dict[str, Estimate] = {}
-    rms = None
-    region: list[int] = []
-    evidence: dict[str, Any] = {"intrinsics": intrinsics.id, "views": as_json(views), "room": asdict(room)}
-    span = max((v.table_deg for v in views), default=0.0) - min((v.table_deg for v in views), default=0.0)
-    if len(views) < MIN_VIEWS or span < MIN_SPAN_DEG:
-        refusals.append(
-            f"The board was found in {len(views)} views over {span:.0f}°, {MIN_VIEWS} over {MIN_SPAN_DEG:g}° are "
-            "needed: is it lit, sharp and in the frame, and the one that --print-board printed?"
-        )
-    else:
-        matrix, distortion = matrix_of(intrinsics)
-        poses = [_pose(board, view, matrix, distortion) for view in views]
-        _, loose = turned_otherwise(views, poses)
-        refusals += [loose] if loose else []
-        axis = _Axis(views, board, intrinsics, poses)
-        estimates, rms = axis.fit()
-        evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
-        evidence["view_rms_px"] = axis.view_rms_px
-        refusals += _judge(estimates, rms) + _measured(estimates, board, room)
-        corners = region_of_interest(estimates, intrinsics, room)
-        region, cut, too_much = _region(corners, intrinsics.evidence["size"], room)
-        refusals += [too_much] if too_much else []
-        evidence["cut_off"] = cut
-    return CalibrationResult(
-        name=NAME,
-        estimates=estimates,
-        residual=rms,
-        limit=MAX_RMS_PX,
-        residual_unit="px",
-        refusals=tuple(refusals),
-        settings={} if refusals else {"view.roi": region},
-        valid_days=VALID_DAYS,
-        when_utc=when_utc,
-        device=device,
-        evidence=evidence,
-    )
-
-
-def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: CalibrationResult, room: Room) -> Floats:
-    """Return the corners in the image of what the ``room`` takes up, float64 (2, 2): x and y, lowest and highest.
+def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: CalibrationResult, space: ObjectSpace) -> Floats:
+    """Return the corners of the image of the object space, float64 (2, 2): lowest and highest x and y.
 
     They may lie outside the frame.
     """
     value = {name: estimate.value for name, estimate in estimates.items()}
     up = np.array([value["ux"], value["uy"], value["uz"]])
-    foot = np.array([value["x"], value["y"], value["z"]]) - up * room.board_mm
+    foot = np.array([value["x"], value["y"], value["z"]]) - up * space.board_mm
     side = np.cross(up, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     depth = np.cross(side, up)
     around = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    ring = room.radius_mm * (np.cos(around)[:, None] * side + np.sin(around)[:, None] * depth)
-    cylinder = np.concatenate([foot + ring, foot + ring + up * room.height_mm])
+    ring = space.radius_mm * (np.cos(around)[:, None] * side + np.sin(around)[:, None] * depth)
+    cylinder = np.concatenate([foot + ring, foot + ring + up * space.height_mm])
     matrix, distortion = matrix_of(intrinsics)
     seen = cv2.projectPoints(cylinder, np.zeros(3), np.zeros(3), matrix, np.array(distortion))[0].reshape(-1, 2)
     return np.stack([seen.min(axis=0), seen.max(axis=0)]).astype(np.float64)
 
 
-def _region(corners: Floats, size: Sequence[int], room: Room) -> tuple[list[int], list[str], str]:
-    """Return the region within a frame of ``size`` (x, y, width, height), what the frame cuts off, and a refusal.
-
-    The refusal is "" where it does not cut off too much.
-    """
-    low, high = np.floor(corners[0] + 0.5).astype(int), np.ceil(corners[1] + 0.5).astype(int)
-    over = np.array([-low, high - size])  # left, top; right, bottom
-    cut = [
-        f"{over[i, j]} px at the {side}"
-        for (i, j), side in (((0, 0), "left"), ((0, 1), "top"), ((1, 0), "right"), ((1, 1), "bottom"))
-        if over[i, j] > 0
-    ]
-    too_much = bool((over > MAX_CUT * (high - low)).any())
-    low, high = np.clip(low, 0, np.array(size) - 1), np.clip(high, 1, size)
-    region = [*low.tolist(), *(high - low).tolist()]
-    if not too_much:
-        return region, cut, ""
-    return (
-        region,
-        cut,
-        f"Objects of {room.radius_mm:g} mm radius and {room.height_mm:g} mm height would be cut off by the frame: "
-        f"{', '.join(cut)}. Aim the camera anew or move it away; or give what your objects need, by --radius-mm and "
-        f"--height-mm. Is the middle of the board {room.board_mm:g} mm above the platter (--middle-mm)?",
-    )
-
-
-def plot(fact: CalibrationResult) -> Chart | None:
-    """Return the way of the board's middle about the axis, seen along it, and the circles that were fitted."""
-    if not fact.estimates:
+def plot(result: CalibrationResult) -> Chart | None:
+    """Return the path of the board's middle about the axis, seen along it, and the fitted circles."""
+    if not result.estimates:
         return None
-    value = {name: estimate.value for name, estimate in fact.estimates.items()}
+    value = {name: estimate.value for name, estimate in result.estimates.items()}
     up = np.array([value["ux"], value["uy"], value["uz"]])
-    offset = np.array(fact.evidence["board_centres_mm"]) - np.array([value["x"], value["y"], value["z"]])
+    offset = np.array(result.evidence["board_centres_mm"]) - np.array([value["x"], value["y"], value["z"]])
     side = np.cross(up, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     across, along = offset @ -side, offset @ np.cross(side, up)  # the camera is below
     around = np.linspace(0.0, 2 * np.pi, 97)
     return Chart(
-        f"The board about the axis, seen from above; wobble {fact.estimates['wobble']}",
+        f"The board about the axis, seen from above; wobble {result.estimates['wobble']}",
         Axis("mm"),
         Axis("mm from the axis"),
         [
             *(
                 Series("", (r * np.cos(around)).tolist(), (r * np.sin(around)).tolist(), MODEL, dots=False, curve=True)
-                for r in fact.evidence["radius_mm"]
+                for r in result.evidence["radius_mm"]
             ),
             Series("middle of the board", across.tolist(), along.tolist()),
             Series("axis", [0.0], [0.0], LIMIT),
@@ -250,15 +125,90 @@ def plot(fact: CalibrationResult) -> Chart | None:
     )
 
 
-def plot_views(fact: CalibrationResult) -> Chart | None:
-    """Return how far the corners of each view are off the fit; see `calibration.board_views.plot_views`."""
-    return plot_views_of(fact, MAX_RMS_PX)
+def plot_views(result: CalibrationResult) -> Chart | None:
+    """Return the deviation of the corners in each view; see `calibration.board_views.plot_views`."""
+    return plot_views_of(result, MAX_RMS_PX)
+
+
+@dataclass(frozen=True)
+class TableAxis(Procedure):
+    """Take views of the board in two positions, from thirteen sides each, and find the axis.
+
+    Needs the camera's calibration.
+    """
+
+    names, title, devices, valid_days = (NAME,), "axis of the table", ("camera", "servo"), 365
+    requires, plots = (camera_model.NAME,), (plot, plot_views)
+    board: Board = field(default_factory=Board)
+    space: ObjectSpace = field(default_factory=ObjectSpace)
+
+    def measure(self, bench: Bench, *required: CalibrationResult) -> Measured:
+        (intrinsics,) = required
+        stands = {stand: ALL_STANDS[stand] for stand in STANDS}
+        stands[STANDS[0]] += f", its middle {self.space.board_mm:g} mm above the platter"
+        found = Evaluation(name=NAME)
+        views = yield from take_views(bench, self.board, stands, ANGLES_DEG, found)
+        evaluate(views, self.board, intrinsics, self.space, found)
+        if found.passed:
+            cut = ", ".join(found.evidence["cut_off"])
+            words = (
+                f"The lens is {_from_lens(found.estimates):.0f} mm from the axis. If this is wrong, the squares of the "
+                f"board are not {self.board.square_mm:g} mm. Objects are seen within {found.settings['view.roi']} "
+                "(x, y, width, height)"
+            )
+            yield Progress(1.0, f"{words}; the frame cuts off {cut} of the space for them" if cut else words)
+        yield found
+
+
+def evaluate(
+    views: Sequence[BoardView],
+    board: Board,
+    intrinsics: CalibrationResult,
+    space: ObjectSpace = ObjectSpace(),
+    found: Evaluation | None = None,
+) -> Evaluation:
+    """Fit the axis to ``views`` of the board; see `calibration.camera_model.evaluate`."""
+    found = found or Evaluation(name=NAME)
+    found.residual_unit, found.limit = "px", MAX_RMS_PX
+    found.evidence = {"intrinsics": intrinsics.id, "views": as_json(views), "room": asdict(space)}
+    span = span_deg(views)
+    if len(views) < MIN_VIEWS or span < MIN_SPAN_DEG:
+        values = {"found": len(views), "span_deg": span, "needed": MIN_VIEWS, "needed_deg": MIN_SPAN_DEG}
+        found.refuse_if(True, RefusalCode.TOO_FEW_VIEWS, **values)
+        return found
+    matrix, distortion = matrix_of(intrinsics)
+    poses = [_pose(board, view, matrix, distortion) for view in views]
+    refuse_loose_board(found, views, poses)
+    axis = _Axis(views, board, intrinsics, poses)
+    found.estimates, found.residual = axis.fit()
+    found.evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
+    found.evidence["view_rms_px"] = axis.view_rms_px
+    _check(found, board, space)
+
+    # The region of interest: the image of the object space, as far as it is within the frame.
+    size = np.array(intrinsics.evidence["size"])
+    corners = region_of_interest(found.estimates, intrinsics, space)
+    low, high = np.floor(corners[0] + 0.5).astype(int), np.ceil(corners[1] + 0.5).astype(int)
+    over = np.array([-low, high - size])  # left, top; right, bottom
+    sides = {"left": over[0, 0], "top": over[0, 1], "right": over[1, 0], "bottom": over[1, 1]}
+    found.evidence["cut_off"] = [f"{pixels} px at the {side}" for side, pixels in sides.items() if pixels > 0]
+    found.refuse_if(
+        (over > MAX_CUT * (high - low)).any(),
+        RefusalCode.OBJECTS_CUT_OFF,
+        **{f"{side}_px": max(int(pixels), 0) for side, pixels in sides.items()},
+        radius_mm=space.radius_mm,
+        height_mm=space.height_mm,
+        board_mm=space.board_mm,
+    )
+    low, high = np.clip(low, 0, size - 1), np.clip(high, 1, size)
+    found.proposed = {"view.roi": [*low.tolist(), *(high - low).tolist()]}
+    return found
 
 
 class _Axis:
-    """The fit: two angles of the axis, two offsets of a point on it, its lean, the camera, and a pose for each stand.
+    """The fit: two angles of the axis, two offsets of a point on it, its lean, the camera, and a pose per position.
 
-    The camera and the height about which the axis leans are not free: what is known of them pulls, by its uncertainty.
+    The camera and the height about which the axis leans enter with their known values and uncertainties.
     """
 
     def __init__(
@@ -272,12 +222,12 @@ class _Axis:
         camera = [intrinsics.estimates[name] for name, _ in PARAMETERS]
         self._known = np.array([-PIVOT_MM, *(estimate.value for estimate in camera)])
         self._known_sigma = np.array([PIVOT_MM / 2, *(estimate.uncertainty for estimate in camera)])
-        self._known_sigma[1:3] *= sqrt(2)  # both focal lengths err together: two of them know no more than one
+        self._known_sigma[1:3] *= sqrt(2)  # both focal lengths err together: they count once
         self._points = [points(board, view) for view in views]
         self._middle = board.points_mm().mean(axis=0)
         self._stands = sorted({view.stand for view in views})
         self._up, self._origin = _first_axis(views, poses, self._middle)
-        # Two directions across the axis, in which the point on it may move and the axis lean.
+        # Two directions across the axis: the point on it may move, and the axis lean, in these.
         first = np.cross(self._up, [0.0, 0.0, 1.0])
         first /= np.linalg.norm(first)
         self._across = np.stack([first, np.cross(self._up, first)])
@@ -303,7 +253,7 @@ class _Axis:
 
     def fit(self) -> tuple[dict[str, Estimate], float]:
         """Return the estimates, and the root mean square of the corners' residuals in pixels."""
-        # From no lean at all the fit may walk to a lean about the wrong side: it begins at three, and the best counts.
+        # Starting without a lean, the fit may end at a lean to the wrong side: try three starts, and use the best.
         starts = [self._start.copy() for _ in range(3)]
         for start, turn in zip(starts, np.radians([0.0, 120.0, 240.0]), strict=True):
             start[4:6] = radians(0.05) * np.array([np.cos(turn), np.sin(turn)])
@@ -316,12 +266,12 @@ class _Axis:
         freedom = max(residuals.size - solved.x.size, 1)
         rms = float(np.sqrt(squares.mean()))
         covariance = np.linalg.inv(solved.jac.T @ solved.jac) * float((residuals**2).sum()) / freedom
-        # How everything told depends on the parameters, by differences.
-        told = self._told(solved.x)
+        # Uncertainties of the reported quantities: their derivatives by the parameters, from differences.
+        reported = self._reported(solved.x)
         steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-12
         jacobian = np.column_stack(
             [
-                (self._told(solved.x + step * unit) - told) / step
+                (self._reported(solved.x + step * unit) - reported) / step
                 for step, unit in zip(steps, np.eye(steps.size), strict=True)
             ]
         )
@@ -330,7 +280,7 @@ class _Axis:
         units = ("mm", "mm", "mm", "", "", "", "px", "px", "°")
         estimates = {
             name: Estimate(float(value), float(s), unit)
-            for name, unit, value, s in zip(names, units, told, sigma, strict=True)
+            for name, unit, value, s in zip(names, units, reported, sigma, strict=True)
         }
         for name in ("px", "py"):
             estimates[name] = replace(estimates[name], uncertainty=hypot(estimates[name].uncertainty, BIAS_PX))
@@ -354,8 +304,8 @@ class _Axis:
         seen = cv2.projectPoints(points_mm, np.zeros(3), np.zeros(3), matrix, np.array(distortion))[0]
         return np.asarray(seen, dtype=np.float64).reshape(-1, 2)
 
-    def _told(self, p: Floats) -> Floats:
-        """Return what is told: the point on the axis beside the first board's middle, the direction, and the rest."""
+    def _reported(self, p: Floats) -> Floats:
+        """Return the reported quantities: the point on the axis beside the first board's middle, its direction, ..."""
         up, point, lean = self._geometry(p)
         pose = p[FIRST_POSE : FIRST_POSE + 6]
         middle = cv2.Rodrigues(pose[:3])[0] @ self._middle + pose[3:]
@@ -368,10 +318,10 @@ class _Axis:
         for view, board_points in zip(self._views, self._points, strict=True):
             begin = FIRST_POSE + 6 * self._stands.index(view.stand)
             at_zero = board_points @ cv2.Rodrigues(p[begin : begin + 3])[0].T + p[begin + 3 : begin + 6]
-            turn = radians(view.table_deg)
-            c, s = np.cos(2 * turn), np.sin(2 * turn)
+            angle = radians(view.table_deg)
+            c, s = np.cos(2 * angle), np.sin(2 * angle)
             leaning = (c * lean[0] - s * lean[1]) * self._across[0] + (s * lean[0] + c * lean[1]) * self._across[1]
-            rotation = cv2.Rodrigues(leaning)[0] @ cv2.Rodrigues(up * turn)[0]
+            rotation = cv2.Rodrigues(leaning)[0] @ cv2.Rodrigues(up * angle)[0]
             now = point + (at_zero - point) @ rotation.T
             parts.append((self._seen(now, p) - view.corners_px).ravel())
         parts.append(CORNER_PX * (p[6:FIRST_POSE] - self._known) / self._known_sigma)
@@ -387,7 +337,7 @@ def _pose(board: Board, view: BoardView, matrix: Floats, distortion: Sequence[fl
 def _first_axis(
     views: Sequence[BoardView], poses: Sequence[tuple[Floats, Floats]], middle: Floats
 ) -> tuple[Floats, Floats]:
-    """Return direction and a point of the axis: from the rotations between poses, and the circles of the middles."""
+    """Return direction and a point of the axis, from the rotations between poses and the circles of the middles."""
     direction = np.zeros(3)
     equations, values = [], []
     for (a, (rotation_a, shift_a)), (b, (rotation_b, shift_b)) in (
@@ -404,7 +354,7 @@ def _first_axis(
         equations.append(np.eye(3) - between)
         values.append(centre_b - between @ centre_a)
     direction /= np.linalg.norm(direction)
-    # Along the axis nothing is determined: the point nearest to the boards is taken.
+    # The position along the axis is not determined: take the point nearest to the boards.
     centres = np.array([cv2.Rodrigues(r)[0] @ middle + t.ravel() for r, t in poses])
     equations.append(direction[None])
     values.append(np.array([float(centres.mean(axis=0) @ direction)]))
@@ -413,40 +363,37 @@ def _first_axis(
 
 
 def _from_lens(estimates: Mapping[str, Estimate]) -> float:
-    """Return how far the lens is from the axis at the height of the board's middle, in mm, along the line of sight."""
+    """Return the distance (mm) from the lens to the point on the axis at the height of the board's middle."""
     return float(np.linalg.norm([estimates[name].value for name in ("x", "y", "z")]))
 
 
-def _measured(estimates: Mapping[str, Estimate], board: Board, room: Room) -> list[str]:
-    """Return why the board's size must be wrong, if the measured distance says so: pictures alone tell no lengths."""
-    found = _from_lens(estimates)
-    if room.lens_mm is None or abs(found - room.lens_mm) <= MAX_LENS_OFF * room.lens_mm:
-        return []
-    return [
-        f"By the board the lens is {found:.0f} mm from the axis, by --lens-mm {room.lens_mm:.0f}: its squares would be "
-        f"{board.square_mm * room.lens_mm / found:.1f} mm wide, not {board.square_mm:g}. Measure a square on the print "
-        "and give --square-mm, or print it true to scale."
-    ]
-
-
-def _judge(estimates: Mapping[str, Estimate], rms: float) -> list[str]:
-    refusals = []
-    if rms > MAX_RMS_PX:
-        refusals.append(
-            f"The corners are off the circles by {rms:.2f} px (RMS), above {MAX_RMS_PX:g}: the board is loose, the "
-            "table moved while it was looked at, or the camera was touched since its calibration. Fix them, run `rig "
-            "calibrate camera` where the lens was touched, and calibrate again."
+def _check(found: Evaluation, board: Board, space: ObjectSpace) -> None:
+    """Refuse a poor fit, a wobbling axis, and a board whose size contradicts the measured distance."""
+    found.refuse_if(
+        (found.residual or 0.0) > MAX_RMS_PX, RefusalCode.CIRCLES_OFF, rms_px=found.residual, limit_px=MAX_RMS_PX
+    )
+    uncertainty = max(found.estimates["px"].uncertainty, found.estimates["py"].uncertainty)
+    found.refuse_if(
+        uncertainty > MAX_UNCERTAINTY_PX,
+        RefusalCode.AXIS_UNCERTAIN,
+        uncertainty_px=uncertainty,
+        limit_px=MAX_UNCERTAINTY_PX,
+    )
+    wobble = found.estimates["wobble"]
+    found.refuse_if(
+        wobble.value - 2 * wobble.uncertainty > MAX_WOBBLE_DEG,
+        RefusalCode.AXIS_WOBBLES,
+        wobble_deg=wobble.value,
+        limit_deg=MAX_WOBBLE_DEG,
+    )
+    # Images alone do not determine lengths: only the measured distance shows a board of another size.
+    if space.lens_mm is not None:
+        lens_mm = _from_lens(found.estimates)
+        found.refuse_if(
+            abs(lens_mm - space.lens_mm) > MAX_LENS_OFF * space.lens_mm,
+            RefusalCode.BOARD_SIZE_WRONG,
+            found_mm=lens_mm,
+            lens_mm=space.lens_mm,
+            true_square_mm=board.square_mm * space.lens_mm / lens_mm,
+            square_mm=board.square_mm,
         )
-    uncertainty = max(estimates["px"].uncertainty, estimates["py"].uncertainty)
-    if uncertainty > MAX_UNCERTAINTY_PX:
-        refusals.append(
-            f"The axis is uncertain by {uncertainty:.2f} px in the image, more than {MAX_UNCERTAINTY_PX:g}: bring "
-            "the board nearer, or light it better."
-        )
-    wobble = estimates["wobble"]
-    if wobble.value - 2 * wobble.uncertainty > MAX_WOBBLE_DEG:
-        refusals.append(
-            f"The axis wobbles by {wobble.value:.2f}°, more than {MAX_WOBBLE_DEG:g}°: the bearing is out of true, or "
-            "the horn loose."
-        )
-    return refusals

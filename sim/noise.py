@@ -94,18 +94,18 @@ class NoiseModel:
         return replace(self, **values)
 
 
-def from_calibration(facts: Iterable[CalibrationResult], base: NoiseModel | None = None) -> NoiseModel:
-    """Return the noise model of the bench on which ``facts`` were calibrated, for the simulated bench beside it.
+def from_calibration(results: Iterable[CalibrationResult], base: NoiseModel | None = None) -> NoiseModel:
+    """Return the noise model of the bench on which ``results`` were calibrated, for the simulated bench beside it.
 
     A value that differs from part to part becomes a spread as wide as the part's own error: worlds of other seeds are
-    other parts as good as that one. What no fact tells is as in ``base``.
+    other parts as good as that one. What no result tells is as in ``base``.
     """
     values: dict[str, float] = {}
-    for fact in facts:
-        if not fact.passed:
+    for result in results:
+        if not result.passed:
             continue
-        found = {name: estimate.value for name, estimate in fact.estimates.items()}
-        match fact.name:
+        found = {name: estimate.value for name, estimate in result.estimates.items()}
+        match result.name:
             case "servo.backlash":
                 values["backlash_deg"] = max(found["backlash"], 0.0)
             case "servo.encoder":

@@ -13,7 +13,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 from pydantic import BaseModel
 
-from rig.calibrations import CalibrationStore, State, apparatus, put_in_force
+from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
 from rig.calibrations.store import CALIBRATIONS
 from rig.config import RigConfig
 from rig.config.values import Values, config_mistakes, validate
@@ -225,29 +225,29 @@ def open_servo(name: str | None = None, config: RigConfig | None = None, *, seed
 
 
 def calibrate(bench: Bench, store: CalibrationStore) -> None:
-    """Put the bench's calibrations in force; what has expired or belongs to other devices becomes a finding.
+    """Apply the bench's calibrations; one that has expired or belongs to other devices becomes a finding.
 
-    A second call takes what was calibrated meanwhile.
+    A second call also applies new calibrations.
 
     Raises
     ------
     ConfigError
-        A calibration sets what the configuration does not take.
+        A calibration sets a value that the configuration does not allow.
     """
     bench._as_opened = bench._as_opened or (bench.config, bench.findings)
     config, findings = bench._as_opened
     standings = store.standings(bench.apparatus(), bench.clock.utc())
-    facts = [standing.fact for standing in standings if standing.state is State.IN_FORCE]
-    bench.config, told = put_in_force(config, facts)
+    in_force = [standing.result for standing in standings if standing.status is CalibrationStatus.IN_FORCE]
+    bench.config, notes = apply_results(config, in_force)
     bench.safety.angle_reference.calibrate(bench.config.table)
-    bench.conditions = {**bench.conditions, CALIBRATIONS: [fact.id for fact in facts]}
+    bench.conditions = {**bench.conditions, CALIBRATIONS: [result.id for result in in_force]}
     bench.calibration_findings = (
-        *told,
+        *notes,
         *(error.what for error in store.unreadable),
         *(
-            f"{standing.words}; calibrate again with `{standing.command}`"
+            f"{standing.text}; calibrate again with `{standing.command}`"
             for standing in standings
-            if standing.state is not State.IN_FORCE
+            if standing.status is not CalibrationStatus.IN_FORCE
         ),
     )
     bench.findings = (*findings, *bench.calibration_findings)

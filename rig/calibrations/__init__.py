@@ -1,7 +1,18 @@
-"""What calibrations found out about a bench: dated facts, their store, and how they take effect."""
+"""Calibration results of a bench: their files, and how they take effect."""
 
-from rig.calibrations.apply import put_in_force
+from rig.calibrations.apply import apply_results
+from rig.calibrations.refusal import Refusal, RefusalCode
 from rig.calibrations.result import CalibrationResult, Estimate
-from rig.calibrations.store import CalibrationStore, Standing, State, apparatus
+from rig.calibrations.store import CalibrationStanding, CalibrationStatus, CalibrationStore, apparatus
 
-__all__ = ["CalibrationResult", "CalibrationStore", "Estimate", "Standing", "State", "apparatus", "put_in_force"]
+__all__ = [
+    "CalibrationResult",
+    "CalibrationStanding",
+    "CalibrationStatus",
+    "CalibrationStore",
+    "Estimate",
+    "Refusal",
+    "RefusalCode",
+    "apparatus",
+    "apply_results",
+]

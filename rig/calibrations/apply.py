@@ -1,4 +1,4 @@
-"""Facts in force: what they set in the configuration, unless a person set it."""
+"""Apply the settings of calibration results to the configuration."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,20 +10,20 @@ from rig.config import RigConfig
 from rig.config.values import validate
 
 
-def put_in_force(config: RigConfig, facts: Iterable[CalibrationResult]) -> tuple[RigConfig, tuple[str, ...]]:
-    """Return the configuration with the settings of ``facts``, and what a person should know about it.
+def apply_results(config: RigConfig, results: Iterable[CalibrationResult]) -> tuple[RigConfig, tuple[str, ...]]:
+    """Return the configuration with the settings of ``results``, and notes about settings that were not applied.
 
-    A value that the configuration gives itself wins over a fact, and is told where it differs.
+    A value in the configuration itself takes precedence over a result; a note reports each difference.
 
     Raises
     ------
     ConfigError
-        A fact sets what the configuration does not take.
+        A result sets a value that the configuration does not allow.
     """
     values = config.model_dump(exclude_unset=True)
-    findings = []
-    for fact in facts:
-        for key, value in fact.settings.items():
+    notes = []
+    for result in results:
+        for key, value in result.settings.items():
             path = key.split(".")
             written = _written(config, path)
             if written is None:
@@ -32,12 +32,12 @@ def put_in_force(config: RigConfig, facts: Iterable[CalibrationResult]) -> tuple
                     here = here.setdefault(part, {})
                 here[path[-1]] = value
             elif _plain(written) != _plain(value):
-                findings.append(f"{key} = {written} of the configuration wins over {value}, calibrated as {fact.id}")
-    return validate(RigConfig, values, where="the calibrations in force"), tuple(findings)
+                notes.append(f"{key} = {written} of the configuration takes precedence over {value} of {result.id}")
+    return validate(RigConfig, values, where="the calibrations in force"), tuple(notes)
 
 
 def _written(config: RigConfig, path: list[str]) -> Any:
-    """Return what the configuration itself says for a key, None where it is silent."""
+    """Return the value that the configuration itself gives a key, None if it gives none."""
     here: Any = config
     for part in path:
         if not isinstance(here, BaseModel) or part not in here.model_fields_set:
@@ -47,5 +47,5 @@ def _written(config: RigConfig, path: list[str]) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as a file has it, where there are no tuples."""
+    """Return a value as JSON has it, which has no tuples."""
     return list(value) if isinstance(value, tuple) else value

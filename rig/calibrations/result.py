@@ -1,4 +1,4 @@
-"""What a calibration leaves behind: a dated fact with its uncertainty, how it was judged, and for which device."""
+"""The result of a calibration: values with uncertainties, its limits, its date and its device."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,10 +6,19 @@ from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from math import floor, log10
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import AwareDatetime, ConfigDict, FiniteFloat, PositiveFloat, TypeAdapter, ValidationError
+from pydantic import (
+    AwareDatetime,
+    BeforeValidator,
+    ConfigDict,
+    FiniteFloat,
+    PositiveFloat,
+    TypeAdapter,
+    ValidationError,
+)
 
+from rig.calibrations.refusal import Refusal, stored_refusal
 from rig.core.errors import ConfigError, UsageError
 from rig.core.files import write
 
@@ -39,26 +48,26 @@ class CalibrationResult:
     name
         What was calibrated: ``imu.scale``, ``camera.intrinsics``.
     estimates
-        The quantities by name; empty where nothing could be estimated.
+        The quantities by name; empty if nothing could be estimated.
     residual, limit
-        The worst residual of the fit and what it may be, in ``residual_unit``.
+        The worst residual of the fit and its limit, in ``residual_unit``.
     refusals
-        Why the estimates must not be used, each with what to do about it; empty when the calibration passed.
+        Why the estimates must not be used; empty if the calibration passed.
     settings
-        What it puts in force, by key of the configuration.
+        The settings that the result applies, by key of the configuration.
     valid_days
-        How long it holds; None: until the device changes.
+        How long the result is valid; None: until the device changes.
     when_utc
         By the bench's clock.
     device
-        What was calibrated, against what, and on which bench (`rig.calibrations.apparatus`): a fact holds for no other.
+        The calibrated devices and their bench (`rig.calibrations.apparatus`): the result is valid for no other.
     evidence
-        What was measured, enough to fit it again.
+        The measurements, enough to fit them again.
 
     Raises
     ------
     ValueError
-        When a fact without refusals has no estimate, one with refusals has settings, or ``when_utc`` no time zone.
+        A result without refusals has no estimate, one with refusals has settings, or ``when_utc`` has no time zone.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -68,7 +77,7 @@ class CalibrationResult:
     residual: FiniteFloat | None
     limit: FiniteFloat | None
     residual_unit: str
-    refusals: tuple[str, ...]
+    refusals: tuple[Annotated[Refusal, BeforeValidator(stored_refusal)], ...]
     when_utc: AwareDatetime
     device: Mapping[str, Any]
     evidence: Mapping[str, Any]
@@ -78,9 +87,9 @@ class CalibrationResult:
 
     def __post_init__(self) -> None:
         if self.passed and not self.estimates:
-            raise ValueError(f"{self.name}: what passed has a value and an uncertainty")
+            raise ValueError(f"{self.name}: a result that passed needs an estimate")
         if self.settings and not self.passed:
-            raise ValueError(f"{self.name}: what was refused puts nothing in force")
+            raise ValueError(f"{self.name}: a result that did not pass applies no settings")
         if self.when_utc.tzinfo is None:
             raise ValueError(f"{self.name}: when_utc needs a time zone")
         object.__setattr__(self, "when_utc", self.when_utc.astimezone(UTC))
@@ -91,14 +100,14 @@ class CalibrationResult:
 
     @property
     def id(self) -> str:
-        """Name by which a stored view refers to the fact."""
+        """The name by which a stored view refers to the result."""
         return f"{self.name}@{self.when_utc:%Y%m%dT%H%M%S.%fZ}"
 
     def expired(self, now_utc: datetime) -> bool:
         return self.valid_days is not None and now_utc - self.when_utc > timedelta(days=self.valid_days)
 
     def to_file(self, path: Path) -> None:
-        """Write the fact as JSON: all of it or, when that fails, nothing.
+        """Write the result as JSON, completely or not at all.
 
         Raises
         ------
@@ -116,22 +125,22 @@ class CalibrationResult:
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
-        """Read a fact that `to_file` wrote.
+        """Read a result that `to_file` wrote, in this version or an earlier one.
 
         Raises
         ------
         ConfigError
-            The file cannot be read, or is no calibration: all its mistakes at once.
+            The file cannot be read, or is not a calibration result; the error lists all mistakes.
         """
         try:
-            fact = _JSON.validate_json(path.read_bytes())
+            result = _JSON.validate_json(path.read_bytes())
         except OSError as error:
             mistakes = [error.strerror or str(error)]
         except ValidationError as error:
             mistakes = [": ".join([*map(str, e["loc"]), e["msg"]]) for e in error.errors(include_url=False)]
         else:
-            assert isinstance(fact, cls)
-            return fact
+            assert isinstance(result, cls)
+            return result
         raise ConfigError(
             f"Cannot read the calibration {path}.",
             next_step="Give a file that `rig calibrate ...` wrote, or remove it and calibrate again.",

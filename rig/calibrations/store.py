@@ -1,4 +1,4 @@
-"""The facts of a bench on disk: a folder of files, one a calibration, to which is only ever added."""
+"""The calibration results of a bench on disk: a folder with one file for each calibration, only ever added to."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,99 +13,117 @@ from rig.config import RigConfig
 from rig.core.errors import ConfigError, UsageError
 
 CALIBRATIONS = "calibrations"
-"""Where a bench's conditions name the facts in force."""
+"""The key in a bench's conditions that names the results in force."""
 
 
-class State(StrEnum):
-    """How a bench stands with one kind of calibration."""
+class CalibrationStatus(StrEnum):
+    """Whether a bench can use one kind of calibration."""
 
     IN_FORCE = "in force"
     EXPIRED = "expired"
     OTHER_DEVICE = "other device"
     FAILED = "failed"
-    """It was tried, and never passed."""
+    """No attempt passed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
-    """The newest fact of a kind that counts, and how the bench stands with it, in words."""
+class CalibrationStanding:
+    """The decisive result of one kind of calibration, and its status on the bench.
 
-    fact: CalibrationResult
-    state: State
-    words: str
+    ``age_days`` is the result's age; ``changes`` are the differences between the calibrated devices and the bench's.
+    """
+
+    result: CalibrationResult
+    status: CalibrationStatus
+    age_days: float = 0.0
+    changes: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The status in words."""
+        name, age = self.result.name, f"{self.result.name} was calibrated {self.age_days:.0f} days ago"
+        match self.status:
+            case CalibrationStatus.FAILED:
+                return f"{name} never passed: {self.result.refusals[0]}"
+            case CalibrationStatus.OTHER_DEVICE:
+                return f"{name} was calibrated on another device: {'; '.join(self.changes)}"
+            case CalibrationStatus.EXPIRED:
+                return f"{age}; it is valid for {self.result.valid_days:.0f} days"
+            case _:
+                return age
 
     @property
     def command(self) -> str:
-        """Return the command that mends what is not in force."""
-        return f"rig calibrate {self.fact.name.partition('.')[0]}"
+        """The command that calibrates again."""
+        return f"rig calibrate {self.result.name.partition('.')[0]}"
 
 
 class CalibrationStore:
-    """The folder of a bench's facts; it need not exist until the first one is kept.
+    """The folder of a bench's calibration results; the first `add` creates it.
 
     Attributes
     ----------
     unreadable
-        Why files of the folder were left out at the last look.
+        Errors of the files that the last `history` left out.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.unreadable: list[ConfigError] = []
 
-    def keep(self, fact: CalibrationResult) -> Path:
-        """Add a fact, passed or not, and return its file.
+    def add(self, result: CalibrationResult) -> Path:
+        """Store a result, passed or not, and return its file.
 
         Raises
         ------
         UsageError
-            The folder cannot be made or written to.
+            The folder cannot be created or written to.
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(
-                f"Cannot keep calibrations in {self.folder}.",
+                f"Cannot store calibrations in {self.folder}.",
                 next_step="Set calibration_dir to a folder that you may write to.",
                 evidence={"reason": error.strerror or str(error)},
             ) from error
-        # Numbered in the order in which they were kept: a clock may be set back, and a simulated one runs ahead.
+        # Numbered in the order of storing: a clock may be set back, and a simulated clock runs ahead.
         number = 1 + max((int(path.name.partition("-")[0]) for path in self._files()), default=0)
-        path = self.folder / f"{number:05d}-{fact.name}-{fact.when_utc:%Y%m%dT%H%M%SZ}.json"
-        fact.to_file(path)
+        path = self.folder / f"{number:05d}-{result.name}-{result.when_utc:%Y%m%dT%H%M%SZ}.json"
+        result.to_file(path)
         return path
 
     def history(self, name: str | None = None) -> list[CalibrationResult]:
-        """Return all facts, of all kinds or one, in the order in which they were kept."""
+        """Return all results, of all kinds or of one, in the order of storing."""
         self.unreadable = []
-        facts = []
+        results = []
         for path in self._files(name or ""):
             try:
-                facts.append(CalibrationResult.from_file(path))
+                results.append(CalibrationResult.from_file(path))
             except ConfigError as error:
                 self.unreadable.append(error)
-        return [fact for fact in facts if name in (None, fact.name)]
+        return [result for result in results if name in (None, result.name)]
 
     def _files(self, name: str = "") -> list[Path]:
         return sorted(self.folder.glob(f"[0-9]*-{escape(name)}*.json"))
 
-    def standings(self, device: Mapping[str, Any], now_utc: datetime) -> list[Standing]:
-        """Return how the bench with these devices stands with each kind of calibration, by name.
+    def standings(self, device: Mapping[str, Any], now_utc: datetime) -> list[CalibrationStanding]:
+        """Return the standing of each kind of calibration on the bench with these devices, sorted by name.
 
-        The newest fact that passed on these very devices counts; where none did, the newest that passed at all.
+        The newest result that passed on these devices decides; if there is none, the newest that passed at all.
         """
         kinds: dict[str, list[CalibrationResult]] = {}
-        for fact in self.history():
-            kinds.setdefault(fact.name, []).append(fact)
+        for result in self.history():
+            kinds.setdefault(result.name, []).append(result)
         return [_standing(kinds[name], device, now_utc) for name in sorted(kinds)]
 
 
 def apparatus(
     name: str, devices: Mapping[str, Any], config: RigConfig, conditions: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what a fact is bound to: the bench, its devices' identities, how they are mounted, and a simulated world.
+    """Return what a result is bound to: the bench, its devices and their mounting, and the conditions.
 
-    What a calibration itself puts in force is no part of it.
+    The settings that a calibration itself applies are not part of it.
     """
     mounting = {
         "servo": config.table.model_dump(include={"direction"}),
@@ -118,9 +136,9 @@ def apparatus(
     }
 
 
-def differences(fact: CalibrationResult, device: Mapping[str, Any]) -> list[str]:
-    """Return in words how the calibrated devices differ from ``device``, as far as both are known."""
-    return list(_differences("", fact.device, device))
+def differences(result: CalibrationResult, device: Mapping[str, Any]) -> list[str]:
+    """Return the differences between the calibrated devices and ``device``, as far as both are known."""
+    return list(_differences("", result.device, device))
 
 
 def _differences(path: str, then: Any, now: Any) -> Iterable[str]:
@@ -131,19 +149,14 @@ def _differences(path: str, then: Any, now: Any) -> Iterable[str]:
         yield f"{path} was {then}, is {now}"
 
 
-def _standing(facts: list[CalibrationResult], device: Mapping[str, Any], now_utc: datetime) -> Standing:
-    passed = [fact for fact in facts if fact.passed]
+def _standing(results: list[CalibrationResult], device: Mapping[str, Any], now_utc: datetime) -> CalibrationStanding:
+    passed = [result for result in results if result.passed]
     if not passed:
-        return Standing(facts[-1], State.FAILED, f"{facts[-1].name} never passed: {facts[-1].refusals[0]}")
-    here = [fact for fact in passed if not differences(fact, device)]
+        return CalibrationStanding(results[-1], CalibrationStatus.FAILED)
+    here = [result for result in passed if not differences(result, device)]
     if not here:
-        changed = "; ".join(sorted(differences(passed[-1], device)))
-        return Standing(
-            passed[-1], State.OTHER_DEVICE, f"{passed[-1].name} was calibrated on another device: {changed}"
-        )
-    fact = here[-1]
-    days = max((now_utc - fact.when_utc).total_seconds() / 86400, 0.0)  # a simulated clock runs ahead
-    age = f"{fact.name} was calibrated {days:.0f} days ago"
-    if fact.expired(now_utc):
-        return Standing(fact, State.EXPIRED, f"{age}; it holds for {fact.valid_days:.0f}")
-    return Standing(fact, State.IN_FORCE, age)
+        changes = tuple(sorted(differences(passed[-1], device)))
+        return CalibrationStanding(passed[-1], CalibrationStatus.OTHER_DEVICE, changes=changes)
+    age_days = max((now_utc - here[-1].when_utc).total_seconds() / 86400, 0.0)  # a simulated clock runs ahead
+    status = CalibrationStatus.EXPIRED if here[-1].expired(now_utc) else CalibrationStatus.IN_FORCE
+    return CalibrationStanding(here[-1], status, age_days)

@@ -10,7 +10,7 @@ from rig.core.clock import seconds_between
 from rig.core.errors import DeviceNotFound
 from rig.devices.camera import Camera
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
-from rig.doctor.case import Case
+from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.views.capture import ImageQuality, rejection_text
 
@@ -22,32 +22,32 @@ MAX_FLICKER = 0.05
 """Largest spread of the mean level of frames of one scene."""
 
 
-def camera(case: Case) -> Iterator[Finding]:
+def camera(context: DoctorContext) -> Iterator[Finding]:
     """Open the camera with its locks, and take some frames."""
-    if case.holder is not None:
-        yield warning("camera", "not opened: the bench is in use", case.rig("stop"))
+    if context.holder is not None:
+        yield warning("camera", "not opened: the bench is in use", context.rig("stop"))
         return
-    config = case.config.camera
+    config = context.config.camera
     try:
-        capture = case.computer.open_capture(config.source)
+        capture = context.computer.open_capture(config.source)
     except DeviceNotFound as error:
         yield of_error("camera", error)
         return
     with ExitStack() as opened:
         opened.callback(capture.release)
         settings = CameraSettings(**config.model_dump(exclude={"source"}))
-        source = OpenCvCamera(capture, clock=case.computer.clock, settings=settings, name=f"camera {config.source}")
+        source = OpenCvCamera(capture, clock=context.computer.clock, settings=settings, name=f"camera {config.source}")
         identity = source.identity
-        case.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+        context.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         text = f"{identity.name}: {identity.width}x{identity.height} at {identity.fps:.3g} frames/s"
         yield fine("camera", f"{text}, frames timed by {source.time_base.value} exposure")
-        yield from _locks(case, source)
-        yield from _frames(case, source)
+        yield from _locks(context, source)
+        yield from _frames(context, source)
 
 
-def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
+def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     locks = source.read_locks()
-    device = f" -d {case.config.camera.source}"
+    device = f" -d {context.config.camera.source}"
     for refused in source.rejected_settings:
         yield warning(
             "camera",
@@ -57,8 +57,8 @@ def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
     automatic = [
         name
         for name, value, wanted in (
-            ("exposure", locks.auto_exposure, case.config.camera.exposure_us),
-            ("white balance", locks.auto_white_balance, case.config.camera.white_balance_k),
+            ("exposure", locks.auto_exposure, context.config.camera.exposure_us),
+            ("white balance", locks.auto_white_balance, context.config.camera.white_balance_k),
         )
         if value or (value is None and wanted is not None)
     ]
@@ -71,9 +71,9 @@ def _locks(case: Case, source: OpenCvCamera) -> Iterator[Finding]:
         yield fine("camera", f"locked and read back: exposure {exposure}, white balance {balance}")
 
 
-def _frames(case: Case, source: Camera) -> Iterator[Finding]:
-    clock = case.computer.clock
-    again = "Unplug the camera, plug it in again, then: " + case.rig("doctor")
+def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
+    clock = context.computer.clock
+    again = "Unplug the camera, plug it in again, then: " + context.rig("doctor")
     frames = []
     ages = []
     after_ns = start_ns = clock.now_ns()
@@ -85,13 +85,13 @@ def _frames(case: Case, source: Camera) -> Iterator[Finding]:
         if number == QUICK - 1:
             rate = QUICK / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
-    seen = [ImageQuality.of(frame, case.config.view) for frame in frames]
+    seen = [ImageQuality.of(frame, context.config.view) for frame in frames]
     levels = [each.mean_level for each in seen]
     text = f"frames are {1e3 * max(ages):.0f} ms old when they come, {rate:.3g} a second"
     evidence: dict[str, Any] = {"frame_age_s": max(ages), "frames_per_s": rate, "mean_levels": levels}
-    if max(levels) < case.config.view.min_mean:
-        mend = "Take the lens cap off and switch the light on, then: " + case.rig("doctor")
-        yield bad("camera", f"black: mean level {max(levels):.1f} of 255", mend, **evidence)
+    if max(levels) < context.config.view.min_mean:
+        fix = "Take the lens cap off and switch the light on, then: " + context.rig("doctor")
+        yield bad("camera", f"black: mean level {max(levels):.1f} of 255", fix, **evidence)
         return
     if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
         yield bad("camera", f"frozen: {len(frames)} frames are the same to the pixel", again, **evidence)
@@ -99,20 +99,18 @@ def _frames(case: Case, source: Camera) -> Iterator[Finding]:
     if max(ages) > MAX_AGE_S:
         yield warning("camera", f"{text}: old", "Try another USB port, or a smaller camera.width", **evidence)
     elif rate < 0.6 * source.identity.fps:
-        mend = "Try another USB port, a shorter camera.exposure_us, or a lower camera.fps"
-        yield warning("camera", f"{text}, not {source.identity.fps:.3g}", mend, **evidence)
+        fix = "Try another USB port, a shorter camera.exposure_us, or a lower camera.fps"
+        yield warning("camera", f"{text}, not {source.identity.fps:.3g}", fix, **evidence)
     else:
         yield fine("camera", text, **evidence)
     spread = (max(levels) - min(levels)) / max(levels)
     if spread > MAX_FLICKER:
-        mend = "Use a lamp that does not flicker, keep daylight and shadows away, then: " + case.rig("doctor")
-        yield warning(
-            "camera", f"the light changes by {spread:.0%} within {SPACED * SPACING_S:.0f} s", mend, **evidence
-        )
+        fix = "Use a lamp that does not flicker, keep daylight and shadows away, then: " + context.rig("doctor")
+        yield warning("camera", f"the light changes by {spread:.0%} within {SPACED * SPACING_S:.0f} s", fix, **evidence)
     words = f"mean level {levels[-1]:.0f}, sharpness {seen[-1].sharpness:.0f}, {seen[-1].saturated_share:.1%} saturated"
-    if reasons := seen[-1].reasons(case.config.view):
+    if reasons := seen[-1].reasons(context.config.view):
         texts = "; ".join(rejection_text(reason, seen[-1]) for reason in reasons)
-        mend = "Look at light, exposure and focus; an empty table may look blurred: " + case.rig("config show view")
-        yield warning("camera", f"a frame as it is would be rejected: {texts}", mend)
+        fix = "Look at light, exposure and focus; an empty table may look blurred: " + context.rig("config show view")
+        yield warning("camera", f"a frame as it is would be rejected: {texts}", fix)
     else:
         yield fine("camera", f"a frame as it is would be taken: {words}")

@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.clock import seconds_between
-from rig.doctor.case import Case
+from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, warning
 from rig.safety.saved_state import FileStore
 
@@ -24,104 +24,106 @@ _OLDEST_UTC = datetime(2025, 1, 1, tzinfo=UTC)
 RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
 
 
-def bench_state(case: Case) -> Iterator[Finding]:
+def bench_state(context: DoctorContext) -> Iterator[Finding]:
     """Who works with the bench, and what it must not forget: a latched fault, a damaged file."""
-    path = case.config.state_path(case.bench)
-    if case.holder is not None:
-        who = f"process {case.holder.pid} ({case.holder.command})" if case.holder.pid else "another process"
+    path = context.config.state_path(context.bench)
+    if context.holder is not None:
+        who = f"process {context.holder.pid} ({context.holder.command})" if context.holder.pid else "another process"
         text = f"in use by {who}: servo, IMU and camera are left to it"
-        yield warning("bench", text, case.rig("stop"), pid=case.holder.pid)
+        yield warning("bench", text, context.rig("stop"), pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
         yield bad(
             "bench",
             state.damage,
-            "Look how far the cable is wound up, then: " + case.rig("home --turns N"),
+            "Look how far the cable is wound up, then: " + context.rig("home --turns N"),
             exit_code=5,
         )
     if state.fault is not None:
         fault = state.fault
         text = f"fault {fault.code} ({fault.title}) is latched since {fault.utc}: {fault.what}"
-        yield bad("bench", text, case.rig("acknowledge"), exit_code=5, code=fault.code, next_step=fault.next_step)
-    if case.holder is None and not state.damage and state.fault is None:
-        yield fine("bench", f"{case.bench}: free, no fault latched", state=str(path))
+        yield bad("bench", text, context.rig("acknowledge"), exit_code=5, code=fault.code, next_step=fault.next_step)
+    if context.holder is None and not state.damage and state.fault is None:
+        yield fine("bench", f"{context.bench}: free, no fault latched", state=str(path))
 
 
-def ports(case: Case) -> Iterator[Finding]:
+def ports(context: DoctorContext) -> Iterator[Finding]:
     """The servo's serial port, the IMU's bus and the camera's device file: there, permitted, free, fast."""
-    head = case.config.imu.connection == "head"
-    for key, wanted in (("servo.port", case.config.servo.port), ("head.port", case.config.head.port))[: 1 + head]:
-        port = case.computer.serial_port(wanted)
+    head = context.config.imu.connection == "head"
+    for key, wanted in (("servo.port", context.config.servo.port), ("head.port", context.config.head.port))[: 1 + head]:
+        port = context.computer.serial_port(wanted)
         if port is None:
-            yield _missing(case, key, wanted, case.computer.serial_ports())
+            yield _missing(context, key, wanted, context.computer.serial_ports())
             continue
-        yield from access(case, "port", port, "dialout")
+        yield from access(context, "port", port, "dialout")
         if port.latency_ms is not None:
-            yield _latency(case, port)
+            yield _latency(context, port)
     if not head:
-        yield from _i2c(case)
-    yield from _video(case)
+        yield from _i2c(context)
+    yield from _video(context)
 
 
-def _i2c(case: Case) -> Iterator[Finding]:
-    bus = case.computer.i2c_name(case.config.imu.bus)
-    buses = case.computer.i2c_buses()
-    node = next((n for n in buses if case.computer.same_file(n.path, bus)), None)
+def _i2c(context: DoctorContext) -> Iterator[Finding]:
+    bus = context.computer.i2c_name(context.config.imu.bus)
+    buses = context.computer.i2c_buses()
+    node = next((n for n in buses if context.computer.same_file(n.path, bus)), None)
     if node is not None:
-        yield from access(case, "port", node, "i2c")
+        yield from access(context, "port", node, "i2c")
     elif buses:
-        mend = case.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
-        yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", mend)
+        fix = context.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
+        yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", fix)
     else:
-        yield bad("port", f"there is no I2C bus {bus}, nor any other", i2c_command(case))
+        yield bad("port", f"there is no I2C bus {bus}, nor any other", i2c_command(context))
 
 
-def _video(case: Case) -> Iterator[Finding]:
-    source = case.config.camera.source
+def _video(context: DoctorContext) -> Iterator[Finding]:
+    source = context.config.camera.source
     if isinstance(source, str) and not source.isdigit() and not source.startswith("/dev/"):
         return  # a file or a stream
     camera = f"/dev/video{source}" if str(source).isdigit() else str(source)
-    cameras = case.computer.cameras()
-    node = next((n for n in cameras if case.computer.same_file(n.path, camera)), None)
+    cameras = context.computer.cameras()
+    node = next((n for n in cameras if context.computer.same_file(n.path, camera)), None)
     if node is not None:
-        yield from access(case, "port", node, "video")
+        yield from access(context, "port", node, "video")
     elif cameras:
         yield bad(
             "port",
             f"there is no camera {camera}; there is {_names(cameras)}",
-            case.set("camera.source", cameras[0].stable or cameras[0].path),
+            context.set("camera.source", cameras[0].stable or cameras[0].path),
         )
     else:
         yield bad(
-            "port", f"there is no camera {camera}, nor any other", "Connect the camera, then: " + case.rig("find")
+            "port", f"there is no camera {camera}, nor any other", "Connect the camera, then: " + context.rig("find")
         )
 
 
-def disk(case: Case) -> Iterator[Finding]:
+def disk(context: DoctorContext) -> Iterator[Finding]:
     """Room for views, and a disk that is this computer's own."""
-    path = case.catalog_path
-    there = case.computer.disk(path)
+    path = context.catalog_path
+    there = context.computer.disk(path)
     views = there.free_bytes // VIEW_BYTES
-    text = f"{there.free_bytes / 1e9:.1f} GB free for {path}: about {views // case.config.enroll.views} more objects"
+    text = f"{there.free_bytes / 1e9:.1f} GB free for {path}: about {views // context.config.enroll.views} more objects"
     if there.free_bytes < TOO_LITTLE_ROOM:
-        yield bad("disk", text, case.rig("catalog gc"), exit_code=7, free_bytes=there.free_bytes)
+        yield bad("disk", text, context.rig("catalog gc"), exit_code=7, free_bytes=there.free_bytes)
     elif there.free_bytes < LITTLE_ROOM:
-        yield warning("disk", text, case.rig("catalog gc"), free_bytes=there.free_bytes)
+        yield warning("disk", text, context.rig("catalog gc"), free_bytes=there.free_bytes)
     else:
         yield fine("disk", text, free_bytes=there.free_bytes)
     if not there.writable:
-        mend = (
-            f"sudo chown -R {case.computer.user.name} {path}" if path.exists() else case.set("catalog.path", "FOLDER")
+        fix = (
+            f"sudo chown -R {context.computer.user.name} {path}"
+            if path.exists()
+            else context.set("catalog.path", "FOLDER")
         )
-        yield bad("disk", f"{case.computer.user.name} may not write to {path}", mend, exit_code=7)
+        yield bad("disk", f"{context.computer.user.name} may not write to {path}", fix, exit_code=7)
     if there.network:
-        mend = case.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
-        yield warning("disk", f"{path} is on a network file system, where locks may not hold", mend)
+        fix = context.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
+        yield warning("disk", f"{path} is on a network file system, where locks may not hold", fix)
 
 
-def clock(case: Case) -> Iterator[Finding]:
+def clock(context: DoctorContext) -> Iterator[Finding]:
     """Monotonic time that runs at the right pace, and a civil time that may be written into records."""
-    time = case.computer.clock
+    time = context.computer.clock
     start_ns, start_utc = time.now_ns(), time.utc()
     time.sleep(_PAUSE_S)
     passed_s = seconds_between(start_ns, time.now_ns())
@@ -130,21 +132,21 @@ def clock(case: Case) -> Iterator[Finding]:
         text = (
             f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.0f} ms: this computer is overloaded, or sleeps"
         )
-        yield warning("clock", text, "Close other programs, switch power saving off, then: " + case.rig("doctor"))
+        yield warning("clock", text, "Close other programs, switch power saving off, then: " + context.rig("doctor"))
     else:
         yield fine("clock", f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.1f} ms", pause_s=passed_s)
     now = time.utc()
-    synchronised = case.computer.time_synchronised()
-    mend = "sudo timedatectl set-ntp true"
+    synchronised = context.computer.time_synchronised()
+    fix = "sudo timedatectl set-ntp true"
     if abs(civil_s - passed_s) > _STEP_S:
-        yield warning("clock", f"the civil time jumped by {civil_s - passed_s:+.1f} s while it was watched", mend)
+        yield warning("clock", f"the civil time jumped by {civil_s - passed_s:+.1f} s while it was watched", fix)
     elif now < _OLDEST_UTC or now > _OLDEST_UTC + timedelta(days=365 * 50):
-        yield bad("clock", f"the date is wrong: {now:%Y-%m-%d %H:%M} UTC; what is stored would carry it", mend, 1)
+        yield bad("clock", f"the date is wrong: {now:%Y-%m-%d %H:%M} UTC; what is stored would carry it", fix, 1)
     elif synchronised is False:
         text = f"{now:%Y-%m-%d %H:%M} UTC, but no time server has been reached since this computer started"
-        yield warning("clock", text, mend)
+        yield warning("clock", text, fix)
     elif synchronised is None:
-        yield warning("clock", f"{now:%Y-%m-%d %H:%M} UTC, kept by no time server that is known here", mend)
+        yield warning("clock", f"{now:%Y-%m-%d %H:%M} UTC, kept by no time server that is known here", fix)
     else:
         yield fine("clock", f"{now:%Y-%m-%d %H:%M} UTC, kept by a time server")
 
@@ -170,58 +172,58 @@ def udev_rules(ports_found: list[SerialPort]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def udev_command(case: Case) -> str:
+def udev_command(context: DoctorContext) -> str:
     """Return the command that puts the rules in force."""
     return (
-        f"{case.rig('doctor --udev')} | sudo tee {RULES_FILE} && "
+        f"{context.rig('doctor --udev')} | sudo tee {RULES_FILE} && "
         "sudo udevadm control --reload && sudo udevadm trigger --action=add"
     )
 
 
-def i2c_command(case: Case) -> str:
+def i2c_command(context: DoctorContext) -> str:
     """Return the command that makes a computer's I2C buses appear."""
-    return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in case.computer.model else "sudo modprobe i2c-dev"
+    return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in context.computer.model else "sudo modprobe i2c-dev"
 
 
-def _missing(case: Case, key: str, wanted: str, found: list[SerialPort]) -> Finding:
+def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPort]) -> Finding:
     usb = [port for port in found if port.usb]
     if not usb:
-        mend = "Plug the adapter in, then: " + case.rig("find")
-        return bad("port", f"there is no serial port {wanted}, nor any other on USB", mend)
-    mend = case.set(key, usb[0].stable or usb[0].path) if len(usb) == 1 else case.rig("setup")
-    return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", mend)
+        fix = "Plug the adapter in, then: " + context.rig("find")
+        return bad("port", f"there is no serial port {wanted}, nor any other on USB", fix)
+    fix = context.set(key, usb[0].stable or usb[0].path) if len(usb) == 1 else context.rig("setup")
+    return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", fix)
 
 
-def access(case: Case, topic: str, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
+def access(context: DoctorContext, topic: str, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
     """Say whether a device file can be opened: nobody else has it open, and the user may."""
     if node.holders:
         who = " and ".join(map(str, node.holders))
-        if not (case.holder and case.holder.pid in {process.pid for process in node.holders}):
+        if not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
             modem = "ModemManager" in node.holders[0].command
-            mend = "sudo systemctl disable --now ModemManager" if modem else f"kill {node.holders[0].pid}"
-            yield bad(topic, f"{node.path} is held by {who}", mend, holders=who)
+            fix = "sudo systemctl disable --now ModemManager" if modem else f"kill {node.holders[0].pid}"
+            yield bad(topic, f"{node.path} is held by {who}", fix, holders=who)
             return
     if node.usable:
         yield fine(topic, f"{node.path}: {node.name}" + (f" ({node.stable})" if node.stable else ""))
         return
     group = node.group or usual_group
-    text = f"{case.computer.user.name} may not use {node.path} ({node.name})"
+    text = f"{context.computer.user.name} may not use {node.path} ({node.name})"
     if group == "root":
-        yield bad(topic, f"{text}: it belongs to root alone", udev_command(case))
-    elif case.computer.joined(group):
+        yield bad(topic, f"{text}: it belongs to root alone", udev_command(context))
+    elif context.computer.joined(group):
         yield bad(topic, f"{text} yet: the group {group} counts from the next login on", f"newgrp {group}")
     else:
-        mend = f"sudo usermod -aG {group} {case.computer.user.name}"
-        yield bad(topic, f"{text}: the group {group} may; log in again after this", mend, group=group)
+        fix = f"sudo usermod -aG {group} {context.computer.user.name}"
+        yield bad(topic, f"{text}: the group {group} may; log in again after this", fix, group=group)
 
 
-def _latency(case: Case, port: SerialPort) -> Finding:
+def _latency(context: DoctorContext, port: SerialPort) -> Finding:
     text = f"latency timer of {port.path} is {port.latency_ms} ms"
     if port.latency_ms is None or port.latency_ms <= LATENCY_MS:
         return fine("port", text, latency_ms=port.latency_ms)
     return warning(
         "port",
-        f"{text}: each reading waits for it; {LATENCY_MS} ms is right (for good: {case.rig('doctor --udev')})",
+        f"{text}: each reading waits for it; {LATENCY_MS} ms is right (for good: {context.rig('doctor --udev')})",
         f"echo {LATENCY_MS} | sudo tee {port.latency_file}",
         latency_ms=port.latency_ms,
     )

@@ -7,7 +7,7 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 
 from rig.core.errors import RigError
-from rig.doctor.case import Case
+from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, of_error
 
 
@@ -20,12 +20,14 @@ class Check:
     """
 
     topic: str
-    look: Callable[[Case], Iterator[Finding | str]]
+    look: Callable[[DoctorContext], Iterator[Finding | str]]
     deadline_s: float = 15.0
     if_it_hangs: str = "Unplug the device, plug it in again, and start over"
 
 
-def examine(case: Case, checks: Iterable[Check], say: Callable[[str], None] = lambda _: None) -> Iterator[Finding]:
+def run_checks(
+    context: DoctorContext, checks: Iterable[Check], say: Callable[[str], None] = lambda _: None
+) -> Iterator[Finding]:
     """Yield what the checks find, in their order; none of them can stop the others.
 
     ``say`` is called with what is being done, for those who wait, and with nothing before each finding.
@@ -34,7 +36,7 @@ def examine(case: Case, checks: Iterable[Check], say: Callable[[str], None] = la
     """
     for check in checks:
         told: SimpleQueue[Finding | str | None] = SimpleQueue()
-        Thread(target=_run, args=(case, check, told.put), name=check.topic, daemon=True).start()
+        Thread(target=_run, args=(context, check, told.put), name=check.topic, daemon=True).start()
         while True:
             try:
                 item = told.get(timeout=check.deadline_s)
@@ -50,14 +52,14 @@ def examine(case: Case, checks: Iterable[Check], say: Callable[[str], None] = la
                 yield item
 
 
-def _run(case: Case, check: Check, tell: Callable[[Finding | str | None], None]) -> None:
+def _run(context: DoctorContext, check: Check, tell: Callable[[Finding | str | None], None]) -> None:
     try:
-        for item in check.look(case):
+        for item in check.look(context):
             tell(item)
     except RigError as error:
         tell(of_error(check.topic, error))
     except OSError as error:  # a device that was pulled out meanwhile, a file that cannot be read
-        tell(bad(check.topic, f"the check broke off: {error}", case.rig("doctor"), error=repr(error)))
+        tell(bad(check.topic, f"the check broke off: {error}", context.rig("doctor"), error=repr(error)))
     except Exception as error:  # a doctor must not die of what it finds; this is a bug, and is told as one
         text = f"the check itself failed: {type(error).__name__}: {error}"
         tell(bad(check.topic, text, "Report this with the output of `rig doctor --json`", exit_code=1))

@@ -1,4 +1,4 @@
-"""What an examination says: one finding a line, and one command that mends it."""
+"""What an examination says: one finding a line, and one command that fixes it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from typing import Any
 from rig.core.errors import RigError
 
 
-class Level(StrEnum):
+class Severity(StrEnum):
     """How bad it is: nothing to do, something to look at, something that stops the work."""
 
     FINE = "fine"
@@ -16,7 +16,7 @@ class Level(StrEnum):
     BAD = "bad"
 
 
-MARKS = {Level.FINE: "✓", Level.WARNING: "!", Level.BAD: "✗"}
+MARKS = {Severity.FINE: "✓", Severity.WARNING: "!", Severity.BAD: "✗"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +31,8 @@ class Finding:
         How bad it is.
     text
         What was found, with its numbers.
-    mend
-        The one command, or act of the hands, that mends it; empty where there is nothing to mend.
+    fix
+        The one command, or act of the hands, that fixes it; empty where there is nothing to fix.
     exit_code
         What `rig doctor` ends with because of it, 0 unless the finding is bad.
     evidence
@@ -40,9 +40,9 @@ class Finding:
     """
 
     topic: str
-    level: Level
+    level: Severity
     text: str
-    mend: str = ""
+    fix: str = ""
     exit_code: int = 0
     evidence: Mapping[str, Any] = field(default_factory=dict)
 
@@ -51,25 +51,25 @@ class Finding:
             "topic": self.topic,
             "level": str(self.level),
             "finding": self.text,
-            "mend": self.mend or None,
+            "fix": self.fix or None,
             "evidence": dict(self.evidence),
         }
 
 
 def fine(topic: str, text: str, **evidence: Any) -> Finding:
-    return Finding(topic, Level.FINE, text, evidence=evidence)
+    return Finding(topic, Severity.FINE, text, evidence=evidence)
 
 
-def warning(topic: str, text: str, mend: str, **evidence: Any) -> Finding:
-    return Finding(topic, Level.WARNING, text, mend, evidence=evidence)
+def warning(topic: str, text: str, fix: str, **evidence: Any) -> Finding:
+    return Finding(topic, Severity.WARNING, text, fix, evidence=evidence)
 
 
-def bad(topic: str, text: str, mend: str, exit_code: int = 4, **evidence: Any) -> Finding:
-    return Finding(topic, Level.BAD, text, mend, exit_code, evidence)
+def bad(topic: str, text: str, fix: str, exit_code: int = 4, **evidence: Any) -> Finding:
+    return Finding(topic, Severity.BAD, text, fix, exit_code, evidence)
 
 
-def of_error(topic: str, error: RigError, mend: str = "") -> Finding:
+def of_error(topic: str, error: RigError, fix: str = "") -> Finding:
     """Return an error of the registry as a finding."""
     reason = error.evidence.get("reason")
     text = f"{error.what.rstrip('.')}: {reason}" if reason else error.what
-    return Finding(topic, Level.BAD, text, mend or error.next_step, error.exit_code, error.evidence)
+    return Finding(topic, Severity.BAD, text, fix or error.next_step, error.exit_code, error.evidence)

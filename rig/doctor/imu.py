@@ -11,9 +11,9 @@ from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, ImuSamples
 from rig.devices.open_imu import open_imu
-from rig.doctor.case import Case
+from rig.doctor.bus_scan import FoundImu, scan_imus
+from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.doctor.scan import FoundImu, scan_imus
 
 SECONDS, DRAIN_S = 1.5, 0.25
 NOISY = 4.0
@@ -25,51 +25,51 @@ UPRIGHT = 0.94
 """Share of gravity along the table's axis when the sensor lies within 20° of it."""
 
 
-def imu(case: Case) -> Iterator[Finding]:
+def imu(context: DoctorContext) -> Iterator[Finding]:
     """Identify the sensor, then look at its noise, its zero, and which way is up for it."""
-    if case.holder is not None:
-        yield warning("imu", "not asked: opening it would spoil the measurement that is running", case.rig("stop"))
+    if context.holder is not None:
+        yield warning("imu", "not asked: opening it would spoil the measurement that is running", context.rig("stop"))
         return
-    config, clock = case.config, case.computer.clock
+    config, clock = context.config, context.computer.clock
     if config.imu.connection == "head":
-        head = open_head(config, lambda: case.computer.open_serial(config.head.port, BAUD), clock)
+        head = open_head(config, lambda: context.computer.open_serial(config.head.port, BAUD), clock)
         with closing(head):
             who = head.identity
             text = f"{who.model} on a rig head ({who.board}, firmware {who.firmware}) at {config.head.port}"
             yield fine("imu", text, serial=who.serial)
             if (fault := head.fault) is not None:
-                yield of_error("imu", fault, case.rig("acknowledge"))
-            yield from _at_rest(case, head)
+                yield of_error("imu", fault, context.rig("acknowledge"))
+            yield from _at_rest(context, head)
         return
     try:
-        there = scan_imus(case.computer, config.imu.bus)
+        there = scan_imus(context.computer, config.imu.bus)
     except OSError as error:
-        yield _bus_failed(case, error)
+        yield _bus_failed(context, error)
         return
     here = next((found for found in there if found.address == config.imu.address), None)
     if here is None or here.driver is None:
-        yield _wrong(case, config.imu, here, there)
+        yield _wrong(context, config.imu, here, there)
         return
-    with closing(open_imu(config.imu, case.computer.i2c_path(config.imu.bus), clock)) as sensor:
-        bus, identity = case.computer.i2c_name(config.imu.bus), sensor.identity
+    with closing(open_imu(config.imu, context.computer.i2c_path(config.imu.bus), clock)) as sensor:
+        bus, identity = context.computer.i2c_name(config.imu.bus), sensor.identity
         text = f"{identity.model} at {identity.bus_address:#04x} of {bus} (identity {identity.who_am_i:#04x})"
         yield fine("imu", text)
-        yield from _at_rest(case, sensor)
+        yield from _at_rest(context, sensor)
 
 
-def _at_rest(case: Case, sensor: Imu) -> Iterator[Finding]:
+def _at_rest(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
     identity = sensor.identity
-    case.identities["imu"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
-    yield from _rest(case, sensor, _samples(case, sensor))
-    yield from _gravity(case, sensor)
+    context.identities["imu"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+    yield from _rest(context, sensor, _samples(context, sensor))
+    yield from _gravity(context, sensor)
 
 
-def _samples(case: Case, sensor: Imu) -> ImuSamples:
+def _samples(context: DoctorContext, sensor: Imu) -> ImuSamples:
     """Collect ``SECONDS`` of samples, what is old thrown away first."""
     sensor.read_samples()
     taken = []
     for _ in range(round(SECONDS / DRAIN_S)):
-        case.computer.clock.sleep(DRAIN_S)
+        context.computer.clock.sleep(DRAIN_S)
         taken.append(sensor.read_samples())
     return ImuSamples(
         np.concatenate([part.time_ns for part in taken]),
@@ -78,12 +78,12 @@ def _samples(case: Case, sensor: Imu) -> ImuSamples:
     )
 
 
-def _rest(case: Case, sensor: Imu, samples: ImuSamples) -> Iterator[Finding]:
-    axis = "xyz".index(case.config.imu.axis)
+def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Iterator[Finding]:
+    axis = "xyz".index(context.config.imu.axis)
     wanted = SECONDS * sensor.rate_hz
     if len(samples.time_ns) < 0.8 * wanted:
         text = f"{len(samples.time_ns)} samples in {SECONDS:g} s instead of {wanted:.0f}, {samples.lost} lost"
-        yield bad("imu", text, "Shorten the I2C cable, take other devices off the bus, then: " + case.rig("doctor"))
+        yield bad("imu", text, "Shorten the I2C cable, take other devices off the bus, then: " + context.rig("doctor"))
         return
     rates = samples.gyro_dps
     spread = rates.std(axis=0)
@@ -92,57 +92,57 @@ def _rest(case: Case, sensor: Imu, samples: ImuSamples) -> Iterator[Finding]:
     text = f"at rest: noise {spread[axis]:.3f} °/s, zero at {bias:+.2f} °/s"
     evidence: dict[str, Any] = {"noise_dps": float(spread[axis]), "bias_dps": bias, "samples": len(rates)}
     if (np.abs(rates) >= sensor.range_dps * 0.999).any():
-        mend = "Check the sensor's supply and cable, then: " + case.rig("doctor")
-        yield bad("imu", f"saturated at {sensor.range_dps:.0f} °/s although nothing moves", mend, **evidence)
+        fix = "Check the sensor's supply and cable, then: " + context.rig("doctor")
+        yield bad("imu", f"saturated at {sensor.range_dps:.0f} °/s although nothing moves", fix, **evidence)
     elif (rates == rates[0]).all():
-        mend = "Switch the sensor's supply off and on, then: " + case.rig("doctor")
-        yield bad("imu", "frozen: every sample is the same, not even noise", mend, **evidence)
+        fix = "Switch the sensor's supply off and on, then: " + context.rig("doctor")
+        yield bad("imu", "frozen: every sample is the same, not even noise", fix, **evidence)
     elif spread.max() > NO_REST_DPS:
-        mend = "Check the sensor's supply, ground and cable, then: " + case.rig("doctor")
-        yield bad("imu", f"{text}: no table at rest shakes so, and no motor runs", mend, **evidence)
+        fix = "Check the sensor's supply, ground and cable, then: " + context.rig("doctor")
+        yield bad("imu", f"{text}: no table at rest shakes so, and no motor runs", fix, **evidence)
     elif spread.max() > NOISY * expected:
-        mend = "Keep hands and vibration off the bench, then: " + case.rig("doctor")
-        yield warning("imu", f"{text}: restless, {expected:.3f} °/s is usual", mend, **evidence)
+        fix = "Keep hands and vibration off the bench, then: " + context.rig("doctor")
+        yield warning("imu", f"{text}: restless, {expected:.3f} °/s is usual", fix, **evidence)
     elif abs(bias) > MAX_BIAS_DPS:
         yield bad("imu", f"{text}: no sensor of its kind is as far off", "Replace the sensor", **evidence)
     else:
         yield fine("imu", text, **evidence)
 
 
-def _gravity(case: Case, sensor: Imu) -> Iterator[Finding]:
+def _gravity(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
     gravity = sensor.read_gravity_g()
     size = float(np.linalg.norm(gravity))
-    axis = case.config.imu.axis
+    axis = context.config.imu.axis
     along = float(gravity["xyz".index(axis)])
     evidence: dict[str, Any] = {"gravity_g": [round(float(g), 4) for g in gravity]}
     if not 0.8 < size < 1.2:
-        mend = "Check the sensor's supply, then: " + case.rig("doctor")
-        yield bad("imu", f"gravity is {size:.2f} g", mend, **evidence)
+        fix = "Check the sensor's supply, then: " + context.rig("doctor")
+        yield bad("imu", f"gravity is {size:.2f} g", fix, **evidence)
     elif abs(along) < UPRIGHT * size:
         upright = "xyz"[int(np.abs(gravity).argmax())]
         text = f"its {axis} axis does not point along the table's axis: {along / size:+.2f} of gravity is along it"
-        mend = case.set("imu.axis", upright) if upright != axis else "Mount the sensor flat on the platter"
-        yield warning("imu", text, mend, **evidence)
+        fix = context.set("imu.axis", upright) if upright != axis else "Mount the sensor flat on the platter"
+        yield warning("imu", text, fix, **evidence)
     else:
         yield fine("imu", f"gravity {size:.2f} g, {abs(along / size):.0%} of it along {axis}", **evidence)
 
 
-def _wrong(case: Case, config: ImuConfig, here: FoundImu | None, there: list[FoundImu]) -> Finding:
-    bus = case.computer.i2c_name(config.bus)
+def _wrong(context: DoctorContext, config: ImuConfig, here: FoundImu | None, there: list[FoundImu]) -> Finding:
+    bus = context.computer.i2c_name(config.bus)
     if here is not None:
-        mend = "Check its wiring; the rig drives MPU-6050 and BNO055"
-        return bad("imu", f"{here}: the rig has no driver for it", mend, address=here.address)
+        fix = "Check its wiring; the rig drives MPU-6050 and BNO055"
+        return bad("imu", f"{here}: the rig has no driver for it", fix, address=here.address)
     usable = [found for found in there if found.driver]
     text = f"nobody answers at {config.address:#04x} of {bus}"
     if usable:
-        return bad("imu", f"{text}; there is {usable[0]}", case.set("imu.address", f"{usable[0].address:#04x}"))
-    mend = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + case.rig("find")
-    return bad("imu", f"{text}, nor at any other address of an IMU", mend)
+        return bad("imu", f"{text}; there is {usable[0]}", context.set("imu.address", f"{usable[0].address:#04x}"))
+    fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
+    return bad("imu", f"{text}, nor at any other address of an IMU", fix)
 
 
-def _bus_failed(case: Case, error: OSError) -> Finding:
-    bus = case.computer.i2c_name(case.config.imu.bus)
+def _bus_failed(context: DoctorContext, error: OSError) -> Finding:
+    bus = context.computer.i2c_name(context.config.imu.bus)
     if isinstance(error, FileNotFoundError | PermissionError):
-        return bad("imu", f"{bus} cannot be opened: {error.strerror}", case.rig("find"))
-    mend = "Take the sensor's supply off and on; check SDA and SCL for a short"
-    return bad("imu", f"{bus} does not move: {error.strerror}; a device holds the bus", mend, errno=error.errno)
+        return bad("imu", f"{bus} cannot be opened: {error.strerror}", context.rig("find"))
+    fix = "Take the sensor's supply off and on; check SDA and SCL for a short"
+    return bad("imu", f"{bus} does not move: {error.strerror}; a device holds the bus", fix, errno=error.errno)

@@ -10,9 +10,9 @@ from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import control_table, protocol_of
-from rig.doctor.case import Case
+from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
+from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos, without_echoes
 
 READS = 100
 REPEATED = 2
@@ -23,97 +23,97 @@ IMPOSSIBLE_C = 150
 POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then: "
 
 
-def servo(case: Case) -> Iterator[Finding | str]:
+def servo(context: DoctorContext) -> Iterator[Finding | str]:
     """Find the configured servo, whoever else is on its bus, and look at its settings, supply and temperature."""
-    if case.holder is not None:
-        yield warning("servo", "not asked: the bench is in use", case.rig("stop"))
+    if context.holder is not None:
+        yield warning("servo", "not asked: the bench is in use", context.rig("stop"))
         return
-    config = case.config.servo
-    if case.config.imu.connection == "head" and case.config.head.power:
+    config = context.config.servo
+    if context.config.imu.connection == "head" and context.config.head.power:
         text = "not asked: its supply goes through the rig head's relay, which is closed only while a program works"
-        yield warning("servo", text, case.rig("status"))
+        yield warning("servo", text, context.rig("status"))
         return
     with ExitStack() as opened:
         try:
-            wire = case.computer.open_serial(config.port, config.baud)
+            wire = context.computer.open_serial(config.port, config.baud)
         except DeviceNotFound as error:
             yield of_error("servo", error)
             return
         opened.callback(wire.close)
         try:
-            found = open_servo(wire, config, case.computer.clock, case.config.table.mode)
+            found = open_servo(wire, config, context.computer.clock, context.config.table.mode)
         except DeviceNotFound:
-            yield from _elsewhere(case, wire)
+            yield from _elsewhere(context, wire)
             return
         except DeviceMismatch as error:
-            yield of_error("servo", error, case.set("servo.model", error.evidence["got"]))
+            yield of_error("servo", error, context.set("servo.model", error.evidence["got"]))
             return
         except DeviceSilent as error:
-            yield from _alone(case, wire)
+            yield from _alone(context, wire)
             yield of_error("servo", error)
             return
         identity = found.identity
-        case.identities["servo"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
+        context.identities["servo"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         name = identity.model.replace("_", "-").upper()
         yield fine(
             "servo", f"{name}, firmware {identity.firmware}, id {config.id} at {config.baud} baud, {config.port}"
         )
         for remark in found.remarks:
             yield warning("servo", remark.removeprefix("servo: "), "Stay beside it, or use a servo of the X series")
-        yield from _alone(case, wire)
-        yield from _settings(case, found)
-        yield from _condition(case, found)
-        yield from _line(case, found)
+        yield from _alone(context, wire)
+        yield from _settings(context, found)
+        yield from _condition(context, found)
+        yield from _line(context, found)
 
 
-def _elsewhere(case: Case, wire: SerialConnection) -> Iterator[Finding | str]:
+def _elsewhere(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding | str]:
     """Nobody answers where the configuration says: look at the other baud rates, and say who is there instead."""
-    config = case.config.servo
+    config = context.config.servo
     protocol = protocol_of(config.model)
     rates = BAUD_RATES if protocol == 2 else BAUD_RATES_1
-    answered: list[Heard] = []
+    answered: list[BaudScan] = []
     for rate in [config.baud, *(rate for rate in rates if rate != config.baud)]:
         yield f"{config.port}: nobody at id {config.id}; asking at {rate} baud ..."
-        for heard in scan_servos(wire, case.computer.clock, [rate], protocol=protocol):
-            if heard.doubtful:
-                yield _duplicate(case, heard)
+        for heard in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
+            if heard.duplicate_ids:
+                yield _duplicate(context, heard)
                 return
             answered.append(heard)
     there = [found for heard in without_echoes(answered, config.baud) for found in heard.servos]
     wanted = f"no servo answers at id {config.id}, {config.baud} baud, {config.port}"
     if not there:
-        yield bad("servo", f"{wanted}, nor any other at any baud rate", POWER + case.rig("doctor"))
+        yield bad("servo", f"{wanted}, nor any other at any baud rate", POWER + context.rig("doctor"))
         return
     if len(there) > 1:
         listed = "; ".join(map(str, there))
-        yield bad("servo", f"{wanted}; {len(there)} others do: {listed}", case.rig("setup"))
+        yield bad("servo", f"{wanted}; {len(there)} others do: {listed}", context.rig("setup"))
         return
-    yield bad("servo", f"{wanted}; there is {there[0]}", _follow(case, config, there[0]))
+    yield bad("servo", f"{wanted}; there is {there[0]}", _follow(context, config, there[0]))
 
 
-def _follow(case: Case, config: ServoConfig, there: FoundServo) -> str:
+def _follow(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
     """Return the command that makes the configuration say what there is."""
     differing = {
         "servo.id": (config.id, there.bus_id),
         "servo.baud": (config.baud, there.baud),
         "servo.model": (config.model, there.model or config.model),
     }
-    changes = [case.set(key, now) for key, (was, now) in differing.items() if was != now]
-    return changes[0] if len(changes) == 1 else case.rig("setup")
+    changes = [context.set(key, now) for key, (was, now) in differing.items() if was != now]
+    return changes[0] if len(changes) == 1 else context.rig("setup")
 
 
-def _alone(case: Case, wire: SerialConnection) -> Iterator[Finding]:
+def _alone(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding]:
     """Say who else answers at this baud rate, and whether two answer at once."""
-    config = case.config.servo
+    config = context.config.servo
     if protocol_of(config.model) == 1:
         return  # has no broadcast ping: `rig find` asks each id
-    for heard in scan_servos(wire, case.computer.clock, [config.baud]):
+    for heard in scan_servos(wire, context.computer.clock, [config.baud]):
         others = [servo for servo in heard.servos if servo.bus_id != config.id]
-        if heard.doubtful:
-            yield _duplicate(case, heard)
+        if heard.duplicate_ids:
+            yield _duplicate(context, heard)
         elif heard.noise:
             text = "bytes arrive that are no servo's: another program or adapter on the line, or a loose contact"
-            yield warning("servo", text, "Take everything but the servo off the bus, then: " + case.rig("doctor"))
+            yield warning("servo", text, "Take everything but the servo off the bus, then: " + context.rig("doctor"))
         elif others:
             listed = "; ".join(map(str, others))
             yield fine("servo", f"also on the bus, left alone: {listed}")
@@ -121,23 +121,23 @@ def _alone(case: Case, wire: SerialConnection) -> Iterator[Finding]:
             yield fine("servo", "alone on its bus, no id twice")
 
 
-def _duplicate(case: Case, heard: Heard) -> Finding:
-    ids = ", ".join(map(str, heard.doubtful))
+def _duplicate(context: DoctorContext, heard: BaudScan) -> Finding:
+    ids = ", ".join(map(str, heard.duplicate_ids))
     return bad(
         "servo",
         f"two servos answer at once to id {ids} at {heard.baud} baud (or the line is very bad)",
-        f"Unplug one of the two, then: {case.rig(f'servo set-id {_free_id(heard)}')}",
-        ids=list(heard.doubtful),
+        f"Unplug one of the two, then: {context.rig(f'servo set-id {_free_id(heard)}')}",
+        ids=list(heard.duplicate_ids),
         baud=heard.baud,
     )
 
 
-def _free_id(heard: Heard) -> int:
-    taken = {servo.bus_id for servo in heard.servos} | set(heard.doubtful)
+def _free_id(heard: BaudScan) -> int:
+    taken = {servo.bus_id for servo in heard.servos} | set(heard.duplicate_ids)
     return next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
 
 
-def _settings(case: Case, found: RegisterServo) -> Iterator[Finding]:
+def _settings(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
     differences = found.setting_differences()
     if not differences:
         yield fine("servo", "its permanent settings (EEPROM) are as the rig needs them")
@@ -145,23 +145,23 @@ def _settings(case: Case, found: RegisterServo) -> Iterator[Finding]:
         yield bad(
             "servo",
             f"EEPROM {difference}",
-            case.rig("servo settings --write"),
+            context.rig("servo settings --write"),
             register=difference.register,
             found=difference.found,
             wanted=difference.wanted,
         )
 
 
-def _condition(case: Case, found: RegisterServo) -> Iterator[Finding]:
-    state, limits, safety = found.read_state(), found.limits, case.config.safety
+def _condition(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
+    state, limits, safety = found.read_state(), found.limits, context.config.safety
     condition = found.read_condition()
     if condition.hardware_errors:
         text = f"reports a hardware error: {', '.join(condition.hardware_errors)}; torque stays off until it restarts"
-        yield bad("servo", text, case.rig("acknowledge --reboot"), hardware_errors=list(condition.hardware_errors))
+        yield bad("servo", text, context.rig("acknowledge --reboot"), hardware_errors=list(condition.hardware_errors))
     if condition.watchdog_tripped:
-        yield warning("servo", "its watchdog tripped: a program died while the table moved", case.rig("status"))
+        yield warning("servo", "its watchdog tripped: a program died while the table moved", context.rig("status"))
     if condition.torque:
-        yield warning("servo", "its torque is on although nobody works with it", case.rig("stop"))
+        yield warning("servo", "its torque is on although nobody works with it", context.rig("stop"))
     low, high = limits.voltage_v
     if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
         text = f"tells what cannot be: {state.voltage_v:.1f} V and {state.temperature_c:.0f} °C"
@@ -177,14 +177,14 @@ def _condition(case: Case, found: RegisterServo) -> Iterator[Finding]:
         yield fine("servo", text, voltage_v=state.voltage_v)
     text = f"temperature {state.temperature_c:.0f} °C (the servo shuts down above {limits.temperature_c:.0f} °C)"
     if state.temperature_c >= limits.temperature_c - safety.temperature_margin_c:
-        mend = "Let it cool, and look for what makes the table hard to turn"
-        yield bad("servo", text, mend, temperature_c=state.temperature_c)
+        fix = "Let it cool, and look for what makes the table hard to turn"
+        yield bad("servo", text, fix, temperature_c=state.temperature_c)
     else:
         yield fine("servo", text, temperature_c=state.temperature_c)
 
 
-def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
-    clock = case.computer.clock
+def _line(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
+    clock = context.computer.clock
     before = found.bus_statistics
     ticks = _ticks(found)
     start_ns = clock.now_ns()
@@ -194,19 +194,24 @@ def _line(case: Case, found: RegisterServo) -> Iterator[Finding]:
     after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
         text = f"frozen: its own clock stood at {ticks} ms during {READS} readings, so no reading of it can be believed"
-        yield bad("servo", text, "Switch the servo's supply off and on, then: " + case.rig("doctor"), tick_ms=ticks)
+        yield bad("servo", text, "Switch the servo's supply off and on, then: " + context.rig("doctor"), tick_ms=ticks)
         return
     again = after["retries"] - before["retries"]
     text = f"{READS} readings of {each_ms:.1f} ms each, {again or 'none'} repeated"
     if again > REPEATED:
         yield warning("servo", text, "Check the plugs of the servo's cable", retries=again, reading_ms=each_ms)
-    elif each_ms > SLOW * 1e3 * case.config.table.poll_s:
+    elif each_ms > SLOW * 1e3 * context.config.table.poll_s:
         port = next(
-            (p for p in case.computer.serial_ports() if case.computer.same_file(p.path, case.config.servo.port)), None
+            (
+                p
+                for p in context.computer.serial_ports()
+                if context.computer.same_file(p.path, context.config.servo.port)
+            ),
+            None,
         )
-        mend = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
-        mend = mend or case.rig("servo set-baud 1000000")
-        yield warning("servo", text + ": slow", mend, retries=again, reading_ms=each_ms)
+        fix = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
+        fix = fix or context.rig("servo set-baud 1000000")
+        yield warning("servo", text + ": slow", fix, retries=again, reading_ms=each_ms)
     else:
         yield fine("servo", text, retries=again, reading_ms=each_ms)
 

@@ -1,12 +1,11 @@
-"""The cable's reach, taught by hand."""
-
-from datetime import UTC, datetime
+"""The cable budget, shown by hand."""
 
 import pytest
 
-from calibration.cable import MARGIN_DEG, from_data, live
-from calibration.events import Ask
-from rig.calibrations import put_in_force
+from calibration.cable import MARGIN_DEG, Cable, evaluate
+from calibration.procedure import Ask
+from rig.calibrations import RefusalCode, apply_results
+from tests.calibration.refused import codes
 
 
 def hand(s, angle_deg: float) -> None:
@@ -14,36 +13,36 @@ def hand(s, angle_deg: float) -> None:
     s.bench.clock.sleep(abs(angle_deg) / 60)
 
 
-def test_the_ends_that_a_hand_shows_become_the_limits(simulated):
+def test_ends_shown_by_hand_become_the_limits(simulated):
     s = simulated(seed=2)
-    fact = None
+    result = None
     turns = iter([500.0, -1100.0, 600.0])
-    for event in live(s.bench):
+    for event in Cable().live(s.bench):
         if isinstance(event, Ask):
             hand(s, next(turns))
         else:
-            fact = event
-    assert fact.passed, fact.refusals
-    low, high = fact.settings["table.limits_deg"]
+            result = event
+    assert result.passed, result.refusals
+    low, high = result.settings["table.limits_deg"]
     assert high == pytest.approx(500 - MARGIN_DEG, abs=2)
     assert low == pytest.approx(-600 + MARGIN_DEG, abs=2)
-    config, _ = put_in_force(s.bench.config, [fact])
+    config, _ = apply_results(s.bench.config, [result])
     assert config.table.limits_deg == (low, high)
 
 
 @pytest.mark.parametrize(
-    ("high", "low", "pan", "reason"),
+    ("high", "low", "pan", "code"),
     [
-        (-200.0, 200.0, False, "table.direction"),
-        (150.0, -150.0, False, 'table.mode = "pan"'),
-        (900.0, 60.0, False, "rig home --set"),
+        (-200.0, 200.0, False, RefusalCode.CABLE_ENDS_SWAPPED),
+        (150.0, -150.0, False, RefusalCode.CABLE_TOO_SHORT),
+        (900.0, 60.0, False, RefusalCode.HOME_OUTSIDE_CABLE),
     ],
 )
-def test_ends_that_cannot_be_are_refused_with_what_to_do(high, low, pan, reason):
-    fact = from_data(high, low, pan=pan, when_utc=datetime(2026, 3, 1, tzinfo=UTC), device={})
-    assert reason in fact.refusals[0]
-    assert not fact.settings
+def test_impossible_ends_are_refused(high, low, pan, code):
+    result = evaluate(high, low, pan=pan)
+    assert codes(result) == [code]
+    assert not result.settings
 
 
-def test_a_pan_table_needs_no_whole_turn():
-    assert from_data(150.0, -150.0, pan=True, when_utc=datetime(2026, 3, 1, tzinfo=UTC), device={}).passed
+def test_pan_table_needs_no_whole_revolution():
+    assert evaluate(150.0, -150.0, pan=True).passed

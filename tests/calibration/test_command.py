@@ -1,4 +1,4 @@
-"""`rig calibrate` as its users call it."""
+"""`rig calibrate` on the command line."""
 
 import json
 from datetime import timedelta
@@ -18,7 +18,7 @@ from rig.views.charuco_board import Board
 @pytest.fixture
 def rig(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config = 'default_bench = "sim"\ncalibration_dir = "facts"\n[catalog]\npath = "catalog"\n'
+    config = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
     (tmp_path / "rig.toml").write_text(config, encoding="utf-8")
 
     def run(*arguments: str):
@@ -27,21 +27,21 @@ def rig(tmp_path, monkeypatch):
     return run
 
 
-def test_the_help_has_an_example_and_the_group_lists_the_procedure(rig):
+def test_help_has_an_example_and_lists_the_procedures(rig):
     assert "Example: rig calibrate imu" in " ".join(rig("calibrate", "imu", "--help").output.split())
     assert "imu" in rig("calibrate", "--help").output
 
 
-def test_what_passed_is_kept_and_in_force_from_then_on(rig, tmp_path):
+def test_passed_results_are_stored_and_in_force(rig, tmp_path):
     done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4", "--seed", "6")
     assert done.exit_code == 0, done.output
-    paths = sorted((tmp_path / "facts" / "sim").iterdir())
-    facts = [CalibrationResult.from_file(path) for path in paths]
-    assert [fact.name for fact in facts] == ["imu.scale", "imu.mounting", "imu.noise", "imu.rotation"]
-    for path, fact in zip(paths, facts, strict=True):
-        assert f"PASS {fact.name}" in done.stdout
+    paths = sorted((tmp_path / "calibrations" / "sim").iterdir())
+    results = [CalibrationResult.from_file(path) for path in paths]
+    assert [result.name for result in results] == ["imu.scale", "imu.mounting", "imu.noise", "imu.rotation"]
+    for path, result in zip(paths, results, strict=True):
+        assert f"PASS {result.name}" in done.stdout
         assert path.name in "".join(done.stdout.split())
-    assert facts[0].device["imu"]["range_dps"] == 250
+    assert results[0].device["imu"]["range_dps"] == 250
     told = json.loads(rig("goto", "90", "--seed", "6", "--json").stdout)
     assert told["agrees"] is True
     assert told["bound_deg"] < 1.5
@@ -49,7 +49,7 @@ def test_what_passed_is_kept_and_in_force_from_then_on(rig, tmp_path):
     assert other["bound_deg"] > 1.5, "another world has another gyro"
 
 
-def test_json_is_one_object_a_line_and_ends_with_the_fact(rig):
+def test_json_is_one_object_per_line_and_ends_with_the_result(rig):
     done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4", "--seed", "6", "--json")
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert {event["event"] for event in events} == {"moved", "progress", "calibrated"}
@@ -59,34 +59,36 @@ def test_json_is_one_object_a_line_and_ends_with_the_fact(rig):
     assert rotation == events[-1]
 
 
-def test_a_failure_says_why_ends_with_6_and_leaves_what_is_in_force(rig, tmp_path):
+def test_refused_calibration_exits_with_6_and_changes_nothing(rig, tmp_path):
     assert rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4").exit_code == 0
     done = rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert done.exit_code == 6
     assert "FAIL imu.scale" in done.stdout
     assert "imu.axis" in done.stdout
-    passed = [CalibrationResult.from_file(path).passed for path in sorted((tmp_path / "facts" / "sim").iterdir())]
+    passed = [
+        CalibrationResult.from_file(path).passed for path in sorted((tmp_path / "calibrations" / "sim").iterdir())
+    ]
     assert passed == [True, True, True, True, False]
     assert json.loads(rig("goto", "90", "--json").stdout)["bound_deg"] < 1.5
 
 
-def test_too_few_turns_are_a_mistake_of_usage(rig):
+def test_too_few_revolutions_are_a_usage_error(rig):
     assert rig("calibrate", "imu", "--turns", "3").exit_code == 2
 
 
-def test_the_servo_is_calibrated_in_a_row_and_each_result_counts_for_the_next(rig, tmp_path):
+def test_servo_results_replace_earlier_ones(rig, tmp_path):
     done = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
     assert done.exit_code == 0, done.output
-    facts = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
-    assert [fact.name for fact in facts] == ["servo.backlash", "servo.encoder", "servo.motion"]
+    results = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "calibrations" / "sim").iterdir())]
+    assert [result.name for result in results] == ["servo.backlash", "servo.encoder", "servo.motion"]
     again = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
     assert again.exit_code == 0, "a newer result takes the place of an older one"
-    assert "of the configuration wins" not in again.output
+    assert "of the configuration takes precedence" not in again.output
 
 
-def test_what_is_in_force_and_what_was_kept_can_be_looked_up(rig):
-    assert "Nothing is calibrated yet" in rig("calibrate", "show").output
-    assert "No calibration of imu.scale was kept" in rig("calibrate", "history", "imu.scale").output
+def test_show_and_history_list_results(rig):
+    assert "No calibrations in" in rig("calibrate", "show").output
+    assert "No calibrations of imu.scale in" in rig("calibrate", "history", "imu.scale").output
     rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert "imu.scale never passed" in rig("calibrate", "show").output
     rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4")
@@ -96,7 +98,7 @@ def test_what_is_in_force_and_what_was_kept_can_be_looked_up(rig):
     assert "FAIL" in failed
     assert "scale " in passed
     told = json.loads(rig("calibrate", "history", "--json").stdout)
-    assert [fact["name"] for fact in told["calibrations"]] == [
+    assert [result["name"] for result in told["calibrations"]] == [
         "imu.scale",
         "imu.scale",
         "imu.mounting",
@@ -105,8 +107,8 @@ def test_what_is_in_force_and_what_was_kept_can_be_looked_up(rig):
     ]
 
 
-def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_path, monkeypatch):
-    # Fewer frames and sides: what the procedures find is proved elsewhere.
+def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch):
+    # Fewer frames and sides: other tests show what the procedures find.
     monkeypatch.setattr(camera_light, "CARD_FRAMES", 12)
     monkeypatch.setattr(camera_light, "PAIRS", 12)
     monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::2])
@@ -117,10 +119,10 @@ def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_p
     assert "rig calibrate camera" in " ".join(refused.stderr.split())
     done = rig("calibrate", "all", "--minutes", "3")
     assert done.exit_code == 0, done.output
-    assert "[O] camera" in done.stderr, "a picture of what to do"
+    assert "[O] camera" in done.stderr, "a picture of the request"
     assert "rig calibrate noise NAME" in done.stderr
-    facts = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "facts" / "sim").iterdir())]
-    assert [fact.name for fact in facts] == [
+    results = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "calibrations" / "sim").iterdir())]
+    assert [result.name for result in results] == [
         "servo.backlash",
         "servo.encoder",
         "servo.motion",
@@ -135,25 +137,25 @@ def test_the_whole_bench_is_calibrated_in_a_row_and_shown_on_one_page(rig, tmp_p
         "camera.intrinsics",
         "table.axis",
     ]
-    assert facts[-1].evidence["intrinsics"] == facts[-2].id
-    pictures = [plots(fact) for fact in facts]
+    assert results[-1].evidence["intrinsics"] == results[-2].id
+    pictures = [plots(result) for result in results]
     assert [len(drawn) for drawn in pictures] == [1] * 11 + [3, 2]
     assert rig("calibrate", "report", "--out", "page.html").exit_code == 0
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.count("<svg") == sum(map(len, pictures))
-    for fact, drawn in zip(facts, pictures, strict=True):
-        assert f'id="{fact.name}"' in page
+    for result, drawn in zip(results, pictures, strict=True):
+        assert f'id="{result.name}"' in page
         assert all(picture.svg(themed=True) in page for picture in drawn)
-    for fact in facts[-2:]:
-        worst = int(np.argmax(fact.evidence["view_rms_px"]))
-        assert f"Worst views: {worst + 1} (stand {fact.evidence['views'][worst]['stand'] + 1} at" in page
-    assert "src=" not in page, "one file, and nothing from elsewhere"
+    for result in results[-2:]:
+        worst = int(np.argmax(result.evidence["view_rms_px"]))
+        assert f"Worst views: {worst + 1} (stand {result.evidence['views'][worst]['stand'] + 1} at" in page
+    assert "src=" not in page, "one self-contained file"
     assert rig("calibrate", "report", "--out", "no/where.html").exit_code == 2
 
 
-def test_json_keeps_the_pictures_to_itself(rig, monkeypatch):
+def test_json_omits_pictures(rig, monkeypatch):
     monkeypatch.setattr(table_axis, "ANGLES_DEG", (0.0,))
-    nothing = camera_model.from_data([], Board(), (640, 480), when_utc=SystemClock().utc(), device={})
+    nothing = camera_model.evaluate([], Board(), (640, 480)).result(when_utc=SystemClock().utc(), device={})
     monkeypatch.setattr("calibration.command._in_force", lambda *_: nothing)
     done = rig("calibrate", "table", "--json")
     assert done.exit_code == 6, "views from one side are too few"
@@ -162,14 +164,14 @@ def test_json_keeps_the_pictures_to_itself(rig, monkeypatch):
     assert json.loads(done.stdout.splitlines()[-1])["passed"] is False
 
 
-def test_the_board_is_printed_without_a_bench(rig, tmp_path):
+def test_board_is_printed_without_a_bench(rig, tmp_path):
     done = rig("calibrate", "table", "--print-board", "board.pdf", "--bench", "hardware")
     assert done.exit_code == 0, done.output
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
 
 
-def kept(tmp_path, days: float, **device: str) -> None:
-    CalibrationStore(tmp_path / "facts" / "sim").keep(
+def store(tmp_path, days: float, **device: str) -> None:
+    CalibrationStore(tmp_path / "calibrations" / "sim").add(
         CalibrationResult(
             name=encoder.NAME,
             estimates={"cos1": Estimate(0.0, 0.01, "°")},
@@ -188,12 +190,12 @@ def kept(tmp_path, days: float, **device: str) -> None:
 @pytest.mark.parametrize(
     ("days", "device", "words"),
     [
-        (100.0, {}, "servo.encoder was calibrated 100 days ago; it holds for 30"),
+        (100.0, {}, "servo.encoder was calibrated 100 days ago; it is valid for 30 days"),
         (1.0, {"bench": "another"}, "servo.encoder was calibrated on another device: bench was another, is sim"),
     ],
 )
-def test_an_enrollment_says_what_has_expired_or_belongs_to_another_device(rig, tmp_path, days, device, words):
-    kept(tmp_path, days, **device)
+def test_enrollment_reports_expired_results_and_results_of_other_devices(rig, tmp_path, days, device, words):
+    store(tmp_path, days, **device)
     done = rig("enroll", "mug-star", "--views", "4")
     assert done.exit_code == 0, done.output
     told = " ".join(done.stderr.split())

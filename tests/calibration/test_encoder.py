@@ -1,17 +1,17 @@
-"""The encoder's error over its turn: found within what is stated, put in force, and all else refused."""
-
-from datetime import UTC, datetime
+"""The encoder's error over its revolution: true within its uncertainty, applied, and wrong steps refused."""
 
 import numpy as np
 import pytest
 
-from calibration.encoder import Step, from_data, live
+from calibration.encoder import Encoder, Step, evaluate
 from calibration.legs import Leg
+from calibration.procedure import Evaluation
 from rig.bench import calibrate
-from rig.calibrations import CalibrationResult, CalibrationStore
+from rig.calibrations import CalibrationStore, RefusalCode
 from rig.core.errors import LimitExceeded, UsageError
 from rig.motion.turntable import Turntable
 from sim.noise import NoiseModel
+from tests.calibration.refused import codes
 
 COUNT_DEG = 360 / 4096
 NAMES = ("cos1", "sin1", "cos2", "sin2")
@@ -34,14 +34,12 @@ def drawn(rng: np.random.Generator, harmonics, *, direction: int = 1, turns: int
     ]
 
 
-def fit(steps: list[Step], direction: int = 1) -> CalibrationResult:
-    return from_data(
+def fit(steps: list[Step], direction: int = 1) -> Evaluation:
+    return evaluate(
         steps,
         direction=direction,
         turn_deg=360.0,
         resolution_deg=COUNT_DEG,
-        when_utc=datetime(2026, 3, 1, tzinfo=UTC),
-        device={},
     )
 
 
@@ -56,7 +54,7 @@ def test_the_truth_lies_within_the_stated_uncertainty():
     assert abs(np.mean(z)) < 0.15
 
 
-def test_put_in_force_the_table_stands_where_it_is_told(simulated, tmp_path):
+def test_applied_result_corrects_the_table_angle(simulated, tmp_path):
     s = simulated(noise=NoiseModel(encoder_harmonic_deg=0.3, backlash_deg=0.0), seed=11)
 
     def errors() -> list[float]:
@@ -64,38 +62,41 @@ def test_put_in_force_the_table_stands_where_it_is_told(simulated, tmp_path):
             return [table.goto(angle).encoder_deg - s.world.table_deg() for angle in (10.0, 100.0, 190.0, 280.0)]
 
     before = np.ptp(errors())
-    *_, fact = live(s.bench)
-    assert fact.passed, fact.refusals
-    CalibrationStore(tmp_path).keep(fact)
+    *_, result = Encoder().live(s.bench)
+    assert result.passed, result.refusals
+    CalibrationStore(tmp_path).add(result)
     calibrate(s.bench, CalibrationStore(tmp_path))
     after = np.ptp(errors())
     assert before > 0.3
     assert after < 0.15
-    *_, again = live(s.bench)  # what is in force is not measured away
+    *_, again = Encoder().live(s.bench)  # the result in force does not hide the error
     for name in NAMES:
-        difference = again.estimates[name].value - fact.estimates[name].value
-        assert abs(difference) < 4 * fact.estimates[name].uncertainty
+        difference = again.estimates[name].value - result.estimates[name].value
+        assert abs(difference) < 4 * result.estimates[name].uncertainty
 
 
 @pytest.mark.parametrize(
-    ("change", "reason"),
+    ("change", "code"),
     [
-        (lambda step: Step(step.from_deg, step.to_deg, Leg(step.leg.encoder_deg, step.leg.gyro_deg, 0.5)), "--turns"),
+        (
+            lambda step: Step(step.from_deg, step.to_deg, Leg(step.leg.encoder_deg, step.leg.gyro_deg, 0.5)),
+            RefusalCode.ENCODER_UNCERTAIN,
+        ),
         (
             lambda step: Step(step.from_deg, step.to_deg, Leg(step.leg.encoder_deg, 30.0, 0.01, "lost 3 samples")),
-            "lost 3 samples",
+            RefusalCode.TOO_FEW_STEPS,
         ),
     ],
 )
-def test_what_cannot_be_trusted_is_refused(change, reason):
-    fact = fit([change(step) for step in drawn(np.random.default_rng(3), (0.1, 0.1, 0.0, 0.0))])
-    assert any(reason in refusal for refusal in fact.refusals), fact.refusals
-    assert not fact.settings
+def test_noisy_and_invalid_steps_are_refused(change, code):
+    result = fit([change(step) for step in drawn(np.random.default_rng(3), (0.1, 0.1, 0.0, 0.0))])
+    assert code in codes(result)
+    assert not result.settings
 
 
-def test_an_error_that_no_encoder_has_and_a_slip_are_refused():
+def test_excessive_error_and_slip_are_refused():
     far = fit(drawn(np.random.default_rng(4), (3.0, 0.0, 0.0, 0.0)))
-    assert any("no sound one is" in refusal for refusal in far.refusals)
+    assert RefusalCode.ENCODER_ERROR_TOO_LARGE in codes(far)
     steps = drawn(np.random.default_rng(5), (0.1, 0.0, 0.0, 0.0))
     slipped = steps[7]
     steps[7] = Step(
@@ -103,12 +104,13 @@ def test_an_error_that_no_encoder_has_and_a_slip_are_refused():
         slipped.to_deg,
         Leg(slipped.leg.encoder_deg, slipped.leg.gyro_deg + 1.0, slipped.leg.sigma_deg),
     )
-    assert any("Step 8 is off" in refusal for refusal in fit(steps).refusals)
+    refusal = fit(steps).refusals[0]
+    assert (refusal.code, refusal.values["leg"]) == (RefusalCode.LEG_SLIPPED, 8)
 
 
-def test_a_short_cable_and_no_turn_are_told_before_anything_moves(simulated):
+def test_short_cable_and_zero_revolutions_are_rejected_before_moving(simulated):
     s = simulated('table.mode="pan"', "table.limits_deg=[-90, 90]")
     with pytest.raises(LimitExceeded):
-        next(live(s.bench))
+        next(Encoder().live(s.bench))
     with pytest.raises(UsageError):
-        next(live(s.bench, turns=0))
+        next(Encoder(turns=0).live(s.bench))

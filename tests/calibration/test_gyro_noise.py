@@ -1,32 +1,32 @@
-"""The gyro at rest: Allan deviation, noise and slope found within what is stated, and disturbances refused."""
+"""The gyro at rest: Allan deviation, noise and slope are true within their uncertainty; disturbances are refused."""
 
-from datetime import UTC, datetime
 from math import sqrt
 
 import numpy as np
 import pytest
 
-from calibration.gyro_noise import Rest, allan, from_data, live, rotation_sigma_deg
-from rig.calibrations import CalibrationResult
+from calibration.gyro_noise import GyroNoise, RestRecord, allan, evaluate, rotation_sigma_deg
+from calibration.procedure import Evaluation
+from rig.calibrations import RefusalCode
 from rig.core.errors import UsageError
+from tests.calibration.refused import codes
 
 ARW, WALK, SLOPE = 0.0035, 0.0003, 0.02
-WHEN = datetime(2026, 3, 1, tzinfo=UTC)
 
 
-def drawn(rng: np.random.Generator, minutes: float = 20.0, *, warm_up_c: float = 5.0) -> Rest:
+def drawn(rng: np.random.Generator, minutes: float = 20.0, *, warm_up_c: float = 5.0) -> RestRecord:
     n = round(minutes * 60)
     temperature_c = 25 + warm_up_c * (1 - np.exp(-np.arange(n) / 300))
     walk = np.cumsum(rng.standard_normal((n, 3)), axis=0) * WALK
     rate = 3.0 + ARW * rng.standard_normal((n, 3)) + walk + SLOPE * (temperature_c - 25)[:, None]
-    return Rest(rate, temperature_c, 1.0)
+    return RestRecord(rate, temperature_c, 1.0)
 
 
-def fit(rest: Rest) -> CalibrationResult:
-    return from_data(rest, column=2, when_utc=WHEN, device={})
+def fit(rest: RestRecord) -> Evaluation:
+    return evaluate(rest, column=2)
 
 
-def test_the_allan_deviation_is_the_one_of_its_definition():
+def test_allan_deviation_matches_its_definition():
     rate = np.random.default_rng(1).standard_normal(64)
     taus, deviation, _ = allan(rate, 0.5)
     for tau, found in zip(taus, deviation, strict=True):
@@ -38,46 +38,47 @@ def test_the_allan_deviation_is_the_one_of_its_definition():
 
 def test_the_truth_lies_within_the_stated_uncertainty():
     truth = {"angle_random_walk": ARW, "rate_random_walk": WALK, "bias_slope": SLOPE}
-    facts = [fit(drawn(np.random.default_rng(seed))) for seed in range(24)]
+    results = [fit(drawn(np.random.default_rng(seed))) for seed in range(24)]
     for name, true in truth.items():
-        z = np.array([(f.estimates[name].value - true) / f.estimates[name].uncertainty for f in facts])
+        z = np.array([(f.estimates[name].value - true) / f.estimates[name].uncertainty for f in results])
         assert (np.abs(z) < 1.96).mean() >= 0.83, name
         assert 0.6 < np.sqrt((z**2).mean()) < 1.5, name
-    assert all(fact.passed for fact in facts)
+    assert all(result.passed for result in results)
 
 
-def test_without_a_change_of_temperature_no_slope_is_claimed():
-    fact = fit(drawn(np.random.default_rng(3), warm_up_c=0.0))
-    assert "bias_slope" not in fact.estimates
-    assert "angle_random_walk" in fact.estimates
+def test_constant_temperature_yields_no_slope():
+    result = fit(drawn(np.random.default_rng(3), warm_up_c=0.0))
+    assert "bias_slope" not in result.estimates
+    assert "angle_random_walk" in result.estimates
 
 
-def test_a_bump_lost_samples_and_a_shaking_bench_are_refused():
+def test_bump_lost_samples_and_shaking_bench_are_refused():
     rest = drawn(np.random.default_rng(4))
     bumped = rest.gyro_dps.copy()
     bumped[600] += 0.3
-    assert "After 600 s the rate jumped by 0." in fit(Rest(bumped, rest.temperature_c, 1.0)).refusals[0]
-    assert "lost 7 samples" in fit(Rest(rest.gyro_dps, rest.temperature_c, 1.0, lost=7)).refusals[0]
+    (jump,) = fit(RestRecord(bumped, rest.temperature_c, 1.0)).refusals
+    assert (jump.code, jump.values["at_s"]) == (RefusalCode.RATE_JUMPED, 600)
+    assert codes(fit(RestRecord(rest.gyro_dps, rest.temperature_c, 1.0, lost=7))) == [RefusalCode.SAMPLES_LOST]
     shaken = rest.gyro_dps + 0.05 * np.random.default_rng(5).standard_normal(rest.gyro_dps.shape)
-    assert "shakes" in fit(Rest(shaken, rest.temperature_c, 1.0)).refusals[0]
+    assert RefusalCode.GYRO_NOISY in codes(fit(RestRecord(shaken, rest.temperature_c, 1.0)))
 
 
-def test_on_the_simulated_bench(simulated):
+def test_simulated_noise_is_found(simulated):
     s = simulated(seed=2)
-    *progress, fact = live(s.bench, minutes=6)
+    *progress, result = GyroNoise(minutes=6).live(s.bench)
     assert [p.share for p in progress] == sorted(p.share for p in progress)
     assert progress[-1].share == 1.0
-    assert fact.passed, fact.refusals
+    assert result.passed, result.refusals
     noise = s.world.noise
     for name, true in (
         ("angle_random_walk", noise.gyro_noise_dps_rthz / sqrt(2)),
         ("bias_slope", float(s.operator.parts.imu.inertial.gyro_slope_dps_c[2])),
     ):
-        estimate = fact.estimates[name]
+        estimate = result.estimates[name]
         assert abs(estimate.value - true) < 3 * estimate.uncertainty, name
-    assert rotation_sigma_deg(fact, 4.0) == pytest.approx(2 * fact.estimates["angle_random_walk"].value, rel=0.1)
+    assert rotation_sigma_deg(result, 4.0) == pytest.approx(2 * result.estimates["angle_random_walk"].value, rel=0.1)
 
 
-def test_too_short_a_rest_is_a_mistake_of_usage(simulated):
+def test_short_recording_is_a_usage_error(simulated):
     with pytest.raises(UsageError, match="too few"):
-        next(live(simulated().bench, minutes=1))
+        next(GyroNoise(minutes=1).live(simulated().bench))

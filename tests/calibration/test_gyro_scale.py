@@ -1,19 +1,20 @@
-"""The gyro's scale: found with an honest uncertainty, or refused with the reason."""
+"""The gyro's scale: true within its uncertainty, or refused."""
 
-from datetime import UTC, datetime
 from math import sqrt
 
 import numpy as np
 import pytest
 
-from calibration.gyro_scale import from_data, live
+from calibration.gyro_scale import GyroScale, evaluate
 from calibration.legs import Leg
-from rig.calibrations import CalibrationResult
+from calibration.procedure import Evaluation
+from rig.calibrations import CalibrationResult, RefusalCode
 from rig.core.errors import DeviceSilent, LimitExceeded, UsageError
 from rig.events.events import Moved
 from rig.motion.turntable import Turntable
 from sim.imu.inertial import InertialModel
 from sim.world import World
+from tests.calibration.refused import codes
 
 COUNT_DEG = 360 / 4096
 SLIP_DELAY_NS = 4_000_000_000
@@ -26,8 +27,8 @@ def true_scale(seed: int) -> float:
     return 1 / float(part.gyro_gain[2] * part.up[2])
 
 
-def fit(legs: list[Leg]) -> CalibrationResult:
-    return from_data(legs, resolution_deg=COUNT_DEG, when_utc=datetime(2026, 3, 1, tzinfo=UTC), device={})
+def fit(legs: list[Leg]) -> Evaluation:
+    return evaluate(legs, resolution_deg=COUNT_DEG)
 
 
 def drawn(rng: np.random.Generator, scale: float, legs: int = 4, turn_deg: float = 720.0) -> list[Leg]:
@@ -41,7 +42,7 @@ def drawn(rng: np.random.Generator, scale: float, legs: int = 4, turn_deg: float
 
 def run(s, *, turns: int = 4, during=None) -> CalibrationResult:
     """Calibrate; ``during`` maps the index of a leg, from 1, to what happens to the world in the middle of it."""
-    events = live(s.bench, turns=turns)
+    events = GyroScale(turns=turns).live(s.bench)
     for event in events:
         if isinstance(event, Moved) and during and (happens := during.get(event.index + 1)):
             s.world.clock.call_at(s.world.clock.now_ns() + SLIP_DELAY_NS, happens)
@@ -53,17 +54,17 @@ def torque(s) -> int:
     return s.bench.servo._read("Torque Enable")
 
 
-def test_the_true_scale_is_found_within_the_stated_uncertainty(simulated):
+def test_true_scale_lies_within_the_stated_uncertainty(simulated):
     """The simulated servo rests in the middle of its counts, a real one anywhere: the errors may be the smaller."""
     z = []
     for seed in range(20):
         s = simulated(seed=seed)
-        fact = run(s)
-        assert fact.passed, fact.refusals
-        assert fact.estimates["scale"].value == pytest.approx(true_scale(seed), rel=0.001)
-        assert fact.residual < fact.limit
-        assert fact.estimates["scale"].uncertainty < 1.5e-4
-        z.append((fact.estimates["scale"].value - true_scale(seed)) / fact.estimates["scale"].uncertainty)
+        result = run(s)
+        assert result.passed, result.refusals
+        assert result.estimates["scale"].value == pytest.approx(true_scale(seed), rel=0.001)
+        assert result.residual < result.limit
+        assert result.estimates["scale"].uncertainty < 1.5e-4
+        z.append((result.estimates["scale"].value - true_scale(seed)) / result.estimates["scale"].uncertainty)
     assert np.mean(np.abs(z) < 1.96) >= 0.85
     assert 0.3 < sqrt(np.mean(np.square(z))) < 1.3
 
@@ -71,13 +72,13 @@ def test_the_true_scale_is_found_within_the_stated_uncertainty(simulated):
 @pytest.mark.parametrize("legs", [4, 12])
 def test_error_over_uncertainty_has_a_standard_deviation_of_one(legs):
     rng = np.random.default_rng(1)
-    facts = [(scale, fit(drawn(rng, scale, legs))) for scale in rng.uniform(0.95, 1.05, 500)]
+    results = [(scale, fit(drawn(rng, scale, legs))) for scale in rng.uniform(0.95, 1.05, 500)]
     z = np.array(
-        [(fact.estimates["scale"].value - scale) / fact.estimates["scale"].uncertainty for scale, fact in facts]
+        [(result.estimates["scale"].value - scale) / result.estimates["scale"].uncertainty for scale, result in results]
     )
     assert 0.85 < z.std() < 1.1
     assert abs(z.mean()) < 0.15
-    assert sum(fact.passed for _, fact in facts) == len(facts)
+    assert sum(result.passed for _, result in results) == len(results)
 
 
 def test_scatter_beyond_the_stated_noise_widens_the_uncertainty():
@@ -86,14 +87,14 @@ def test_scatter_beyond_the_stated_noise_widens_the_uncertainty():
         [Leg(leg.encoder_deg, leg.gyro_deg + rng.normal(0, 0.2), leg.sigma_deg) for leg in drawn(rng, 1.0, legs=12)]
         for _ in range(200)
     ]
-    z = [(fact.estimates["scale"].value - 1.0) / fact.estimates["scale"].uncertainty for fact in map(fit, modest)]
+    z = [(result.estimates["scale"].value - 1.0) / result.estimates["scale"].uncertainty for result in map(fit, modest)]
     assert 0.8 < np.std(z) < 1.25
 
 
-def test_a_drifting_bias_cancels_between_the_ways_and_a_strong_one_is_refused():
+def test_slow_bias_drift_cancels_and_strong_drift_is_refused():
     rng = np.random.default_rng(2)
 
-    def drifting(by_deg: float) -> CalibrationResult:
+    def drifting(by_deg: float) -> Evaluation:
         return fit([Leg(leg.encoder_deg, leg.gyro_deg + by_deg, leg.sigma_deg) for leg in drawn(rng, 1.02)])
 
     mild = drifting(0.08)
@@ -101,78 +102,79 @@ def test_a_drifting_bias_cancels_between_the_ways_and_a_strong_one_is_refused():
     assert mild.estimates["scale"].value == pytest.approx(1.02, abs=3 * mild.estimates["scale"].uncertainty)
     strong = drifting(0.3)
     assert not strong.passed
-    assert any("bias drifts" in reason for reason in strong.refusals)
+    assert RefusalCode.DIRECTIONS_DIFFER in codes(strong)
 
 
 @pytest.mark.parametrize(("slip_deg", "leg"), [(0.6, 1), (-0.6, 2), (6.0, 3)])
-def test_a_slipping_platter_is_refused(simulated, slip_deg, leg):
+def test_slipping_platter_is_refused(simulated, slip_deg, leg):
     s = simulated(seed=3)
-    fact = run(s, during={leg: lambda: s.world.slip(slip_deg, 0.2)})
-    assert not fact.passed
-    assert f"Leg {leg} is off by" in fact.refusals[0]
-    assert fact.residual > fact.limit
-    assert not fact.settings
+    result = run(s, during={leg: lambda: s.world.slip(slip_deg, 0.2)})
+    assert not result.passed
+    assert (result.refusals[0].code, result.refusals[0].values["leg"]) == (RefusalCode.LEG_SLIPPED, leg)
+    assert result.residual > result.limit
+    assert not result.settings
 
 
-def test_a_saturated_gyro_is_refused_with_nothing_estimated(simulated):
+def test_saturated_gyro_is_refused_without_estimates(simulated):
     s = simulated(seed=3)
 
     def whirl():
         s.world.slip(75.0, 0.2)
         s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-75.0, 0.2))
 
-    fact = run(s, during=dict.fromkeys(range(1, 5), whirl))
-    assert "scale" not in fact.estimates
-    assert "beyond the gyro's range" in fact.refusals[0]
-    assert "imu.range_dps" in fact.refusals[0]
+    result = run(s, during=dict.fromkeys(range(1, 5), whirl))
+    assert "scale" not in result.estimates
+    assert codes(result) == [RefusalCode.TOO_FEW_REVOLUTIONS]
+    assert "beyond the gyro's range" in str(result.refusals[0])
 
 
-def test_one_lost_leg_is_left_out_and_too_few_are_refused():
+def test_one_lost_leg_is_left_out_and_too_few_legs_are_refused():
     legs = drawn(np.random.default_rng(4), 1.01, legs=6)
     spoiled = [Leg(legs[0].encoder_deg, 17.0, 0.03, "the sensor lost 9 samples"), *legs[1:]]
     assert fit(spoiled).passed
     assert fit(spoiled).estimates["scale"].value == pytest.approx(1.01, abs=2e-4)
     few = fit(spoiled[:4])
-    assert "1 upwards and 2 downwards" in few.refusals[0]
-    assert "lost 9 samples" in few.refusals[0]
+    (refusal,) = few.refusals
+    assert (refusal.values["up"], refusal.values["down"]) == (1, 2)
+    assert "lost 9 samples" in str(refusal)
     assert not fit([]).passed
 
 
 @pytest.mark.parametrize("ratio", [0.0, -1.0, 0.5, 2.0])
-def test_a_gyro_of_another_axis_sign_range_or_gear_is_refused(ratio):
-    fact = fit([Leg(e, ratio * e, 0.03) for e in (360.0, -360.0) * 2])
-    assert "scale" not in fact.estimates
-    assert "imu.axis" in fact.refusals[0]
+def test_wrong_axis_sign_range_or_gear_is_refused(ratio):
+    result = fit([Leg(e, ratio * e, 0.03) for e in (360.0, -360.0) * 2])
+    assert "scale" not in result.estimates
+    assert codes(result) == [RefusalCode.GYRO_IMPLAUSIBLE]
 
 
-def test_a_noisy_gyro_is_refused():
-    fact = fit([Leg(e, e, 1.0) for e in (360.0, -360.0) * 2])
-    assert "more than 0.1%" in fact.refusals[0]
+def test_noisy_gyro_is_refused():
+    result = fit([Leg(e, e, 1.0) for e in (360.0, -360.0) * 2])
+    assert codes(result) == [RefusalCode.SCALE_UNCERTAIN]
 
 
-def test_a_cable_that_does_not_reach_around_is_said_before_anything_moves(simulated):
+def test_short_cable_is_rejected_before_moving(simulated):
     s = simulated("table.limits_deg=[-180, 181]")
-    with pytest.raises(LimitExceeded, match="358°"):
-        next(live(s.bench))
+    with pytest.raises(LimitExceeded, match="361°"):
+        next(GyroScale().live(s.bench))
     assert s.world.shaft()[0] == pytest.approx(0, abs=0.2)
     with pytest.raises(UsageError, match="too few"):
-        next(live(s.bench, turns=3))
+        next(GyroScale(turns=3).live(s.bench))
 
 
-def test_a_short_cable_is_enough_and_is_never_exceeded(simulated):
+def test_limits_are_never_exceeded(simulated):
     s = simulated("table.limits_deg=[-10, 354]", seed=5)
-    events, shaft_deg = zip(*((event, s.world.shaft()[0]) for event in live(s.bench, turns=4)), strict=True)
+    events, shaft_deg = zip(*((event, s.world.shaft()[0]) for event in GyroScale(turns=4).live(s.bench)), strict=True)
     assert events[-1].passed
     assert len(events[-1].evidence["legs"]) == 4
     assert -10 <= min(shaft_deg) < max(shaft_deg) <= 354
 
 
-def test_the_table_returns_when_done_and_when_closed_between_turns(simulated):
+def test_table_returns_at_the_end_and_when_closed_between_moves(simulated):
     for seed in (1, 2):
         s = simulated(seed=seed)
         with Turntable(s.bench) as table:
             table.goto(40.0)
-        events = live(s.bench, turns=4)
+        events = GyroScale(turns=4).live(s.bench)
         if seed == 1:
             assert list(events)[-1].passed
         else:
@@ -184,13 +186,13 @@ def test_the_table_returns_when_done_and_when_closed_between_turns(simulated):
 
 
 @pytest.mark.parametrize("after_s", [1.0, 4.0])  # during a rest, and in the middle of a leg
-def test_nothing_moves_by_itself_after_an_interruption(simulated, after_s):
+def test_nothing_moves_after_an_interruption(simulated, after_s):
     s = simulated()
 
     def interrupt():
         raise KeyboardInterrupt
 
-    events = live(s.bench, turns=4)
+    events = GyroScale(turns=4).live(s.bench)
     next(events)
     before = s.world.shaft()[0]
     s.world.clock.call_at(s.world.clock.now_ns() + round(after_s * 1e9), interrupt)
@@ -203,9 +205,9 @@ def test_nothing_moves_by_itself_after_an_interruption(simulated, after_s):
     assert abs(stopped[0] - before) == (pytest.approx(0, abs=0.2) if after_s < 2 else pytest.approx(180, abs=100))
 
 
-def test_a_servo_that_falls_silent_ends_it(simulated):
+def test_silent_servo_ends_the_calibration(simulated):
     s = simulated()
-    events = live(s.bench, turns=4)
+    events = GyroScale(turns=4).live(s.bench)
     next(events)
     s.bench.servo.bus.port.ser.unplug()
     with pytest.raises(DeviceSilent):
@@ -214,22 +216,22 @@ def test_a_servo_that_falls_silent_ends_it(simulated):
         s.bench.close()  # says that the torque could not be taken off
 
 
-def test_a_scale_in_force_does_not_change_what_is_found(simulated):
+def test_scale_in_force_does_not_change_the_result(simulated):
     plain = run(simulated(seed=6)).estimates["scale"]
     scaled = run(simulated("imu.scale=1.05", "imu.scale_uncertainty=0.0", seed=6)).estimates["scale"]
     assert scaled.value == pytest.approx(plain.value, abs=plain.uncertainty)  # of 5 % nothing is left
     assert scaled.uncertainty == pytest.approx(plain.uncertainty, rel=0.02)
 
 
-def test_the_calibrated_scale_narrows_what_a_move_may_differ_by(simulated):
-    fact = run(simulated(seed=6))
+def test_calibrated_scale_narrows_the_agreement_bound(simulated):
+    result = run(simulated(seed=6))
     moves = []
-    for settings in ([], [f"{key}={value}" for key, value in fact.settings.items()]):
+    for settings in ([], [f"{key}={value}" for key, value in result.settings.items()]):
         with Turntable(simulated(*settings, seed=6).bench) as table:
             table.goto(5.0)
             moves.append(table.goto(95.0))
     before, after = (move.agreement for move in moves)
-    play_deg = 0.5
+    backlash_deg = 0.5
     assert after.agrees
-    assert after.bound_deg - play_deg < 0.2 * (before.bound_deg - play_deg)
+    assert after.bound_deg - backlash_deg < 0.2 * (before.bound_deg - backlash_deg)
     assert abs(after.difference_deg) < abs(before.difference_deg)

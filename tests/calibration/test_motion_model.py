@@ -1,30 +1,29 @@
-"""The time that moves take: the profile is found again, new moves are foretold, and a hindered one is refused."""
+"""The duration of rotations: true within its uncertainty, predicts new rotations, and refuses a hindered one."""
 
 from dataclasses import replace
-from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 
-from calibration.motion_model import DISTANCES_DEG, Timed, from_data, live, predicted_s
-from rig.calibrations import CalibrationResult
+from calibration.motion_model import DISTANCES_DEG, MotionModel, TimedMove, evaluate, predicted_s
+from calibration.procedure import Evaluation
+from rig.calibrations import RefusalCode
 from rig.core.errors import UsageError
 from rig.devices.servo import MotionProfile
 from rig.motion.turntable import Turntable
+from tests.calibration.refused import codes
 
-WHEN = datetime(2026, 3, 1, tzinfo=UTC)
 
-
-def drawn(rng: np.random.Generator, pace: float, wind_up: float, delay: float) -> list[Timed]:
+def drawn(rng: np.random.Generator, pace: float, wind_up: float, delay: float) -> list[TimedMove]:
     distances = np.array([d * sign for _ in range(3) for d in DISTANCES_DEG for sign in (1, -1)])
     reach = np.abs(distances)
     seconds = np.where(reach * pace < wind_up, 2 * np.sqrt(reach * pace * wind_up), reach * pace + wind_up) + delay
     seconds += rng.normal(0, 0.03, seconds.size)
-    return [Timed(float(d), float(t)) for d, t in zip(distances, seconds, strict=True)]
+    return [TimedMove(float(d), float(t)) for d, t in zip(distances, seconds, strict=True)]
 
 
-def fit(moves: list[Timed]) -> CalibrationResult:
-    return from_data(moves, MotionProfile(70.0, 220.0), when_utc=WHEN, device={})
+def fit(moves: list[TimedMove]) -> Evaluation:
+    return evaluate(moves, MotionProfile(70.0, 220.0))
 
 
 def test_the_truth_lies_within_the_stated_uncertainty():
@@ -43,29 +42,29 @@ def test_the_truth_lies_within_the_stated_uncertainty():
         assert (np.abs(values) < 1.96).mean() >= 0.85, name
 
 
-def test_moves_that_were_not_timed_are_foretold(simulated):
+def test_new_rotations_are_predicted(simulated):
     s = simulated("table.velocity_dps=60", "table.acceleration_dps2=150", seed=4)
-    *_, fact = live(s.bench)
-    assert fact.passed, fact.refusals
-    assert fact.estimates["pace"].value == pytest.approx(1 / 60, rel=0.05)
+    *_, result = MotionModel().live(s.bench)
+    assert result.passed, result.refusals
+    assert result.estimates["pace"].value == pytest.approx(1 / 60, rel=0.05)
     assert s.bench.config.table.approach_deg == 3.0
     with Turntable(s.bench) as table:
         table.goto(5.0)
         for goal_deg in (35.0, 170.0, 178.0):
             distance_deg = goal_deg - table.rest_deg
-            assert table.goto(goal_deg).seconds == pytest.approx(predicted_s(fact, distance_deg), abs=0.25)
+            assert table.goto(goal_deg).seconds == pytest.approx(predicted_s(result, distance_deg), abs=0.25)
 
 
-def test_a_hindered_move_is_refused():
+def test_hindered_rotation_is_refused():
     moves = drawn(np.random.default_rng(2), 0.012, 0.3, 0.4)
     moves[5] = replace(moves[5], seconds=moves[5].seconds + 1.0)
-    fact = fit(moves)
-    assert "something hindered it" in fact.refusals[0]
-    assert not fact.settings
-    # One bad move does not drag the others along.
-    assert fact.estimates["pace"].value == pytest.approx(0.012, rel=0.05)
+    result = fit(moves)
+    assert codes(result) == [RefusalCode.MOVE_HINDERED]
+    assert not result.settings
+    # One bad rotation does not change the fit.
+    assert result.estimates["pace"].value == pytest.approx(0.012, rel=0.05)
 
 
-def test_too_few_rounds_are_a_mistake_of_usage(simulated):
+def test_too_few_rounds_are_a_usage_error(simulated):
     with pytest.raises(UsageError):
-        next(live(simulated().bench, rounds=1))
+        next(MotionModel(rounds=1).live(simulated().bench))

@@ -19,9 +19,9 @@ BEFORE = [80, 0, 480, 480]
 @pytest.fixture
 def rig(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config = 'default_bench = "sim"\ncalibration_dir = "facts"\n[catalog]\npath = "catalog"\n'
+    config = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
     (tmp_path / "rig.toml").write_text(config, encoding="utf-8")
-    # Fewer sides: what the procedures find is proved elsewhere.
+    # Fewer sides: other tests show what the procedures find.
     monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::3])
     monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
 
@@ -37,21 +37,21 @@ def region(rig, name: str) -> list[int]:
     return told["views"][0]["record"]["region"]
 
 
-def test_the_region_follows_the_object_of_a_camera_that_was_moved(rig):
+def test_region_follows_the_object_after_the_camera_moved(rig):
     assert rig("enroll", "mug-star", "--views", "4").exit_code == 0
     assert region(rig, "mug-star") == BEFORE
     config = load_config(Path("rig.toml"), [MOVED])
-    with open_bench("sim", config, seed=2) as bench:  # of the camera, what the axis needs
-        *_, intrinsics = camera_model.live(bench)
-    CalibrationStore(config.calibration_path("sim")).keep(intrinsics)
+    with open_bench("sim", config, seed=2) as bench:  # the axis needs the camera's calibration
+        *_, intrinsics = camera_model.CameraModel().live(bench)
+    CalibrationStore(config.calibration_path("sim")).add(intrinsics)
     done = rig("calibrate", "table", "--lens-mm", "490")
     assert done.exit_code == 0, done.output
     assert "if it was moved" in " ".join(done.stderr.split()).lower(), "what is enrolled already"
     assert "its middle 75 mm above the platter" in done.stderr
-    (fact,) = json.loads(rig("calibrate", "history", "table.axis", "--json").stdout)["calibrations"]
-    follows = fact["settings"]["view.roi"]
+    (result,) = json.loads(rig("calibrate", "history", "table.axis", "--json").stdout)["calibrations"]
+    follows = result["settings"]["view.roi"]
     x, _, width, _ = follows
-    assert x + width / 2 == pytest.approx(fact["estimates"]["px"]["value"], abs=12), "it holds the axis in its middle"
+    assert x + width / 2 == pytest.approx(result["estimates"]["px"]["value"], abs=12), "it holds the axis in its middle"
 
     note = " ".join(rig("enroll", "mug-dots", "--views", "8").stderr.split())
     assert region(rig, "mug-dots") == follows
@@ -65,7 +65,7 @@ def test_the_region_follows_the_object_of_a_camera_that_was_moved(rig):
 
     assert f"    sets view.roi = {follows}" in rig("calibrate", "show").stdout
     written = rig("identify", "--set", "bench.sim.object=mug-dots", "--set", f"view.roi={BEFORE}").stderr
-    assert "of the configuration wins over" in written
+    assert "of the configuration takes precedence over" in written
     assert f"described within {follows}, view.roi is {BEFORE}" in " ".join(written.split())
     other = rig("identify", "--set", "bench.sim.object=mug-dots", seed=3).stderr
     assert "table.axis was calibrated on another device: conditions.seed was 2, is 3" in " ".join(other.split())

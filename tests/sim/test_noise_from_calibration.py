@@ -4,20 +4,20 @@ from math import sqrt
 
 import pytest
 
-from calibration import backlash, gyro_noise
+from calibration.procedures import Backlash, GyroNoise
 from sim.noise import NoiseModel, from_calibration
 
 
 def test_a_bench_is_found_again_in_the_noise_model_of_its_calibrations(simulated):
     true = NoiseModel(backlash_deg=0.7, gyro_noise_dps_rthz=0.012, gyro_bias_walk_dps_rts=0.0)
     bench = simulated(noise=true, seed=5).bench
-    facts = [[*backlash.live(bench)][-1], [*gyro_noise.live(bench, minutes=5)][-1]]
-    assert all(fact.passed for fact in facts)
-    found = from_calibration(facts)
+    results = [[*Backlash().live(bench)][-1], [*GyroNoise(minutes=5).live(bench)][-1]]
+    assert all(result.passed for result in results)
+    found = from_calibration(results)
     assert found.backlash_deg == pytest.approx(0.7, abs=0.05)
     assert found.gyro_noise_dps_rthz == pytest.approx(0.012, rel=0.1)
-    assert found.vignetting == NoiseModel().vignetting, "what no fact tells stays"
-    assert found.gyro_bias_slope_dps_c == abs(facts[1].estimates["bias_slope"].value)
+    assert found.vignetting == NoiseModel().vignetting, "what no result tells stays"
+    assert found.gyro_bias_slope_dps_c == abs(results[1].estimates["bias_slope"].value)
     perfect = from_calibration([], NoiseModel.none())
     assert perfect == NoiseModel.none()
-    assert sqrt(2) * facts[1].estimates["angle_random_walk"].value == found.gyro_noise_dps_rthz
+    assert sqrt(2) * results[1].estimates["angle_random_walk"].value == found.gyro_noise_dps_rthz

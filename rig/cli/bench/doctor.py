@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.bench.examination import case_of, print_finding, say
+from rig.cli.bench.examination import doctor_context, print_finding, say
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ConfigError, RigError
@@ -20,7 +20,7 @@ def doctor(
         bool, typer.Option("--udev", help="Only print rules for udev: permissions, latency, a lasting name.")
     ] = False,
 ) -> None:
-    """Look at everything the bench needs and say, a line a finding, what is wrong and which command mends it.
+    """Look at everything the bench needs and say, a line a finding, what is wrong and which command fixes it.
 
     Moves nothing and writes nothing. The exit code is that of the first finding marked ✗, else 0.
 
@@ -29,8 +29,8 @@ def doctor(
     from rig.doctor.computer import udev_rules
 
     if udev:
-        with case_of(settings) as case:
-            print(udev_rules(case.computer.serial_ports()), end="")
+        with doctor_context(settings) as context:
+            print(udev_rules(context.computer.serial_ports()), end="")
         return
     code = examination(settings)
     if code:
@@ -42,8 +42,8 @@ def examination(settings: Settings) -> int:
     from rig.cli.ui.present import console
     from rig.config import RigConfig
     from rig.doctor.checks import CHECKS
-    from rig.doctor.examination import examine
-    from rig.doctor.finding import Level, bad, fine, of_error
+    from rig.doctor.examination import run_checks
+    from rig.doctor.finding import Severity, bad, fine, of_error
 
     screen = console()
     findings: list[Finding] = []
@@ -62,28 +62,28 @@ def examination(settings: Settings) -> int:
             tell(bad("config", f"{error.what.rstrip('.')}: {mistake}", "rig config check", error.exit_code))
         config = None
     try:
-        with case_of(settings, default=config is None) as case:
-            for finding in examine(case, CHECKS, say):
+        with doctor_context(settings, default=config is None) as context:
+            for finding in run_checks(context, CHECKS, say):
                 tell(finding)
     except RigError as error:  # there is no such bench, or no such part of it
         tell(of_error("bench", error))
-    counts = {level: sum(finding.level is level for finding in findings) for level in Level}
-    code = next((finding.exit_code for finding in findings if finding.level is Level.BAD), 0)
+    counts = {level: sum(finding.level is level for finding in findings) for level in Severity}
+    code = next((finding.exit_code for finding in findings if finding.level is Severity.BAD), 0)
     if settings.json:
         settings.print_json(
             {
                 "bench": settings.bench or (config.default_bench if config else RigConfig().default_bench),
-                "bad": counts[Level.BAD],
-                "warnings": counts[Level.WARNING],
+                "bad": counts[Severity.BAD],
+                "warnings": counts[Severity.WARNING],
                 "exit_code": code,
                 "findings": [finding.as_dict() for finding in findings],
             }
         )
     else:
-        problems, warnings = counts[Level.BAD], counts[Level.WARNING]
+        problems, warnings = counts[Severity.BAD], counts[Severity.WARNING]
         screen.print(
             f"{problems or 'No'} problem{'s' if problems != 1 else ''}, {warnings or 'no'} "
-            f"warning{'s' if warnings != 1 else ''}, {counts[Level.FINE]} fine.",
+            f"warning{'s' if warnings != 1 else ''}, {counts[Severity.FINE]} fine.",
             highlight=False,
         )
     return code

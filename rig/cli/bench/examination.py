@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from rig.doctor.case import Case
+    from rig.doctor.context import DoctorContext
     from rig.doctor.finding import Finding
 
 _TOPIC_WIDTH = 12
@@ -20,27 +20,27 @@ _INDENT = 2 + _TOPIC_WIDTH
 
 
 @contextmanager
-def case_of(settings: Settings, *, default: bool = False) -> "Iterator[Case]":
+def doctor_context(settings: Settings, *, default: bool = False) -> "Iterator[DoctorContext]":
     """Yield the bench that the common options mean; with ``default`` as if there were no configuration."""
     from rig.config import RigConfig
-    from rig.doctor.case import open_case
+    from rig.doctor.context import open_context
 
     config = RigConfig() if default else settings.load()
     file_options = ("--config", str(settings.config)) if settings.config else ()
     options = (*(("--bench", settings.bench) if settings.bench else ()), *file_options)
     options += tuple(part for override in settings.overrides for part in ("--set", override))
     name = settings.bench or config.default_bench
-    with open_case(name, config, seed=settings.seed, options=options, file_options=file_options) as case:
-        yield case
+    with open_context(name, config, seed=settings.seed, options=options, file_options=file_options) as context:
+        yield context
 
 
 def print_finding(screen: "Console", finding: "Finding") -> None:
-    """Print a finding: its mark, its topic, what was found, and below it the command that mends it."""
+    """Print a finding: its mark, its topic, what was found, and below it the command that fixes it."""
     from rich.text import Text
 
-    from rig.doctor.finding import MARKS, Level
+    from rig.doctor.finding import MARKS, Severity
 
-    style = {Level.FINE: "green", Level.WARNING: "yellow", Level.BAD: "bold red"}[finding.level]
+    style = {Severity.FINE: "green", Severity.WARNING: "yellow", Severity.BAD: "bold red"}[finding.level]
     width = max(screen.width - _INDENT, 24) if screen.is_terminal else 10_000
     first, *more = wrap(finding.text, width, break_on_hyphens=False) or [""]
     screen.print(
@@ -48,8 +48,8 @@ def print_finding(screen: "Console", finding: "Finding") -> None:
     )
     for line in more:
         screen.print(Text(" " * _INDENT + line), soft_wrap=True)
-    if finding.mend:
-        screen.print(Text(f"{' ' * _INDENT}→ {finding.mend}", "bold"), soft_wrap=True)
+    if finding.fix:
+        screen.print(Text(f"{' ' * _INDENT}→ {finding.fix}", "bold"), soft_wrap=True)
 
 
 def say(text: str) -> None:

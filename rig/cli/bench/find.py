@@ -4,14 +4,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.bench.examination import case_of, print_finding, say
+from rig.cli.bench.examination import doctor_context, print_finding, say
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from rig.config.toml_file import Key
+    from rig.doctor.device_scan import DeviceScan
     from rig.doctor.finding import Finding
-    from rig.doctor.survey import Survey
 
 
 @command
@@ -29,19 +29,19 @@ def find(
     """
     from rig.cli.ui.present import console
     from rig.config.toml_file import with_values
-    from rig.doctor.examination import examine
-    from rig.doctor.survey import Survey
+    from rig.doctor.device_scan import DeviceScan
+    from rig.doctor.examination import run_checks
 
     screen = console()
     findings: list[Finding] = []
-    survey = Survey(both_protocols)
-    with case_of(settings) as case:
-        case.require_free()
-        for finding in examine(case, survey.checks, say):
+    scan = DeviceScan(both_protocols)
+    with doctor_context(settings) as context:
+        context.require_free()
+        for finding in run_checks(context, scan.checks, say):
             findings.append(finding)
             if not settings.json:
                 print_finding(screen, finding)
-    wanted = proposal(survey)
+    wanted = proposal(scan)
     if settings.json:
         settings.print_json(
             {
@@ -55,17 +55,17 @@ def find(
         raise typer.Exit(4)
 
 
-def proposal(survey: "Survey") -> "dict[Key, Any]":
+def proposal(scan: "DeviceScan") -> "dict[Key, Any]":
     """Return the settings that leave no choice: of devices of which there is one."""
-    from rig.doctor.survey import camera_settings, head_settings, imu_settings, servo_settings
+    from rig.doctor.device_scan import camera_settings, head_settings, imu_settings, servo_settings
 
     wanted: dict[Key, Any] = {}
-    if len(survey.servos) == 1 and not survey.doubtful:
-        wanted |= servo_settings(*survey.servos[0])
-    if len(survey.heads) == 1 and not survey.imus:
-        wanted |= head_settings(survey.heads[0])
-    if len(survey.imus) == 1 and not survey.heads:
-        wanted |= imu_settings(survey.imus[0])
-    if len(survey.cameras) == 1:
-        wanted |= camera_settings(survey.cameras[0])
+    if len(scan.servos) == 1 and not scan.duplicate_ids:
+        wanted |= servo_settings(*scan.servos[0])
+    if len(scan.heads) == 1 and not scan.imus:
+        wanted |= head_settings(scan.heads[0])
+    if len(scan.imus) == 1 and not scan.heads:
+        wanted |= imu_settings(scan.imus[0])
+    if len(scan.cameras) == 1:
+        wanted |= camera_settings(scan.cameras[0])
     return wanted

@@ -9,8 +9,8 @@ from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
-    from rig.doctor.case import Case
-    from rig.doctor.lone_servo import LoneServo
+    from rig.doctor.context import DoctorContext
+    from rig.doctor.single_servo import SingleServo
 
 app = typer.Typer(help="Look at the servo's registers, and set it up.", no_args_is_help=True)
 
@@ -24,11 +24,11 @@ def info(settings: Settings) -> None:
 
     Example: rig servo info --bench sim
     """
-    from rig.cli.bench.examination import case_of, say
-    from rig.doctor.lone_servo import lone_servo
-    from rig.doctor.register_words import words
+    from rig.cli.bench.examination import doctor_context, say
+    from rig.doctor.register_meaning import words
+    from rig.doctor.single_servo import single_servo
 
-    with case_of(settings) as case, lone_servo(case, say) as servo:
+    with doctor_context(settings) as context, single_servo(context, say) as servo:
         values = servo.read()
     if settings.json:
         settings.print_json(
@@ -70,14 +70,14 @@ def settings_(
 
     Example: rig servo settings --write --bench sim
     """
-    from rig.cli.bench.examination import case_of, say
+    from rig.cli.bench.examination import doctor_context, say
     from rig.devices.dynamixel.settings import ServoMode, compare
     from rig.devices.dynamixel.settings import write as write_settings
-    from rig.doctor.lone_servo import lone_servo
+    from rig.doctor.single_servo import single_servo
 
-    with case_of(settings) as case, lone_servo(case, say) as servo:
+    with doctor_context(settings) as context, single_servo(context, say) as servo:
         say("")
-        differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(case.config.table.mode))
+        differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(context.config.table.mode))
         if not settings.json:
             print(servo.found)
             print("\n".join(f"  {difference}" for difference in differences) or "  as the rig needs it")
@@ -90,7 +90,7 @@ def settings_(
     elif written:
         print("Written, and read back.")
     elif differences:
-        print(f"To write them: {case.rig('servo settings --write')}")
+        print(f"To write them: {context.rig('servo settings --write')}")
     if differences and not written:
         raise typer.Exit(4)
 
@@ -124,10 +124,10 @@ def set_baud(
 
 
 def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
-    from rig.cli.bench.examination import case_of, say
-    from rig.doctor.lone_servo import lone_servo
+    from rig.cli.bench.examination import doctor_context, say
+    from rig.doctor.single_servo import single_servo
 
-    with case_of(settings) as case, lone_servo(case, say) as servo:
+    with doctor_context(settings) as context, single_servo(context, say) as servo:
         say("")
         old = servo.found.bus_id if what == "id" else servo.found.baud
         if not settings.json:
@@ -140,31 +140,31 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
                 servo.set_id(new)
             else:
                 servo.set_baud(new)
-    followed = _follow(settings, case, what, old, new)
+    followed = _follow(settings, context, what, old, new)
     if settings.json:
         settings.print_json({**_identity(servo), what: new, "was": old, "config_changed": followed or None})
         return
     print(f"It has {what} {new} already." if old == new else f"Its {what} is {new} now, verified.")
     if followed:
         print(f"{followed}: servo.{what} = {new}")
-    elif getattr(case.config.servo, what) != new:
-        print(f"For the rig to find it: {case.set(f'servo.{what}', new)}")
+    elif getattr(context.config.servo, what) != new:
+        print(f"For the rig to find it: {context.set(f'servo.{what}', new)}")
 
 
-def _follow(settings: Settings, case: "Case", what: str, old: int, new: int) -> str:
+def _follow(settings: Settings, context: "DoctorContext", what: str, old: int, new: int) -> str:
     """Let the configuration file say what the servo says now, where it said what the servo said before."""
     from rig.config.toml_file import read_text, save, with_values
     from rig.config.values import default_path
 
     path = settings.config or default_path()
-    configured = getattr(case.config.servo, what)
+    configured = getattr(context.config.servo, what)
     if path is None or not path.exists() or configured != old or configured == new:
         return ""
     save(path, with_values(read_text(path), {("servo", what): new}))
     return str(path)
 
 
-def _identity(servo: "LoneServo") -> dict[str, Any]:
+def _identity(servo: "SingleServo") -> dict[str, Any]:
     found = servo.found
     return {
         "model": found.model,

@@ -16,8 +16,8 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from rig.bench.computer import DeviceFile
     from rig.config.toml_file import Key
-    from rig.doctor.case import Case
-    from rig.doctor.survey import Survey
+    from rig.doctor.context import DoctorContext
+    from rig.doctor.device_scan import DeviceScan
 
 T = TypeVar("T")
 
@@ -39,7 +39,7 @@ def setup(
     Example: rig setup --bench sim --yes
     """
     from rig.cli.bench.doctor import examination
-    from rig.cli.bench.examination import case_of
+    from rig.cli.bench.examination import doctor_context
     from rig.config import RigConfig
     from rig.config.toml_file import read_text, save, stated, with_values
     from rig.config.values import FILE_NAME, default_path
@@ -49,14 +49,14 @@ def setup(
     there = path.exists()
     now = settings if there else replace(settings, config=None, _loaded={})
     out = sys.stderr if settings.json else sys.stdout
-    with case_of(now) as case:
-        case.require_free()
-        dialogue = Dialogue(case, ask_nothing=yes or settings.json, out=out)
+    with doctor_context(now) as context:
+        context.require_free()
+        dialogue = Dialogue(context, ask_nothing=yes or settings.json, out=out)
         wanted = dialogue.run()
-        if settings.bench and settings.bench != case.config.default_bench:
+        if settings.bench and settings.bench != context.config.default_bench:
             wanted[("default_bench",)] = settings.bench
         old = read_text(path) if there else blank_file(RigConfig)
-        changes = {key: value for key, value in wanted.items() if not there or _in_force(case.config, key) != value}
+        changes = {key: value for key, value in wanted.items() if not there or _in_force(context.config, key) != value}
         new = with_values(old, changes)
         write = not there or new != old
         lines = [f"{'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
@@ -73,7 +73,7 @@ def setup(
         print(f"{done}\n")
     code = examination(after)
     if not settings.json:
-        print(_next(case, code))
+        print(_next(context, code))
     if code:
         raise typer.Exit(code)
 
@@ -82,51 +82,51 @@ def setup(
 class Dialogue:
     """Finds the devices of a bench, asking the person where there is a choice."""
 
-    case: "Case"
+    context: "DoctorContext"
     ask_nothing: bool
     out: Any
     wanted: "dict[Key, Any]" = field(default_factory=dict)
 
     def run(self) -> "dict[Key, Any]":
         """Return the keys of the configuration that were found out."""
-        from rig.doctor.survey import Survey, camera_settings, head_settings, imu_settings, servo_settings
+        from rig.doctor.device_scan import DeviceScan, camera_settings, head_settings, imu_settings, servo_settings
 
-        survey = Survey()
-        self._survey(survey)
-        while not survey.servos and not survey.doubtful and self._again("No servo was found."):
-            survey = Survey()
-            self._survey(survey)
-        computer = self.case.computer
-        servo = self._pick("servo", survey.servos, [f"{p.path}: {s}" for p, s in survey.servos], lambda pair: pair[0])
+        scan = DeviceScan()
+        self._scan(scan)
+        while not scan.servos and not scan.duplicate_ids and self._again("No servo was found."):
+            scan = DeviceScan()
+            self._scan(scan)
+        computer = self.context.computer
+        servo = self._pick("servo", scan.servos, [f"{p.path}: {s}" for p, s in scan.servos], lambda pair: pair[0])
         if servo is not None:
             self.wanted |= servo_settings(*servo)
-            if computer.same_file(servo[0].path, self.case.config.servo.port) and self._configured("servo", "port"):
-                self.wanted[("servo", "port")] = self.case.config.servo.port  # a name that a person chose
+            if computer.same_file(servo[0].path, self.context.config.servo.port) and self._configured("servo", "port"):
+                self.wanted[("servo", "port")] = self.context.config.servo.port  # a name that a person chose
             self._permanent_settings()
-        elif not survey.servos:
+        elif not scan.servos:
             self._which_port()
-        imus = [(str(found), imu_settings(found)) for found in survey.imus]
-        imus += [(f"on the rig head at {port.path}", head_settings(port)) for port in survey.heads]
+        imus = [(str(found), imu_settings(found)) for found in scan.imus]
+        imus += [(f"on the rig head at {port.path}", head_settings(port)) for port in scan.heads]
         imu = self._pick("IMU", imus, [shown for shown, _ in imus])
         if imu is not None:
             self.wanted |= imu[1]
-            if self.case.config.imu.connection == "head" and ("imu", "connection") not in imu[1]:
+            if self.context.config.imu.connection == "head" and ("imu", "connection") not in imu[1]:
                 self.wanted[("imu", "connection")] = "i2c"
-        shown = [f"{c.node.path}: {c.node.name}, {c.width}x{c.height}" for c in survey.cameras]
-        camera = self._pick("camera", survey.cameras, shown, lambda found: found.node)
+        shown = [f"{c.node.path}: {c.node.name}, {c.width}x{c.height}" for c in scan.cameras]
+        camera = self._pick("camera", scan.cameras, shown, lambda found: found.node)
         if camera is not None:
             self.wanted |= camera_settings(camera)
         self._reach()
         return self.wanted
 
-    def _survey(self, survey: "Survey") -> None:
+    def _scan(self, scan: "DeviceScan") -> None:
         from rich.console import Console
 
         from rig.cli.bench.examination import print_finding, say
-        from rig.doctor.examination import examine
+        from rig.doctor.examination import run_checks
 
         screen = Console(file=self.out)
-        for finding in examine(self.case, survey.checks, say):
+        for finding in run_checks(self.context, scan.checks, say):
             print_finding(screen, finding)
 
     def _again(self, what: str) -> bool:
@@ -152,7 +152,7 @@ class Dialogue:
         )
         if index is not None:
             return found[index]
-        pulled = self._pulled(what, lambda: [*self.case.computer.serial_ports(), *self.case.computer.cameras()])
+        pulled = self._pulled(what, lambda: [*self.context.computer.serial_ports(), *self.context.computer.cameras()])
         return next((each for each, its in zip(found, nodes, strict=True) if pulled and its.path == pulled.path), None)
 
     def _pulled(self, what: str, there: "Callable[[], Sequence[DeviceFile]]") -> "DeviceFile | None":
@@ -172,7 +172,7 @@ class Dialogue:
 
     def _which_port(self) -> None:
         """Without a servo that answers: at least its adapter may be known."""
-        ports = [port for port in self.case.computer.serial_ports() if port.usb]
+        ports = [port for port in self.context.computer.serial_ports() if port.usb]
         port: DeviceFile | None = ports[0] if len(ports) == 1 else None
         if len(ports) > 1 and not self.ask_nothing:
             index = prompts.ask_choice(
@@ -180,8 +180,8 @@ class Dialogue:
                 [f"{each.path}: {each.name}" for each in ports],
                 other="find out by unplugging it",
             )
-            port = ports[index] if index is not None else self._pulled("adapter", self.case.computer.serial_ports)
-        if port is not None and not self.case.computer.same_file(port.path, self.case.config.servo.port):
+            port = ports[index] if index is not None else self._pulled("adapter", self.context.computer.serial_ports)
+        if port is not None and not self.context.computer.same_file(port.path, self.context.config.servo.port):
             self.wanted[("servo", "port")] = port.stable or port.path
 
     def _permanent_settings(self) -> None:
@@ -189,28 +189,28 @@ class Dialogue:
         from rig.config.toml_file import Key
         from rig.core.errors import SeveralServos
         from rig.devices.dynamixel.settings import ServoMode, compare, write
-        from rig.doctor.lone_servo import lone_servo
+        from rig.doctor.single_servo import single_servo
 
         key: Key = ("servo", "port")
-        config = self.case.config
+        config = self.context.config
         found = config.servo.model_copy(update={"port": self.wanted[key]})
-        case = replace(self.case, config=config.model_copy(update={"servo": found}))
-        with suppress(SeveralServos), lone_servo(case) as servo:
+        context = replace(self.context, config=config.model_copy(update={"servo": found}))
+        with suppress(SeveralServos), single_servo(context) as servo:
             differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(config.table.mode))
             if not differences:
                 return
             print("The servo's permanent settings (EEPROM) are not as the rig needs them:", file=self.out)
             print("\n".join(f"  {difference}" for difference in differences), file=self.out)
             if self.ask_nothing:
-                print(f"  left as they are; to write them: {case.rig('servo settings --write')}", file=self.out)
+                print(f"  left as they are; to write them: {context.rig('servo settings --write')}", file=self.out)
             elif prompts.ask_yes_no("Write them now, with the servo's torque off?", default=True):
                 write(servo.bus, servo.found.bus_id, servo.table, differences)
                 print("Written, and read back.", file=self.out)
 
     def _reach(self) -> None:
         """Ask for the cable's budget."""
-        low, high = self.case.config.table.limits_deg
-        if self.ask_nothing or self._configured("table", "limits_deg") or self.case.config.table.mode == "pan":
+        low, high = self.context.config.table.limits_deg
+        if self.ask_nothing or self._configured("table", "limits_deg") or self.context.config.table.mode == "pan":
             return
         reach = prompts.ask_value(
             "How far may the table turn either way, in degrees, before the IMU's cable is taut?",
@@ -220,7 +220,7 @@ class Dialogue:
         self.wanted[("table", "limits_deg")] = [-reach, reach]
 
     def _configured(self, section: str, key: str) -> bool:
-        return key in getattr(self.case.config, section).model_fields_set
+        return key in getattr(self.context.config, section).model_fields_set
 
 
 def _degrees(text: str) -> float:
@@ -239,7 +239,7 @@ def _in_force(config: Any, key: "Key") -> Any:
     return list(config) if isinstance(config, tuple) else config
 
 
-def _next(case: "Case", code: int) -> str:
+def _next(context: "DoctorContext", code: int) -> str:
     if code:
-        return f"\nNext: what is marked ✗ above, then {case.rig('doctor')}."
-    return f"\nNext: {case.rig('goto 90')} turns the table; then {case.rig('enroll NAME')}."
+        return f"\nNext: what is marked ✗ above, then {context.rig('doctor')}."
+    return f"\nNext: {context.rig('goto 90')} turns the table; then {context.rig('enroll NAME')}."

@@ -45,10 +45,10 @@ def parts(home, monkeypatch):
 
             @contextmanager
             def host(self, config, options, seed):
-                bench.case.computer._port = config.servo.port
-                yield bench.case.computer
+                bench.context.computer._port = config.servo.port
+                yield bench.context.computer
 
-        monkeypatch.setattr("rig.doctor.case.bench_kind", lambda _: Kind())
+        monkeypatch.setattr("rig.doctor.context.bench_kind", lambda _: Kind())
         yield bench
 
 
@@ -153,7 +153,7 @@ class Hands(io.StringIO):
 
 
 def test_an_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
-    monkeypatch.setattr("rig.doctor.survey.BAUD_RATES_1", (1_000_000,))
+    monkeypatch.setattr("rig.doctor.device_scan.BAUD_RATES_1", (1_000_000,))
     parts.parts.servo_bus.detach(parts.parts.servo)  # nothing answers: the ports cannot be told apart
     parts.computer.serial_port("ttyUSB5", serial="OTHER")
     class_file = parts.computer.root / "sys/class/tty/ttyUSB5"
@@ -214,7 +214,7 @@ def test_the_doctor_in_json(parts, home):
     assert told["exit_code"] == 4
     bad = [finding for finding in told["findings"] if finding["level"] == "bad"]
     assert len(bad) == told["bad"] > 0
-    assert all(finding["mend"] for finding in bad)
+    assert all(finding["fix"] for finding in bad)
     voltage = next(f for f in told["findings"] if "voltage_v" in f["evidence"])
     assert voltage["evidence"]["voltage_v"] == pytest.approx(12, abs=0.5)
 

@@ -9,10 +9,10 @@ from tempfile import TemporaryDirectory
 
 from rig.bench.computer import User
 from rig.config import load_config
-from rig.doctor.case import Case
 from rig.doctor.checks import CHECKS
-from rig.doctor.examination import examine
-from rig.doctor.finding import Finding, Level
+from rig.doctor.context import DoctorContext
+from rig.doctor.examination import run_checks
+from rig.doctor.finding import Finding, Severity
 from sim.clock import VirtualClock
 from sim.computer import ComputerFiles, SimComputer
 from sim.noise import NoiseModel
@@ -27,7 +27,7 @@ class Bench:
 
     computer: ComputerFiles
     parts: SimParts
-    case: Case
+    context: DoctorContext
     sent: list[Frame] = field(default_factory=list)
 
     def add_servo(self, bus_id: int, baud: int, model: str = "xl430_w250") -> XSeriesServo:
@@ -38,11 +38,11 @@ class Bench:
 
     def findings(self, *topics: str) -> list[Finding]:
         """Examine the bench, or some topics of it."""
-        return list(examine(self.case, [check for check in CHECKS if not topics or check.topic in topics]))
+        return list(run_checks(self.context, [check for check in CHECKS if not topics or check.topic in topics]))
 
-    def troubles(self, *topics: str) -> dict[str, str]:
-        """Return what is not fine: the finding, and what mends it."""
-        return {f.text: f.mend for f in self.findings(*topics) if f.level is not Level.FINE}
+    def problems(self, *topics: str) -> dict[str, str]:
+        """Return what is not fine: the finding, and what fixes it."""
+        return {f.text: f.fix for f in self.findings(*topics) if f.level is not Severity.FINE}
 
     @property
     def instructions(self) -> set[int]:
@@ -85,7 +85,7 @@ def unopened(
                 computer.i2c_bus()
                 computer.camera()
                 computer.keeps_time()
-            case = Case(SimComputer(Path(folder), parts, config, user), config, "sim", ("--bench", "sim"))
-            bench = Bench(computer, parts, case)
+            context = DoctorContext(SimComputer(Path(folder), parts, config, user), config, "sim", ("--bench", "sim"))
+            bench = Bench(computer, parts, context)
             parts.servo_bus.taps.append(bench.sent.append)
             yield bench

@@ -1,4 +1,4 @@
-"""Every finding of the doctor: what is wrong is found, says which command mends it, and stops no other check."""
+"""Every finding of the doctor: what is wrong is found, says which command fixes it, and stops no other check."""
 
 import os
 import sqlite3
@@ -15,8 +15,8 @@ from rig.core.clock import SystemClock
 from rig.core.errors import DeviceSilent
 from rig.doctor.checks import CHECKS
 from rig.doctor.computer import udev_rules
-from rig.doctor.examination import Check, examine
-from rig.doctor.finding import Level, fine
+from rig.doctor.examination import Check, run_checks
+from rig.doctor.finding import Severity, fine
 from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
 from rig.safety.saved_state import BenchState as State
 from sim.clock import VirtualClock
@@ -36,10 +36,10 @@ def set_up(bench) -> None:
         bench.parts.servo.memory[name] = value
 
 
-def one(troubles: dict[str, str]) -> tuple[str, str]:
+def one(problems: dict[str, str]) -> tuple[str, str]:
     """Return the only trouble there is."""
-    ((text, mend),) = troubles.items()
-    return text, mend
+    ((text, fix),) = problems.items()
+    return text, fix
 
 
 def test_a_bench_in_order_has_only_its_calibration_to_come():
@@ -47,9 +47,9 @@ def test_a_bench_in_order_has_only_its_calibration_to_come():
         set_up(bench)
         findings = bench.findings()
         assert {f.topic for f in findings} == {check.topic for check in CHECKS}
-        (trouble,) = [f for f in findings if f.level is not Level.FINE]
+        (trouble,) = [f for f in findings if f.level is not Severity.FINE]
         assert trouble.topic == "calibration"
-        assert trouble.mend == "rig calibrate imu --bench sim"
+        assert trouble.fix == "rig calibrate imu --bench sim"
         assert bench.instructions <= {PING, READ}  # nothing is written, so nothing can move
 
 
@@ -59,10 +59,10 @@ def test_an_empty_computer_is_told_device_by_device():
         bench.parts.camera.unplug()
         bench.parts.i2c.detach(0x68)
         findings = bench.findings()
-        bad = {f.topic for f in findings if f.level is Level.BAD}
+        bad = {f.topic for f in findings if f.level is Severity.BAD}
         assert bad == {"port", "servo", "imu", "camera"}
-        assert all(f.mend for f in findings if f.level is not Level.FINE)
-        assert {f.topic for f in findings if f.level is Level.FINE} >= {"bench", "disk", "clock", "catalog"}
+        assert all(f.fix for f in findings if f.level is not Severity.FINE)
+        assert {f.topic for f in findings if f.level is Severity.FINE} >= {"bench", "disk", "clock", "catalog"}
 
 
 # -- the computer -----------------------------------------------------------------------------------------------------
@@ -73,9 +73,9 @@ def test_the_latency_timer_is_mended_by_one_command():
         bench.computer.serial_port(latency_ms=16)
         bench.computer.i2c_bus()
         bench.computer.camera()
-        text, mend = one(bench.troubles("port"))
+        text, fix = one(bench.problems("port"))
         assert "is 16 ms" in text
-        assert mend == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+        assert fix == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
 
 
 @pytest.mark.parametrize(("members", "command"), [((), "sudo usermod -aG dialout ada"), (("ada",), "newgrp dialout")])
@@ -85,9 +85,9 @@ def test_a_missing_permission_names_the_group_or_the_new_login(members, command)
         bench.computer.serial_port(mode=0o660)
         bench.computer.i2c_bus(mode=0o666)
         bench.computer.camera(mode=0o666)
-        text, mend = one(bench.troubles("port"))
+        text, fix = one(bench.problems("port"))
         assert "ada may not use /dev/ttyUSB0" in text
-        assert mend == command
+        assert fix == command
 
 
 def test_a_port_of_root_alone_is_mended_by_rules_for_udev():
@@ -96,9 +96,9 @@ def test_a_port_of_root_alone_is_mended_by_rules_for_udev():
         bench.computer.serial_port(mode=0o600, serial="FT3M9M97")
         bench.computer.i2c_bus(mode=0o666)
         bench.computer.camera(mode=0o666)
-        _, mend = one(bench.troubles("port"))
-        assert mend.startswith("rig doctor --udev --bench sim | sudo tee /etc/udev/rules.d/")
-        rules = udev_rules(bench.case.computer.serial_ports())
+        _, fix = one(bench.problems("port"))
+        assert fix.startswith("rig doctor --udev --bench sim | sudo tee /etc/udev/rules.d/")
+        rules = udev_rules(bench.context.computer.serial_ports())
         assert 'ATTR{latency_timer}="1"' in rules
         assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT3M9M97"' in rules
         assert 'SYMLINK+="rig-servo"' in rules
@@ -106,15 +106,15 @@ def test_a_port_of_root_alone_is_mended_by_rules_for_udev():
 
 
 @pytest.mark.parametrize(
-    ("command", "mend"),
+    ("command", "fix"),
     [("dynamixel_wizard", "kill 77"), ("/usr/sbin/ModemManager", "sudo systemctl disable --now ModemManager")],
 )
-def test_who_holds_the_port_is_named(command, mend):
+def test_who_holds_the_port_is_named(command, fix):
     with unopened() as bench:
         bench.computer.process(77, command, "/dev/ttyUSB0")
-        text, told = one(bench.troubles("port"))
+        text, told = one(bench.problems("port"))
         assert f"held by process 77 ({command})" in text
-        assert told == mend
+        assert told == fix
 
 
 def test_another_port_than_the_configured_one_is_offered_by_its_lasting_name():
@@ -122,8 +122,8 @@ def test_another_port_than_the_configured_one_is_offered_by_its_lasting_name():
         bench.computer.serial_port("ttyUSB3", serial="FT7")
         bench.computer.i2c_bus(4)
         bench.computer.camera(2, "Cam")
-        mends = list(bench.troubles("port").values())
-        assert mends == [
+        fixes = list(bench.problems("port").values())
+        assert fixes == [
             "rig config set servo.port /dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_FT7-if00-port0",
             "rig config set imu.bus 4",
             "rig config set camera.source /dev/v4l/by-id/usb-Cam-video-index0",
@@ -136,42 +136,42 @@ def test_two_other_ports_are_a_case_for_the_set_up():
         bench.computer.serial_port("ttyUSB4", serial="B")
         bench.computer.i2c_bus()
         bench.computer.camera()
-        assert one(bench.troubles("port"))[1] == "rig setup --bench sim"
+        assert one(bench.problems("port"))[1] == "rig setup --bench sim"
 
 
 def test_a_bench_in_use_is_left_alone():
     with unopened() as bench:
-        path = bench.case.config.state_path("sim")
+        path = bench.context.config.state_path("sim")
         lock = BenchLock(path, SystemClock())
-        bench.case.holder = holder(path)
+        bench.context.holder = holder(path)
         findings = bench.findings()
         lock.close()
-        told = {f.topic: f for f in findings if f.level is Level.WARNING}
+        told = {f.topic: f for f in findings if f.level is Severity.WARNING}
         assert f"process {os.getpid()}" in told["bench"].text
         assert {"servo", "imu", "camera"} <= set(told)
-        assert told["servo"].mend == "rig stop --bench sim"
+        assert told["servo"].fix == "rig stop --bench sim"
         assert not bench.sent
 
 
 def test_a_latched_fault_and_a_damaged_state_are_told():
     with unopened() as bench:
-        store = FileStore(bench.case.config.state_path("sim"))
+        store = FileStore(bench.context.config.state_path("sim"))
         utc = "2026-05-01T10:00:00+00:00"
         store.save(State(fault=LatchedFault.of(DeviceSilent("Servo 1 is gone.", next_step="Look."), utc)))
-        text, mend = one(bench.troubles("bench"))
+        text, fix = one(bench.problems("bench"))
         assert "fault 402" in text
         assert "Servo 1 is gone." in text
-        assert mend == "rig acknowledge --bench sim"
+        assert fix == "rig acknowledge --bench sim"
         (store.path / "state.json").write_text("{")
-        text, mend = one(bench.troubles("bench"))
+        text, fix = one(bench.problems("bench"))
         assert "damaged" in text
-        assert "rig home --turns" in mend
+        assert "rig home --turns" in fix
 
 
-@pytest.mark.parametrize(("free", "level"), [(50e9, Level.FINE), (1e9, Level.WARNING), (1e8, Level.BAD)])
+@pytest.mark.parametrize(("free", "level"), [(50e9, Severity.FINE), (1e9, Severity.WARNING), (1e8, Severity.BAD)])
 def test_room_on_the_disk_is_told_in_objects(monkeypatch, free, level):
     with unopened() as bench:
-        monkeypatch.setattr(type(bench.case.computer), "disk", lambda *_: Disk(int(free), network=False))
+        monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: Disk(int(free), network=False))
         (finding,) = bench.findings("disk")
         assert finding.level is level
         assert f"about {int(free / 500_000) // 72} more objects" in finding.text
@@ -179,30 +179,32 @@ def test_room_on_the_disk_is_told_in_objects(monkeypatch, free, level):
 
 def test_a_folder_that_may_not_be_written_to_is_told(monkeypatch):
     with unopened() as bench:
-        monkeypatch.setattr(type(bench.case.computer), "disk", lambda *_: Disk(10**11, network=False, writable=False))
-        text, mend = one(bench.troubles("disk"))
+        monkeypatch.setattr(
+            type(bench.context.computer), "disk", lambda *_: Disk(10**11, network=False, writable=False)
+        )
+        text, fix = one(bench.problems("disk"))
         assert "may not write" in text
-        assert mend == "rig config set catalog.path FOLDER"
+        assert fix == "rig config set catalog.path FOLDER"
 
 
 def test_a_catalog_on_another_computer_is_warned_of(monkeypatch):
     with unopened() as bench:
-        monkeypatch.setattr(type(bench.case.computer), "disk", lambda *_: Disk(10**11, network=True))
-        text, _ = one(bench.troubles("disk"))
+        monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: Disk(10**11, network=True))
+        text, _ = one(bench.problems("disk"))
         assert "network file system" in text
 
 
 def test_a_clock_that_nobody_keeps_is_told_and_one_that_is_wrong_stops_the_work():
     with unopened(plugged=False) as bench:
-        assert "no time server that is known" in one(bench.troubles("clock"))[0]
+        assert "no time server that is known" in one(bench.problems("clock"))[0]
         bench.computer.keeps_time(synchronised=False)
-        text, mend = one(bench.troubles("clock"))
+        text, fix = one(bench.problems("clock"))
         assert "no time server has been reached" in text
-        assert mend == "sudo timedatectl set-ntp true"
+        assert fix == "sudo timedatectl set-ntp true"
         bench.computer.keeps_time()
-        assert not bench.troubles("clock")
-        bench.case.computer.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
-        (wrong,) = [f for f in bench.findings("clock") if f.level is Level.BAD]
+        assert not bench.problems("clock")
+        bench.context.computer.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
+        (wrong,) = [f for f in bench.findings("clock") if f.level is Severity.BAD]
         assert "1970-01-01" in wrong.text
 
 
@@ -220,8 +222,8 @@ def test_a_civil_time_that_jumps_and_a_pause_that_drags_on_are_told():
             return super().utc() + self.jump
 
     with unopened() as bench:
-        bench.case.computer.clock = Bad()
-        texts = "\n".join(bench.troubles("clock"))
+        bench.context.computer.clock = Bad()
+        texts = "\n".join(bench.problems("clock"))
         assert "took 1020 ms" in texts
         assert "jumped by +3600.0 s" in texts
 
@@ -231,66 +233,66 @@ def test_a_civil_time_that_jumps_and_a_pause_that_drags_on_are_told():
 
 def test_each_setting_of_the_factory_is_told_with_what_is_wanted_and_why():
     with unopened() as bench:
-        troubles = bench.troubles("servo")
-        assert set(troubles.values()) == {"rig servo settings --write --bench sim"}
-        assert any(text.startswith("EEPROM Operating Mode: 3 → 4") for text in troubles)
-        assert any(text.startswith("EEPROM Return Delay Time: 250 → 0") for text in troubles)
+        problems = bench.problems("servo")
+        assert set(problems.values()) == {"rig servo settings --write --bench sim"}
+        assert any(text.startswith("EEPROM Operating Mode: 3 → 4") for text in problems)
+        assert any(text.startswith("EEPROM Return Delay Time: 250 → 0") for text in problems)
 
 
 @pytest.mark.parametrize(
-    ("place", "mend"),
+    ("place", "fix"),
     [
         ((3, 57_600), "rig config set servo.id 3"),
         ((1, 1_000_000), "rig config set servo.baud 1000000"),
         ((3, 1_000_000), "rig setup --bench sim"),
     ],
 )
-def test_a_servo_elsewhere_is_found_and_the_configuration_can_follow(place, mend):
+def test_a_servo_elsewhere_is_found_and_the_configuration_can_follow(place, fix):
     with unopened(servo_at=place) as bench:
-        text, told = one(bench.troubles("servo"))
+        text, told = one(bench.problems("servo"))
         assert f"id {place[0]} at {place[1]} baud" in text
-        assert told == mend
+        assert told == fix
 
 
 def test_several_servos_elsewhere_are_listed():
     with unopened(servo_at=(3, 57_600)) as bench:
         bench.add_servo(4, 115_200)
-        text, mend = one(bench.troubles("servo"))
+        text, fix = one(bench.problems("servo"))
         assert "2 others" in text
-        assert mend == "rig setup --bench sim"
+        assert fix == "rig setup --bench sim"
 
 
 def test_no_servo_at_all_asks_for_power():
     with unopened() as bench:
         bench.parts.servo_bus.detach(bench.parts.servo)
-        text, mend = one(bench.troubles("servo"))
+        text, fix = one(bench.problems("servo"))
         assert "nor any other at any baud rate" in text
-        assert "12 V" in mend
+        assert "12 V" in fix
 
 
 def test_a_neighbour_is_mentioned_and_a_twin_is_an_obstacle():
     with unopened() as bench:
         set_up(bench)
         bench.add_servo(7, 57_600)
-        assert not bench.troubles("servo")
+        assert not bench.problems("servo")
         assert any("also on the bus" in f.text and "id 7" in f.text for f in bench.findings("servo"))
         bench.add_servo(1, 57_600)
-        text, mend = one(bench.troubles("servo"))
+        text, fix = one(bench.problems("servo"))
         assert "two servos answer at once to id 1" in text
-        assert "rig servo set-id 2 --bench sim" in mend
+        assert "rig servo set-id 2 --bench sim" in fix
 
 
 def test_another_model_can_be_made_the_configured_one():
     with unopened("servo.model=xm430_w350") as bench:
         bench.parts.servo_bus.detach(bench.parts.servo)
         bench.add_servo(1, 57_600, "xl430_w250")
-        assert one(bench.troubles("servo"))[1] == "rig config set servo.model xl430_w250"
+        assert one(bench.problems("servo"))[1] == "rig config set servo.model xl430_w250"
 
 
 def test_an_ax_12a_says_what_it_lacks():
     with unopened("servo.model=ax_12a", "table.mode=pan", "servo.baud=1000000") as bench:
         bench.parts.servo.memory["Return Delay Time"] = 0
-        texts = "\n".join(bench.troubles("servo"))
+        texts = "\n".join(bench.problems("servo"))
         assert "no watchdog" in texts
         assert "EEPROM" not in texts
 
@@ -300,7 +302,7 @@ def test_torque_left_on_and_a_tripped_watchdog_are_told_and_left():
         set_up(bench)
         bench.parts.servo.memory["Torque Enable"] = 1
         bench.parts.servo.memory["Bus Watchdog"] = 0xFF
-        texts = "\n".join(bench.troubles("servo"))
+        texts = "\n".join(bench.problems("servo"))
         assert "torque is on" in texts
         assert "watchdog tripped" in texts
         assert bench.parts.servo.memory["Torque Enable"] == 1
@@ -354,13 +356,13 @@ def test_under_every_fault_all_checks_come_to_an_end_and_those_that_show_are_fou
         seen = name.startswith("camera") or name in LOOKS
         findings = bench.findings("port", "servo", "imu", "clock", *(["camera"] if seen else []))
         faults.clear()
-        troubles = [f for f in findings if f.level is not Level.FINE]
-        assert all(f.mend for f in troubles)
+        problems = [f for f in findings if f.level is not Severity.FINE]
+        assert all(f.fix for f in problems)
         assert not any("the check itself failed" in f.text or "given up" in f.text for f in findings)
         if name in FOUND:
             topic, word = FOUND[name]
-            assert any(f.topic == topic and word in f.text for f in troubles), troubles
-            others = {f.topic for f in troubles} - {topic}
+            assert any(f.topic == topic and word in f.text for f in problems), problems
+            others = {f.topic for f in problems} - {topic}
             assert not others
 
 
@@ -371,18 +373,18 @@ def test_an_imu_at_its_other_address_and_on_its_side():
     with unopened("imu.address=0x69") as bench:
         device = bench.parts.i2c.detach(0x69)
         bench.parts.i2c.attach(0x68, device)
-        assert one(bench.troubles("imu"))[1] == "rig config set imu.address 0x68"
+        assert one(bench.problems("imu"))[1] == "rig config set imu.address 0x68"
     with unopened("imu.model=bno055") as bench:
-        bench.case.computer.clock.sleep(1.0)  # it is silent for a while after power-up
-        assert not bench.troubles("imu")
+        bench.context.computer.clock.sleep(1.0)  # it is silent for a while after power-up
+        assert not bench.problems("imu")
     with unopened("imu.axis=x") as bench:
-        assert one(bench.troubles("imu"))[1] == "rig config set imu.axis z"
+        assert one(bench.problems("imu"))[1] == "rig config set imu.axis z"
 
 
 def test_a_clone_is_named():
     with unopened() as bench:
         bench.parts.imu.who_am_i = 0x70
-        text, _ = one(bench.troubles("imu"))
+        text, _ = one(bench.problems("imu"))
         assert "MPU-6500" in text
 
 
@@ -390,15 +392,15 @@ def test_an_imu_on_a_rig_head_is_looked_at_there():
     with unopened("imu.connection=head", "head.port=/dev/ttyUSB1") as bench:
         set_up(bench)
         bench.computer.serial_port("ttyUSB1", serial="HEAD")
-        assert not bench.troubles("port", "servo", "imu")
+        assert not bench.problems("port", "servo", "imu")
         assert any("rig head" in f.text for f in bench.findings("imu"))
         bench.parts.head.unplugged = True
-        assert "no rig head" in one(bench.troubles("imu"))[0]
+        assert "no rig head" in one(bench.problems("imu"))[0]
 
 
 def test_a_servo_fed_by_the_heads_relay_is_not_called_dead():
     with unopened("imu.connection=head", "head.port=/dev/ttyUSB1", "head.power=true") as bench:
-        text, _ = one(bench.troubles("servo"))
+        text, _ = one(bench.problems("servo"))
         assert "relay" in text
 
 
@@ -413,35 +415,35 @@ def enroll(path: Path, views: int) -> None:
 def test_a_catalog_is_looked_into():
     with unopened() as bench:
         assert "none yet" in bench.findings("catalog")[0].text
-        path = bench.case.catalog_path
+        path = bench.context.catalog_path
         enroll(path, 6)
         (finding,) = bench.findings("catalog")
-        assert finding.level is Level.FINE
+        assert finding.level is Severity.FINE
         assert "1 objects, 6 views" in finding.text
         image = next((path / "images").rglob("*.png"))
         image.write_bytes(b"no image")
-        text, mend = one(bench.troubles("catalog"))
+        text, fix = one(bench.problems("catalog"))
         assert "1 of 6 images" in text
-        assert mend == "rig catalog verify --repair --bench sim"
+        assert fix == "rig catalog verify --repair --bench sim"
         image.unlink()
         (path / "catalog.sqlite").write_bytes(b"SQLite format 3\0" + b"rubbish" * 999)
         (finding,) = bench.findings("catalog")
-        assert finding.level is Level.BAD
+        assert finding.level is Severity.BAD
         assert finding.exit_code == 7
 
 
 def test_a_catalog_with_rows_of_nobody_is_damaged():
     with unopened() as bench:
-        path = bench.case.catalog_path
+        path = bench.context.catalog_path
         enroll(path, 4)
         with sqlite3.connect(path / "catalog.sqlite") as connection:
             connection.execute("PRAGMA foreign_keys = off")
             connection.execute("DELETE FROM sittings")
         connection.close()
-        assert any("damaged" in text for text in bench.troubles("catalog"))
+        assert any("damaged" in text for text in bench.problems("catalog"))
 
 
-def fact(bench, days_ago: float, valid_days: float | None = None, **device: object) -> CalibrationResult:
+def result(bench, days_ago: float, valid_days: float | None = None, **device: object) -> CalibrationResult:
     return CalibrationResult(
         name="imu.scale",
         estimates={"scale": Estimate(1.01, 0.001, "")},
@@ -449,7 +451,7 @@ def fact(bench, days_ago: float, valid_days: float | None = None, **device: obje
         limit=0.2,
         residual_unit="°",
         refusals=(),
-        when_utc=bench.case.computer.clock.utc() - timedelta(days=days_ago),
+        when_utc=bench.context.computer.clock.utc() - timedelta(days=days_ago),
         device=device,
         evidence={},
         valid_days=valid_days,
@@ -459,23 +461,23 @@ def fact(bench, days_ago: float, valid_days: float | None = None, **device: obje
 def test_calibrations_missing_expired_and_of_another_device():
     with unopened() as bench:
         set_up(bench)
-        store = CalibrationStore(bench.case.config.calibration_path("sim"))
-        assert "never calibrated" in one(bench.troubles("calibration"))[0]
-        store.keep(fact(bench, 100, valid_days=30))
-        text, mend = one(bench.troubles("calibration"))
-        assert "calibrated 100 days ago; it holds for 30" in text
-        assert mend == "rig calibrate imu --bench sim"
-        store.keep(fact(bench, 1, imu={"who_am_i": 0x99}))
+        store = CalibrationStore(bench.context.config.calibration_path("sim"))
+        assert "never calibrated" in one(bench.problems("calibration"))[0]
+        store.add(result(bench, 100, valid_days=30))
+        text, fix = one(bench.problems("calibration"))
+        assert "calibrated 100 days ago; it is valid for 30 days" in text
+        assert fix == "rig calibrate imu --bench sim"
+        store.add(result(bench, 1, imu={"who_am_i": 0x99}))
         bench.findings("servo", "imu")  # the devices are known only when they were met
-        assert "calibrated 100 days ago" in one(bench.troubles("calibration"))[0]
+        assert "calibrated 100 days ago" in one(bench.problems("calibration"))[0]
         for path in store.folder.glob("*.json"):
             path.unlink()
-        store.keep(fact(bench, 1, imu={"who_am_i": 0x99}))
-        assert "another device: imu.who_am_i was 153, is 104" in one(bench.troubles("calibration"))[0]
-        store.keep(fact(bench, 0.5, valid_days=30))
-        assert not bench.troubles("calibration")
+        store.add(result(bench, 1, imu={"who_am_i": 0x99}))
+        assert "another device: imu.who_am_i was 153, is 104" in one(bench.problems("calibration"))[0]
+        store.add(result(bench, 0.5, valid_days=30))
+        assert not bench.problems("calibration")
         (store.folder / "20260430T000000.000000Z-imu.scale.json").write_text("{")
-        assert "Cannot read the calibration" in one(bench.troubles("calibration"))[0]
+        assert "Cannot read the calibration" in one(bench.problems("calibration"))[0]
 
 
 # -- the examination itself -------------------------------------------------------------------------------------------
@@ -484,20 +486,20 @@ def test_calibrations_missing_expired_and_of_another_device():
 def test_a_check_that_hangs_fails_or_dies_stops_no_other_one():
     released = threading.Event()
 
-    def hangs(case):
+    def hangs(context):
         yield fine("hangs", "begun")
         released.wait()
         yield fine("hangs", "never told")
 
-    def refused(case):
+    def refused(context):
         raise DeviceSilent("Nobody is there.", next_step="Knock.")
         yield
 
-    def pulled(case):
+    def pulled(context):
         yield fine("pulled", "begun")
         raise OSError(5, "Input/output error")
 
-    def broken(case):
+    def broken(context):
         yield from ()
         raise KeyError("oh")
 
@@ -509,15 +511,15 @@ def test_a_check_that_hangs_fails_or_dies_stops_no_other_one():
         Check("well", lambda _: iter([fine("well", "well")])),
     ]
     with unopened() as bench:
-        findings = list(examine(bench.case, checks))
+        findings = list(run_checks(bench.context, checks))
     released.set()
-    told = [(f.topic, f.level, f.mend, f.exit_code) for f in findings]
+    told = [(f.topic, f.level, f.fix, f.exit_code) for f in findings]
     assert told == [
-        ("hangs", Level.FINE, "", 0),
-        ("hangs", Level.BAD, "Pull the plug", 9),
-        ("refused", Level.BAD, "Knock.", 4),
-        ("pulled", Level.FINE, "", 0),
-        ("pulled", Level.BAD, "rig doctor --bench sim", 4),
-        ("broken", Level.BAD, "Report this with the output of `rig doctor --json`", 1),
-        ("well", Level.FINE, "", 0),
+        ("hangs", Severity.FINE, "", 0),
+        ("hangs", Severity.BAD, "Pull the plug", 9),
+        ("refused", Severity.BAD, "Knock.", 4),
+        ("pulled", Severity.FINE, "", 0),
+        ("pulled", Severity.BAD, "rig doctor --bench sim", 4),
+        ("broken", Severity.BAD, "Report this with the output of `rig doctor --json`", 1),
+        ("well", Severity.FINE, "", 0),
     ]

@@ -47,27 +47,27 @@ class FoundServo:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """What one baud rate brought.
+class BaudScan:
+    """The answers at one baud rate.
 
-    ``doubtful`` are ids under which something answers that is no whole packet, time after time: two servos with one
-    id. ``noise`` is True where bytes came that belong to no id: another baud rate, another master, a bad line.
+    ``duplicate_ids`` are ids that repeatedly answer with broken packets: two servos have the same id. ``noise`` is True
+    if bytes came that belong to no id: another baud rate, another master, or a bad connection.
     """
 
     baud: int
     protocol: int
     servos: tuple[FoundServo, ...] = ()
-    doubtful: tuple[int, ...] = ()
+    duplicate_ids: tuple[int, ...] = ()
     noise: bool = False
 
     @property
     def anything(self) -> bool:
-        return bool(self.servos or self.doubtful)
+        return bool(self.servos or self.duplicate_ids)
 
 
 def scan_servos(
     wire: SerialConnection, clock: Clock, bauds: Sequence[int] = BAUD_RATES, *, protocol: int = 2
-) -> Iterator[Heard]:
+) -> Iterator[BaudScan]:
     """Ask at each baud rate who is there, and yield what was heard; at last the wire has the baud rate it had.
 
     Takes about a second a baud rate, four at 9,600; with Protocol 1.0, where each id is asked, five.
@@ -91,7 +91,7 @@ def scan_servos(
             wire.baudrate = before
 
 
-def without_echoes(heard: Sequence[Heard], preferred: int) -> list[Heard]:
+def without_echoes(heard: Sequence[BaudScan], preferred: int) -> list[BaudScan]:
     """Return what was heard at several rates; of a port that has no baud rate, what was heard at one, ``preferred``.
 
     On a pseudo-terminal, a port in the network or a board that relays bytes the same servos answer whatever the rate.
@@ -116,18 +116,18 @@ def spoiled_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) ->
     return spoiled
 
 
-def _heard_2(port: ClockedPort, baud: int) -> Heard:
+def _heard_2(port: ClockedPort, baud: int) -> BaudScan:
     listening = _Recording(port)
     try:
         answers, _ = Protocol2PacketHandler().broadcastPing(listening)
     except BusBabble:
-        return Heard(baud, 2, noise=True)
+        return BaudScan(baud, 2, noise=True)
     port.drain()
     if _unasked(port):
-        return Heard(baud, 2, noise=True)
+        return BaudScan(baud, 2, noise=True)
     servos = [_servo(bus_id, baud, 2, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
     bus = DynamixelBus(port, retries=0)
-    doubtful = [servo.bus_id for servo in servos if spoiled_reads(bus, servo.bus_id) > _STATUS_READS // 2]
+    duplicate_ids = [servo.bus_id for servo in servos if spoiled_reads(bus, servo.bus_id) > _STATUS_READS // 2]
     # The SDK leaves out what it cannot read, and calls that a success. The answers of servos with one id fall into each
     # other: where more bytes came than belong to whole answers, each id is asked by itself.
     rest = len(listening.answered) - _PING_ANSWER * len(answers)
@@ -135,11 +135,11 @@ def _heard_2(port: ClockedPort, baud: int) -> Heard:
         try:
             head = bus.read_block(bus_id, 0, 7)
         except (RequestRejected, DeviceSilent):
-            doubtful += [bus_id] if _spoils(bus, bus_id) else []
+            duplicate_ids += [bus_id] if _spoils(bus, bus_id) else []
         else:  # its answer to all was spoiled, that to the question of its own is not
             servos.append(_servo(bus_id, baud, 2, int.from_bytes(head[:2], "little"), head[6]))
-    sound = tuple(servo for servo in servos if servo.bus_id not in doubtful)
-    return Heard(baud, 2, sound, tuple(sorted(doubtful)), bool(rest) and not doubtful and not sound)
+    sound = tuple(servo for servo in servos if servo.bus_id not in duplicate_ids)
+    return BaudScan(baud, 2, sound, tuple(sorted(duplicate_ids)), bool(rest) and not duplicate_ids and not sound)
 
 
 class _Recording(ClockedPort):
@@ -164,11 +164,11 @@ class _Recording(ClockedPort):
         return data
 
 
-def _heard_1(port: ClockedPort, baud: int) -> Heard:
+def _heard_1(port: ClockedPort, baud: int) -> BaudScan:
     if _unasked(port):
-        return Heard(baud, 1, noise=True)
+        return BaudScan(baud, 1, noise=True)
     servos = []
-    doubtful = []
+    duplicate_ids = []
     bus = DynamixelBus(_Hasty(port), retries=0, protocol=1)
     for bus_id in range(253):
         corrupt = bus.statistics.corrupt
@@ -178,10 +178,10 @@ def _heard_1(port: ClockedPort, baud: int) -> Heard:
             continue
         except DeviceSilent:
             if bus.statistics.corrupt > corrupt and _spoils(bus, bus_id):
-                doubtful.append(bus_id)
+                duplicate_ids.append(bus_id)
             continue
         servos.append(_servo(bus_id, baud, 1, int.from_bytes(head[:2], "little"), head[2]))
-    return Heard(baud, 1, tuple(servos), tuple(doubtful))
+    return BaudScan(baud, 1, tuple(servos), tuple(duplicate_ids))
 
 
 def _unasked(port: ClockedPort) -> bool:

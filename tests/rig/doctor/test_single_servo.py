@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, RequestRejected, SeveralServos, UsageError
 from rig.devices.dynamixel.registers import control_table, model_numbers
-from rig.doctor.lone_servo import lone_servo
-from rig.doctor.register_words import baud_codes, words
+from rig.doctor.register_meaning import baud_codes, words
+from rig.doctor.single_servo import single_servo
 from rig.safety.saved_state import Holder
 from tests.fuzzing import fuzz_settings
 from tests.rig.doctor.doctor_parts import unopened
@@ -25,15 +25,15 @@ def test_a_servo_found_anywhere_gets_another_id_and_rate(at, new_id, new_baud):
     with unopened(servo_at=at) as bench:
         memory = bench.parts.servo.memory
         memory["Torque Enable"] = 1
-        with lone_servo(bench.case) as servo:
+        with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == at
             servo.set_id(new_id)
         assert memory["ID"] == new_id
         assert memory["Torque Enable"] == 0
-        with lone_servo(bench.case) as servo:
+        with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == (new_id, at[1])
             servo.set_baud(new_baud)
-        with lone_servo(bench.case) as servo:
+        with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == (new_id, new_baud)
 
 
@@ -41,7 +41,7 @@ def test_a_servo_found_anywhere_gets_another_id_and_rate(at, new_id, new_baud):
 def test_a_second_servo_at_any_rate_forbids_it_and_nothing_is_written(place):
     with unopened() as bench:
         bench.add_servo(*place)
-        with pytest.raises(SeveralServos) as caught, lone_servo(bench.case):
+        with pytest.raises(SeveralServos) as caught, single_servo(bench.context):
             pass
         assert "Unplug" in caught.value.next_step
         assert caught.value.exit_code == 4
@@ -49,23 +49,23 @@ def test_a_second_servo_at_any_rate_forbids_it_and_nothing_is_written(place):
 
 
 def test_no_servo_an_unknown_one_and_a_bench_in_use(monkeypatch):
-    monkeypatch.setattr("rig.doctor.lone_servo.BAUD_RATES_1", (1_000_000,))
+    monkeypatch.setattr("rig.doctor.single_servo.BAUD_RATES_1", (1_000_000,))
     with unopened() as bench:
         bench.parts.servo.memory["Model Number"] = 4711
-        with pytest.raises(DeviceMismatch, match="4711"), lone_servo(bench.case):
+        with pytest.raises(DeviceMismatch, match="4711"), single_servo(bench.context):
             pass
         bench.parts.servo_bus.detach(bench.parts.servo)
-        with pytest.raises(DeviceNotFound, match="at any baud rate"), lone_servo(bench.case):
+        with pytest.raises(DeviceNotFound, match="at any baud rate"), single_servo(bench.context):
             pass
         bench.sent.clear()
-        bench.case.holder = Holder(pid=7, command="rig enroll mug", since_utc="")
-        with pytest.raises(BenchBusy, match="rig enroll mug"), lone_servo(bench.case):
+        bench.context.holder = Holder(pid=7, command="rig enroll mug", since_utc="")
+        with pytest.raises(BenchBusy, match="rig enroll mug"), single_servo(bench.context):
             pass
         assert not bench.sent
 
 
 def test_what_a_servo_cannot_be_set_to_is_refused_before_anything_is_written():
-    with unopened() as bench, lone_servo(bench.case) as servo:
+    with unopened() as bench, single_servo(bench.context) as servo:
         with pytest.raises(UsageError, match="No servo has the id 253"):
             servo.set_id(253)
         with pytest.raises(UsageError) as caught:
@@ -75,14 +75,14 @@ def test_what_a_servo_cannot_be_set_to_is_refused_before_anything_is_written():
 
 
 def test_a_servo_that_keeps_its_old_id_is_not_believed(monkeypatch):
-    with unopened() as bench, lone_servo(bench.case) as servo:
+    with unopened() as bench, single_servo(bench.context) as servo:
         monkeypatch.setattr(type(bench.parts.servo), "bus_id", property(lambda _: 1))
         with pytest.raises(RequestRejected, match="did not take the id 9"):
             servo.set_id(9)
 
 
 def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
-    with unopened() as bench, lone_servo(bench.case) as servo:
+    with unopened() as bench, single_servo(bench.context) as servo:
         monkeypatch.setattr(type(bench.parts.servo), "baudrate", property(lambda _: 57_600))
         with pytest.raises(RequestRejected, match="1000000 baud"):
             servo.set_baud(1_000_000)
@@ -92,19 +92,19 @@ def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
 def test_a_servo_that_answers_reads_alone_can_be_renamed():
     with unopened() as bench:
         bench.parts.servo.memory["Status Return Level"] = 1
-        with lone_servo(bench.case) as servo:
+        with single_servo(bench.context) as servo:
             servo.set_id(5)
         assert bench.parts.servo.memory["ID"] == 5
 
 
 def test_an_ax_12a_is_renamed_by_its_own_protocol(monkeypatch):
-    monkeypatch.setattr("rig.doctor.lone_servo.BAUD_RATES_1", (1_000_000, 115_200))  # each asks 253 ids
+    monkeypatch.setattr("rig.doctor.single_servo.BAUD_RATES_1", (1_000_000, 115_200))  # each asks 253 ids
     with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(1, 1_000_000)) as bench:
-        with lone_servo(bench.case) as servo:
+        with single_servo(bench.context) as servo:
             assert servo.found.model == "ax_12a"
             servo.set_id(4)
             servo.set_baud(115_200)
-        with lone_servo(bench.case) as servo:
+        with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == (4, 115_200)
             assert words(servo.table, "Baud Rate", servo.read()["Baud Rate"]).startswith("1176")  # 2 MBd by 17
 

@@ -15,7 +15,7 @@ from rig.safety.saved_state import Holder, busy, holder
 
 
 @dataclass
-class Case:
+class DoctorContext:
     """A bench that is not opened, and the computer where its devices are looked for.
 
     Attributes
@@ -57,14 +57,14 @@ class Case:
 
 
 @contextmanager
-def open_case(
+def open_context(
     bench: str,
     config: RigConfig,
     *,
     seed: int | None = None,
     options: tuple[str, ...] = (),
     file_options: tuple[str, ...] = (),
-) -> Iterator[Case]:
+) -> Iterator[DoctorContext]:
     """Yield a bench to be examined; for one that brings no computer of its own it is this one.
 
     Raises
@@ -80,6 +80,6 @@ def open_case(
         who = None
     if isinstance(kind, ComputerProvider):
         with kind.computer(config, chosen, seed) as computer:
-            yield Case(computer, config, bench, options, file_options, who)
+            yield DoctorContext(computer, config, bench, options, file_options, who)
     else:
-        yield Case(LinuxComputer(), config, bench, options, file_options, who)
+        yield DoctorContext(LinuxComputer(), config, bench, options, file_options, who)

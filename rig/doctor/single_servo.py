@@ -10,16 +10,16 @@ from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, Reques
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import ControlTable, control_table
-from rig.doctor.case import Case
-from rig.doctor.register_words import baud_codes
-from rig.doctor.scan import BAUD_RATES, BAUD_RATES_1, FoundServo, Heard, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
+from rig.doctor.context import DoctorContext
+from rig.doctor.register_meaning import baud_codes
 
 MAX_ID = 252
 _SETTLE_S = 0.05
 """How long a servo may take to speak at a new rate."""
 
 
-class LoneServo:
+class SingleServo:
     """The one servo on a bus, found at whatever id and baud rate it has.
 
     Raises
@@ -32,10 +32,12 @@ class LoneServo:
         It is of a model that has no control table.
     """
 
-    def __init__(self, case: Case, wire: SerialConnection, say: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(
+        self, context: DoctorContext, wire: SerialConnection, say: Callable[[str], None] = lambda _: None
+    ) -> None:
         self._wire = wire
-        self._clock = case.computer.clock
-        self.found = _the_only_one(case, wire, say)
+        self._clock = context.computer.clock
+        self.found = _the_only_one(context, wire, say)
         if self.found.model is None:
             raise DeviceMismatch(
                 f"There is no control table for this servo: model number {self.found.model_number}.",
@@ -134,43 +136,43 @@ class LoneServo:
 
 
 @contextmanager
-def lone_servo(case: Case, say: Callable[[str], None] = lambda _: None) -> Iterator[LoneServo]:
-    """Yield the one servo on the configured port, its port open for this program alone; see `LoneServo`."""
-    case.require_free()
-    wire = case.computer.open_serial(case.config.servo.port, case.config.servo.baud)
+def single_servo(context: DoctorContext, say: Callable[[str], None] = lambda _: None) -> Iterator[SingleServo]:
+    """Yield the one servo on the configured port, its port open for this program alone; see `SingleServo`."""
+    context.require_free()
+    wire = context.computer.open_serial(context.config.servo.port, context.config.servo.baud)
     try:
-        yield LoneServo(case, wire, say)
+        yield SingleServo(context, wire, say)
     finally:
         wire.close()
 
 
-def _the_only_one(case: Case, wire: SerialConnection, say: Callable[[str], None]) -> FoundServo:
+def _the_only_one(context: DoctorContext, wire: SerialConnection, say: Callable[[str], None]) -> FoundServo:
     """Look at all baud rates: a second servo at another one would answer as soon as their rates are the same."""
     found: list[FoundServo] = []
     for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
         if protocol == 1 and found:
             break
-        there: list[Heard] = []
+        there: list[BaudScan] = []
         for rate in rates:
-            say(f"{case.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
-            for heard in scan_servos(wire, case.computer.clock, [rate], protocol=protocol):
+            say(f"{context.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
+            for heard in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
                 there.append(heard)
-                if heard.doubtful:
+                if heard.duplicate_ids:
                     raise SeveralServos(
-                        f"Two servos answer at once to id {', '.join(map(str, heard.doubtful))} at {rate} baud.",
+                        f"Two servos answer at once to id {', '.join(map(str, heard.duplicate_ids))} at {rate} baud.",
                         next_step="Unplug all servos but the one that is meant, then try again.",
-                        evidence={"ids": list(heard.doubtful), "baud": rate},
+                        evidence={"ids": list(heard.duplicate_ids), "baud": rate},
                     )
-        found = [servo for heard in without_echoes(there, case.config.servo.baud) for servo in heard.servos]
+        found = [servo for heard in without_echoes(there, context.config.servo.baud) for servo in heard.servos]
     if not found:
         raise DeviceNotFound(
-            f"No servo answers on {case.config.servo.port} at any baud rate.",
+            f"No servo answers on {context.config.servo.port} at any baud rate.",
             next_step="Check the servo's cable and switch on its supply (its LED blinks once), then try again.",
-            evidence={"port": case.config.servo.port},
+            evidence={"port": context.config.servo.port},
         )
     if len(found) > 1:
         raise SeveralServos(
-            f"There are {len(found)} servos on {case.config.servo.port}.",
+            f"There are {len(found)} servos on {context.config.servo.port}.",
             next_step="Unplug all servos but the one that is meant, then try again.",
             evidence={"servos": list(map(str, found))},
         )

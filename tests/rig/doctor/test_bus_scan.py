@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.devices.dynamixel.registers import model_numbers
-from rig.doctor.scan import BAUD_RATES, CHIPS, Heard, scan_imus, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, CHIPS, BaudScan, scan_imus, scan_servos, without_echoes
 from sim.faults import Faults
 from sim.faults.schedule import read_faults
 from tests.fuzzing import fuzz_settings
@@ -16,8 +16,8 @@ from tests.rig.doctor.doctor_parts import unopened
 PING, READ = 0x01, 0x02
 
 
-def heard(bench, *bauds: int, protocol: int = 2) -> list[Heard]:
-    return list(scan_servos(bench.parts.adapter, bench.case.computer.clock, bauds or BAUD_RATES, protocol=protocol))
+def heard(bench, *bauds: int, protocol: int = 2) -> list[BaudScan]:
+    return list(scan_servos(bench.parts.adapter, bench.context.computer.clock, bauds or BAUD_RATES, protocol=protocol))
 
 
 places = st.tuples(
@@ -36,7 +36,7 @@ def test_every_servo_is_found_at_its_id_and_baud_rate(placed):
         all_heard = heard(bench)
         found = {(s.bus_id, s.baud): s.model for h in all_heard for s in h.servos}
         assert found == {**placed, first: "xl430_w250"}
-        assert not any(h.doubtful or h.noise for h in all_heard)
+        assert not any(h.duplicate_ids or h.noise for h in all_heard)
         assert bench.parts.adapter.baudrate == before
         assert bench.instructions <= {PING, READ}
 
@@ -47,7 +47,7 @@ def test_two_servos_with_one_id_are_noticed_wherever_they_are(bus_id, baud):
     with unopened(servo_at=(bus_id, baud)) as bench:
         bench.add_servo(bus_id, baud, "xm430_w350")
         (said,) = heard(bench, baud)
-        assert said.doubtful == (bus_id,)
+        assert said.duplicate_ids == (bus_id,)
         assert bus_id not in {servo.bus_id for servo in said.servos}
 
 
@@ -56,7 +56,7 @@ def test_twins_are_found_beside_a_third_one():
         bench.add_servo(1, 57_600)
         bench.add_servo(7, 57_600)
         (said,) = heard(bench, 57_600)
-        assert said.doubtful == (1,)
+        assert said.duplicate_ids == (1,)
         assert [servo.bus_id for servo in said.servos] == [7]
 
 
@@ -67,7 +67,7 @@ def test_a_line_that_babbles_is_noise_and_no_253_servos():
         (said,) = heard(bench, 57_600)
         faults.clear()
         assert said.noise
-        assert not said.doubtful
+        assert not said.duplicate_ids
 
 
 def test_a_servo_whose_answer_to_all_was_spoiled_is_asked_by_itself():
@@ -83,7 +83,7 @@ def test_a_servo_whose_answer_to_all_was_spoiled_is_asked_by_itself():
         bench.parts.servo_bus.tampers.append(spoil)
         (said,) = heard(bench, 57_600)
         assert [servo.bus_id for servo in said.servos] == [1]
-        assert not said.doubtful
+        assert not said.duplicate_ids
 
 
 def test_an_adapter_that_hears_itself_changes_nothing():
@@ -93,7 +93,7 @@ def test_an_adapter_that_hears_itself_changes_nothing():
         (said,) = heard(bench, 57_600)
         faults.clear()
         assert [servo.bus_id for servo in said.servos] == [1]
-        assert not said.doubtful
+        assert not said.duplicate_ids
 
 
 def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
@@ -107,7 +107,7 @@ def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
             return getattr(self.wire, name)
 
     with unopened() as bench:
-        said = list(scan_servos(Relay(bench.parts.adapter), bench.case.computer.clock))
+        said = list(scan_servos(Relay(bench.parts.adapter), bench.context.computer.clock))
         assert [len(each.servos) for each in said] == [1] * 8
         (once,) = without_echoes(said, 115_200)
         assert once.baud == 115_200
@@ -132,7 +132,7 @@ def test_rates_that_the_adapter_lacks_are_left_out():
             setattr(self.wire, name, value)
 
     with unopened() as bench:
-        rates = [said.baud for said in scan_servos(Slow(bench.parts.adapter), bench.case.computer.clock)]
+        rates = [said.baud for said in scan_servos(Slow(bench.parts.adapter), bench.context.computer.clock)]
         assert rates == [57_600, 1_000_000, 115_200, 9_600]
 
 
@@ -142,7 +142,7 @@ def test_an_ax_12a_is_found_by_its_own_protocol():
         (said,) = heard(bench, 1_000_000, protocol=1)
         (servo,) = said.servos
         assert (servo.bus_id, servo.model, servo.protocol) == (9, "ax_12a", 1)
-        assert not said.doubtful
+        assert not said.duplicate_ids
 
 
 def test_an_unknown_model_is_told_by_its_number():
@@ -185,7 +185,7 @@ def test_each_imu_is_known_by_its_own_register_at_each_of_its_addresses(chip):
             bench.parts.i2c.detach(0x68)
             device = RegisterFile({chip.register: chip.value})
             bench.parts.i2c.attach(address, device)
-            (found,) = scan_imus(bench.case.computer, 1)
+            (found,) = scan_imus(bench.context.computer, 1)
             assert (found.name, found.driver, found.address) == (chip.name, chip.driver, address)
             assert all(len(data) == 1 for data in device.written)  # a register's number, never a value
 
@@ -196,7 +196,7 @@ def test_an_unknown_chip_is_told_with_what_it_says_and_foreign_addresses_are_lef
         clock, memory = RegisterFile({0x00: 0x37}), RegisterFile({})
         bench.parts.i2c.attach(0x68, clock)
         bench.parts.i2c.attach(0x50, memory)
-        (found,) = scan_imus(bench.case.computer, 1)
+        (found,) = scan_imus(bench.context.computer, 1)
         assert found.driver is None
         assert "register 0x00 is 0x37" in str(found)
         assert not memory.written
@@ -206,4 +206,4 @@ def test_a_bus_that_is_held_low_is_an_error_of_the_system():
     with unopened() as bench:
         bench.parts.i2c.stuck = True
         with pytest.raises(TimeoutError):
-            scan_imus(bench.case.computer, 1)
+            scan_imus(bench.context.computer, 1)

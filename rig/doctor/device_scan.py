@@ -15,20 +15,20 @@ from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
-from rig.doctor.case import Case
-from rig.doctor.computer import access, i2c_command
-from rig.doctor.examination import Check
-from rig.doctor.finding import Finding, bad, fine, of_error, warning
-from rig.doctor.scan import (
+from rig.doctor.bus_scan import (
     BAUD_RATES,
     BAUD_RATES_1,
+    BaudScan,
     FoundImu,
     FoundServo,
-    Heard,
     scan_imus,
     scan_servos,
     without_echoes,
 )
+from rig.doctor.computer import access, i2c_command
+from rig.doctor.context import DoctorContext
+from rig.doctor.examination import Check
+from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
 _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
 """I2C buses with memory, monitors and clock chips on them, which are not to be asked."""
@@ -45,7 +45,7 @@ class FoundCamera:
 
 
 @dataclass
-class Survey:
+class DeviceScan:
     """Looks at all ports, buses and cameras, and keeps what answered.
 
     Parameters
@@ -61,7 +61,7 @@ class Survey:
     imus: list[FoundImu] = field(default_factory=list)
     cameras: list[FoundCamera] = field(default_factory=list)
     heads: list[SerialPort] = field(default_factory=list)
-    doubtful: bool = False
+    duplicate_ids: bool = False
     """Two servos with one id were heard."""
 
     @property
@@ -72,60 +72,64 @@ class Survey:
             Check("camera", self.look_for_cameras, deadline_s=20.0),
         )
 
-    def look_for_servos(self, case: Case) -> Iterator[Finding | str]:
-        known = case.computer.serial_ports()
-        configured = case.computer.serial_port(case.config.servo.port)
-        if configured is not None and not any(case.computer.same_file(port.path, configured.path) for port in known):
+    def look_for_servos(self, context: DoctorContext) -> Iterator[Finding | str]:
+        known = context.computer.serial_ports()
+        configured = context.computer.serial_port(context.config.servo.port)
+        if configured is not None and not any(context.computer.same_file(port.path, configured.path) for port in known):
             known.append(configured)
         if self.ports is not None:
             known = [port for port in known if port.path in self.ports]
-        asked = [p for p in known if p.usb or case.computer.same_file(p.path, case.config.servo.port)]
+        asked = [p for p in known if p.usb or context.computer.same_file(p.path, context.config.servo.port)]
         if not asked:
             text = f"no serial port on USB{'; there is ' + ', '.join(p.path for p in known) if known else ''}"
-            yield bad("servo", text, "Plug the U2D2 in, then: " + case.rig("find"))
+            yield bad("servo", text, "Plug the U2D2 in, then: " + context.rig("find"))
         for port in asked:
-            yield from self._on_port(case, port)
+            yield from self._on_port(context, port)
 
-    def _on_port(self, case: Case, port: SerialPort) -> Iterator[Finding | str]:
+    def _on_port(self, context: DoctorContext, port: SerialPort) -> Iterator[Finding | str]:
         """Ask who is at a port, the quick questions first: AX-12A can only be asked one by one."""
-        troubles = [finding for finding in access(case, "servo", port, "dialout") if finding.mend]
-        if troubles:
-            yield from troubles
+        problems = [finding for finding in access(context, "servo", port, "dialout") if finding.fix]
+        if problems:
+            yield from problems
             return
-        known_head = case.config.imu.connection == "head" and case.computer.same_file(port.path, case.config.head.port)
+        known_head = context.config.imu.connection == "head" and context.computer.same_file(
+            port.path, context.config.head.port
+        )
         try:
-            servos = False if known_head else (yield from self._servos(case, port, 2, BAUD_RATES))
-            head = False if servos else (yield from self._head(case, port))
+            servos = False if known_head else (yield from self._servos(context, port, 2, BAUD_RATES))
+            head = False if servos else (yield from self._head(context, port))
             if not (head or known_head) and (self.both_protocols or not servos):
-                servos = (yield from self._servos(case, port, 1, BAUD_RATES_1)) or servos
+                servos = (yield from self._servos(context, port, 1, BAUD_RATES_1)) or servos
         except DeviceNotFound as error:
             yield of_error("servo", error)
         except (serial.SerialException, OSError) as error:
-            yield bad("servo", f"{port.path} failed: {error}", "Plug the adapter in again, then: " + case.rig("find"))
+            yield bad(
+                "servo", f"{port.path} failed: {error}", "Plug the adapter in again, then: " + context.rig("find")
+            )
         else:
-            if not (servos or head or self.doubtful):
+            if not (servos or head or self.duplicate_ids):
                 text = f"{port.path} ({port.name}): no servo answers at any baud rate, nor a rig head"
-                mend = "Check the servo's cable and switch on its supply, then: " + case.rig("find")
-                yield warning("servo", text, mend)
+                fix = "Check the servo's cable and switch on its supply, then: " + context.rig("find")
+                yield warning("servo", text, fix)
 
     def _servos(
-        self, case: Case, port: SerialPort, protocol: int, rates: Sequence[int]
+        self, context: DoctorContext, port: SerialPort, protocol: int, rates: Sequence[int]
     ) -> Generator[Finding | str, None, bool]:
-        answered: list[Heard] = []
-        with closing(case.computer.open_serial(port.path, rates[0])) as wire:
+        answered: list[BaudScan] = []
+        with closing(context.computer.open_serial(port.path, rates[0])) as wire:
             for rate in rates:
                 yield f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ..."
-                answered += scan_servos(wire, case.computer.clock, [rate], protocol=protocol)
-        for heard in without_echoes(answered, case.config.servo.baud):
-            yield from self._heard(case, port, heard)
+                answered += scan_servos(wire, context.computer.clock, [rate], protocol=protocol)
+        for heard in without_echoes(answered, context.config.servo.baud):
+            yield from self._heard(context, port, heard)
         return any(heard.anything for heard in answered)
 
-    def _head(self, case: Case, port: SerialPort) -> Generator[Finding | str, None, bool]:
+    def _head(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
         yield f"{port.path}: asking for a rig head ..."
-        config = case.config.model_copy(update={"head": case.config.head.model_copy(update={"port": port.path})})
+        config = context.config.model_copy(update={"head": context.config.head.model_copy(update={"port": port.path})})
         try:
             with closing(
-                open_head(config, lambda: case.computer.open_serial(port.path, BAUD), case.computer.clock)
+                open_head(config, lambda: context.computer.open_serial(port.path, BAUD), context.computer.clock)
             ) as head:
                 who = head.identity
         except DeviceNotFound:
@@ -138,37 +142,37 @@ class Survey:
         yield fine("imu", text, port=port.path)
         return True
 
-    def _heard(self, case: Case, port: SerialPort, heard: Heard) -> Iterator[Finding]:
+    def _heard(self, context: DoctorContext, port: SerialPort, heard: BaudScan) -> Iterator[Finding]:
         for found in heard.servos:
             self.servos.append((port, found))
             yield fine("servo", f"{port.path}: {found}", port=port.path, id=found.bus_id, baud=found.baud)
-        if heard.doubtful:
-            self.doubtful = True
-            ids = ", ".join(map(str, heard.doubtful))
+        if heard.duplicate_ids:
+            self.duplicate_ids = True
+            ids = ", ".join(map(str, heard.duplicate_ids))
             text = f"{port.path}: two servos answer at once to id {ids} at {heard.baud} baud"
-            yield bad("servo", text, "Unplug one of the two, then: " + case.rig("servo set-id NEW"))
+            yield bad("servo", text, "Unplug one of the two, then: " + context.rig("servo set-id NEW"))
         if heard.noise:
             text = f"{port.path}: bytes at {heard.baud} baud that are no servo's"
-            yield warning("servo", text, "Take everything but servos off the bus, then: " + case.rig("find"))
+            yield warning("servo", text, "Take everything but servos off the bus, then: " + context.rig("find"))
 
-    def look_for_imus(self, case: Case) -> Iterator[Finding | str]:
-        configured = case.computer.i2c_name(case.config.imu.bus)
+    def look_for_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
+        configured = context.computer.i2c_name(context.config.imu.bus)
         asked = 0
         before = len(self.imus)
-        for node in case.computer.i2c_buses():
-            if _COMPUTERS_OWN.search(node.name) and not case.computer.same_file(node.path, configured):
+        for node in context.computer.i2c_buses():
+            if _COMPUTERS_OWN.search(node.name) and not context.computer.same_file(node.path, configured):
                 continue
             asked += 1
-            troubles = [finding for finding in access(case, "imu", node, "i2c") if finding.mend]
-            if troubles:
-                yield from troubles
+            problems = [finding for finding in access(context, "imu", node, "i2c") if finding.fix]
+            if problems:
+                yield from problems
                 continue
             yield f"{node.path}: asking for IMUs ..."
             try:
-                there = scan_imus(case.computer, node.path)
+                there = scan_imus(context.computer, node.path)
             except OSError as error:
-                mend = "Take the sensor's supply off and on; check SDA and SCL for a short"
-                yield bad("imu", f"{node.path} does not move: {error.strerror}", mend)
+                fix = "Take the sensor's supply off and on; check SDA and SCL for a short"
+                yield bad("imu", f"{node.path} does not move: {error.strerror}", fix)
                 continue
             for found in there:
                 if found.driver:
@@ -177,23 +181,23 @@ class Survey:
                 else:
                     yield warning("imu", f"{found}: the rig has no driver for it", "Use an MPU-6050 or a BNO055")
         if not asked and not self.heads:
-            yield bad("imu", "no I2C bus", i2c_command(case))
+            yield bad("imu", "no I2C bus", i2c_command(context))
         elif len(self.imus) == before and not self.heads:
-            mend = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + case.rig("find")
-            yield warning("imu", "no IMU answers on any I2C bus", mend)
+            fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
+            yield warning("imu", "no IMU answers on any I2C bus", fix)
 
-    def look_for_cameras(self, case: Case) -> Iterator[Finding | str]:
-        nodes = case.computer.cameras()
+    def look_for_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
+        nodes = context.computer.cameras()
         if not nodes:
-            yield warning("camera", "no camera", "Connect the camera, then: " + case.rig("find"))
+            yield warning("camera", "no camera", "Connect the camera, then: " + context.rig("find"))
         for node in nodes:
-            troubles = [finding for finding in access(case, "camera", node, "video") if finding.mend]
-            if troubles:
-                yield from troubles
+            problems = [finding for finding in access(context, "camera", node, "video") if finding.fix]
+            if problems:
+                yield from problems
                 continue
             yield f"{node.path}: opening ..."
             try:
-                capture = case.computer.open_capture(node.path)
+                capture = context.computer.open_capture(node.path)
             except DeviceNotFound as error:
                 yield of_error("camera", error)
                 continue

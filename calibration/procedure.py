@@ -1,0 +1,207 @@
+"""A calibration procedure: it measures on a bench, evaluates the data, and yields results.
+
+A procedure is a dataclass of its options. `Procedure.measure` moves the bench and yields events; each `Evaluation` that
+it yields becomes a dated `CalibrationResult`. The function ``evaluate`` of each module fits the data without a bench.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, ClassVar
+
+from rig.bench import Bench
+from rig.calibrations import CalibrationResult, Estimate, Refusal, RefusalCode
+from rig.calibrations.refusal import refusal
+from rig.charts.xy import Chart
+from rig.core.errors import LimitExceeded, UsageError
+from rig.events.events import Event
+from rig.motion.move import Move
+from rig.motion.turntable import Turntable
+
+Plot = Callable[[CalibrationResult], Chart | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Progress of a measurement: ``share`` from 0 to 1, and ``words`` about the last step."""
+
+    share: float
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A request to the operator; the procedure continues when the next event is requested.
+
+    ``picture`` shows the request on a terminal.
+    """
+
+    words: str
+    picture: str = ""
+
+
+@dataclass(slots=True, kw_only=True)
+class Evaluation:
+    """What a fit found: the part of a `CalibrationResult` that does not depend on date and device."""
+
+    name: str
+    residual_unit: str = ""
+    limit: float | None = None
+    residual: float | None = None
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    proposed: dict[str, Any] = field(default_factory=dict)
+    """Settings to apply if the calibration passes."""
+    evidence: dict[str, Any] = field(default_factory=dict)
+    refusals: list[Refusal] = field(default_factory=list)
+
+    @property
+    def passed(self) -> bool:
+        return not self.refusals
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings to apply; none unless the calibration passed."""
+        return self.proposed if self.passed else {}
+
+    def refuse_if(self, condition: object, code: RefusalCode, **values: Any) -> None:
+        """Add a refusal with the numbers that its words need, if ``condition`` is true."""
+        if condition:
+            self.refusals.append(refusal(code, values))
+
+    def estimate(self, name: str, value: Any, uncertainty: Any, unit: str = "") -> None:
+        """Add an estimate."""
+        self.estimates[name] = Estimate(float(value), float(uncertainty), unit)
+
+    def result(self, *, when_utc: datetime, device: Any, valid_days: float | None = None) -> CalibrationResult:
+        """Return the dated result for a device."""
+        return CalibrationResult(
+            name=self.name,
+            estimates=self.estimates,
+            residual=self.residual,
+            limit=self.limit,
+            residual_unit=self.residual_unit,
+            refusals=tuple(self.refusals),
+            settings=self.settings,
+            valid_days=valid_days,
+            when_utc=when_utc,
+            device=device,
+            evidence=self.evidence,
+        )
+
+
+Measured = Generator[Event | Ask | Progress | Evaluation, None, None]
+
+
+class Procedure(ABC):
+    """A calibration procedure; subclasses are dataclasses of their options.
+
+    Attributes
+    ----------
+    names
+        The results that the procedure yields, in order.
+    title
+        What it calibrates, for people.
+    devices
+        The devices that its results are bound to.
+    valid_days
+        How long its results are valid.
+    requires
+        Names of the results that must be in force; `measure` gets them in this order.
+    plots
+        Draw a result, the main plot first; None if there is nothing to draw.
+    """
+
+    names: ClassVar[tuple[str, ...]]
+    title: ClassVar[str]
+    devices: ClassVar[tuple[str, ...]]
+    valid_days: ClassVar[float]
+    requires: ClassVar[tuple[str, ...]] = ()
+    plots: ClassVar[Sequence[Plot]] = ()
+
+    @abstractmethod
+    def measure(self, bench: Bench, *required: CalibrationResult) -> Measured:
+        """Measure on the bench, and yield events and evaluations.
+
+        Raises
+        ------
+        UsageError
+            An option is out of range; before anything moves.
+        LimitExceeded
+            The cable leaves too little room; before anything moves.
+        ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
+            See `rig.views.capture` and `rig.motion.turntable`.
+        """
+
+    def live(
+        self, bench: Bench, *required: CalibrationResult
+    ) -> Generator[Event | Ask | Progress | CalibrationResult, None, None]:
+        """Calibrate the bench: yield events, and each result when it is known. Raises what `measure` raises."""
+        when_utc = bench.clock.utc()
+        with closing(self.measure(bench, *required)) as events:
+            for event in events:
+                if isinstance(event, Evaluation):
+                    device = bench.apparatus(*self.devices)
+                    yield event.result(when_utc=when_utc, device=device, valid_days=self.valid_days)
+                else:
+                    yield event
+
+
+@contextmanager
+def returning(table: Turntable) -> Iterator[Callable[[float], Move]]:
+    """Yield the function that rotates the table; return to the start angle at the end of the ``with`` block.
+
+    The table also returns when the generator around the block is closed. After an error or an interruption nothing
+    moves: the table stays where it stopped, without torque.
+    """
+    low_deg, high_deg = table.limits_deg
+    start_deg = min(max(table.rest_deg, low_deg), high_deg)
+    try:
+        yield table.goto
+    except GeneratorExit:
+        table.goto(start_deg)
+        raise
+    table.goto(start_deg)
+
+
+@contextmanager
+def table_settings(bench: Bench, **changes: float) -> Iterator[None]:
+    """Change settings of ``table`` for the length of a ``with`` block."""
+    before = bench.config
+    bench.config = before.model_copy(update={"table": before.table.model_copy(update=changes)})
+    try:
+        yield
+    finally:
+        bench.config = before
+
+
+def require_at_least(minimum: float, value: float, what: str) -> None:
+    """Raise `UsageError` if ``value`` is below ``minimum``."""
+    if value < minimum:
+        raise UsageError(f"{value:g} {what} are too few.", next_step=f"Give at least {minimum:g}.")
+
+
+def lower_end(bench: Bench, start_deg: float, length_deg: float) -> float:
+    """Return the lower end of a range of ``length_deg`` that begins or ends at ``start_deg``, within the cable budget.
+
+    Raises
+    ------
+    LimitExceeded
+        The cable leaves too little room.
+    """
+    low, high = bench.config.table.limits_deg
+    lower = start_deg if start_deg + length_deg <= high else start_deg - length_deg
+    if lower < low:
+        raise too_little_room(bench, f"{length_deg:g}°")
+    return lower
+
+
+def too_little_room(bench: Bench, needed: str) -> LimitExceeded:
+    """Return the error of a cable budget below what is ``needed``."""
+    low, high = bench.config.table.limits_deg
+    return LimitExceeded(
+        f"The cable leaves {high - low:.0f}°, the procedure needs {needed}.",
+        next_step="If the cable is long enough, widen table.limits_deg.",
+        evidence={"limits_deg": [low, high]},
+    )
