@@ -1,1 +1,1 @@
-"""Angles, array types and checks that every room uses."""
+"""Angles, array types and checks that the other packages use."""

@@ -12,9 +12,9 @@ def wrap360(angle_deg: float) -> float: ...
 @overload
 def wrap360(angle_deg: FloatArray) -> FloatArray: ...
 def wrap360(angle_deg: float | FloatArray) -> float | FloatArray:
-    """The same direction in [0, 360)."""
+    """Return the same direction in [0, 360)."""
     wrapped = np.mod(angle_deg, 360.0)
-    # a tiny negative angle has the remainder 360.0 after rounding
+    # the remainder of a tiny negative angle is rounded to 360.0
     wrapped = np.where(wrapped == 360.0, 0.0, wrapped)
     return wrapped if isinstance(angle_deg, np.ndarray) else float(wrapped)
 
@@ -24,18 +24,18 @@ def wrap180(angle_deg: float) -> float: ...
 @overload
 def wrap180(angle_deg: FloatArray) -> FloatArray: ...
 def wrap180(angle_deg: float | FloatArray) -> float | FloatArray:
-    """The same direction in [-180, 180)."""
+    """Return the same direction in [-180, 180)."""
     return wrap360(angle_deg + 180.0) - 180.0
 
 
 @overload
-def turns_between(a_deg: float, b_deg: float) -> float: ...
+def revolutions_between(a_deg: float, b_deg: float) -> float: ...
 @overload
-def turns_between(a_deg: FloatArray, b_deg: FloatArray | float) -> FloatArray: ...
-def turns_between(a_deg: float | FloatArray, b_deg: float | FloatArray) -> float | FloatArray:
-    """Distance of two directions in turns, 0..0.5 (the Δ of the Hough score)."""
+def revolutions_between(a_deg: FloatArray, b_deg: FloatArray | float) -> FloatArray: ...
+def revolutions_between(a_deg: float | FloatArray, b_deg: float | FloatArray) -> float | FloatArray:
+    """Return the distance of two directions in revolutions, 0..0.5 (Δ of the Hough score)."""
     difference_deg: float | FloatArray = a_deg - b_deg
     if isinstance(difference_deg, np.ndarray):
-        # as wrap180, at a third of the time: the nearest whole turn is subtracted without rounding
+        # same result as wrap180 in a third of the time: the nearest whole revolution is subtracted without rounding
         return np.abs(difference_deg - 360.0 * np.rint(difference_deg / 360.0)) / 360.0
     return abs(wrap180(difference_deg)) / 360.0

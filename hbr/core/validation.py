@@ -1,20 +1,20 @@
-"""What an image must be."""
+"""Checks of images."""
 
 from typing import Final
 
 import numpy as np
 
-#: Sides of a frame in which an object can be looked for.
-LEAST_PX: Final = 16
+#: Smallest side of a frame that can be segmented.
+MIN_SIDE_PX: Final = 16
 
 
 def check_image(image: object) -> None:
-    """Refuse what is no uint8 array of shape (H, W, 3) with pixels in it.
+    """Check that an image is a uint8 array of shape (H, W, 3) and not empty.
 
     Raises
     ------
     TypeError, ValueError
-        The message says what it is instead, and what to do.
+        It is not. The message says what it is, and what to do.
     """
     if not isinstance(image, np.ndarray):
         raise TypeError(
@@ -33,7 +33,7 @@ def check_image(image: object) -> None:
 
 
 def check_frame(image: object) -> None:
-    """Refuse what `check_image` refuses, and what is too small to look for an object in.
+    """Check an image like `check_image`, and that it is large enough for a segmentation.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def check_frame(image: object) -> None:
     """
     check_image(image)
     assert isinstance(image, np.ndarray)
-    if min(image.shape[:2]) < LEAST_PX:
+    if min(image.shape[:2]) < MIN_SIDE_PX:
         raise ValueError(
-            f"the frame has {image.shape[1]} x {image.shape[0]} pixels; an object is looked for in {LEAST_PX} and more"
+            f"the frame has {image.shape[1]} x {image.shape[0]} pixels; sides of at least {MIN_SIDE_PX} are needed"
         )

@@ -1,9 +1,9 @@
-"""CEDD, the Color and Edge Directivity Descriptor, equal to the LIRE reference at all 144 levels.
+"""CEDD, the Color and Edge Directivity Descriptor, equal to the reference implementation of LIRE at all 144 levels.
 
 Source: Chatzichristofis and Boutalis, "CEDD: Color and Edge Directivity Descriptor. A Compact Descriptor for Image
-Indexing and Retrieval", ICVS 2008, in the reading of LIRE's ``features.global.CEDD``.
+Indexing and Retrieval", ICVS 2008, as implemented by LIRE's ``features.global.CEDD``.
 
-Vectors over the blocks are laid out component first, ``(k, blocks)``, so that every operation runs along memory.
+Vectors over the blocks have the shape ``(k, blocks)``, so that every operation reads contiguous memory.
 """
 
 from functools import lru_cache
@@ -18,16 +18,16 @@ from hbr.descriptors.cedd_tables import HUE_WEIGHT, REPRESENTATIVES, SATURATION,
 
 #: Bins of the descriptor: 6 texture classes of 24 colours, bin = 24 * texture + colour.
 BINS: Final = 144
-#: The sides that the block grid covers completely are multiples of this many pixels.
+#: The block grid covers an image completely if both sides are multiples of this number of pixels.
 GRID: Final = 80
-#: `describe` brings no image to a longer side than this.
+#: Longest side to which `describe` scales an image.
 LONGEST_SIDE: Final = 640
 
 _EDGE_THRESHOLD: Final = 14.0
 _CLASS_THRESHOLDS: Final = np.array([[0.68], [0.98], [0.98], [0.98], [0.98]])
-#: Luminance of a pixel B, G, R, in thousandths.
+#: Weights of B, G, R in the luminance of a pixel, in thousandths.
 _LUMINANCE: Final = np.array([114, 587, 299])
-#: The same as the reference rounds it, of a grey pixel.
+#: Luminance of a grey pixel, rounded like the reference.
 _GREYS: Final = (0.114 * np.arange(256) + 0.587 * np.arange(256)) + 0.299 * np.arange(256)
 _SQRT2: Final = np.sqrt(2.0)
 #: Non-directional, horizontal and vertical edge, of the quarters a, b, c, d.
@@ -35,25 +35,25 @@ _FILTERS: Final = np.array([[2.0, -2.0, -2.0, 2.0], [1.0, 1.0, -1.0, -1.0], [1.0
 
 
 def cedd(image_bgr: ImageArray) -> LevelArray:
-    """Describe an image by CEDD, to the letter of the reference.
+    """Return the CEDD levels of an image, exactly like the reference.
 
-    The reference lays a grid of equal blocks over the top left of the image and ignores what remains on the right and
-    at the bottom (61 % of a 128 x 128 image). `describe` is the call that looks at the whole image.
+    The reference divides the top left part of the image into equal blocks and ignores the rest on the right and at the
+    bottom (61 % of a 128 x 128 image). `describe` uses the whole image.
 
     Parameters
     ----------
     image_bgr : uint8 array (H, W, 3)
-        Any size, in OpenCV's channel order; slices and flipped views are welcome.
+        Any size, in OpenCV's channel order. Slices and flipped views are possible.
 
     Returns
     -------
     uint8 array (144,)
-        Levels 0..7, bin = 24 * texture + colour. All zero where a side is shorter than 2 pixels.
+        Levels 0..7, bin = 24 * texture + colour. All are zero if a side is shorter than 2 pixels.
 
     Raises
     ------
     TypeError, ValueError
-        The image is no uint8 array, or is not of shape (H, W, 3).
+        The image is not a uint8 array of shape (H, W, 3).
     """
     check_image(image_bgr)
     image = np.ascontiguousarray(image_bgr)
@@ -63,7 +63,7 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
     row_sums = _row_sums(image, grid)
     textures, blocks = _texture_votes(_areas(image, _luminance(row_sums, grid), grid))
     hue, outputs = _colour_outputs(_block_colours(row_sums, grid))
-    # bincount adds in the order given: raster order in every bin, so the sums equal the reference's to the last bit
+    # bincount adds in raster order in every bin, so that the sums equal those of the reference to the last bit
     histogram = np.bincount(
         VOTE_BINS.take(360 * textures + hue.take(blocks), axis=0).ravel(),
         weights=outputs.take(blocks, axis=0).ravel(),
@@ -75,18 +75,18 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
 
 
 def describe(image_bgr: ImageArray, *, size: tuple[int, int] | None = None) -> LevelArray:
-    """Describe the whole image: bring it to a size that the block grid covers, then apply `cedd`.
+    """Return the CEDD levels of the whole image, scaled to a size that the block grid covers.
 
     Without `size`, an image with a side above 640 pixels is scaled down to that side; then each side becomes the
     nearest multiple of 80 (half-way up), at least 80: 640 x 480 stays, 128 x 128 becomes 160 x 160, 1920 x 1080 becomes
-    640 x 400. Views that are to be compared should come from frames of one size.
+    640 x 400. Compare only views of frames of the same size.
 
     Parameters
     ----------
     image_bgr : uint8 array (H, W, 3)
         As for `cedd`; no side may be 0.
     size : (int, int), optional
-        Width and height to use instead, multiples of 80.
+        Width and height, multiples of 80.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def describe(image_bgr: ImageArray, *, size: tuple[int, int] | None = None) -> L
     Raises
     ------
     TypeError, ValueError
-        As for `cedd`, or `size` is not of positive multiples of 80.
+        As for `cedd`, or a side of `size` is not a positive multiple of 80.
     """
     check_image(image_bgr)
     if size is not None and any(side <= 0 or side % GRID for side in size):
@@ -106,7 +106,7 @@ def describe(image_bgr: ImageArray, *, size: tuple[int, int] | None = None) -> L
 
 
 def covered(image_bgr: ImageArray) -> ImageArray:
-    """The image at the size that `describe` brings it to."""
+    """Return the image at the size to which `describe` scales it."""
     check_image(image_bgr)
     height, width = image_bgr.shape[:2]
     return _resize(image_bgr, *_covered_size(width, height))
@@ -122,7 +122,7 @@ def _covered_size(width: int, height: int) -> tuple[int, int]:
 
 
 def _resize(image: ImageArray, width: int, height: int) -> ImageArray:
-    """Shrink by area, then enlarge linearly (the bit-exact kind: the same bytes on every machine)."""
+    """Shrink by area, then enlarge linearly (bit-exact: the same bytes on every machine)."""
     shrunk = (min(width, image.shape[1]), min(height, image.shape[0]))
     for size, method in ((shrunk, cv2.INTER_AREA), ((width, height), cv2.INTER_LINEAR_EXACT)):
         if (image.shape[1], image.shape[0]) != size:
@@ -131,7 +131,7 @@ def _resize(image: ImageArray, width: int, height: int) -> ImageArray:
 
 
 class _Grid(NamedTuple):
-    """Rows and columns of blocks, height and width of a quarter of a block in pixels."""
+    """Numbers of rows and columns of blocks, height and width of a quarter of a block in pixels."""
 
     rows: int
     columns: int
@@ -148,13 +148,13 @@ def _grid(height: int, width: int) -> _Grid:
 
 
 def _strips(image: ImageArray, grid: _Grid) -> ImageArray:
-    """The rows of pixels of every row of quarters, (2 * rows, height of a quarter, 3 * pixels)."""
+    """Return the rows of pixels of every row of quarters, (2 * rows, height of a quarter, 3 * pixels)."""
     rows, columns, height, width = grid
     return image[: 2 * rows * height, : 2 * columns * width].reshape(2 * rows, height, -1)
 
 
 def _row_sums(image: ImageArray, grid: _Grid) -> RealArray:
-    """The rows of pixels of every row of quarters, added up: whole numbers, (2 * rows, 3 * pixels)."""
+    """Return the sums of the rows of pixels of every row of quarters: integers, (2 * rows, 3 * pixels)."""
     strips = _strips(image, grid)
     sums = np.zeros((2 * grid.rows, strips.shape[2]), _weights(grid)[0].dtype)
     for k in range(grid.height):
@@ -164,36 +164,36 @@ def _row_sums(image: ImageArray, grid: _Grid) -> RealArray:
 
 @lru_cache(maxsize=64)
 def _weights(grid: _Grid) -> tuple[RealArray, RealArray]:
-    """What a row of the pixels of a quarter and one of a block are multiplied with: to luminance, and to B, G, R."""
-    # float32 holds whole numbers up to 2 ** 24
+    """Return matrices from a row of pixels of a quarter to luminance, and from one of a block to B, G, R."""
+    # float32 represents integers up to 2 ** 24
     dtype = np.float32 if 255_000 * grid.height * grid.width < 2**24 else np.float64
     return np.tile(_LUMINANCE, grid.width).astype(dtype), np.tile(np.eye(3), (2 * grid.width, 1)).astype(dtype)
 
 
 def _luminance(row_sums: RealArray, grid: _Grid) -> RealArray:
-    """Luminance of the quarters in thousandths, summed over their pixels, (2 * rows, 2 * columns)."""
+    """Return the luminance of the quarters in thousandths, summed over their pixels, (2 * rows, 2 * columns)."""
     luminance: RealArray = row_sums.reshape(-1, 3 * grid.width) @ _weights(grid)[0]
     return luminance.reshape(2 * grid.rows, 2 * grid.columns)
 
 
 def _block_colours(row_sums: RealArray, grid: _Grid) -> RealArray:
-    """Mean B, G, R of the blocks, cut to whole numbers, (blocks, 3), float32."""
+    """Return the mean B, G, R of the blocks, truncated to integers, (blocks, 3), float32."""
     sums = cv2.add(row_sums[::2], row_sums[1::2]).reshape(-1, 6 * grid.width) @ _weights(grid)[1]
     return np.floor(sums / (4 * grid.height * grid.width)).astype(np.float32, copy=False)
 
 
 def _areas(image: ImageArray, luminance: RealArray, grid: _Grid) -> FloatArray:
-    """Luminance of the quarters (a top left, b top right, c, d) of the blocks, (4, blocks), whole numbers 0..255.
+    """Return the luminance of the quarters (a top left, b top right, c, d) of the blocks, (4, blocks), 0..255.
 
     The reference sums ``0.114 B + 0.587 G + 0.299 R`` pixel by pixel in double and truncates the mean. Exact arithmetic
-    gives the same, except where the true mean is a whole number: there the rounding errors decide and are repeated.
+    gives the same result, except if the true mean is an integer. Then the rounding errors decide, and are reproduced.
     """
     rows, columns, height, width = grid
     count = height * width
     mean = luminance / (1000 * count)
     area = np.floor(mean)
     white = np.trunc(255.0 * count * (4.0 / (4 * count)))
-    if white < 255:  # white adds up without rounding, but the reciprocal of the number of pixels may round down
+    if white < 255:  # the sum of white is exact, but the reciprocal of the number of pixels may be rounded down
         area[mean == 255] = white
     undecided = np.flatnonzero((mean == area) & (mean > 0) & (mean < 255))
     if len(undecided):
@@ -203,13 +203,13 @@ def _areas(image: ImageArray, luminance: RealArray, grid: _Grid) -> FloatArray:
 
 
 def _areas_as_rounded(image: ImageArray, luminance: RealArray, quarters: IndexArray, grid: _Grid) -> FloatArray:
-    """Luminance of some quarters in raster order, with the rounding errors of the reference."""
-    # drawings and other flat images: most are equal to the one on their left, which then is among them too
+    """Return the luminance of some quarters in raster order, with the rounding errors of the reference."""
+    # in drawings and other flat images, most quarters equal the one on their left, which is then in the list too
     repeats = _repeats(image, luminance, grid).take(quarters)
     strips = _strips(image, grid).view(f"V{3 * grid.width}")
     i, j = np.divmod(quarters[~repeats], luminance.shape[1])
     count = grid.height * grid.width
-    step = max(1, 50_000 // count)  # what the cache holds
+    step = max(1, 50_000 // count)  # fits into the cache
     totals = []
     for some in (slice(k, k + step) for k in range(0, len(i), step)):
         pixels = strips[i[some], :, j[some]].view(np.uint8).reshape(-1, count, 3)
@@ -227,9 +227,9 @@ def _areas_as_rounded(image: ImageArray, luminance: RealArray, quarters: IndexAr
 
 
 def _repeats(image: ImageArray, luminance: RealArray, grid: _Grid) -> BoolArray:
-    """Which quarters are pixel by pixel equal to the one on their left, (4 * blocks,).
+    """Return which quarters equal the one on their left in every pixel, (4 * blocks,).
 
-    That is only looked for where there may be many.
+    The comparison is skipped if there cannot be many.
     """
     repeats = np.zeros(luminance.shape, np.bool_)
     np.equal(luminance[:, 1:], luminance[:, :-1], out=repeats[:, 1:])
@@ -242,7 +242,7 @@ def _repeats(image: ImageArray, luminance: RealArray, grid: _Grid) -> BoolArray:
 
 
 def _texture_votes(areas: FloatArray) -> tuple[IndexArray, IndexArray]:
-    """Texture class and block of every vote, blocks ascending in each class; a block may be of several classes."""
+    """Return texture class and block of every vote, blocks ascending in each class. A block may have several."""
     scaled = areas * _SQRT2
     magnitudes = np.empty((5, areas.shape[1]))
     np.matmul(_FILTERS, areas, out=magnitudes[:3])
@@ -260,24 +260,24 @@ def _texture_votes(areas: FloatArray) -> tuple[IndexArray, IndexArray]:
 
 
 def _hsv(colours: RealArray) -> IndexArray:
-    """Hue 0..358, saturation 0..255 and value 0..255, (3, blocks), of whole numbers B, G, R, (blocks, 3) float32.
+    """Return hue 0..358, saturation 0..255 and value 0..255, (3, blocks), of integers B, G, R, (blocks, 3) float32.
 
-    The fractions that are cut off have denominators of at most 255: a thousandth more keeps whole what OpenCV's single
-    precision leaves a hair below a whole number, and carries nothing else over one.
+    The truncated fractions have denominators of at most 255. OpenCV's single precision can leave an integer slightly
+    too small; adding 0.001 before truncation corrects that and changes no other value.
     """
     hsv = cv2.cvtColor(colours.reshape(1, -1, 3), cv2.COLOR_BGR2HSV)[0]
     hsv[:, 1] *= 255
     whole: IndexArray = (hsv + 0.001).T.astype(np.intp)
-    # green, blue and the far side of red count from 119, 239 and 359, not 120, 240 and 360: the fuzzy sets expect it
+    # green, blue and the end of red start at 119, 239 and 359, not at 120, 240 and 360: the fuzzy sets expect it
     whole[0] -= hsv[:, 0] > 60.001
     return whole
 
 
 def _colour_outputs(colours: RealArray) -> tuple[IndexArray, FloatArray]:
-    """Hue of whole-number colours B, G, R, (blocks, 3), and votes of the two fuzzy systems, (blocks, 9).
+    """Return the hue of integer colours B, G, R, (blocks, 3), and the votes of the two fuzzy systems, (blocks, 9).
 
-    At most two hue classes are active, so nine of the 24 outputs can differ from 0: white, grey, black, and the light,
-    pure and dark shade of two colours. `VOTE_BINS` has their bins.
+    At most two hue classes are active, so that only nine of the 24 outputs can differ from 0: white, grey, black, and
+    the light, pure and dark shade of two colours. `VOTE_BINS` has their bins.
     """
     hue, saturation, value = _hsv(colours)
     rules = cv2.transpose(np.minimum(SATURATION.take(saturation, axis=0), VALUE.take(value, axis=0)))

@@ -1,4 +1,4 @@
-"""Descriptors of many images over several processes."""
+"""CEDD of many images in several processes."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -10,7 +10,7 @@ import numpy as np
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors.cedd import BINS, describe
 
-#: Images that a process is handed at a time.
+#: Images that a process gets at once.
 _CHUNK = 16
 
 
@@ -20,19 +20,19 @@ def describe_all(
     size: tuple[int, int] | None = None,
     processes: int | None = None,
 ) -> LevelArray:
-    """Describe many images as `hbr.describe` does.
+    """Return the CEDD levels of many images, like `hbr.describe`.
 
-    The processes are started anew and import the calling program, whose own work belongs under
-    ``if __name__ == "__main__":``. Files are read by the processes; arrays have to be sent to them.
+    The processes import the calling program. Protect its own work by ``if __name__ == "__main__":``. Paths are faster
+    than arrays, because the processes read the files themselves.
 
     Parameters
     ----------
     images : iterable of uint8 arrays (H, W, 3), or of paths of image files
-        All are submitted at once.
+        The images. All are submitted at once.
     size : (int, int), optional
         As for `describe`.
     processes : int, optional
-        One for each core by default; 1 works in the calling process.
+        Number of processes, by default one for each core; 1 uses the calling process.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""CEDD levels in 54 bytes: 144 levels of 3 bits, bin 0 first, most significant bit first."""
+"""Packing of CEDD levels into 54 bytes: 144 levels of 3 bits, bin 0 first, most significant bit first."""
 
 from typing import Final
 
@@ -22,7 +22,7 @@ def pack(levels: LevelArray) -> bytes:
     Returns
     -------
     bytes
-        54 bytes; several descriptors packed and joined are a table of 54-byte rows.
+        54 bytes. Several packed descriptors, joined, are a table of 54-byte rows.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def pack(levels: LevelArray) -> bytes:
 
 
 def unpack(packed: bytes) -> LevelArray:
-    """Restore one descriptor from its 54 bytes, the inverse of `pack`.
+    """Return the levels of one packed descriptor; the inverse of `pack`.
 
     Returns
     -------
@@ -62,7 +62,7 @@ def unpack(packed: bytes) -> LevelArray:
 
 
 def unpack_rows(packed: bytes) -> LevelArray:
-    """Restore a table of descriptors, packed and joined, at once.
+    """Return the levels of many packed descriptors, joined.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def unpack_rows(packed: bytes) -> LevelArray:
     Raises
     ------
     ValueError
-        The bytes are no multiple of 54.
+        The number of bytes is not a multiple of 54.
     """
     if len(packed) % PACKED_BYTES:
         raise ValueError(f"{len(packed)} bytes are no multiple of {PACKED_BYTES}, check how they were stored")

@@ -1,7 +1,7 @@
-"""The constants of CEDD: fuzzy memberships as look-up tables, and the quantiser.
+"""Constants of CEDD: fuzzy memberships as look-up tables, and the quantiser.
 
 Source: Chatzichristofis and Boutalis, "CEDD: Color and Edge Directivity Descriptor", ICVS 2008, with the numbers
-of the LIRE reference (``features.global.CEDD``), which settles what the paper leaves open.
+of the LIRE reference (``features.global.CEDD``), which defines what the paper does not.
 """
 
 from typing import Final
@@ -14,9 +14,9 @@ Trapezoid = tuple[float, float, float, float]
 
 
 def _membership(x: FloatArray, trapezoid: Trapezoid) -> FloatArray:
-    """1 on [b, c], linear on [a, b) and (c, d], 0 elsewhere."""
+    """Return the membership: 1 on [b, c], linear on [a, b) and (c, d], 0 elsewhere."""
     a, b, c, d = trapezoid
-    with np.errstate(divide="ignore", invalid="ignore"):  # the vertical flanks (a = b, c = d) are never selected
+    with np.errstate(divide="ignore", invalid="ignore"):  # vertical edges (a = b, c = d) are never selected
         rising, falling = (x - a) / (b - a), (x - c) / (c - d) + 1
     return np.select([(b <= x) & (x <= c), (a <= x) & (x < b), (c < x) & (x <= d)], [np.ones_like(x), rising, falling])
 
@@ -37,8 +37,8 @@ _S0, _S1 = (_membership(_LEVELS, t) for t in ((0, 0, 10, 75), (10, 75, 255, 255)
 _V0, _V1, _V2 = (_membership(_LEVELS, t) for t in ((0, 0, 10, 75), (10, 75, 180, 220), (180, 220, 255, 255)))
 _LOW, _HIGH = (_membership(_LEVELS, t) for t in ((0, 0, 68, 188), (68, 188, 255, 255)))
 
-#: (256, 10) each: memberships of every saturation and of every value in the ten rules. Six are of the first fuzzy
-#: system (white, grey, black, black, colour, colour) and four of the second (light, pure, dark, dark).
+#: (256, 10) each: memberships of every saturation and of every value in the ten rules. Six rules belong to the first
+#: fuzzy system (white, grey, black, black, colour, colour), four to the second (light, pure, dark, dark).
 SATURATION: Final = np.stack([_S0, _S0, _S0, _S1, _S1, _S1, _LOW, _HIGH, _LOW, _HIGH], axis=1)
 VALUE: Final = np.stack([_V2, _V1, _V0, _V0, _V1, _V2, _HIGH, _HIGH, _LOW, _LOW], axis=1)
 
@@ -80,5 +80,5 @@ _REPRESENTATIVES: Final = (
     ),
 )  # fmt: skip
 
-#: (144, 8): histogram share that stands for each level, a row for each bin.
+#: (144, 8): histogram share that each level represents; one row for each bin.
 REPRESENTATIVES: Final = (np.array(_REPRESENTATIVES) / 1_000_000)[[0, 1, 2, 2, 3, 3]].repeat(24, axis=0)

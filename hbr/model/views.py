@@ -18,27 +18,28 @@ _T = TypeVar("_T", bound=np.generic)
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Descriptors of enrolled views, each with its object and the orientation it was taken from.
+    """Descriptors of enrolled views, with the object and the azimuth of each.
 
-    Arrays of the right type are kept, not copied, and are read-only through this class.
+    Arrays of the correct type are not copied. They are read-only through this class.
 
     Parameters
     ----------
     descriptors : uint8 array (n, length)
-        Levels of the descriptor; of CEDD 144, each 0..7.
+        Levels of the descriptor; for CEDD, 144 levels 0..7.
     azimuth_deg : float64 array (n,)
-        Orientation of the camera around the object, counter-clockwise seen from above; kept in [0, 360).
+        Orientation of the camera around the object, counter-clockwise seen from above; wrapped to [0, 360).
     object_index : integer array (n,)
         Index of each view's object in `object_names`.
     object_names : sequence of str
-        Distinct names. An object may be without views.
+        Distinct names. An object may have no views.
     descriptor : str
-        Name of the descriptor that all views were described by.
+        Name of the descriptor of all views.
 
     Raises
     ------
     TypeError, ValueError
-        A wrong type or shape, a level above 7, an azimuth that is not finite, an index without a name, equal names.
+        A type or shape is wrong, a level is too large, an azimuth is not finite, an index has no name, or two names are
+        equal.
     """
 
     descriptors: LevelArray
@@ -51,7 +52,7 @@ class Views:
         names = tuple(self.object_names)
         if len(set(names)) != len(names):
             repeated = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"object name {repeated!r} occurs twice; give each object a name of its own")
+            raise ValueError(f"object name {repeated!r} occurs twice; give each object a different name")
         azimuth_deg = np.asarray(self.azimuth_deg, np.float64)
         _check_views(self.descriptors, azimuth_deg, np.asarray(self.object_index), len(names), self.descriptor)
         object.__setattr__(self, "descriptors", _read_only(self.descriptors))
@@ -64,24 +65,24 @@ class Views:
 
     @classmethod
     def empty(cls, descriptor: str = "cedd") -> "Views":
-        """No objects, no views."""
+        """Return a model set without objects and views."""
         none = np.empty((0, descriptor_of(descriptor).length), np.uint8)
         return cls(none, np.empty(0), np.empty(0, np.intp), (), descriptor)
 
     @classmethod
     def of_object(cls, name: str, descriptors: LevelArray, azimuth_deg: ArrayLike, descriptor: str = "cedd") -> "Views":
-        """Views of one object."""
+        """Return the views of one object."""
         azimuths = np.asarray(azimuth_deg, np.float64)
         return cls(descriptors, azimuths, np.zeros(len(descriptors), np.intp), (name,), descriptor)
 
     @classmethod
     def concatenate(cls, parts: Sequence["Views"]) -> "Views":
-        """All views of the parts in their order; objects of the same name become one.
+        """Return all views of the parts in their order; objects of the same name are merged.
 
         Raises
         ------
         ValueError
-            The parts are of different descriptors.
+            The parts have different descriptors.
         """
         kinds = dict.fromkeys(part.descriptor for part in parts) or {"cedd": None}
         if len(kinds) > 1:
@@ -102,7 +103,7 @@ class Views:
         )
 
     def select(self, rows: IndexArray | NDArray[np.bool_]) -> "Views":
-        """The views of these indices, or where a mask holds; every object keeps its index and name."""
+        """Return the views of these indices, or of a mask. Every object keeps its index and name."""
         return replace(
             self,
             descriptors=self.descriptors[rows],
@@ -111,11 +112,11 @@ class Views:
         )
 
     def of(self, object_index: int) -> IndexArray:
-        """Indices of the views of an object, ascending."""
+        """Return the indices of the views of an object, ascending."""
         return self.of_each(np.array([object_index]))[0]
 
     def of_each(self, object_index: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Indices of the views of these objects, one object after the other, and where each object begins."""
+        """Return the indices of the views of these objects, one object after the other, and where each begins."""
         order, start = self._by_object
         positions, begin = ranges(start[object_index], start[object_index + 1] - start[object_index])
         return order[positions], begin

@@ -1,4 +1,4 @@
-"""Hough-based retrieval (HBR): objects vote with paths of views that fit the queries and the turns between them.
+"""Hough-based retrieval (HBR): scores of objects by paths of views that fit the queries and the rotations.
 
 Source: Czúni and Rashad, "Lightweight Active Object Retrieval with Weak Classifiers", Sensors 2018, 18, 801, Eq. 2-4.
 """
@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hbr.core.angles import turns_between
+from hbr.core.angles import revolutions_between
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import first_maximum, lengths, ranges
 from hbr.descriptors.tanimoto import tanimoto
@@ -18,7 +18,7 @@ from hbr.model.views import Views
 from hbr.paper.index import ViewIndex, check_queries
 
 Extension = Literal["visual", "orient", "orient_all"]
-#: View indices for each query.
+#: Indices of views for each query.
 _Columns = list[IndexArray]
 
 
@@ -29,17 +29,17 @@ class Ranking:
     Attributes
     ----------
     object_index : integer array (C,)
-        The objects with a view on any retrieval list, by falling score, equal scores by lower index.
+        The objects with a view on any retrieval list, by falling score; equal scores by rising index.
     scores : float64 array (C,)
-        Hough score H of each; at most the number of queries.
+        Hough score H of each object; at most the number of queries.
     pose_deg : float64 array (C,)
         Orientation of the camera around each object at the last query, in [0, 360).
     paths : integer array (C, N)
-        The view of each object that stands for each query on its best path.
+        The view for each query on the best path of each object.
     lists : tuple of N integer arrays
         Retrieval list of each query: view indices, best first.
     orientation_deg : float64 array (N,)
-        Orientations of the queries as given.
+        Orientations of the queries, as passed.
     views : Views
         The model set that the indices refer to.
     """
@@ -62,7 +62,7 @@ class Ranking:
 
     @property
     def margin(self) -> float:
-        """Score of the best candidate above the second's; its whole score where there is no second."""
+        """Score of the best candidate minus that of the second; the whole score if there is only one."""
         return float(self.scores[0] - self.scores[1]) if len(self) > 1 else float(self.scores[0])
 
 
@@ -77,37 +77,39 @@ def retrieve(
 ) -> Ranking:
     """Rank the enrolled objects by their Hough score over all queries so far.
 
-    For each object, H = max over its paths of Σ T(q_i, c_i) - ω Σ Δ(o_i - o_{i+1}, o_{c_i} - o_{c_{i+1}}), Δ in turns,
-    where a path takes one view of the object from every query's list. Exact, by dynamic programming; of equal paths the
-    one whose last view has the lower index is taken, then the one whose view before it has, and so on.
+    For each object, H = max over its paths of Σ T(q_i, c_i) - ω Σ Δ(o_i - o_{i+1}, o_{c_i} - o_{c_{i+1}}),
+    Δ in revolutions, where a path takes one view of the object from every query's list. The maximum is exact (dynamic
+    programming). Of equal paths, the one whose last view has the lowest index is taken, then by the view before, and so
+    on.
 
     Parameters
     ----------
     queries : uint8 array (N, 144)
-        Descriptors of the views so far, in their order; N >= 1.
+        Descriptors of the views so far, in their order. N is at least 1.
     orientation_deg : array (N,)
-        Orientation of the camera around the object at each query, in degrees from any zero, e.g. the first query.
+        Orientation of the camera around the object at each query, in degrees, with any zero (e.g. the first query).
     index : ViewIndex
         The enrolled views.
     omega : float
-        Weight ω of the orientation; 0 leaves it out.
+        Weight ω of the orientation; 0 ignores it.
     list_length : int
-        Views on the retrieval list of each query.
+        Number of views on the retrieval list of each query.
     extension : {"orient_all", "orient", "visual"}
-        What stands in where an object is missing from a list. ``visual``: its view most similar to the query.
-        ``orient``: outward from the first list it is on, each view of the neighbouring list adds the view that the turn
-        between the two queries leads to. ``orient_all``: each of its views on any list does so on all other lists, also
-        where it is not missing. Of equally close views the lower index is taken.
+        How an object that is missing from a list is added to it. ``visual``: by its view most similar to the query.
+        ``orient``: each of its views on the neighbouring list adds the view that the rotation between the two queries
+        leads to, starting from the first list that has the object. ``orient_all``: each of its views on any list adds
+        such views to all other lists, even if the object is not missing there. Of equally close views, the one with the
+        lower index is taken.
 
     Returns
     -------
     Ranking
-        Never empty.
+        It is never empty.
 
     Raises
     ------
     TypeError, ValueError
-        No query, not one finite orientation for each, an empty index, or a setting out of range.
+        There is no query, a query has no finite orientation, the index is empty, or a setting is out of range.
     """
     queries, orientations = np.asarray(queries), np.array(orientation_deg, np.float64)
     _check(queries, orientations, index, omega, list_length, extension)
@@ -160,7 +162,7 @@ def _check(
 
 
 def _extend_visual(lists: _Columns, queries: LevelArray, views: Views) -> _Columns:
-    """An object missing from a list gets there by its view most similar to the query."""
+    """Add each missing object to a list by its view most similar to the query."""
     candidates = np.unique(views.object_index[np.concatenate(lists)])
     extended = []
     for rows, query in zip(lists, queries, strict=True):
@@ -173,39 +175,39 @@ def _extend_visual(lists: _Columns, queries: LevelArray, views: Views) -> _Colum
 
 
 def _extend_orient(lists: _Columns, orientations: FloatArray, views: Views) -> _Columns:
-    """An object missing from a list gets there by its views on the neighbouring list, turned like the camera."""
+    """Add each missing object to a list by its views on the neighbouring list, rotated like the camera."""
     columns = list(lists)
     forward = [(i, i - 1) for i in range(1, len(lists))]
     backward = [(i, i + 1) for i in reversed(range(len(lists) - 1))]
     for here, neighbour in forward + backward:
         objects = views.object_index[columns[neighbour]]
         anchors = columns[neighbour][~np.isin(objects, views.object_index[columns[here]])]
-        turn_deg = np.full(len(anchors), orientations[here] - orientations[neighbour])
-        columns[here] = np.concatenate([columns[here], _turned(anchors, turn_deg, views)])
+        rotation_deg = np.full(len(anchors), orientations[here] - orientations[neighbour])
+        columns[here] = np.concatenate([columns[here], _rotated(anchors, rotation_deg, views)])
     return columns
 
 
 def _extend_orient_all(lists: _Columns, orientations: FloatArray, views: Views) -> _Columns:
-    """Every view on a list gets on all others too, turned like the camera."""
+    """Add every view on a list to all other lists, rotated like the camera."""
     anchors, listed = np.concatenate(lists), np.repeat(np.arange(len(lists)), [len(rows) for rows in lists])
     here, anchor = np.nonzero(np.arange(len(lists))[:, None] != listed)
-    turned = _turned(anchors[anchor], orientations[here] - orientations[listed[anchor]], views)
-    added = np.split(turned, np.searchsorted(here, np.arange(1, len(lists))))
+    rotated = _rotated(anchors[anchor], orientations[here] - orientations[listed[anchor]], views)
+    added = np.split(rotated, np.searchsorted(here, np.arange(1, len(lists))))
     return [np.concatenate(column) for column in zip(lists, added, strict=True)]
 
 
-def _turned(anchors: IndexArray, turn_deg: FloatArray, views: Views) -> IndexArray:
-    """ρ: for each view the one of its object whose azimuth is closest to turn_deg further on."""
+def _rotated(anchors: IndexArray, rotation_deg: FloatArray, views: Views) -> IndexArray:
+    """Return for each view the view of its object whose azimuth is closest to rotation_deg further on (ρ)."""
     if not len(anchors):
         return anchors
     rows, begin = views.of_each(views.object_index[anchors])
     count = lengths(begin, len(rows))
-    turned_deg = views.azimuth_deg[rows] - np.repeat(views.azimuth_deg[anchors], count)
-    return rows[first_maximum(-turns_between(turned_deg, np.repeat(turn_deg, count)), begin)]
+    rotated_deg = views.azimuth_deg[rows] - np.repeat(views.azimuth_deg[anchors], count)
+    return rows[first_maximum(-revolutions_between(rotated_deg, np.repeat(rotation_deg, count)), begin)]
 
 
 def _by_object(rows: IndexArray, views: Views) -> IndexArray:
-    """The distinct views, ascending by object, then by index."""
+    """Return the distinct views, by rising object, then by rising index."""
     rows = np.unique(rows)
     return rows[np.argsort(views.object_index[rows], kind="stable")]
 
@@ -213,8 +215,9 @@ def _by_object(rows: IndexArray, views: Views) -> IndexArray:
 def _best_paths(
     columns: _Columns, queries: LevelArray, orientations: FloatArray, views: Views, omega: float
 ) -> tuple[FloatArray, IndexArray]:
-    """Score (C,) and path (C, N) of every object, ascending by object; every object is in every column."""
+    """Return score (C,) and path (C, N) of every object, by rising object. Every object is in every column."""
     azimuth_deg = views.azimuth_deg
+    # forward: the best value of a path that ends at each view, and its predecessor on that path
     value = tanimoto(queries[0], views.descriptors[columns[0]])[0]
     predecessors = []
     for i in range(1, len(columns)):
@@ -223,13 +226,14 @@ def _best_paths(
         start = np.searchsorted(objects_before, objects_here, side="left")
         count = np.searchsorted(objects_before, objects_here, side="right") - start
         tails, begin = ranges(start, count)
-        turned_deg = azimuth_deg[before[tails]] - np.repeat(azimuth_deg[here], count)
-        penalty = omega * turns_between(turned_deg, orientations[i - 1] - orientations[i])
+        rotated_deg = azimuth_deg[before[tails]] - np.repeat(azimuth_deg[here], count)
+        penalty = omega * revolutions_between(rotated_deg, orientations[i - 1] - orientations[i])
         through = value[tails] - penalty
         best = first_maximum(through, begin)
         value = through[best] + tanimoto(queries[i], views.descriptors[here])[0]
         predecessors.append(tails[best])
 
+    # backward: follow the predecessors from the best last view of each object
     _, begin = np.unique(views.object_index[columns[-1]], return_index=True)
     node = first_maximum(value, begin)
     scores = value[node]

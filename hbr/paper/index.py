@@ -14,32 +14,32 @@ from hbr.model.views import Views
 Method = Literal["auto", "flat", "bound", "kdtree"]
 _T = TypeVar("_T", np.float32, np.float64)
 
-#: Below this many views one product over all 144 levels is as quick as the bound.
+#: Below this number of views, one product over all 144 levels is as fast as the bound.
 _SMALL: Final = 10_000
-#: Principal components in the bound: more cost more memory traffic, fewer leave more views to refine.
+#: Principal components in the bound: more of them need more memory traffic, fewer leave more views to compare fully.
 _COMPONENTS: Final = 15
-#: Rows that share one maximum when the first candidates are looked for.
+#: Rows that share one maximum in the search for the first candidates.
 _GROUP: Final = 64
-#: Searches whose answers are kept; then all are given up.
+#: Results of so many searches are cached; then the cache is cleared.
 _REMEMBERED: Final = 64
-#: Rows that are converted to float at a time.
+#: Rows that are converted to float at once.
 _CHUNK: Final = 4_096
 
 
 class ViewIndex:
-    """Exact nearest views by Tanimoto.
+    """Exact search for the most similar views, by the Tanimoto coefficient.
 
     Parameters
     ----------
     views : Views
-        The model set; not copied.
+        The model set; it is not copied.
     method : {"auto", "flat", "bound", "kdtree"}
         ``flat`` compares with every view. ``bound`` compares a few principal components with every view: with an
         orthonormal projection P, q·c <= Pq·Pc + |q - PᵀPq| |c - PᵀPc|, which bounds the similarity from above, and only
-        views whose bound reaches the k-th best similarity found so far are compared in full. ``kdtree`` looks up the
-        k nearest by Euclid in a KD-tree, then all in the ball that holds every view as similar as those; it takes eight
-        times the memory of the descriptors, and scipy. ``auto`` takes ``flat`` for small sets, ``bound`` for others.
-        The answers are the same.
+        views whose bound reaches the k-th best similarity found so far are compared in full. ``kdtree`` finds the k
+        nearest views by Euclidean distance in a KD-tree, then all views in the ball that contains every view as similar
+        as those. It needs SciPy and eight times the memory of the descriptors. ``auto`` uses ``flat`` for small sets
+        and ``bound`` for others. All methods return the same result.
     """
 
     def __init__(self, views: Views, method: Method = "auto") -> None:
@@ -58,14 +58,14 @@ class ViewIndex:
         return len(self.views)
 
     def extended(self, more: Views) -> "ViewIndex":
-        """Return an index of these views and more, behind them; this one stays as it is.
+        """Return an index of these views followed by more; this index does not change.
 
-        What was computed of the views at hand is kept, except where their number has doubled since, and by ``kdtree``.
+        The new index reuses what was computed for these views, except with ``kdtree`` or if their number has doubled.
 
         Parameters
         ----------
         more : Views
-            Objects of the same name become one (`Views.concatenate`).
+            Objects of the same name are merged (`Views.concatenate`).
         """
         views = Views.concatenate([self.views, more])
         grown = copy(self)
@@ -87,14 +87,14 @@ class ViewIndex:
         Returns
         -------
         view_indices : integer array (min(k, n),)
-            Best first, equal similarities by lower index.
+            Best first; equal similarities by rising index.
         similarities : float64 array (min(k, n),)
             As `hbr.tanimoto` computes them.
 
         Raises
         ------
         TypeError, ValueError
-            The query is no uint8 array of shape (144,) with levels 0..7, or `k` is below 1.
+            The query is not a uint8 array of shape (144,) with levels 0..7, or `k` is below 1.
         """
         check_queries(np.asarray(query)[None])
         if k < 1:
@@ -102,7 +102,7 @@ class ViewIndex:
         k = min(k, len(self.views))
         if k == 0:
             return np.empty(0, np.intp), np.empty(0)
-        # an active search asks for the lists of its earlier queries again with every new one
+        # an active search repeats the searches of its earlier queries with every new query
         key = np.asarray(query).tobytes(), k
         found = self._remembered.get(key)
         if found is None:
@@ -114,7 +114,13 @@ class ViewIndex:
 
 
 def check_queries(queries: LevelArray) -> None:
-    """Refuse what is not a uint8 array (n, 144) of levels 0..7."""
+    """Check that queries are a uint8 array (n, 144) of levels 0..7.
+
+    Raises
+    ------
+    TypeError, ValueError
+        They are not.
+    """
     if queries.dtype != np.uint8:
         raise TypeError(f"the query is of {queries.dtype}; pass the uint8 levels that cedd or describe returns")
     if queries.ndim != 2 or queries.shape[1] != BINS:
@@ -125,7 +131,7 @@ def check_queries(queries: LevelArray) -> None:
 
 class _Searcher(Protocol):
     def extended(self, descriptors: LevelArray, /) -> Self | None:
-        """A searcher of these rows, which begin with its own; None where it had better be built anew."""
+        """Return a searcher of these rows, which start with its own; None if a new one is better."""
         ...
 
     def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]: ...
@@ -140,7 +146,7 @@ def _searcher(descriptors: LevelArray, method: Method, known: _Searcher | None =
 
 
 class _Flat:
-    """Products with every view; float32 holds them exactly (below 144 * 49)."""
+    """Products with every view. They are exact in float32 (below 144 * 49)."""
 
     def __init__(self, descriptors: LevelArray) -> None:
         self._rows = descriptors.astype(np.float32)
@@ -159,28 +165,28 @@ class _Flat:
 
 
 class _Bound:
-    """Bounds for every view, products for the few that can still be among the best."""
+    """Bounds for every view, and products only for the views that can be among the best."""
 
     def __init__(self, descriptors: LevelArray) -> None:
         moments = np.zeros((BINS, BINS))
         for start in range(0, len(descriptors), _CHUNK):
             rows = descriptors[start : start + _CHUNK].astype(np.float32)
             moments += rows.T @ rows
-        # eigh sorts ascending: the last components carry most of the length
+        # eigh sorts ascending: the last components contain most of the length
         self._axes = np.ascontiguousarray(np.linalg.eigh(moments)[1][:, -_COMPONENTS:])
         self._fitted = len(descriptors)
         self._columns, self._squares = np.empty((_COMPONENTS + 1, 0), np.float32), np.empty(0, np.float32)
-        self._take_in(descriptors)
+        self._add(descriptors)
 
     def extended(self, descriptors: LevelArray, /) -> "_Bound | None":
         if len(descriptors) > 2 * self._fitted:
-            return None  # the axes may no longer be those of most views
+            return None  # the axes may not fit the majority of the views any more
         grown = copy(self)
-        grown._take_in(descriptors)
+        grown._add(descriptors)
         return grown
 
-    def _take_in(self, descriptors: LevelArray) -> None:
-        """Project the rows that are new, into arrays of their own."""
+    def _add(self, descriptors: LevelArray) -> None:
+        """Project the new rows; the arrays are copied, because another index may share the old ones."""
         self._descriptors = descriptors
         known = len(self._squares)
         columns, lengths = self._columns, self._squares
@@ -193,7 +199,7 @@ class _Bound:
             self._columns[:, chunk] = projected.T
 
     def _project(self, rows: LevelArray) -> tuple[FloatArray, FloatArray]:
-        """Components and length of the residual, (n, components + 1), and squared length of each row."""
+        """Return components and length of the residual, (n, components + 1), and squared length of each row."""
         x = rows.astype(np.float64)
         inside = x @ self._axes
         residual = np.linalg.norm(x - inside @ self._axes.T, axis=1)
@@ -204,7 +210,7 @@ class _Bound:
         own = float(own_squares[0])
         if own == 0:
             return np.arange(k), np.zeros(k)
-        # float32 errs by less than (components + 3) * 2**-24 of |q| |c|, and |c| <= 84
+        # the error of float32 is less than (components + 3) * 2**-24 of |q| |c|, and |c| <= 84
         dots = columns[0].astype(np.float32) @ self._columns + np.float32(1e-5 * 84 * own**0.5)
         bounds = dots / (self._squares + np.float32(own) - dots)
         promising = _promising(bounds, k)
@@ -219,9 +225,9 @@ class _Bound:
 
 
 class _Tree:
-    """A KD-tree by Euclid, and a ball that makes it exact by Tanimoto.
+    """A KD-tree of Euclidean distances, and a ball that makes the result exact for the Tanimoto coefficient.
 
-    With α = (1 + t) / 2t, T(q, c) >= t is |c - αq| <= |q| √(α² - 1): multiply T's definition out, complete the square.
+    With α = (1 + t) / 2t, T(q, c) >= t is equivalent to |c - αq| <= |q| √(α² - 1): complete the square.
     """
 
     def __init__(self, descriptors: LevelArray) -> None:
@@ -242,7 +248,7 @@ class _Tree:
             rows = np.arange(len(self._descriptors))
         else:
             alpha = (1 + reached) / (2 * reached)
-            # a hair wider: a view on the rim may tie with the k-th
+            # slightly larger: a view on the border can be as similar as the k-th
             radius = np.sqrt(q @ q * (alpha * alpha - 1)) * (1 + 1e-9) + 1e-6
             rows = np.sort(np.array(self._tree.query_ball_point(alpha * q, radius), np.intp))
         best, similarities = _best(tanimoto(query, self._descriptors[rows])[0], k)
@@ -250,10 +256,10 @@ class _Tree:
 
 
 def _best(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:
-    """Indices and values of the `k` largest, best first, equal values by lower index."""
+    """Return indices and values of the `k` largest values, best first; equal values by rising index."""
     rows = np.arange(len(values))
     if len(values) >= k * _GROUP:
-        # k groups have a maximum of at least `limit`, so at least k values have
+        # k groups have a maximum of at least `limit`, therefore at least k values do
         limit = np.partition(_group_maxima(values), -k)[-k]
         rows = np.flatnonzero(values >= limit)
     best = rows[np.argsort(-values[rows], kind="stable")[:k]]
@@ -261,7 +267,7 @@ def _best(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:
 
 
 def _promising(values: NDArray[np.float32], k: int) -> IndexArray:
-    """Some `k` indices or more, of large values."""
+    """Return at least `k` indices of large values."""
     wanted = 4 * k
     if len(values) < wanted * _GROUP:
         return np.arange(len(values))
@@ -273,7 +279,7 @@ def _promising(values: NDArray[np.float32], k: int) -> IndexArray:
 
 
 def _group_maxima(values: NDArray[_T]) -> NDArray[_T]:
-    """Maxima over groups of every n-th value, so that neighbours (views of one object) fall into different groups."""
+    """Return maxima over groups of every n-th value, so that views of one object are in different groups."""
     whole = len(values) // _GROUP * _GROUP
     maxima: NDArray[_T] = values[:whole].reshape(_GROUP, -1).max(axis=0)
     return maxima

@@ -1,4 +1,4 @@
-"""Active Hough-based retrieval (AHBR): where to look next.
+"""Active Hough-based retrieval (AHBR): the next best view.
 
 Source: Czúni and Rashad, "Lightweight Active Object Retrieval with Weak Classifiers", Sensors 2018, 18, 801, Eq. 5-7.
 """
@@ -24,22 +24,23 @@ _BEST: Final = 10
 
 @dataclass(frozen=True)
 class Decision:
-    """A side to turn to, and what it was decided on.
+    """The side to rotate to, and the numbers of the decision.
 
     Attributes
     ----------
     side : {"left", "right"}
-        ``left`` turns the camera counter-clockwise around the object, seen from above.
+        ``left`` moves the camera counter-clockwise around the object, seen from above.
     rotation_deg : float
-        Turn of the camera around the object, positive to the left; the detour is included.
+        Rotation of the camera around the object, positive to the left, including the detour.
     s_left, s_right : float
-        How alike the candidates look from either side (Eq. 6), summed over their pairs; the smaller sum tells more.
+        Similarity of the candidates on each side (Eq. 6), summed over their pairs. The side with the smaller sum
+        separates them better.
     candidates : tuple of int
-        The objects that were compared.
+        Indices of the compared objects.
     orientation_deg : float
-        Where the turn leads, in the zero of the queries' orientations, in [0, 360).
+        Orientation after the rotation, with the same zero as those of the queries, in [0, 360).
     detour_deg : float
-        How much of the turn, in degrees without sign, avoids orientations that were visited before.
+        Part of the rotation, without sign, that avoids orientations that were visited before.
     """
 
     side: Side
@@ -58,39 +59,40 @@ def next_view(
     revisit_deg: float = 10.0,
     side: Side | None = None,
 ) -> Decision:
-    """Decide to which side the candidates differ most, and turn to the next sector centre of the best candidate there.
+    """Choose the side on which the candidates differ most, and the rotation to the next sector centre there.
 
-    The views of an object fall into four sectors of 90 degrees; an average view stands for each (Eq. 5). The candidates
-    are the objects on the last retrieval list; if they are fewer than two, the ten best of the ranking.
+    The views of an object are divided into four sectors of 90 degrees, each represented by an average view (Eq. 5).
+    The sector centre is that of the best candidate. The candidates are the objects on the last retrieval list; if there
+    are fewer than two, the ten best ones of the ranking.
 
     Parameters
     ----------
     ranking : Ranking
-        Of at least two queries.
+        A ranking of at least two queries.
     visited_deg : array, optional
-        Orientations not to visit again; those of the ranking's queries by default. The last query's is always avoided.
+        Orientations to avoid; by default those of the ranking's queries. That of the last query is always avoided.
     revisit_deg : float
-        A turn that would end this close to a visited orientation, or closer, goes on for 90 degrees, and again until it
-        is clear of all. If all four endings are visited, the first is taken.
+        A rotation that ends this close to a visited orientation, or closer, is extended by 90 degrees, repeatedly until
+        it is clear of all. If all four ends are visited, the first one is used.
     side : {"left", "right"}, optional
-        Turn to this side whatever the similarities say, by the same step: the control that a decision is measured by.
+        Rotate to this side by the same step, independently of the similarities: a control for measurements.
 
     Returns
     -------
     Decision
-        Left if both sides are equally alike.
+        The side is left if both sums are equal.
 
     Raises
     ------
     ValueError
-        The ranking is of a single query, `revisit_deg` is out of range, a visited orientation is not finite, or `side`
+        The ranking has only one query, `revisit_deg` is out of range, a visited orientation is not finite, or `side`
         is unknown.
     """
     if len(ranking.orientation_deg) < 2:
-        raise ValueError("a decision needs two queries; turn to the second view by a fixed step such as +90 degrees")
+        raise ValueError("a decision needs two queries; rotate to the second view by a fixed step such as +90 degrees")
     visited = np.asarray(ranking.orientation_deg if visited_deg is None else visited_deg, np.float64).ravel()
     if not np.isfinite(visited).all():
-        raise ValueError(f"visited_deg is {visited}; leave out orientations that are not known")
+        raise ValueError(f"visited_deg is {visited}; leave unknown orientations out")
     if not 0 <= revisit_deg < _SECTOR_DEG / 2:
         raise ValueError(f"revisit_deg is {revisit_deg}; at least 0 and less than {_SECTOR_DEG / 2} is needed")
     if side not in (None, *get_args(Side)):
@@ -115,20 +117,20 @@ def next_view(
 
 
 def _next_sector(pose_deg: FloatArray, sign: int) -> tuple[IndexArray, FloatArray]:
-    """The sector whose centre comes next to the left (+1) or right (-1), and the turn to it, in (0, 90]."""
+    """Return the sector whose centre is next on the left (+1) or right (-1), and the rotation to it, in (0, 90]."""
     gap_deg = wrap360(sign * (_CENTRES_DEG - pose_deg[:, None]))
     gap_deg[gap_deg == 0] = 360.0
     return gap_deg.argmin(axis=1), gap_deg.min(axis=1)
 
 
 def _side_similarity(views: Views, candidates: IndexArray, sectors: IndexArray) -> float:
-    """Sum of the similarities of all pairs of candidates, each seen in its sector (Eq. 6)."""
+    """Return the sum of the similarities of all pairs of candidates, each in its sector (Eq. 6)."""
     averages = np.stack([_average_view(views, int(j), int(s)) for j, s in zip(candidates, sectors, strict=True)])
     return float(np.triu(tanimoto(averages, averages), k=1).sum())
 
 
 def _average_view(views: Views, object_index: int, sector: int) -> FloatArray:
-    """Mean descriptor of an object's views in a sector (Eq. 5); of an empty sector, the view nearest to it."""
+    """Return the mean descriptor of an object's views in a sector (Eq. 5), or the nearest view if it is empty."""
     rows = views.of(object_index)
     offset_deg = wrap180(views.azimuth_deg[rows] - _CENTRES_DEG[sector])
     half = _SECTOR_DEG / 2

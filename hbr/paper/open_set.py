@@ -1,4 +1,4 @@
-"""What score an enrolled object reaches when it is seen again, judged from the enrolled views alone."""
+"""Open-set threshold of the paper's retrieval, computed from the enrolled views."""
 
 from typing import Final
 
@@ -8,31 +8,31 @@ from hbr.core.arrays import FloatArray
 from hbr.model.views import Views
 
 _QUERIES: Final = 4
-"""Views that a typical retrieval takes, spread evenly around the object."""
+"""Number of views of a typical retrieval, spread evenly around the object."""
 
 
 def open_set_threshold(views: Views, *, quantile: float = 0.05, repeatability: float = 0.97) -> float:
-    """Return the score a view below which an object is probably none of those enrolled.
+    """Return the mean score per view below which an object is probably unknown.
 
-    Every enrolled view is taken for a query and compared with its two neighbours in azimuth, as if it were not enrolled
-    itself; the better one counts, averaged over four views a quarter of a turn apart. A real query lies at most half as
-    far from an enrolled view, so fewer known objects than ``quantile`` fall below. What a second sitting costs (placed
-    by hand, other light) is not in the enrolled views; ``repeatability`` allows for it, which matters where all views
-    of all objects are nearly alike.
+    Each enrolled view is a query and is compared with its two neighbours in azimuth, as if it were not enrolled itself.
+    The larger similarity counts, averaged over four views 90° apart. A real query is at most half as far from an
+    enrolled view, so that less than ``quantile`` of the known objects fall below the threshold. The enrolled views do
+    not show the differences between two sessions (placement by hand, other illumination). ``repeatability`` allows for
+    them, which matters if all views of all objects are similar.
 
     Parameters
     ----------
     views : Views
         The model set.
     quantile : float
-        Share of these averages, over all objects and starting points, that lie below the result.
+        Share of these averages, over all objects and starting points, that is below the result.
     repeatability : float
-        The result is never above this similarity, which the same view of two sittings surely keeps.
+        Upper limit of the result: a similarity that the same view has at least in two sessions.
 
     Returns
     -------
     float
-        In [0, 1]; 0, so that nothing is unknown, where no object has four views.
+        In [0, 1]. It is 0, so that no object is unknown, if no object has four views.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def open_set_threshold(views: Views, *, quantile: float = 0.05, repeatability: f
 
 
 def _averages(ring: FloatArray) -> FloatArray:
-    """Mean similarity to the better neighbour over four views, for each first view; ``ring`` by rising azimuth."""
+    """Return the mean similarity to the more similar neighbour over four views, for each first view."""
     following = np.roll(ring, -1, axis=0)
     dots = (ring * following).sum(axis=1)
     squares = (ring * ring).sum(axis=1)

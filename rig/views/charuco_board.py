@@ -1,4 +1,4 @@
-"""The calibration board: its layout, its picture, and where its corners are in an image."""
+"""The calibration board: its layout, its print, and the detection of its corners."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -12,16 +12,16 @@ DICTIONARY: Final = cv2.aruco.DICT_4X4_50
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A ChArUco board: a chessboard with a marker in each white square, so that each corner has a name.
+    """A ChArUco board: a chessboard with a marker in each white square, which identifies the corners.
 
     Attributes
     ----------
     columns, rows
-        Squares.
+        Numbers of squares.
     square_mm, marker_mm
-        Sides of a square and of a marker.
+        Side of a square and of a marker.
     margin_mm
-        White paper around the squares.
+        Width of the white margin around the squares.
     """
 
     columns: int = 8
@@ -32,16 +32,16 @@ class Board:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height of the squares, without the margin."""
+        """Width and height of all squares, without the margin."""
         return self.columns * self.square_mm, self.rows * self.square_mm
 
     @property
     def corners(self) -> int:
-        """How many inner corners it has."""
+        """Number of inner corners."""
         return (self.columns - 1) * (self.rows - 1)
 
     def layout(self) -> "cv2.aruco.CharucoBoard":
-        """Return the board as OpenCV has it."""
+        """Return the board as an OpenCV object."""
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows),
             self.square_mm,
@@ -50,11 +50,11 @@ class Board:
         )
 
     def points_mm(self) -> NDArray[np.float64]:
-        """Return the inner corners in the board's frame, float64 (n, 3), z = 0."""
+        """Return the inner corners in the board's coordinates, float64 (n, 3), z = 0."""
         return np.asarray(self.layout().getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
     def picture(self, px_mm: int) -> NDArray[np.uint8]:
-        """Return the print, with its margin, uint8 (rows, columns), at ``px_mm`` pixels a millimetre."""
+        """Return the print with its margin, uint8 (rows, columns), with ``px_mm`` pixels for each millimetre."""
         margin = round(self.margin_mm * px_mm)
         size = (
             round(self.columns * self.square_mm * px_mm) + 2 * margin,
@@ -65,7 +65,7 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class BoardDetection:
-    """The board's corners in one image: which ones, int (n,), where, float64 (n, 2) pixels, and the markers' ids."""
+    """The board's corners in one image: ids, int (n,), positions, float64 (n, 2) in pixels, and ids of the markers."""
 
     ids: NDArray[np.int64]
     corners_px: NDArray[np.float64]
@@ -73,13 +73,13 @@ class BoardDetection:
 
 
 def detect_board(board: Board, image_bgr: NDArray[np.uint8]) -> BoardDetection:
-    """Find the board in an image, uint8 (H, W, 3); no corners where it is not seen.
+    """Find the board in an image, uint8 (H, W, 3). The result has no corners if the board is not visible.
 
-    OpenCV 4.7 and later return them in shapes of their own.
+    The shapes of OpenCV's results differ between versions from 4.7 on.
     """
     grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
     detector = cv2.aruco.CharucoDetector(board.layout())
-    found: list[Any] = list(detector.detectBoard(grey))  # None for what was not seen
+    found: list[Any] = list(detector.detectBoard(grey))  # None for parts that were not found
     corners, ids, _, marker_ids = ([] if part is None else part for part in found)
     return BoardDetection(
         np.asarray(ids, dtype=np.int64).ravel(),

@@ -1,4 +1,4 @@
-"""Images of views: encoding and file names."""
+"""Image files of views: encoding, decoding and names."""
 
 import hashlib
 import re
@@ -18,13 +18,13 @@ MAX_SLUG_LENGTH: Final = 40
 MAX_FILE_BYTES: Final = 256_000_000
 MAX_SIDE: Final = 20_000
 MAX_PIXELS: Final = 100_000_000
-"""Of one image; more than any camera of such a bench has, and 300 MB decoded."""
+"""Largest image: more pixels than any camera of such a bench has, and 300 MB decoded."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
 
-# The fastest lossless settings for camera frames, and among the smallest: noise hides the repeats that the other
-# strategies search for. OpenCV before 4.12 chooses its filter by itself.
+# The fastest lossless settings for camera frames, with nearly the smallest files: noise hides the repetitions that the
+# other strategies search for. OpenCV before 4.12 chooses the filter itself.
 PNG_SETTINGS: Final = [
     cv2.IMWRITE_PNG_STRATEGY,
     cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
@@ -38,11 +38,11 @@ def encode(image_bgr: NDArray[np.uint8]) -> bytes:
     Raises
     ------
     UsageError
-        The image has another type or shape, or is empty.
+        The array has another type or shape, or is empty.
     """
     if image_bgr.dtype != np.uint8 or image_bgr.ndim != 3 or image_bgr.shape[2] != 3 or not image_bgr.size:
         raise UsageError(
-            f"an image of {image_bgr.dtype} with shape {image_bgr.shape}",
+            f"an image of {image_bgr.dtype} with shape {image_bgr.shape} cannot be stored",
             next_step="store BGR images as uint8 with shape (H, W, 3)",
         )
     encoded, png = cv2.imencode(".png", np.ascontiguousarray(image_bgr), PNG_SETTINGS)
@@ -59,18 +59,18 @@ def digest(png: bytes) -> str:
 
 
 class BadImage(ValueError):
-    """Bytes that are no image the catalog can keep; the message says why."""
+    """Bytes that are not a valid image; the message says why."""
 
 
 def decode(content: bytes) -> NDArray[np.uint8]:
-    """Return the pixels of a PNG or JPEG file of anybody's making, uint8 (H, W, 3) BGR.
+    """Return the pixels of any PNG or JPEG file, uint8 (H, W, 3) BGR.
 
-    What the file says of its size is looked at before memory is spent on it.
+    The size in the file's header is checked before memory is allocated.
 
     Raises
     ------
     BadImage
-        It is another kind of file, cut off, damaged or absurdly large.
+        The file has another type, is truncated, damaged or too large.
     """
     if len(content) > MAX_FILE_BYTES:
         raise BadImage(f"{len(content)} bytes, more than {MAX_FILE_BYTES}")
@@ -81,10 +81,10 @@ def decode(content: bytes) -> NDArray[np.uint8]:
     else:
         raise BadImage("neither a PNG nor a JPEG file")
     if size is None or end not in content[-4096:]:  # padding after the end is legal
-        raise BadImage("cut off or damaged")
+        raise BadImage("truncated or damaged")
     width, height = size
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
-        raise BadImage(f"{width} x {height} pixels; at most {MAX_PIXELS} and {MAX_SIDE} a side are taken")
+        raise BadImage(f"{width} x {height} pixels; at most {MAX_PIXELS} pixels and sides of {MAX_SIDE} are possible")
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:
@@ -95,7 +95,7 @@ def decode(content: bytes) -> NDArray[np.uint8]:
 
 
 def suffix(content: bytes) -> str:
-    """Return the suffix of a file name for an image that `decode` takes."""
+    """Return the suffix of the file name for a PNG or JPEG file."""
     return ".png" if content.startswith(_PNG) else ".jpg"
 
 
@@ -106,11 +106,11 @@ def _png_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """The size that the frame header (SOF, ITU-T T.81 B.2.2) tells."""
+    """Return the size in the frame header (SOF, ITU-T T.81 B.2.2)."""
     at = 2
     while at + 9 < len(content) and content[at] == 0xFF:
         marker = content[at + 1]
-        if marker == 0xFF:  # fill
+        if marker == 0xFF:  # fill byte
             at += 1
             continue
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
@@ -125,23 +125,23 @@ def read(path: Path, sha256: str) -> NDArray[np.uint8]:
     Raises
     ------
     CatalogError
-        The file is missing or is not the one that was stored.
+        The file is missing or differs from the one that was stored.
     """
-    mend = "look for a copy of it: rig catalog verify --repair; else enroll the object again with --replace"
+    fix = "run rig catalog verify --repair to find a copy; otherwise enroll the object again with --replace"
     try:
         content = path.read_bytes()
     except FileNotFoundError as error:
-        raise CatalogError(f"the image {path} is missing", next_step=mend) from error
+        raise CatalogError(f"the image {path} is missing", next_step=fix) from error
     if digest(content) != sha256:
-        raise CatalogError(f"the image {path} is not the one that was stored", next_step=mend)
+        raise CatalogError(f"the image {path} is not the one that was stored", next_step=fix)
     try:
         return decode(content)
     except BadImage as error:
-        raise CatalogError(f"the image {path} cannot be read: {error}", next_step=mend) from error
+        raise CatalogError(f"the image {path} is not readable: {error}", next_step=fix) from error
 
 
 def folder(object_id: int, object_name: str, enrollment_id: int) -> Path:
-    """Return an enrollment's folder, relative to the catalog; the id makes it unique, the name is for people."""
+    """Return an enrollment's folder, relative to the catalog. The id makes it unique, the name helps the reader."""
     ascii_name = unicodedata.normalize("NFKD", object_name).encode("ascii", "ignore").decode().lower()
     slug = re.sub(r"[^a-z0-9]+", "-", ascii_name)[:MAX_SLUG_LENGTH].strip("-")
     return Path(IMAGE_FOLDER, f"{object_id:06d}-{slug}".rstrip("-"), f"{enrollment_id:06d}")

@@ -1,4 +1,4 @@
-"""CEDD written out pixel by pixel in plain floats, as slow and as literal as the definition: the tests' oracle."""
+"""CEDD computed pixel by pixel in plain floats, exactly as defined: slow, for comparison in tests."""
 
 import math
 
@@ -59,7 +59,7 @@ def hsv(r: int, g: int, b: int) -> tuple[int, int, int]:
 
 
 def colours(r: int, g: int, b: int) -> list[float]:
-    """The 24 outputs of the two fuzzy systems."""
+    """Return the 24 outputs of the two fuzzy systems."""
     h, s, v = hsv(r, g, b)
     ten = [0.0] * 10
     for index, shape in enumerate(HUES):

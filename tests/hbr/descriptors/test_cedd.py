@@ -58,7 +58,7 @@ side = st.one_of(st.integers(1, 45), st.sampled_from([2, 39, 40, 41, 79, 80, 81,
 
 @st.composite
 def images(draw: st.DrawFn) -> Image:
-    """Noise, few colours in patches, gradients and greys: what reaches every branch of the definition."""
+    """Noise, patches of few colours, gradients and greys, which together reach every branch of the definition."""
     height, width = draw(side), draw(side)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     patch = draw(st.sampled_from([1, 2, 3, 5, 16]))
@@ -91,13 +91,13 @@ def test_equals_the_literal_definition_at_the_borders_of_the_grids(side: int) ->
 
 
 def test_sums_of_tall_blocks_do_not_overflow() -> None:
-    """Quarters of 260 rows: their white sums to more than 16 bits hold."""
+    """Quarters of 260 rows: the sums of white need more than 16 bits."""
     image = noise(10_400, 40) | np.uint8(254)
     assert cedd(image).tolist() == cedd_reference(image)
 
 
 def test_areas_with_a_whole_mean_round_like_the_reference() -> None:
-    """Colours whose luminance is a whole number: the order of the additions decides it."""
+    """Colours whose luminance is an integer: the order of the additions decides the rounding."""
     colours_bgr = np.random.default_rng(4).integers(0, 256, (800_000, 3), dtype=np.uint8)
     whole = colours_bgr[(colours_bgr @ np.array([114, 587, 299])) % 1000 == 0][:800].reshape(2, -1, 3)
     quarters = areas(whole)
@@ -108,7 +108,7 @@ def test_areas_with_a_whole_mean_round_like_the_reference() -> None:
 
 
 def drawing(name: str, height: int, width: int) -> Image:
-    """Greys of which most sums are whole numbers, and many quarters of blocks repeat."""
+    """Greys with mostly integer sums, and many equal quarters of blocks."""
     y, x = np.mgrid[:height, :width]
     grey = {
         "flat": 127 + 0 * x,
@@ -156,8 +156,8 @@ def test_texture_classes_equal_the_literal_definition() -> None:
 
 
 @pytest.mark.parametrize("height", [560, 568])
-def test_white_follows_the_rounding_of_the_reference(height: int) -> None:
-    """The reciprocal of 49 pixels (560 x 560) rounds such that white has luminance 254."""
+def test_white_rounds_like_the_reference(height: int) -> None:
+    """The reciprocal of 49 pixels (560 x 560) is rounded so that white has luminance 254."""
     image = noise(height, height)
     image[:, height // 3 :] = 255
     assert cedd(image).tolist() == cedd_reference(image)
@@ -179,7 +179,7 @@ def test_all_colour_outputs_equal_the_literal_definition() -> None:
         assert dense.tolist() == colours(r, g, b), (b, g, r)
 
 
-def test_hue_saturation_value_of_every_shade_equal_the_literal_definition() -> None:
+def test_hsv_of_every_shade_equals_the_literal_definition() -> None:
     """All 256 x 256 pairs of maximum and minimum, in each of the six orders of the channels, middle drawn at random."""
     high, low = (x.ravel() for x in np.triu_indices(256)[::-1])
     middle = np.random.default_rng(2).integers(low, high + 1)
@@ -190,11 +190,11 @@ def test_hue_saturation_value_of_every_shade_equal_the_literal_definition() -> N
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 200), (200, 1)])
-def test_an_image_without_a_block_is_all_zero(height: int, width: int) -> None:
+def test_image_without_a_block_gives_zeros(height: int, width: int) -> None:
     assert not cedd(noise(height, width)).any()
 
 
-def test_only_the_covered_area_counts() -> None:
+def test_pixels_outside_the_grid_are_ignored() -> None:
     image = noise(128, 128)
     changed = image.copy()
     changed[80:] = changed[:, 80:] = 7
@@ -221,7 +221,7 @@ def test_memory_layout_does_not_matter(view: Callable[[Image], Image]) -> None:
     assert (cedd(view(image)) == cedd(np.ascontiguousarray(view(image)))).all()
 
 
-def test_the_image_is_left_as_it_is() -> None:
+def test_image_is_not_changed() -> None:
     image = noise(130, 90)
     before = image.copy()
     image.flags.writeable = False
@@ -246,7 +246,7 @@ def test_the_image_is_left_as_it_is() -> None:
         (np.zeros((0, 80, 3), np.uint8), ValueError, "empty"),
     ],
 )
-def test_what_is_no_bgr_image_is_refused(
+def test_invalid_images_are_rejected(
     function: Callable[[Any], Image], image: Any, error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=re.escape(message)):
@@ -267,20 +267,20 @@ def test_what_is_no_bgr_image_is_refused(
         ((3000, 40), (640, 80)),
     ],
 )
-def test_describe_brings_an_image_to_covered_sides(size: tuple[int, int], brought_to: tuple[int, int]) -> None:
+def test_describe_scales_to_covered_sides(size: tuple[int, int], brought_to: tuple[int, int]) -> None:
     image = flat((0, 0, 0), size[1], size[0])
     assert _covered_size(*size) == brought_to
     assert (describe(image) == describe(image, size=brought_to)).all()
 
 
-def test_describe_of_a_covered_image_is_cedd() -> None:
+def test_describe_of_a_covered_image_equals_cedd() -> None:
     image = noise(480, 640)
     assert (describe(image) == cedd(image)).all()
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 2000), st.integers(1, 2000))
-def test_described_sides_are_covered_and_close(width: int, height: int) -> None:
+def test_scaled_sides_are_covered_and_close(width: int, height: int) -> None:
     covered = _covered_size(width, height)
     scale = min(1.0, 640 / max(width, height))
     for side, result in zip((width, height), covered, strict=True):
@@ -289,7 +289,7 @@ def test_described_sides_are_covered_and_close(width: int, height: int) -> None:
         assert abs(result - side * scale) <= 40 or result == 80
 
 
-def test_describe_sees_the_whole_image() -> None:
+def test_describe_uses_the_whole_image() -> None:
     image = noise(128, 128)
     changed = image.copy()
     changed[90:, 90:] = (255, 0, 0)
@@ -298,6 +298,6 @@ def test_describe_sees_the_whole_image() -> None:
 
 
 @pytest.mark.parametrize("size", [(0, 80), (80, -80), (128, 128), (640, 470)])
-def test_a_size_that_is_not_covered_is_refused(size: tuple[int, int]) -> None:
+def test_size_that_is_not_covered_is_rejected(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="multiples of 80"):
         describe(noise(80, 80), size=size)

@@ -20,12 +20,12 @@ def test_arrays_and_files_are_described_in_their_order(tmp_path: Path, processes
     np.testing.assert_array_equal(describe_all(mixed, size=(80, 160), processes=processes), expected)
 
 
-def test_nothing_gives_nothing() -> None:
+def test_no_images_give_no_rows() -> None:
     assert describe_all([], processes=1).shape == (0, 144)
 
 
 @pytest.mark.parametrize("processes", [1, 2])
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, processes: int) -> None:
+def test_unreadable_file_is_named(tmp_path: Path, processes: int) -> None:
     with pytest.raises(ValueError, match=r"gone\.png is missing"):
         describe_all([IMAGES[0], tmp_path / "gone.png"], processes=processes)
     with pytest.raises(ValueError, match="processes is 0"):

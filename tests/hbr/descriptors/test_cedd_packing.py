@@ -15,18 +15,18 @@ def test_unpack_restores_what_pack_wrote(levels: np.ndarray) -> None:
 
 
 @given(st.binary(min_size=54, max_size=54))
-def test_every_54_bytes_are_a_descriptor(packed: bytes) -> None:
+def test_any_54_bytes_are_a_descriptor(packed: bytes) -> None:
     assert pack(unpack(packed)) == packed
 
 
-def test_bin_0_comes_first_and_its_high_bit_first() -> None:
+def test_bin_0_and_its_high_bit_are_first() -> None:
     levels = np.zeros(144, np.uint8)
     levels[:3] = 0b100, 0b011, 0b110
     levels[-1] = 0b101
     assert pack(levels) == bytes([0b10001111, 0b00000000]) + bytes(51) + bytes([0b101])
 
 
-def test_other_integers_are_welcome() -> None:
+def test_other_integer_types_are_accepted() -> None:
     assert pack([7] * 144) == b"\xff" * 54  # type: ignore[arg-type]
 
 
@@ -40,22 +40,22 @@ def test_other_integers_are_welcome() -> None:
         (np.zeros(144), TypeError, "integer levels"),
     ],
 )
-def test_what_is_no_descriptor_is_refused(levels: np.ndarray, error: type[Exception], message: str) -> None:
+def test_invalid_descriptors_are_rejected(levels: np.ndarray, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         pack(levels)
 
 
 @pytest.mark.parametrize("count", [0, 53, 55])
-def test_a_wrong_number_of_bytes_is_refused(count: int) -> None:
+def test_wrong_number_of_bytes_is_rejected(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count} bytes; a packed descriptor has 54"):
         unpack(bytes(count))
 
 
 @given(arrays(np.uint8, st.tuples(st.integers(0, 5), st.just(144)), elements=st.integers(0, 7)))
-def test_joined_descriptors_unpack_as_single_ones(levels: np.ndarray) -> None:
+def test_joined_descriptors_unpack_like_single_ones(levels: np.ndarray) -> None:
     assert np.array_equal(unpack_rows(b"".join(pack(row) for row in levels)), levels)
 
 
-def test_a_table_that_ends_within_a_row_is_refused() -> None:
+def test_table_that_ends_within_a_row_is_rejected() -> None:
     with pytest.raises(ValueError, match="109 bytes are no multiple of 54"):
         unpack_rows(bytes(109))

@@ -13,7 +13,7 @@ def one(request: pytest.FixtureRequest) -> Descriptor:
 
 
 def photo(seed: int = 0, size: tuple[int, int] = (120, 160)) -> np.ndarray:
-    """A coloured blob with stripes before a dark ground."""
+    """Return an image of a coloured, striped blob before a dark background."""
     rng = np.random.default_rng(seed)
     image = np.full((*size, 3), 20, np.uint8)
     y, x = np.indices(size)
@@ -23,7 +23,7 @@ def photo(seed: int = 0, size: tuple[int, int] = (120, 160)) -> np.ndarray:
     return image
 
 
-def test_what_it_says_of_itself_holds(one: Descriptor) -> None:
+def test_attributes_fit_the_levels(one: Descriptor) -> None:
     levels = one.describe(photo())
     assert levels.shape == (one.length,)
     assert levels.dtype == np.uint8
@@ -31,7 +31,7 @@ def test_what_it_says_of_itself_holds(one: Descriptor) -> None:
     assert descriptor(one.name) is one
 
 
-def test_packing_loses_nothing(one: Descriptor) -> None:
+def test_unpack_restores_packed_levels(one: Descriptor) -> None:
     for seed in range(5):
         levels = one.describe(photo(seed))
         np.testing.assert_array_equal(one.unpack(one.pack(levels)), levels)
@@ -51,7 +51,7 @@ def test_similarity_is_1_to_itself_symmetric_and_between_0_and_1(one: Descriptor
     np.testing.assert_allclose(one.similarity(rows[:2], rows), similar[:2], atol=1e-6)
 
 
-def test_an_unknown_name_is_answered_with_those_there_are() -> None:
+def test_unknown_name_is_rejected_with_the_known_names() -> None:
     with pytest.raises(ValueError, match="'sift' is unknown; use one of cedd"):
         descriptor("sift")
 
@@ -62,14 +62,14 @@ def varint(number: int) -> bytes:
 
 
 def field(number: int, value: int | bytes) -> bytes:
-    """A field of a protocol buffer."""
+    """Return a field of a protocol buffer."""
     if isinstance(value, int):
         return varint(number << 3) + varint(value)
     return varint(number << 3 | 2) + varint(len(value)) + value
 
 
 def model() -> bytes:
-    """An ONNX model of two nodes that returns the means of its three channels."""
+    """Return an ONNX model of two nodes that computes the means of the three channels."""
 
     def tensor(name: bytes, *sides: int) -> bytes:
         shape = b"".join(field(1, field(1, side)) for side in sides)
@@ -83,7 +83,7 @@ def model() -> bytes:
     return field(1, 8) + field(7, graph) + field(8, field(1, b"") + field(2, 13))
 
 
-def test_a_network_s_embedding_is_a_descriptor_like_any_other(tmp_path: Path) -> None:
+def test_embedding_of_a_neural_network_is_a_descriptor(tmp_path: Path) -> None:
     file = tmp_path / "means.onnx"
     file.write_bytes(model())
     own = descriptor(f"onnx:{file}")
@@ -101,7 +101,7 @@ def test_a_network_s_embedding_is_a_descriptor_like_any_other(tmp_path: Path) ->
     assert update_belief(levels[1], 0.0, index).ranking().object_index[0] == 1
 
 
-def test_a_model_that_cannot_be_used_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_unusable_model_is_rejected_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be read: No such file"):
         descriptor(f"onnx:{tmp_path / 'none.onnx'}")
     (tmp_path / "text.onnx").write_text("no model")
@@ -109,8 +109,7 @@ def test_a_model_that_cannot_be_used_is_refused_with_the_reason(tmp_path: Path) 
         descriptor(f"onnx:{tmp_path / 'text.onnx'}")
 
 
-def test_a_blur_of_a_block_makes_cedd_of_noise_like_cedd_without() -> None:
-    """What the prefilter is for."""
+def test_blur_of_a_block_makes_cedd_robust_to_noise() -> None:
     rng = np.random.default_rng(0)
     noisy = np.clip(photo() + rng.normal(0, 25, (120, 160, 3)), 0, 255).astype(np.uint8)
     same = {
@@ -120,7 +119,7 @@ def test_a_blur_of_a_block_makes_cedd_of_noise_like_cedd_without() -> None:
     assert same["cedd-blurred"] > 0.8 > 0.5 > same["cedd"]
 
 
-def test_views_of_different_descriptors_are_not_mixed() -> None:
+def test_views_of_different_descriptors_cannot_be_mixed() -> None:
     views = [Views.of_object("a", descriptor(n).describe(photo())[None], [0.0], n) for n in ("cedd", "edges")]
     with pytest.raises(ValueError, match="views of cedd and edges cannot be compared"):
         Views.concatenate(views)
@@ -132,9 +131,7 @@ def test_views_of_different_descriptors_are_not_mixed() -> None:
 
 @pytest.mark.parametrize("name", [name for name in names() if not name.startswith("cedd")])
 @pytest.mark.parametrize(("gain", "exponent"), [(0.6, 1.0), (1.25, 1.0), (1.0, 1.2)])
-def test_strength_of_the_light_and_gamma_hardly_matter_to_what_sees_the_object_alone(
-    name: str, gain: float, exponent: float
-) -> None:
+def test_exposure_and_gamma_hardly_change_descriptors_of_the_object(name: str, gain: float, exponent: float) -> None:
     own = descriptor(name)
     image = np.where(photo(3) > 20, photo(3) * 0.75, photo(3))
     changed = (255 * (np.clip(image * gain, 0, 255) / 255) ** exponent).astype(np.uint8)
@@ -143,7 +140,7 @@ def test_strength_of_the_light_and_gamma_hardly_matter_to_what_sees_the_object_a
 
 
 @pytest.mark.parametrize("name", names())
-def test_many_packed_views_come_back_as_each_alone(name: str) -> None:
+def test_unpack_rows_equals_unpack_of_each_row(name: str) -> None:
     kind, rng = descriptor(name), np.random.default_rng(0)
     images = rng.integers(0, 256, (5, 64, 64, 3), np.uint8)
     packed = [kind.pack(kind.describe(image)) for image in images]

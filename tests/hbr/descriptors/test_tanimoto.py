@@ -25,7 +25,7 @@ def test_equals_exact_fractions(a: np.ndarray, b: np.ndarray) -> None:
             assert found[i, j] == (float(Fraction(dot, union)) if union else 0.0)
 
 
-def test_full_bytes_are_exact_too() -> None:
+def test_bytes_up_to_255_are_exact() -> None:
     a = np.full((1, 144), 255, np.uint8)
     b = a.copy()
     b[0, 0] = 254
@@ -49,17 +49,17 @@ def test_equal_ratios_of_different_integers_are_equal() -> None:
     assert tanimoto(query, rows).tolist() == [[0.5, 0.5]]
 
 
-def test_zero_rows_are_unlike_everything() -> None:
+def test_zero_rows_have_similarity_0() -> None:
     zero, one = np.zeros(144, np.uint8), np.ones(144, np.uint8)
     assert tanimoto(np.stack([zero, one]), np.stack([zero, one])).tolist() == [[0, 0], [0, 1]]
 
 
-def test_real_valued_averages_are_compared_as_they_are() -> None:
+def test_real_valued_averages_are_not_rounded() -> None:
     a, b = np.array([0.5, 1.5]), np.array([2.0, 0.25])
     dot = 0.5 * 2.0 + 1.5 * 0.25
     assert tanimoto(a, b)[0, 0] == pytest.approx(dot / (2.5 + 4.0625 - dot), abs=1e-15)
 
 
-def test_rows_of_different_length_are_refused() -> None:
+def test_rows_of_different_lengths_are_rejected() -> None:
     with pytest.raises(ValueError, match="same d"):
         tanimoto(np.zeros(144, np.uint8), np.zeros(143, np.uint8))

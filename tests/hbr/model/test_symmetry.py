@@ -1,4 +1,4 @@
-"""How alike an object is to itself from other sides, and to others."""
+"""Symmetry of objects, and objects that can be confused."""
 
 import numpy as np
 import pytest
@@ -27,24 +27,24 @@ def views_of(*objects: np.ndarray) -> hbr.Views:
 
 
 @pytest.mark.parametrize(("period", "expected_deg"), [(36, 360), (18, 180), (12, 120), (9, 90)])
-def test_the_period_is_found(period, expected_deg):
+def test_period_is_found(period, expected_deg):
     found = symmetry(views_of(ring(period)), 0)
     assert found is not None
     assert found.period_deg == pytest.approx(expected_deg)
     if expected_deg < 360:
-        assert found.alike == pytest.approx(1.0)
+        assert found.similarity == pytest.approx(1.0)
 
 
-def test_a_round_object_looks_alike_from_everywhere_and_few_views_say_nothing():
+def test_round_object_has_period_0_and_few_views_have_none():
     same = np.tile(np.arange(144, dtype=np.uint8) % 8, (COUNT, 1))
     found = symmetry(views_of(same), 0)
     assert found is not None
-    assert (found.period_deg, found.neighbours, found.alike) == (0.0, 1.0, 1.0)
+    assert (found.period_deg, found.neighbours, found.similarity) == (0.0, 1.0, 1.0)
     assert symmetry(views_of(same[:17]), 0) is None
 
 
 @given(turn=st.integers(0, COUNT - 1), period=st.sampled_from([36, 18, 12]), order=st.randoms())
-def test_where_a_ring_begins_and_in_which_order_it_is_stored_does_not_matter(turn, period, order):
+def test_symmetry_is_independent_of_start_and_order_of_views(turn, period, order):
     descriptors = ring(period)
     rows = list(range(COUNT))
     order.shuffle(rows)
@@ -54,12 +54,12 @@ def test_where_a_ring_begins_and_in_which_order_it_is_stored_does_not_matter(tur
     assert shuffled is not None
     assert straight is not None
     assert shuffled.period_deg == straight.period_deg
-    assert shuffled.alike == pytest.approx(straight.alike)
+    assert shuffled.similarity == pytest.approx(straight.similarity)
 
 
 @given(start=st.integers(0, COUNT - 1), length=st.integers(1, COUNT - 8))
-def test_a_twin_that_differs_on_one_side_is_found_on_the_other_to_two_steps(start, length):
-    """Views start .. start + length - 1 are the same on both objects; their neighbours are nearly so."""
+def test_arc_of_a_partly_equal_object_is_found_to_two_steps(start, length):
+    """Views start .. start + length - 1 of both objects are equal; their neighbours are similar."""
     mine, other = ring(36), ring(36, seed=1)
     same = (start + np.arange(length)) % COUNT
     other[same] = mine[same]
@@ -72,7 +72,7 @@ def test_a_twin_that_differs_on_one_side_is_found_on_the_other_to_two_steps(star
     assert 0 <= (end_deg / STEP_DEG - (start + length - 1)) % COUNT <= 2
 
 
-def test_twins_come_before_others_and_strangers_not_at_all():
+def test_most_similar_objects_come_first_and_others_are_left_out():
     mine, half, other_object = ring(36), ring(36, seed=1), ring(36, seed=2)
     half[:18] = mine[:18]
     found = similar_objects(views_of(mine, other_object, half, mine), 0)
@@ -82,27 +82,27 @@ def test_twins_come_before_others_and_strangers_not_at_all():
     assert similar_objects(views_of(mine[:2], mine), 0) == ()
 
 
-def test_one_view_that_differs_does_not_part_an_arc_but_two_do():
-    alike = np.zeros(COUNT, bool)
-    alike[[3, 4, 6, 7, 10]] = True
-    assert _arcs(np.arange(COUNT) * STEP_DEG, alike) == ((30.0, 70.0), (100.0, 100.0))
+def test_two_views_that_differ_split_an_arc_but_one_does_not():
+    confused = np.zeros(COUNT, bool)
+    confused[[3, 4, 6, 7, 10]] = True
+    assert _arcs(np.arange(COUNT) * STEP_DEG, confused) == ((30.0, 70.0), (100.0, 100.0))
 
 
 @given(st.lists(st.booleans(), min_size=3, max_size=40).filter(any))
-def test_arcs_hold_every_view_that_is_alike_and_end_at_such(held):
-    alike = np.array(held)
-    azimuth_deg = np.arange(len(alike)) * 360.0 / len(alike)
-    covered = np.zeros(len(alike), bool)
-    for begin_deg, end_deg in _arcs(azimuth_deg, alike):
+def test_arcs_contain_every_confused_view_and_end_at_one(held):
+    confused = np.array(held)
+    azimuth_deg = np.arange(len(confused)) * 360.0 / len(confused)
+    covered = np.zeros(len(confused), bool)
+    for begin_deg, end_deg in _arcs(azimuth_deg, confused):
         if (begin_deg, end_deg) == (0.0, 360.0):
             covered[:] = True
             continue
-        begin, end = round(begin_deg / 360 * len(alike)), round(end_deg / 360 * len(alike))
-        assert alike[begin]
-        assert alike[end]
-        rows = (begin + np.arange((end - begin) % len(alike) + 1)) % len(alike)
+        begin, end = round(begin_deg / 360 * len(confused)), round(end_deg / 360 * len(confused))
+        assert confused[begin]
+        assert confused[end]
+        rows = (begin + np.arange((end - begin) % len(confused) + 1)) % len(confused)
         assert not covered[rows].any()
         covered[rows] = True
-    assert covered[alike].all()
-    gaps = covered & ~alike  # single views at most
+    assert covered[confused].all()
+    gaps = covered & ~confused  # single views at most
     assert not (gaps & np.roll(gaps, 1)).any() or covered.all()

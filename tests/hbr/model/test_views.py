@@ -20,7 +20,7 @@ def test_azimuths_are_wrapped() -> None:
     assert make(azimuth_deg=np.array([-5.0, 360.0, 725.0])).azimuth_deg.tolist() == [355.0, 0.0, 5.0]
 
 
-def test_the_arrays_are_read_only_here_and_stay_writeable_outside() -> None:
+def test_arrays_are_read_only_inside_and_writeable_outside() -> None:
     descriptors = np.zeros((3, 144), np.uint8)
     views = make(descriptors=descriptors)
     for column in (views.descriptors, views.azimuth_deg, views.object_index):
@@ -37,11 +37,11 @@ def test_views_of_an_object_are_found() -> None:
     assert (rows.tolist(), begin.tolist()) == ([0, 2, 1], [0, 2])
 
 
-def test_an_object_may_be_without_views() -> None:
+def test_object_may_have_no_views() -> None:
     assert make(object_names=("cup", "duck", "fox")).of(2).tolist() == []
 
 
-def test_concatenation_joins_objects_of_the_same_name() -> None:
+def test_concatenation_merges_objects_of_the_same_name() -> None:
     more = Views.of_object("duck", np.full((2, 144), 7, np.uint8), [10, -10])
     other = Views.of_object("fox", np.full((1, 144), 3, np.uint8), [20])
     joined = Views.concatenate([make(), other, more])
@@ -52,7 +52,7 @@ def test_concatenation_joins_objects_of_the_same_name() -> None:
     assert (joined.descriptors[4:] == 7).all()
 
 
-def test_nothing_concatenated_is_empty() -> None:
+def test_concatenation_of_nothing_is_empty() -> None:
     assert len(Views.concatenate([])) == len(Views.empty()) == 0
     assert Views.concatenate([Views.empty(), make()]).object_names == ("cup", "duck")
 
@@ -81,6 +81,6 @@ def test_selection_keeps_the_objects() -> None:
         ({"object_names": ("cup", "cup")}, ValueError, "'cup' occurs twice"),
     ],
 )
-def test_what_does_not_fit_is_refused(changed: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_invalid_arguments_are_rejected(changed: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make(**changed)

@@ -1,4 +1,4 @@
-"""Retrieval written out by enumeration: every path of every object, every pair of candidates. The tests' oracle."""
+"""Retrieval by enumeration of every path of every object and every pair of candidates, for comparison in tests."""
 
 import itertools
 import math
@@ -24,7 +24,7 @@ def similarity(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 class Enumeration:
-    """Scores, poses and node sets of all candidates for some queries."""
+    """Return scores, poses and node sets of all candidates for some queries."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Enumeration:
         return [{v for v in rows if self.object_of[v] == j} for rows in self.lists]
 
     def rho(self, k: int, i: int, i_from: int) -> int:
-        """The view of k's object that the camera sees at i if it saw k at i_from; the first of equally close ones."""
+        """Return the view of k's object that the camera sees at i if it saw k at i_from; the first of equals."""
 
         def miss(v: int) -> float:
             turned = self.azimuth[v] - self.azimuth[k]
@@ -97,7 +97,7 @@ def next_view_reference(
     here: float,
     visited: Sequence[float],
 ) -> tuple[str, float, float, float]:
-    """Side, rotation, S_left and S_right from (object, pose) pairs, best first."""
+    """Return side, rotation, S_left and S_right from (object, pose) pairs, best first."""
     centres = [90 * s + 45 for s in range(4)]
     azimuth: list[float] = views.azimuth_deg.tolist()
 

@@ -20,7 +20,7 @@ def one_hot(*levels: tuple[int, int]) -> np.ndarray:
 
 @st.composite
 def small_cases(draw: st.DrawFn) -> tuple[np.ndarray, list[float], Views, float, int]:
-    """Few bins and few levels, so that similarities tie; azimuths regular or not, wrapped around 0."""
+    """Model sets with few bins and levels, so that similarities are equal; azimuths regular or not."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count = draw(st.integers(1, 14))
     steps = draw(st.integers(1, 4))
@@ -65,7 +65,7 @@ def test_equals_the_enumeration_of_all_paths(
 
 @settings(max_examples=30, deadline=None)
 @given(small_cases(), st.integers(-720, 720))
-def test_the_zero_of_the_orientations_does_not_matter(
+def test_zero_of_the_orientations_does_not_matter(
     case: tuple[np.ndarray, list[float], Views, float, int], zero_deg: int
 ) -> None:
     queries, orientations, views, omega, length = case
@@ -108,12 +108,14 @@ def by_hand(extension: Extension, omega: float, list_length: int = 1) -> tuple[A
         ("orient", 4.0, [("a", 1.0, [0, 2])]),
     ],
 )
-def test_extensions_by_hand(extension: Extension, omega: float, expected: list[tuple[str, float, list[int]]]) -> None:
+def test_extensions_of_a_known_example(
+    extension: Extension, omega: float, expected: list[tuple[str, float, list[int]]]
+) -> None:
     assert by_hand(extension, omega)[0] == expected
 
 
-def test_a_missing_object_by_hand() -> None:
-    """b is on the second list only: its one view stands in at the first query too, a quarter turn off."""
+def test_missing_object_of_a_known_example() -> None:
+    """b is only on the second list: its one view is also used for the first query, 90° off."""
     for extension in EXTENSIONS:
         found, ranking = by_hand(extension, 1.0, list_length=2)
         assert [rows.tolist() for rows in ranking.lists] == [[0, 1], [2, 3]]
@@ -122,8 +124,8 @@ def test_a_missing_object_by_hand() -> None:
         assert ranking.pose_deg.tolist() == [180.0, 0.0]
 
 
-def test_orient_takes_the_turned_view_where_visual_takes_the_likest() -> None:
-    """Object a misses the second list; visual takes its view 2 (T = 1/2, wrong turn), orient view 1 (T = 0, right)."""
+def test_orient_takes_the_rotated_view_and_visual_the_most_similar_one() -> None:
+    """Object a is not on the second list: visual takes view 2 (T = 1/2, wrong), orient view 1 (T = 0, right)."""
     half = one_hot((1, 1), (2, 1))
     views = Views(
         np.stack([Q1, one_hot((5, 1)), half, Q2]),
@@ -147,14 +149,14 @@ def test_one_query_ranks_by_the_best_view() -> None:
     assert ranking.margin == 0.0
 
 
-def test_a_single_candidate_has_its_whole_score_as_margin() -> None:
+def test_margin_of_a_single_candidate_is_its_score() -> None:
     ranking = retrieve(Q1[None], [0.0], ViewIndex(HAND), list_length=1)
     assert len(ranking) == 1
     assert ranking.margin == 1.0
 
 
-def test_object_indices_need_not_follow_the_order_of_views() -> None:
-    """Views of the objects interleaved, and in another order: the same scores by name."""
+def test_object_indices_are_independent_of_the_order_of_views() -> None:
+    """Interleaved views and views in another order give the same scores by name."""
     rng = np.random.default_rng(3)
     descriptors = rng.integers(0, 3, (24, 144), dtype=np.uint8)
     azimuth = np.repeat(np.arange(6) * 60.0, 4)
@@ -183,7 +185,7 @@ def test_object_indices_need_not_follow_the_order_of_views() -> None:
         ({"extension": "both"}, ValueError, "visual, orient, orient_all"),
     ],
 )
-def test_what_does_not_fit_is_refused(changed: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_invalid_arguments_are_rejected(changed: dict[str, Any], error: type[Exception], message: str) -> None:
     arguments: dict[str, Any] = {
         "queries": np.stack([Q1, Q2]),
         "orientation_deg": [0.0, 90.0],

@@ -1,4 +1,4 @@
-"""The lead is a lower bound of what enumeration over all objects gives."""
+"""The margin is a lower bound of the margin over all objects by enumeration."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def random_views(rng, objects, per_object):
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), objects=st.integers(2, 6), n=st.integers(1, 3), list_length=st.integers(1, 8))
-def test_no_object_not_even_one_off_the_lists_comes_closer_than_the_lead(seed, objects, n, list_length):
+def test_no_object_has_a_smaller_margin_even_off_the_lists(seed, objects, n, list_length):
     rng = np.random.default_rng(seed)
     views = random_views(rng, objects, 4)
     queries = views.descriptors[rng.integers(0, len(views), n)]
@@ -36,7 +36,7 @@ def test_no_object_not_even_one_off_the_lists_comes_closer_than_the_lead(seed, o
     assert hbr.score_margin(ranking, queries) <= ranking.margin + 1e-9
 
 
-def test_a_twin_that_the_lists_do_not_hold_is_not_led():
+def test_twin_outside_the_lists_has_no_margin():
     rng = np.random.default_rng(1)
     face = rng.integers(0, 8, 144).astype(np.uint8)
     round_one = hbr.Views.of_object("round", np.tile(face, (12, 1)), np.arange(12) * 30.0)
@@ -48,7 +48,7 @@ def test_a_twin_that_the_lists_do_not_hold_is_not_led():
     assert hbr.score_margin(ranking, face[None]) == 0.0
 
 
-def test_an_only_object_leads_by_its_score_and_wrong_queries_are_refused():
+def test_margin_of_a_single_object_is_its_score_and_wrong_queries_are_rejected():
     rng = np.random.default_rng(2)
     views = random_views(rng, 1, 4)
     ranking = hbr.retrieve(views.descriptors[:2], [0.0, 10.0], hbr.ViewIndex(views))

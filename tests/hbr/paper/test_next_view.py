@@ -48,13 +48,13 @@ def flat(level: int, bin_: int) -> np.ndarray:
     return row
 
 
-def pair(left_alike: bool, pose_deg: float = 0.0, orientations: tuple[float, ...] = (0.0, 0.0)) -> Ranking:
-    """Objects a and b seen at `pose_deg`, alike on one side of azimuth 0 and different on the other."""
+def pair(similar_on_left: bool, pose_deg: float = 0.0, orientations: tuple[float, ...] = (0.0, 0.0)) -> Ranking:
+    """Return a ranking of two objects at `pose_deg`, similar on one side of azimuth 0 and different on the other."""
     descriptors, azimuths, owners = [], [], []
     for owner in (0, 1):
         for azimuth in np.arange(0, 360, 5.0):
             on_left = azimuth < 180
-            descriptors.append(flat(4, 1 if on_left == left_alike else 2 + owner))
+            descriptors.append(flat(4, 1 if on_left == similar_on_left else 2 + owner))
             azimuths.append(azimuth)
             owners.append(owner)
     views = Views(np.array(descriptors), np.array(azimuths), np.array(owners), ("a", "b"))
@@ -70,26 +70,26 @@ def pair(left_alike: bool, pose_deg: float = 0.0, orientations: tuple[float, ...
     )
 
 
-def test_the_table_turns_to_the_side_that_tells_the_candidates_apart() -> None:
-    decision = next_view(pair(left_alike=True))
+def test_decision_is_the_side_on_which_the_candidates_differ() -> None:
+    decision = next_view(pair(similar_on_left=True))
     assert (decision.side, decision.rotation_deg) == ("right", -45.0)
     assert (decision.s_left, decision.s_right) == (1.0, 0.0)
     assert decision.candidates == (0, 1)
     assert decision.orientation_deg == 315.0
-    decision = next_view(pair(left_alike=False))
+    decision = next_view(pair(similar_on_left=False))
     assert (decision.side, decision.rotation_deg) == ("left", 45.0)
 
 
-def test_equal_sides_go_left() -> None:
-    decision = next_view(pair(left_alike=True, pose_deg=90.0, orientations=(0.0, 90.0)))
-    assert decision.s_left == decision.s_right == 1.0  # 90 lies between two sectors that look alike
+def test_equal_sides_give_left() -> None:
+    decision = next_view(pair(similar_on_left=True, pose_deg=90.0, orientations=(0.0, 90.0)))
+    assert decision.s_left == decision.s_right == 1.0  # 90 lies between two sectors that look the same
     assert (decision.side, decision.rotation_deg) == ("left", 45.0)
 
 
 @pytest.mark.parametrize(("pose_deg", "rotation_deg"), [(45.0, 90.0), (50.0, 85.0), (40.0, 95.0), (355.0, 50.0)])
-def test_the_turn_ends_at_the_next_sector_centre(pose_deg: float, rotation_deg: float) -> None:
-    """From a centre to the next one; 5 degrees before a centre the turn would hardly leave the place, so it goes on."""
-    decision = next_view(pair(left_alike=False, pose_deg=pose_deg, orientations=(200.0, 0.0)))
+def test_rotation_ends_at_the_next_sector_centre(pose_deg: float, rotation_deg: float) -> None:
+    """From a centre to the next one; 5° before a centre the rotation would be too small, so it goes on."""
+    decision = next_view(pair(similar_on_left=False, pose_deg=pose_deg, orientations=(200.0, 0.0)))
     assert (decision.side, decision.rotation_deg) == ("left", rotation_deg)
 
 
@@ -105,32 +105,30 @@ def test_the_turn_ends_at_the_next_sector_centre(pose_deg: float, rotation_deg: 
         ((45.0, 135.0, 225.0, 315.0), 45.0, 0.0),
     ],
 )
-def test_visited_orientations_are_passed_over(
-    visited: tuple[float, ...], rotation_deg: float, detour_deg: float
-) -> None:
-    decision = next_view(pair(left_alike=False), visited_deg=visited)
+def test_visited_orientations_are_avoided(visited: tuple[float, ...], rotation_deg: float, detour_deg: float) -> None:
+    decision = next_view(pair(similar_on_left=False), visited_deg=visited)
     assert (decision.rotation_deg, decision.detour_deg) == (rotation_deg, detour_deg)
 
 
 def test_visited_orientations_are_the_queries_by_default() -> None:
-    decision = next_view(pair(left_alike=False, orientations=(45.0, 0.0)))
+    decision = next_view(pair(similar_on_left=False, orientations=(45.0, 0.0)))
     assert (decision.rotation_deg, decision.detour_deg) == (135.0, 90.0)
-    assert next_view(pair(left_alike=False, orientations=(45.0, 0.0)), visited_deg=[]).rotation_deg == 45.0
-    assert next_view(pair(left_alike=False, orientations=(54.0, 0.0)), revisit_deg=5.0).rotation_deg == 45.0
+    assert next_view(pair(similar_on_left=False, orientations=(45.0, 0.0)), visited_deg=[]).rotation_deg == 45.0
+    assert next_view(pair(similar_on_left=False, orientations=(54.0, 0.0)), revisit_deg=5.0).rotation_deg == 45.0
 
 
-def test_the_detour_keeps_its_side() -> None:
-    decision = next_view(pair(left_alike=True), visited_deg=[-45.0])
+def test_detour_stays_on_its_side() -> None:
+    decision = next_view(pair(similar_on_left=True), visited_deg=[-45.0])
     assert (decision.side, decision.rotation_deg, decision.orientation_deg) == ("right", -135.0, 225.0)
 
 
-def test_a_catalog_of_one_object_goes_left() -> None:
+def test_catalog_of_one_object_gives_left() -> None:
     views = Views.of_object("a", np.ones((4, 144), np.uint8), [0, 90, 180, 270])
     decision = next_view(retrieve(np.ones((2, 144), np.uint8), [0, 90], ViewIndex(views)))
     assert (decision.side, decision.s_left, decision.s_right, decision.candidates) == ("left", 0.0, 0.0, (0,))
 
 
-def test_one_query_is_too_few() -> None:
+def test_one_query_is_rejected() -> None:
     views = Views.of_object("a", np.ones((1, 144), np.uint8), [0])
     with pytest.raises(ValueError, match="needs two queries"):
         next_view(retrieve(np.ones((1, 144), np.uint8), [0], ViewIndex(views)))
@@ -138,15 +136,15 @@ def test_one_query_is_too_few() -> None:
 
 @pytest.mark.parametrize(
     ("changed", "message"),
-    [({"visited_deg": [np.nan]}, "not known"), ({"revisit_deg": 45.0}, "revisit"), ({"revisit_deg": -1.0}, "revisit")],
+    [({"visited_deg": [np.nan]}, "unknown"), ({"revisit_deg": 45.0}, "revisit"), ({"revisit_deg": -1.0}, "revisit")],
 )
-def test_what_does_not_fit_is_refused(changed: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_rejected(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        next_view(pair(left_alike=True), **changed)
+        next_view(pair(similar_on_left=True), **changed)
 
 
-def test_a_given_side_replaces_the_decision_and_keeps_the_step() -> None:
-    ranking = pair(left_alike=True, pose_deg=20.0)
+def test_given_side_replaces_the_decision_and_keeps_the_step() -> None:
+    ranking = pair(similar_on_left=True, pose_deg=20.0)
     decided, forced = next_view(ranking), next_view(ranking, side="left")
     assert decided.side == "right" == next_view(ranking, side="right").side
     assert next_view(ranking, side="right") == decided

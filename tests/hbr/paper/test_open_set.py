@@ -1,4 +1,4 @@
-"""The score to expect of known objects."""
+"""The open-set threshold of the paper's retrieval."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import hbr
 
 
 def ring(seed: int, n: int, change: int) -> hbr.Views:
-    """Views of an object that changes by ``change`` bins from each view to the next."""
+    """Return views of an object that changes by ``change`` bins from each view to the next."""
     rng = np.random.default_rng(seed)
     rows = [rng.integers(0, 8, 144).astype(np.uint8)]
     for _ in range(n - 1):
@@ -18,20 +18,20 @@ def ring(seed: int, n: int, change: int) -> hbr.Views:
 
 
 def by_hand(views: hbr.Views) -> list[float]:
-    """Every average, literally; one object with views by rising azimuth, their number a multiple of four."""
+    """Return every average for one object with views by rising azimuth; their number is a multiple of four."""
     n = len(views)
     T = hbr.tanimoto(views.descriptors, views.descriptors)
     best = [max(T[k, k - 1], T[k, (k + 1) % n]) for k in range(n)]
     return [np.mean([best[(k + i * n // 4) % n] for i in range(4)]) for k in range(n)]
 
 
-def test_it_is_the_quantile_of_what_neighbouring_views_score():
+def test_threshold_is_the_quantile_of_neighbour_similarities():
     views = ring(1, 24, 12)
     assert hbr.open_set_threshold(views, quantile=0.0, repeatability=1.0) == pytest.approx(min(by_hand(views)))
     assert hbr.open_set_threshold(views, quantile=0.5, repeatability=1.0) == pytest.approx(np.median(by_hand(views)))
 
 
-def test_the_order_of_the_views_does_not_matter_and_objects_are_kept_apart():
+def test_threshold_is_independent_of_the_order_and_separate_for_objects():
     both = hbr.Views.concatenate([ring(1, 24, 12), ring(2, 16, 30)])
     shuffled = both.select(np.random.default_rng(0).permutation(len(both)))
     assert hbr.open_set_threshold(shuffled) == pytest.approx(hbr.open_set_threshold(both))
@@ -39,19 +39,19 @@ def test_the_order_of_the_views_does_not_matter_and_objects_are_kept_apart():
     assert hbr.open_set_threshold(both) == pytest.approx(expected)
 
 
-def test_coarser_enrollment_expects_less():
+def test_coarser_enrollment_has_a_lower_threshold():
     fine = ring(3, 72, 8)
     assert hbr.open_set_threshold(fine.select(np.arange(0, 72, 6))) < hbr.open_set_threshold(fine)
 
 
-def test_too_few_views_make_nothing_unknown_and_a_wrong_quantile_is_refused():
+def test_too_few_views_give_0_and_an_invalid_quantile_is_rejected():
     assert hbr.open_set_threshold(ring(4, 3, 5)) == 0.0
     assert hbr.open_set_threshold(hbr.Views.empty()) == 0.0
     with pytest.raises(ValueError, match="quantile is 5"):
         hbr.open_set_threshold(ring(4, 8, 5), quantile=5)
 
 
-def test_no_more_is_asked_of_a_round_object_than_two_sittings_keep():
+def test_threshold_of_round_objects_is_limited_by_the_repeatability():
     face = np.random.default_rng(5).integers(0, 8, 144).astype(np.uint8)
     views = hbr.Views.of_object("vase", np.tile(face, (36, 1)), np.arange(36) * 10.0)
     assert hbr.open_set_threshold(views) == 0.97

@@ -1,4 +1,4 @@
-"""The whole chain, descriptor to decision, on photographs of ten objects."""
+"""Retrieval from descriptor to decision, with photographs of ten objects."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def model(rig_test_data: Path) -> Views:
 
 
 def query(folder: Path, number: int, angle: float) -> tuple[np.ndarray, int]:
-    """Descriptor of the photograph nearest to the angle among those between the model's, blurred; and its angle."""
+    """Return descriptor and angle of the blurred photograph that is nearest to an angle and not in the model."""
     present = [a for a in range(5, 360, 10) if (folder / f"coil-100/obj{number}__{a}.png").is_file()]
     nearest = min(present, key=lambda a: abs((a - angle + 180) % 360 - 180))
     image = cv2.imread(str(folder / f"coil-100/obj{number}__{nearest}.png"))
@@ -31,7 +31,7 @@ def query(folder: Path, number: int, angle: float) -> tuple[np.ndarray, int]:
 
 
 def test_every_object_is_found_with_its_pose(model: Views, rig_test_data: Path) -> None:
-    """Views 5 degrees off the model's and blurred; the third view where the decision leads."""
+    """Views are blurred and 5° off those of the model; the third view follows the decision."""
     rng = np.random.default_rng(0)
     index = ViewIndex(model)
     found, pose_errors = [], []

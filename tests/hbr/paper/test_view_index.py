@@ -17,7 +17,7 @@ def views_of(descriptors: np.ndarray) -> Views:
 
 
 def adversarial(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Rows of the kinds that break a search: zeros, equal rows, ties, one-hot, saturated, sparse, dense."""
+    """Rows that are difficult for a search: zeros, equal rows, ties, one-hot, saturated, sparse, dense."""
     kinds = [
         np.zeros((1, 144), np.uint8),
         np.full((1, 144), 7, np.uint8),
@@ -45,8 +45,8 @@ def test_equals_brute_force(seed: int, count: int, k: int) -> None:
         assert values.tolist() == similarities[expected].tolist(), method
 
 
-def test_the_bound_refines_a_small_part_and_equals_brute_force_on_a_large_set() -> None:
-    """Sparse clustered rows, as views are; above the size where the bound is the default."""
+def test_bound_compares_few_views_and_equals_brute_force_on_a_large_set() -> None:
+    """Sparse clustered rows, like views, above the size at which the bound is the default."""
     rng = np.random.default_rng(5)
     centres = rng.integers(0, 8, (400, 144)) * (rng.random((400, 144)) < 0.15)
     rows = np.repeat(centres, 50, axis=0) + rng.integers(-1, 2, (20_000, 144)) * (rng.random((20_000, 144)) < 0.1)
@@ -60,7 +60,7 @@ def test_the_bound_refines_a_small_part_and_equals_brute_force_on_a_large_set() 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 900), min_size=1, max_size=4), st.sampled_from(METHODS))
-def test_an_index_that_was_extended_equals_one_that_was_built(seed: int, sizes: list[int], method: Method) -> None:
+def test_extended_index_equals_a_new_one(seed: int, sizes: list[int], method: Method) -> None:
     rng = np.random.default_rng(seed)
     parts = [views_of(adversarial(rng, size)) for size in sizes]
     grown = ViewIndex(Views.empty(), method)
@@ -74,7 +74,7 @@ def test_an_index_that_was_extended_equals_one_that_was_built(seed: int, sizes: 
         assert found.tolist() == expected.tolist()
 
 
-def test_extending_projects_the_new_views_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extension_projects_only_the_new_views(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = adversarial(np.random.default_rng(0), 3000)
     index = ViewIndex(views_of(rows[:2000]), "bound")
     projected = []
@@ -92,7 +92,7 @@ def test_extending_projects_the_new_views_alone(monkeypatch: pytest.MonkeyPatch)
     assert projected[2:] == [4001]
 
 
-def test_answers_are_remembered_for_a_while_and_belong_to_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_cached_and_returned_as_copies(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = np.random.default_rng(0).integers(0, 8, (100, 144), dtype=np.uint8)
     index = ViewIndex(views_of(rows))
     searched = []
@@ -118,7 +118,7 @@ def test_answers_are_remembered_for_a_while_and_belong_to_the_caller(monkeypatch
 
 
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=400), st.integers(1, 10))
-def test_best_of_tied_values_by_lower_index(values: list[int], k: int) -> None:
+def test_best_of_equal_values_has_the_lower_index(values: list[int], k: int) -> None:
     rows, best = _best(np.array(values, float), k)
     expected = sorted(range(len(values)), key=lambda i: (-values[i], i))[:k]
     assert rows.tolist() == expected
@@ -133,7 +133,7 @@ def test_promising_rows_are_distinct_and_enough(k: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_more_than_there_are_gives_all(method: Method) -> None:
+def test_large_k_returns_all_views(method: Method) -> None:
     index = ViewIndex(views_of(np.eye(3, 144, dtype=np.uint8)), method)
     rows, similarities = index.search(np.eye(1, 144, 1, dtype=np.uint8)[0], 10)
     assert rows.tolist() == [1, 0, 2]
@@ -157,11 +157,11 @@ def test_an_empty_index_finds_nothing(method: Method) -> None:
         (np.zeros(144, np.uint8), 0, ValueError, "k is 0"),
     ],
 )
-def test_what_is_no_query_is_refused(query: np.ndarray, k: int, error: type[Exception], message: str) -> None:
+def test_invalid_queries_are_rejected(query: np.ndarray, k: int, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         ViewIndex(views_of(np.ones((1, 144), np.uint8))).search(query, k)
 
 
-def test_an_unknown_method_is_refused() -> None:
+def test_unknown_method_is_rejected() -> None:
     with pytest.raises(ValueError, match="auto, flat, bound, kdtree"):
         ViewIndex(Views.empty(), "hash")  # type: ignore[arg-type]

@@ -315,7 +315,7 @@ class TestFolders:
         preview = finished(preview_import(plan_import(None, package)))
         done = come_in(catalog, package)
         assert {(Path(file.path).name, file.reason) for file in done.refused} == {
-            ("mug__90.png", "cut off or damaged"),
+            ("mug__90.png", "truncated or damaged"),
             ("tin__0.png", "neither a PNG nor a JPEG file"),
             ("mug__180.png", "shows 'mug' from the same azimuth as mug__180.0.png"),
             ("mug__45.png", "is a link that leaves the folder"),
