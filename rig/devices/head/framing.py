@@ -1,4 +1,4 @@
-"""Frames on the rig head's line: COBS, closed by a zero byte; inside id, sequence, body, CRC-16 (see PROTOCOL.md)."""
+"""Frames of the rig head: COBS, ended by a zero byte, with id, sequence, body and CRC-16 inside (see PROTOCOL.md)."""
 
 from binascii import crc_hqx
 from collections.abc import Iterator
@@ -10,11 +10,11 @@ from rig.devices.head.protocol import MAX_BODY
 
 HEADER, CRC = 2, 2
 LONGEST = MAX_BODY + HEADER + CRC + 2
-"""Bytes of the longest frame on the line, its zero included."""
+"""Bytes of the longest frame on the wire, including its zero."""
 
 
 class FrameError(ValueError):
-    """The bytes between two zeros are no frame."""
+    """The bytes between two zeros are not a frame."""
 
 
 class CrcError(FrameError):
@@ -23,7 +23,7 @@ class CrcError(FrameError):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What a frame carries."""
+    """The content of a frame."""
 
     id: int
     sequence: int
@@ -31,10 +31,10 @@ class Frame:
 
 
 def encode(frame: Frame) -> bytes:
-    """Return the frame's bytes on the line, with the zero that closes them."""
+    """Return the frame's bytes on the wire, including the zero that ends them."""
     content = bytes([frame.id, frame.sequence]) + frame.body
-    line: bytes = cobs.encode(content + crc_hqx(content, 0xFFFF).to_bytes(CRC, "big"))
-    return line + b"\0"
+    encoded: bytes = cobs.encode(content + crc_hqx(content, 0xFFFF).to_bytes(CRC, "big"))
+    return encoded + b"\0"
 
 
 def decode(line: bytes) -> Frame:
@@ -45,7 +45,7 @@ def decode(line: bytes) -> Frame:
     CrcError
         The checksum is wrong.
     FrameError
-        The bytes are no COBS, too few or too many.
+        The bytes are not COBS, too few or too many.
     """
     if len(line) >= LONGEST:
         raise FrameError(f"{len(line)} bytes, longer than any frame")
@@ -61,7 +61,7 @@ def decode(line: bytes) -> Frame:
 
 
 class Deframer:
-    """Cuts a stream of bytes into frames, and counts what was none."""
+    """Splits a stream of bytes into frames, and counts invalid ones."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -70,9 +70,9 @@ class Deframer:
         self._line = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Frame]:
-        """Take further bytes and yield the frames that they complete."""
+        """Add bytes and yield the frames that they complete."""
         *lines, rest = (bytes(self._line) + data).split(b"\0")
-        # A line that is too long is garbage whatever follows: no more of it is kept than shows that.
+        # A frame that is too long is invalid: keep only enough of it to detect that.
         self._line[:] = rest[:LONGEST]
         for line in lines:
             if not line:
@@ -88,9 +88,9 @@ class Deframer:
                 yield frame
 
     def missing(self, length: int) -> int:
-        """Return how many bytes complete the present line, at least 1, if it is ``length`` bytes long with its zero."""
+        """Return how many bytes the present frame lacks, at least 1, if it has ``length`` bytes with its zero."""
         return max(length - len(self._line), 1)
 
     def reset(self) -> None:
-        """Forget a frame that has begun."""
+        """Drop an incomplete frame."""
         self._line.clear()

@@ -1,4 +1,4 @@
-"""Requests and events over the rig head's line: sequence numbers, repetitions, counts."""
+"""Requests to the rig head, its replies and its events: sequence numbers, repetitions, statistics."""
 
 import termios
 from collections.abc import Callable
@@ -13,28 +13,28 @@ from rig.devices.head.framing import CRC, HEADER, Deframer, Frame, encode
 from rig.devices.head.protocol import Answer, Done, Rejection, Request, Sample, StatusChanged
 
 REPLY_S = 0.06
-"""How long an answer may take: 6 ms behind a full transmitter, and twice a USB adapter's latency timer."""
+"""How long a reply may take: 6 ms behind a full transmitter, plus twice a USB adapter's latency timer."""
 ATTEMPTS = 3
 
 A = TypeVar("A")
 
 _REASONS: dict[int, str] = {
-    Rejection.UNKNOWN_REQUEST: "its firmware does not know the request",
-    Rejection.MALFORMED: "the request has another length than its firmware expects",
+    Rejection.UNKNOWN_REQUEST: "its firmware does not know this request",
+    Rejection.MALFORMED: "its firmware expects a different length of this request",
     Rejection.OUT_OF_RANGE: "a value is out of range",
     Rejection.FAULT_LATCHED: "a fault is latched",
-    Rejection.NOT_ACTIVE: "it hears no heartbeat",
+    Rejection.NOT_ACTIVE: "it receives no heartbeat",
     Rejection.CAUSE_PERSISTS: "the cause of the fault is still there",
-    Rejection.BUSY: "it is still busy with the last one",
+    Rejection.BUSY: "it still processes the last one",
 }
 
 
 @dataclass(slots=True)
 class LinkStatistics:
-    """What the line has been through.
+    """Statistics of the connection.
 
-    ``missed`` counts events of the head that never arrived whole, ``late`` answers that came after their time,
-    ``retries`` requests that were sent again.
+    ``missed`` counts events that did not arrive intact, ``late`` replies that came too late, ``retries`` repeated
+    requests.
     """
 
     frames: int = 0
@@ -46,28 +46,28 @@ class LinkStatistics:
 
 
 class HeadLink:
-    """One open line to a head.
+    """Requests, replies and events on an open port of a head.
 
     Parameters
     ----------
-    wire
-        Open port; its reads return after a few milliseconds.
+    connection
+        The open port; its reads return after a few milliseconds.
     clock
         The bench's clock.
     on_event
-        Given each `Sample` and `StatusChanged` that arrives.
+        Called with each `Sample` and `StatusChanged` that arrives.
     name
-        Of the port, for messages.
+        The port's name, for messages.
     """
 
     def __init__(
-        self, wire: SerialConnection, clock: Clock, on_event: Callable[[Sample | StatusChanged], None], name: str
+        self, connection: SerialConnection, clock: Clock, on_event: Callable[[Sample | StatusChanged], None], name: str
     ) -> None:
         self.name = name
         self.statistics = LinkStatistics()
         self.sent_ns = self.heard_ns = clock.now_ns()
-        """When the last request left, and when its answer was here."""
-        self._wire = wire
+        """When the last request was sent, and when its reply arrived."""
+        self._connection = connection
         self._clock = clock
         self._on_event = on_event
         self._deframer = Deframer()
@@ -76,51 +76,51 @@ class HeadLink:
         self._reply: Frame | None = None
 
     def frame_ns(self, body_bytes: int) -> float:
-        """Return what a frame with such a body takes on the line."""
-        return (body_bytes + HEADER + CRC + 2) * 10e9 / self._wire.baudrate
+        """Return the time that a frame with such a body takes on the wire."""
+        return (body_bytes + HEADER + CRC + 2) * 10e9 / self._connection.baudrate
 
     def close(self) -> None:
-        self._wire.close()
+        self._connection.close()
 
-    def replace(self, wire: SerialConnection) -> None:
-        """Go on with a port that was opened anew."""
-        self._wire = wire
+    def replace(self, connection: SerialConnection) -> None:
+        """Continue with a port that was opened again."""
+        self._connection = connection
 
     def start(self) -> None:
-        """Close a frame that an earlier program may have left half sent, and forget what it left unread."""
-        self._guarded(lambda: self._wire.write(b"\0"))
-        self._guarded(self._wire.reset_input_buffer)
+        """End a frame that an earlier program may have sent in part, and drop what it did not read."""
+        self._guarded(lambda: self._connection.write(b"\0"))
+        self._guarded(self._connection.reset_input_buffer)
         self._deframer.reset()
         self._event_sequence = None
 
     def poll(self) -> None:
-        """Take what has arrived, without waiting."""
-        if waiting := self._guarded(lambda: self._wire.in_waiting):
-            self._take(self._guarded(lambda: self._wire.read(waiting)))
+        """Process what has arrived, without waiting."""
+        if waiting := self._guarded(lambda: self._connection.in_waiting):
+            self._take(self._guarded(lambda: self._connection.read(waiting)))
 
     def request(self, message: Request, expected: type[A], *, attempts: int = ATTEMPTS) -> A:
-        """Send ``message`` and return its answer; what arrives meanwhile is handed on.
+        """Send ``message`` and return its reply; events that arrive meanwhile are passed on.
 
-        A repetition carries the same sequence number: the head answers it again, but does nothing twice.
+        A repetition has the same sequence number: the head replies again, but does nothing twice.
 
         Raises
         ------
         DeviceSilent
-            There was no answer to any of the ``attempts``.
+            The head did not reply to any of the ``attempts``.
         DeviceUnplugged
-            The line is gone.
+            The port is gone.
         RequestRejected
-            The head did not do it, and says why.
+            The head rejected the request; the error says why.
         """
         self._sequence = (self._sequence + 1) % 256
         body = message.LAYOUT.pack(*astuple(message))
-        line = encode(Frame(message.ID, self._sequence, body))
+        frame = encode(Frame(message.ID, self._sequence, body))
         reply_bytes = protocol.REPLIES.get(type(message), Done).LAYOUT.size + HEADER + CRC + 2
         for attempt in range(attempts):
             self.statistics.retries += bool(attempt)
             self._reply = None
             self.sent_ns = self._clock.now_ns()
-            self._guarded(lambda: self._wire.write(line))
+            self._guarded(lambda: self._connection.write(frame))
             deadline_ns = self.sent_ns + round(REPLY_S * 1e9)
             while self._clock.now_ns() < deadline_ns:
                 self._take(self._guarded(lambda: self._read(reply_bytes)))
@@ -128,13 +128,13 @@ class HeadLink:
                 if isinstance(answer, expected):
                     return answer
         raise DeviceSilent(
-            f"the rig head at {self.name} does not answer",
-            next_step="Check its USB cable and supply, and that head.port is the head's and not another board's.",
+            f"The rig head at {self.name} does not answer.",
+            next_step="Check its USB cable and supply, and that head.port is not the port of another board.",
             evidence={"request": type(message).__name__.lower(), "attempts": attempts, **self.counts()},
         )
 
     def counts(self) -> dict[str, int]:
-        """Return the statistics by name, up to now."""
+        """Return the statistics by name."""
         s, d = self.statistics, self._deframer
         s.frames, s.crc_errors, s.malformed = d.frames, d.crc_errors, d.malformed
         return {name: getattr(s, name) for name in s.__dataclass_fields__}
@@ -142,20 +142,20 @@ class HeadLink:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _answer(self, message: Request) -> Answer | None:
-        """Return the answer that has come to ``message``, if it has."""
+        """Return the reply to ``message`` if it has arrived."""
         frame, self._reply = self._reply, None
         if frame is None:
             return None
         answer = _parse(frame)
         if isinstance(answer, Done):
             if answer.request == message.ID and answer.rejection != Rejection.NONE:
-                raise refusal(self.name, message, answer.rejection)
+                raise rejection(self.name, message, answer.rejection)
             return answer if answer.request == message.ID else None
         return answer
 
-    def _read(self, line_bytes: int) -> bytes:
-        """Read what is there, and what a line of so many bytes still lacks: its end is then known when it is there."""
-        return self._wire.read(max(self._wire.in_waiting, self._deframer.missing(line_bytes)))
+    def _read(self, frame_bytes: int) -> bytes:
+        """Read what has arrived, or wait for the bytes that the present frame still lacks."""
+        return self._connection.read(max(self._connection.in_waiting, self._deframer.missing(frame_bytes)))
 
     def _take(self, data: bytes) -> None:
         for frame in self._deframer.feed(data):
@@ -175,7 +175,7 @@ class HeadLink:
             self._on_event(event)
 
     def restarted(self) -> None:
-        """Take note that the head numbers its events anew."""
+        """Restart the count of events, because the head restarted."""
         self._event_sequence = None
 
     def _guarded(self, use: Callable[[], A]) -> A:
@@ -183,27 +183,27 @@ class HeadLink:
             return use()
         except (OSError, termios.error) as gone:  # pyserial's exceptions are OSErrors, but for those of termios
             raise DeviceUnplugged(
-                f"the rig head's port {self.name} is gone",
-                next_step="Plug its USB cable in, then give the command again.",
+                f"The rig head's port {self.name} is gone.",
+                next_step="Plug its USB cable in, then run the command again.",
                 evidence={"reason": str(gone)},
             ) from gone
 
 
-def refusal(name: str, message: Request, reason: int) -> RequestRejected:
-    """Return the error for a request that the head at ``name`` did not do."""
-    words = _REASONS.get(reason, f"reason {reason}, which is not known here")
+def rejection(name: str, message: Request, reason: int) -> RequestRejected:
+    """Return the error for a request that the head at ``name`` rejected."""
+    words = _REASONS.get(reason, f"unknown reason {reason}")
     what = type(message).__name__.lower()
     return RequestRejected(
-        f"the rig head at {name} refused the request '{what}': {words}",
-        next_step="Remove the cause and acknowledge the fault (rig acknowledge)."
+        f"The rig head at {name} rejected the request '{what}': {words}.",
+        next_step="Remove the cause of the fault, then run `rig acknowledge`."
         if reason in (Rejection.FAULT_LATCHED, Rejection.CAUSE_PERSISTS)
-        else "Flash the firmware that belongs to this program: make -C firmware flash.",
-        evidence={"request": what, "refusal": reason},
+        else "Flash the firmware of this program: make -C firmware flash.",
+        evidence={"request": what, "rejection": reason},
     )
 
 
 def _parse(frame: Frame) -> Answer | None:
-    """Return the frame as a message; None where no head of this protocol would send it."""
+    """Return the frame as a message; None if it is no message of this protocol."""
     kind = protocol.MESSAGES.get(frame.id)
     if kind is None or kind.LAYOUT.size != len(frame.body):
         return None

@@ -1,4 +1,4 @@
-"""Opens the rig head that the configuration describes, and switches on what it carries."""
+"""Opens the configured rig head, and switches on its outputs."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from rig.devices.head.sensors import head_sensor
 def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> RigHead:
     """Open the head at ``config.head.port``; its outputs stay off.
 
-    ``open_port`` opens its line, again where the cable was pulled meanwhile.
+    ``open_port`` opens its port, also again after the cable was unplugged.
 
     Raises
     ------
@@ -29,22 +29,24 @@ def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], cloc
         rate_hz=imu.rate_hz,
         bandwidth_hz=imu.bandwidth_hz,
     )
-    wire = open_port()
+    connection = open_port()
     try:
-        return RigHead(wire, clock, sensor, deadman_s=config.head.deadman_s, name=config.head.port, reopen=open_port)
+        return RigHead(
+            connection, clock, sensor, deadman_s=config.head.deadman_s, name=config.head.port, reopen=open_port
+        )
     except BaseException:
-        wire.close()
+        connection.close()
         raise
 
 
 @contextmanager
 def powered(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> Iterator[None]:
-    """Feed the servo for the length of a ``with`` block, where its supply goes through a rig head.
+    """Power the servo for the duration of a ``with`` block if its supply goes through a rig head.
 
     Raises
     ------
     EmergencyStop, HeartbeatLost, HeadRestarted
-        The head keeps the supply open until that is acknowledged.
+        The head keeps the supply off until the fault is acknowledged.
     DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent
         See `RigHead`.
     """
@@ -62,9 +64,9 @@ def powered(config: RigConfig, open_port: Callable[[], SerialConnection], clock:
 
 
 def switch_on(head: RigHead, config: HeadConfig, clock: Clock) -> RigError | None:
-    """Close the servo's power relay and light the ring, where they are wired; return the fault that was latched.
+    """Switch on the servo's power and the ring light if they are connected; return the fault that was latched.
 
-    A fault that the head kept from an earlier program is taken over: the caller latches it where a person must
+    A fault of an earlier program is cleared on the head and returned. The caller latches it, so that the operator must
     acknowledge it before anything moves.
 
     Raises

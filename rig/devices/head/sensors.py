@@ -1,4 +1,4 @@
-"""What the sensors on a rig head mean by their words."""
+"""Scales and settings of the sensors on a rig head."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,16 +9,16 @@ from rig.devices.head.protocol import Imu, ImuModel
 
 BNO055_RANGE_DPS = 2000.0
 BNO055_RATE_HZ = 100.0
-"""Of its fusion; in the fusion modes it sets its ranges itself (BST-BNO055-DS000, 3.5)."""
+"""Rate and range of its fusion modes, in which the sensor sets them itself (BST-BNO055-DS000, 3.5)."""
 BNO055_NOISE_DPS_RTHZ = 0.014
 """BST-BNO055-DS000, table 0-2: output noise density of the gyroscope."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeadSensor:
-    """A sensor as it was set up: its scales, and the request that sets it up.
+    """A sensor with its settings: its scales, and the request that sets it up.
 
-    ``others`` names the likely chip for other values of ``who_am_i``; ``start_s`` is how long it may take to run.
+    ``others`` names the likely chip for other values of ``who_am_i``; ``start_s`` is how long its start may take.
     """
 
     name: str
@@ -40,7 +40,7 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
     Raises
     ------
     ConfigError
-        There is no such sensor, or it has no such setting.
+        The sensor or the setting does not exist.
     """
     if kind == "bno055":
         return HeadSensor(
@@ -58,7 +58,7 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
         )
     if kind != "mpu6050":
         raise ConfigError(
-            f"a rig head knows no sensor {kind!r}", next_step="Set head.sensor to mpu6050 or bno055.", evidence={}
+            f"A rig head does not support the sensor {kind!r}.", next_step="Set imu.model to mpu6050 or bno055."
         )
     divider, dlpf, full_scale, _ = mpu6050.settings(range_dps, rate_hz, bandwidth_hz)[mpu6050.SMPLRT_DIV]
     return HeadSensor(

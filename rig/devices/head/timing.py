@@ -1,9 +1,10 @@
-"""The head's clock on the bench's clock: offset and drift from round trips, with an honest uncertainty.
+"""Converts the head's clock to the bench's clock: offset and drift from round trips, with their uncertainty.
 
-A beat leaves the host at t0, is received by the head at u1, its answer leaves the head at u2 and is here at t3. Both
-frames are equally long, so that on an even line the head's u = (u1 + u2)/2 is the bench's t = (t0 + t3)/2, off by at
-most half of what the round trip d = (t3 − t0) − (u2 − u1) took beyond the time of the bytes on the line. Beats that
-were held up count less. The drift of a ceramic resonator is up to 0.5 %.
+A heartbeat leaves the computer at t0 and is received by the head at u1. The reply leaves the head at u2 and arrives at
+t3. Both frames have the same length. If the delays are equal in both directions, the head's time u = (u1 + u2)/2 is the
+bench's time t = (t0 + t3)/2. The error is at most half of the time by which the round trip d = (t3 − t0) − (u2 − u1)
+exceeds the transmission time of the bytes. Delayed heartbeats have less weight. The drift of a ceramic resonator is up
+to 0.5 %.
 """
 
 from collections import deque
@@ -14,19 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 DRIFT_SIGMA = 3e-3
-"""What is known of the drift before it is measured."""
+"""Standard uncertainty of the drift before it is measured."""
 STEP_SIGMA_NS = 4_000.0
-"""Of one beat that was not held up: the head's clock ticks in whole microseconds, in steps of 4 on some boards."""
+"""Uncertainty of one heartbeat without delay: the head's clock has steps of 1 µs, on some boards 4 µs."""
 MEMORY = 48
-"""Beats that the estimate looks back on: a few seconds, in which a resonator does not warm up."""
-LINE_TOLERANCE = 0.95
-"""Baud rates differ by up to 5 % between the two ends of a line that works."""
+"""Heartbeats that the estimate uses: a few seconds, in which the temperature of a resonator is constant."""
+BAUD_TOLERANCE = 0.95
+"""The baud rates at the two ends of a working connection differ by up to 5 %."""
 _WRAP = 1 << 32
 
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
-    """One round trip: the middle of it on both clocks, and what the line took."""
+    """One round trip: its middle on both clocks, and its transmission time."""
 
     head_us: float
     host_ns: float
@@ -34,20 +35,20 @@ class RoundTrip:
 
 
 class HeadClock:
-    """Turns times of the head (µs, wrapping at 2³²) into the bench's (ns).
+    """Converts times of the head (µs, wrapping at 2³²) to times of the bench (ns).
 
     Parameters
     ----------
-    line_ns
-        What the two frames take on the line at its baud rate; the same both ways, so it adds no uncertainty.
+    transmission_ns
+        Time that the two frames take at the baud rate; equal in both directions, so it adds no uncertainty.
     """
 
-    def __init__(self, line_ns: float) -> None:
-        self._line_ns = line_ns
+    def __init__(self, transmission_ns: float) -> None:
+        self._transmission_ns = transmission_ns
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything: the head's clock began anew."""
+        """Drop all round trips: the head's clock started again."""
         self._round_trips: deque[RoundTrip] = deque(maxlen=MEMORY)
         self._newest_us: int | None = None
         self._origin_us = self._origin_ns = 0.0
@@ -66,11 +67,11 @@ class HeadClock:
 
     @property
     def uncertainty_ns(self) -> float:
-        """Standard uncertainty of a time at the newest beat."""
+        """Standard uncertainty of a time at the newest heartbeat."""
         return self._sigma_ns(0.0)
 
     def unwrap(self, head_us: int) -> int:
-        """Return a time of the head without its wrap, counted on from the newest that was seen."""
+        """Return a time of the head without wrapping, counted from the newest known time."""
         if self._newest_us is None:
             self._newest_us = head_us
             return head_us
@@ -80,7 +81,7 @@ class HeadClock:
         return time_us
 
     def add(self, sent_ns: int, received_us: int, answered_us: int, heard_ns: int) -> None:
-        """Learn from one round trip; the head's times are unwrapped."""
+        """Add one round trip; the head's times are unwrapped."""
         delay_ns = (heard_ns - sent_ns) - (answered_us - received_us) * 1000.0
         self._round_trips.append(
             RoundTrip((received_us + answered_us) / 2, (sent_ns + heard_ns) / 2, max(delay_ns, 0.0))
@@ -90,20 +91,20 @@ class HeadClock:
         x = np.array([b.head_us - self._origin_us for b in round_trips]) * 1e3
         y = np.array([b.host_ns - self._origin_ns for b in round_trips]) - x
         delays = np.array([b.delay_ns for b in round_trips])
-        # A line that is faster than its baud rate says is none that bytes pass one by one (a pseudo-terminal): then
-        # nothing is known of how much of the shortest round trip was the line itself.
+        # A connection that is faster than its baud rate does not transmit byte by byte (a pseudo-terminal): then the
+        # transmission time in the shortest round trip is not known.
         shortest = float(delays.min())
-        line_ns = self._line_ns if shortest >= LINE_TOLERANCE * self._line_ns else 0.0
-        held_up = np.maximum(delays - line_ns, 0.0)
-        # What a frame was held up may have been all on one way: an error spread evenly over ± half of it.
-        weight = 1 / (STEP_SIGMA_NS**2 + held_up**2 / 12)
+        transmission_ns = self._transmission_ns if shortest >= BAUD_TOLERANCE * self._transmission_ns else 0.0
+        delay_ns_beyond = np.maximum(delays - transmission_ns, 0.0)
+        # The whole delay may be in one direction: the error is uniform within ± half of the delay.
+        weight = 1 / (STEP_SIGMA_NS**2 + delay_ns_beyond**2 / 12)
         information = np.array([[weight.sum(), weight @ x], [weight @ x, weight @ x**2 + DRIFT_SIGMA**-2]])
         self._covariance = np.linalg.inv(information)
         self._fit = self._covariance @ np.array([weight @ y, weight @ (x * y)])
-        self._asymmetry_ns = float(held_up.min()) / 2  # and that of the best one may be the same in all of them
+        self._asymmetry_ns = float(delay_ns_beyond.min()) / 2  # the delay of the best round trip may be in all of them
 
     def to_host(self, head_us: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
-        """Return the bench's times (ns) of unwrapped times of the head, and their largest standard uncertainty (ns)."""
+        """Return the bench's times (ns) of unwrapped times of the head, and their largest standard uncertainty."""
         ahead_ns = (head_us - self._origin_us) * 1e3
         offset, drift = self._fit
         time_ns = round(self._origin_ns) + np.rint(ahead_ns * (1 + drift) + offset).astype(np.int64)
