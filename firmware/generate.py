@@ -124,7 +124,7 @@ def module(table: Table) -> str:
         "from dataclasses import dataclass",
         "from enum import IntEnum, IntFlag",
         "from struct import Struct",
-        "from typing import ClassVar",
+        "from typing import ClassVar, get_args",
         "",
         f"PROTOCOL_VERSION = {table['version']}",
         f"FIRMWARE = ({major}, {minor}, {patch})",
@@ -142,25 +142,23 @@ def module(table: Table) -> str:
     for message in table["message"]:
         fields = message["fields"]
         lines += ["", "", "@dataclass(frozen=True, slots=True)", f"class {camel(message['name'])}:"]
-        text = [message["doc"]]
-        documented = [(name, doc) for name, _, doc in fields if doc and doc != "0"]
-        if documented:
-            text += ["", "Attributes", "----------"]
-            for name, doc in documented:
-                text += [name, *wrap(sentence(doc), 105, initial_indent="    ", subsequent_indent="    ")]
-        body = "\n".join(f"    {line}" if line else "" for line in text)
-        lines.append(f'    """{body.strip()}' + ('\n    """' if documented else '"""'))
         layout = "<" + "".join(PY_FORMATS[kind] for _, kind, _ in fields)
-        lines += ["", f"    ID: ClassVar[int] = 0x{message['id']:02X}"]
+        lines += [f'    """{message["doc"]}"""', "", f"    ID: ClassVar[int] = 0x{message['id']:02X}"]
         lines += [f'    LAYOUT: ClassVar[Struct] = Struct("{layout}")']
-        if fields:
-            lines += ["", *(f"    {name}: int" + " = 0" * name.startswith("pad_") for name, _, _ in fields)]
+        for name, _, doc in fields:
+            field = f"    {name}: int" + " = 0" * name.startswith("pad_")
+            comment = f"  # {sentence(doc)}" if doc and doc != "0" else ""
+            fits = len(field + comment) <= 120
+            lines += (
+                [field + comment]
+                if fits
+                else [*wrap(comment[2:], 116, initial_indent="    ", subsequent_indent="    # "), field]
+            )
     for direction, title in (("host", "Request"), ("head", "Answer")):
         names = [camel(m["name"]) for m in table["message"] if m["from"] == direction]
         lines += ["", "", f"{title} = {' | '.join(names)}"][direction == "head" :]
     lines += ["", "MESSAGES: dict[int, type[Request] | type[Answer]] = {"]
-    lines += [f"    {camel(m['name'])}.ID: {camel(m['name'])}," for m in table["message"]]
-    lines += ["}"]
+    lines += ["    kind.ID: kind for kind in (*get_args(Request), *get_args(Answer))", "}"]
     lines += ["", "REPLIES: dict[type[Request], type[Answer]] = {"]
     lines += [f"    {camel(m['name'])}: {camel(m['reply'])}," for m in table["message"] if m["from"] == "host"]
     return "\n".join([*lines, "}", '"""The answer to a request that was not refused."""', ""])

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from struct import Struct
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 PROTOCOL_VERSION = 1
 FIRMWARE = (1, 0, 0)
@@ -122,34 +122,20 @@ class SampleFlag(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Who is there? The host's protocol version; the head answers whatever it is.
-
-    Attributes
-    ----------
-    protocol
-        Version that the host speaks.
-    """
+    """Who is there? The host's protocol version; the head answers whatever it is."""
 
     ID: ClassVar[int] = 0x01
     LAYOUT: ClassVar[Struct] = Struct("<B")
-
-    protocol: int
+    protocol: int  # Version that the host speaks.
 
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The host lives. As long as its reply, so that both take the same time on the line.
-
-    Attributes
-    ----------
-    deadman_ms
-        How long the next silence may last.
-    """
+    """The host lives. As long as its reply, so that both take the same time on the line."""
 
     ID: ClassVar[int] = 0x02
     LAYOUT: ClassVar[Struct] = Struct("<HIII")
-
-    deadman_ms: int
+    deadman_ms: int  # How long the next silence may last.
     pad_0: int = 0
     pad_1: int = 0
     pad_2: int = 0
@@ -165,110 +151,60 @@ class Shutdown:
 
 @dataclass(frozen=True, slots=True)
 class Acknowledge:
-    """Clear latched faults whose cause is gone.
-
-    Attributes
-    ----------
-    faults
-        The faults that a person has seen; others stay.
-    """
+    """Clear latched faults whose cause is gone."""
 
     ID: ClassVar[int] = 0x04
     LAYOUT: ClassVar[Struct] = Struct("<B")
-
-    faults: int
+    faults: int  # The faults that a person has seen; others stay.
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Set the ring light.
-
-    Attributes
-    ----------
-    level
-        Duty in 1/255; 0 is off.
-    """
+    """Set the ring light."""
 
     ID: ClassVar[int] = 0x05
     LAYOUT: ClassVar[Struct] = Struct("<B")
-
-    level: int
+    level: int  # Duty in 1/255; 0 is off.
 
 
 @dataclass(frozen=True, slots=True)
 class Relay:
-    """Close or open the servo-power relay.
-
-    Attributes
-    ----------
-    closed
-        0 or 1.
-    """
+    """Close or open the servo-power relay."""
 
     ID: ClassVar[int] = 0x06
     LAYOUT: ClassVar[Struct] = Struct("<B")
-
-    closed: int
+    closed: int  # 0 or 1.
 
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """One pulse for the camera.
-
-    Attributes
-    ----------
-    width_us
-        Length of the pulse.
-    """
+    """One pulse for the camera."""
 
     ID: ClassVar[int] = 0x07
     LAYOUT: ClassVar[Struct] = Struct("<H")
-
-    width_us: int
+    width_us: int  # Length of the pulse.
 
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Set up the sensor; how that went is told by `changed` and by every pulse.
-
-    Attributes
-    ----------
-    model
-        Imu_model.
-    address
-        7-bit I2C address.
-    divider
-        MPU-6050: SMPLRT_DIV, the rate is 1 kHz / (1 + divider).
-    filter
-        MPU-6050: DLPF_CFG, 1 to 6.
-    range
-        MPU-6050: FS_SEL, 0 to 3.
-    """
+    """Set up the sensor; how that went is told by `changed` and by every pulse."""
 
     ID: ClassVar[int] = 0x08
     LAYOUT: ClassVar[Struct] = Struct("<BBBBB")
-
-    model: int
-    address: int
-    divider: int
-    filter: int
-    range: int
+    model: int  # Imu_model.
+    address: int  # 7-bit I2C address.
+    divider: int  # MPU-6050: SMPLRT_DIV, the rate is 1 kHz / (1 + divider).
+    filter: int  # MPU-6050: DLPF_CFG, 1 to 6.
+    range: int  # MPU-6050: FS_SEL, 0 to 3.
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Send each sample as it comes, or no longer.
-
-    Attributes
-    ----------
-    on
-        0 or 1.
-    """
+    """Send each sample as it comes, or no longer."""
 
     ID: ClassVar[int] = 0x09
     LAYOUT: ClassVar[Struct] = Struct("<B")
-
-    on: int
+    on: int  # 0 or 1.
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,181 +217,85 @@ class ReadCounters:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The request was done, or why not; also the reply to whatever cannot be done.
-
-    Attributes
-    ----------
-    request
-        Its message id.
-    rejection
-        Rejection; 0 where it was done.
-    """
+    """The request was done, or why not; also the reply to whatever cannot be done."""
 
     ID: ClassVar[int] = 0x80
     LAYOUT: ClassVar[Struct] = Struct("<BB")
-
-    request: int
-    rejection: int
+    request: int  # Its message id.
+    rejection: int  # Rejection; 0 where it was done.
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who the head is.
-
-    Attributes
-    ----------
-    protocol
-        Version that the head speaks.
-    major
-        Firmware version.
-    board
-        Board.
-    capabilities
-        Capability bits.
-    reset_cause
-        Reset.
-    serial
-        Number given when it was flashed.
-    uptime_us
-        Since its start, wraps with the clock.
-    """
+    """Who the head is."""
 
     ID: ClassVar[int] = 0x81
     LAYOUT: ClassVar[Struct] = Struct("<BBBBBBBII")
-
-    protocol: int
-    major: int
+    protocol: int  # Version that the head speaks.
+    major: int  # Firmware version.
     minor: int
     patch: int
-    board: int
-    capabilities: int
-    reset_cause: int
-    serial: int
-    uptime_us: int
+    board: int  # Board.
+    capabilities: int  # Capability bits.
+    reset_cause: int  # Reset.
+    serial: int  # Number given when it was flashed.
+    uptime_us: int  # Since its start, wraps with the clock.
 
 
 @dataclass(frozen=True, slots=True)
 class HeartbeatReply:
-    """Two times of the head's clock, and how it does.
-
-    Attributes
-    ----------
-    received_us
-        When the beat's last byte was there.
-    sent_us
-        When the first byte of this goes out.
-    state
-        State.
-    faults
-        Fault bits.
-    inputs
-        Input bits.
-    imu_status
-        Imu_status.
-    who_am_i
-        What the sensor answered.
-    light
-        Duty in 1/255.
-    """
+    """Two times of the head's clock, and how it does."""
 
     ID: ClassVar[int] = 0x82
     LAYOUT: ClassVar[Struct] = Struct("<IIBBBBBB")
-
-    received_us: int
-    sent_us: int
-    state: int
-    faults: int
-    inputs: int
-    imu_status: int
-    who_am_i: int
-    light: int
+    received_us: int  # When the beat's last byte was there.
+    sent_us: int  # When the first byte of this goes out.
+    state: int  # State.
+    faults: int  # Fault bits.
+    inputs: int  # Input bits.
+    imu_status: int  # Imu_status.
+    who_am_i: int  # What the sensor answered.
+    light: int  # Duty in 1/255.
 
 
 @dataclass(frozen=True, slots=True)
 class Triggered:
-    """The pulse was begun.
-
-    Attributes
-    ----------
-    time_us
-        Its leading edge.
-    width_us
-        Its length.
-    """
+    """The pulse was begun."""
 
     ID: ClassVar[int] = 0x87
     LAYOUT: ClassVar[Struct] = Struct("<IH")
-
-    time_us: int
-    width_us: int
+    time_us: int  # Its leading edge.
+    width_us: int  # Its length.
 
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """Counts since the start; they stay at 65535.
-
-    Attributes
-    ----------
-    frames
-        Whole frames received.
-    crc_errors
-        Frames with a wrong CRC.
-    malformed
-        Frames that are no COBS, too short or too long.
-    overruns
-        Bytes lost by the receiver.
-    dropped
-        Samples without room in the transmitter.
-    nacks
-        I2C: not acknowledged.
-    timeouts
-        I2C: transfers without an end.
-    recoveries
-        I2C: buses freed by clocking out.
-    fifo_overflows
-        The sensor's FIFO ran over.
-    restarts
-        Sensor set up anew.
-    """
+    """Counts since the start; they stay at 65535."""
 
     ID: ClassVar[int] = 0x8A
     LAYOUT: ClassVar[Struct] = Struct("<HHHHHHHHHH")
-
-    frames: int
-    crc_errors: int
-    malformed: int
-    overruns: int
-    dropped: int
-    nacks: int
-    timeouts: int
-    recoveries: int
-    fifo_overflows: int
-    restarts: int
+    frames: int  # Whole frames received.
+    crc_errors: int  # Frames with a wrong CRC.
+    malformed: int  # Frames that are no COBS, too short or too long.
+    overruns: int  # Bytes lost by the receiver.
+    dropped: int  # Samples without room in the transmitter.
+    nacks: int  # I2C: not acknowledged.
+    timeouts: int  # I2C: transfers without an end.
+    recoveries: int  # I2C: buses freed by clocking out.
+    fifo_overflows: int  # The sensor's FIFO ran over.
+    restarts: int  # Sensor set up anew.
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One sample, as the sensor gave it.
-
-    Attributes
-    ----------
-    index
-        Counts what the sensor took, lost samples included.
-    time_us
-        The head's clock.
-    flags
-        Sample_flag bits.
-    dropped
-        Counters.dropped, its low byte.
-    """
+    """One sample, as the sensor gave it."""
 
     ID: ClassVar[int] = 0xC0
     LAYOUT: ClassVar[Struct] = Struct("<HIBBhhhhhhh")
-
-    index: int
-    time_us: int
-    flags: int
-    dropped: int
+    index: int  # Counts what the sensor took, lost samples included.
+    time_us: int  # The head's clock.
+    flags: int  # Sample_flag bits.
+    dropped: int  # Counters.dropped, its low byte.
     accel_x: int
     accel_y: int
     accel_z: int
@@ -467,61 +307,24 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class StatusChanged:
-    """The state, a fault, the e-stop or the sensor changed; also the first word after a start.
-
-    Attributes
-    ----------
-    time_us
-        When.
-    state
-        State.
-    faults
-        Fault bits.
-    inputs
-        Input bits.
-    imu_status
-        Imu_status.
-    who_am_i
-        What the sensor answered.
-    reset_cause
-        Reset.
-    """
+    """The state, a fault, the e-stop or the sensor changed; also the first word after a start."""
 
     ID: ClassVar[int] = 0xC1
     LAYOUT: ClassVar[Struct] = Struct("<IBBBBBB")
-
-    time_us: int
-    state: int
-    faults: int
-    inputs: int
-    imu_status: int
-    who_am_i: int
-    reset_cause: int
+    time_us: int  # When.
+    state: int  # State.
+    faults: int  # Fault bits.
+    inputs: int  # Input bits.
+    imu_status: int  # Imu_status.
+    who_am_i: int  # What the sensor answered.
+    reset_cause: int  # Reset.
 
 
 Request = Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger | Imu | Stream | ReadCounters
 
 Answer = Done | Identity | HeartbeatReply | Triggered | Counters | Sample | StatusChanged
 
-MESSAGES: dict[int, type[Request] | type[Answer]] = {
-    Hello.ID: Hello,
-    Heartbeat.ID: Heartbeat,
-    Shutdown.ID: Shutdown,
-    Acknowledge.ID: Acknowledge,
-    Light.ID: Light,
-    Relay.ID: Relay,
-    Trigger.ID: Trigger,
-    Imu.ID: Imu,
-    Stream.ID: Stream,
-    ReadCounters.ID: ReadCounters,
-    Done.ID: Done,
-    Identity.ID: Identity,
-    HeartbeatReply.ID: HeartbeatReply,
-    Triggered.ID: Triggered,
-    Counters.ID: Counters,
-    Sample.ID: Sample,
-    StatusChanged.ID: StatusChanged,
-}
+MESSAGES: dict[int, type[Request] | type[Answer]] = {kind.ID: kind for kind in (*get_args(Request), *get_args(Answer))}
 
 REPLIES: dict[type[Request], type[Answer]] = {
     Hello: Identity,
