@@ -16,7 +16,7 @@ from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
 from benchmarks.large_catalog import build
 from hbr import describe, pack
 from rig.catalog import Catalog
-from rig.catalog.exchange import bring_in, plan_import, read_folder
+from rig.catalog.exchange import import_objects, plan_import, read_folder
 from rig.core.clock import SystemClock, seconds_between
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
@@ -100,7 +100,7 @@ def imports(folder: Path, photographs: Path) -> None:
     begin_ns, before_s = _CLOCK.now_ns(), cpu_s()
     with Catalog.open(folder / "coil", clock=_CLOCK) as catalog:
         package = read_folder(photographs, now=_CLOCK.utc())
-        for _ in bring_in(catalog, plan_import(catalog, package)):
+        for _ in import_objects(catalog, plan_import(catalog, package)):
             pass
     import_s, import_cpu_s = seconds_between(begin_ns, _CLOCK.now_ns()), cpu_s() - before_s
     rest_s, rest_cpu_s = bare_loop(files[half:])

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
 from hbr import Views, descriptor, pack
 from rig.catalog import Catalog, EnrollmentStatus
-from rig.catalog.exchange import Package, bring_in, plan_import
-from rig.catalog.exchange.package import Enrollment, ImageSource, Levels, Object, Sitting, View
+from rig.catalog.exchange import ImportBatch, import_objects, plan_import
+from rig.catalog.exchange.batch import BundledDescriptor, Enrollment, ImageSource, Object, Session, View
 from rig.core.clock import SystemClock
 from rig.views import image_files as images
 from rig.views.description import BENCH_DESCRIPTOR
@@ -47,7 +47,7 @@ _EVIDENCE: dict[str, Any] = {
         "still": True,
     },
 }
-_SITTING = Sitting(
+_SESSION = Session(
     started_utc=_NOW,
     bench="bench-1",
     software="hbr-rig",
@@ -66,7 +66,7 @@ def build(folder: Path, objects: int = OBJECTS) -> Views:
         sources = {
             view.image: ImageSource(str(tiny)) for item in made for one in item.enrollments for view in one.views
         }
-        for _ in bring_in(catalog, plan_import(catalog, Package("benchmark", made, sources)), jobs=1):
+        for _ in import_objects(catalog, plan_import(catalog, ImportBatch("benchmark", made, sources)), jobs=1):
             pass
     return views
 
@@ -88,11 +88,11 @@ def _objects(views: Views) -> Iterator[Object]:
                     started_utc=_NOW,
                     finished_utc=_NOW,
                     planned_azimuth_deg=tuple(azimuths_deg),
-                    sittings=(_SITTING,),
+                    sessions=(_SESSION,),
                     views=tuple(
                         View(
                             index=i,
-                            sitting=0,
+                            session=0,
                             azimuth_deg=azimuths_deg[i],
                             commanded_deg=-5.0 * i,
                             encoder_deg=-5.0 * i + 0.03,
@@ -103,10 +103,12 @@ def _objects(views: Views) -> Iterator[Object]:
                             image=f"{j}/{i}",
                             evidence=_EVIDENCE,
                             descriptors=(
-                                Levels(
+                                BundledDescriptor(
                                     name="cedd", version=1, settings=settings, packed=pack(views.descriptors[row]).hex()
                                 ),
-                                Levels(name=own.name, version=own.version, settings=settings, packed=turning[i]),
+                                BundledDescriptor(
+                                    name=own.name, version=own.version, settings=settings, packed=turning[i]
+                                ),
                             ),
                         )
                         for i, row in enumerate(rows.tolist())

@@ -306,7 +306,7 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
     """
     from rig.bench import calibrate
     from rig.calibrations import CalibrationStore
-    from rig.cli.catalog.catalog import tell_other_regions
+    from rig.cli.catalog.catalog import report_other_regions
 
     with settings.open_bench() as bench:
         store = CalibrationStore(bench.config.calibration_path(bench.name))
@@ -328,7 +328,7 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
                     print(f"Note: {finding}.", file=sys.stderr)
             if bench.config.view.roi != region and (catalog := settings.catalog_there()):
                 with catalog:
-                    tell_other_regions(settings, catalog, bench)
+                    report_other_regions(settings, catalog, bench)
 
 
 def _board(columns: int, rows: int, square_mm: float) -> "Board":

@@ -1,4 +1,4 @@
-"""The catalog of enrolled objects: an SQLite file, and the images as plain files beside it."""
+"""The catalog of enrolled objects: an SQLite file, and the images as files beside it."""
 
 from rig.catalog.audit import AuditEntry
 from rig.catalog.catalog import Catalog, ModelSet
@@ -10,7 +10,7 @@ from rig.catalog.records import (
     ObjectDetails,
     ObjectSummary,
     Provenance,
-    Sitting,
+    Session,
     StoredView,
     ViewRecord,
     clean_name,
@@ -27,7 +27,7 @@ __all__ = [
     "ObjectDetails",
     "ObjectSummary",
     "Provenance",
-    "Sitting",
+    "Session",
     "StoredView",
     "ViewRecord",
     "clean_name",

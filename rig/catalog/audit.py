@@ -1,4 +1,4 @@
-"""Who did what, when: a log that is only appended to, in the transaction of the change itself."""
+"""The audit log: who did what and when. Entries are only added, in the transaction of the change itself."""
 
 import os
 import pwd
@@ -17,7 +17,7 @@ from rig.core.clock import Clock
 
 @dataclass(frozen=True, slots=True)
 class AuditEntry:
-    """One thing that was done, by which user of which computer, with which program, to which object."""
+    """One action: when, by which user of which computer, with which program, on which object."""
 
     id: int
     time_utc: datetime
@@ -30,7 +30,7 @@ class AuditEntry:
 
 
 def append(connection: Connection, clock: Clock, action: str, object_name: str | None = None, **details: Any) -> None:
-    """Log an action within the transaction that carries it out."""
+    """Add an action to the log, in the transaction of the action itself."""
     connection.execute(
         insert(audit).values(
             time_utc=clock.utc(),
@@ -39,7 +39,7 @@ def append(connection: Connection, clock: Clock, action: str, object_name: str |
             software=this_software(),
             action=action,
             object_name=object_name,
-            details=as_json(details, "the details for the log"),
+            details=as_json(details, "the details of the log entry"),
         )
     )
 
@@ -59,7 +59,7 @@ def _fields(row: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _user() -> str:
-    # the account, not LOGNAME, which anybody may set
+    # the account, not LOGNAME, which any user can change
     try:
         return pwd.getpwuid(os.getuid()).pw_name
     except KeyError:

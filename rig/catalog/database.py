@@ -1,4 +1,4 @@
-"""The SQLite file of a catalog: how it is opened, its transactions, and what goes wrong in words."""
+"""The SQLite file of a catalog: how it is opened, and its transactions."""
 
 import os
 import sqlite3
@@ -19,15 +19,15 @@ from rig.core.files import make_folder, sync_folder
 class Database:
     """The database of the catalog in the folder ``root``.
 
-    A commit is durable (WAL, synchronous FULL). Writers take the write lock when they begin, so that a transaction
-    either waits its turn at the start or goes through; readers never wait.
+    A commit is durable (WAL, synchronous FULL). A writer takes the write lock at the start of its transaction: it waits
+    there, or the transaction succeeds. Readers never wait.
 
     Parameters
     ----------
     root
         Folder of the catalog.
     create
-        Make the catalog where there is none.
+        Create the catalog if there is none.
     read_only
         Write nothing.
     busy_timeout_s
@@ -38,7 +38,7 @@ class Database:
     CatalogError
         There is no catalog, it is damaged or of a newer version, or the system denies access.
     CatalogBusy
-        Another process holds the catalog for longer than the timeout.
+        Another process locks the catalog for longer than the timeout.
     """
 
     def __init__(self, root: Path, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
@@ -61,29 +61,27 @@ class Database:
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
-        """A transaction that sees the catalog as it is at its first query."""
+        """Yield a transaction that sees the catalog as it is at its first query."""
         with self.in_words(), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """A transaction that is alone in writing; an exception takes it back."""
+        """Yield a transaction that only one process can have at a time. An exception rolls it back."""
         if self._read_only:
-            raise CatalogError(
-                f"the catalog {self.root} is open for reading only", next_step="open it for writing to enroll"
-            )
+            raise CatalogError(f"the catalog {self.root} is open for reading only", next_step="open it for writing")
         with self.in_words(), self._writing.begin() as connection:
             yield connection
 
     def in_words(self) -> AbstractContextManager[None]:
-        """Turn the errors of SQLite and of the file system into the catalog's."""
+        """Raise errors of SQLite and of the file system as errors of the catalog."""
         return in_words(self.root, self._busy_timeout_s)
 
     def _open(self, *, create: bool) -> None:
         if not is_there(self.root):
             if not create:
                 raise absent(self.root)
-            make_folder(self.root, within=next(above for above in self.root.parents if above.exists()))
+            make_folder(self.root, within=next(parent for parent in self.root.parents if parent.exists()))
             self._create()
         with self.read() as connection:
             _check_up_to_date(connection, self.root)
@@ -108,17 +106,17 @@ class Database:
         return connection
 
     def _is_shareable(self) -> bool:
-        # Readers of a WAL database share an index file beside it. Where they may not create it and no writer has,
-        # the catalog rests (an archive, a read-only disk) and SQLite must be told that nobody will write.
+        # Readers of a WAL database share an index file beside it. If they may not create it and no writer has created
+        # it, the catalog is an archive or on a read-only disk: SQLite must know that no process will write.
         return os.access(self.root, os.W_OK) or self._file.with_name(f"{DATABASE_NAME}-wal").exists()
 
     def _create(self) -> None:
-        """Make the database aside and give it its name when it is whole: nobody ever opens one that is half made.
+        """Create the database under another name and rename it when it is complete.
 
-        Changing the journal mode of a file that others open already would fail now and then, whatever the timeout.
+        Changing the journal mode of a file that other processes have open sometimes fails, whatever the timeout.
         """
-        with TemporaryDirectory(prefix=".new-", dir=self.root) as aside:
-            made = Path(aside, DATABASE_NAME)
+        with TemporaryDirectory(prefix=".new-", dir=self.root) as folder:
+            made = Path(folder, DATABASE_NAME)
             engine = create_engine("sqlite://", creator=partial(sqlite3.connect, made), poolclass=NullPool)
             with engine.connect() as connection:
                 connection.exec_driver_sql("PRAGMA journal_mode = WAL")
@@ -128,19 +126,19 @@ class Database:
                 connection.commit()
             try:
                 self._file.hardlink_to(made)
-            except FileExistsError:  # somebody was faster, or a program was cut off when it had made an empty file
+            except FileExistsError:  # another process was faster, or one was killed after it had created an empty file
                 self._replace_empty(made)
         sync_folder(self.root)
 
     def _replace_empty(self, made: Path) -> None:
         with closing(self._connect()) as lock:
-            lock.execute("BEGIN EXCLUSIVE")  # of those who find the same empty file one goes first
+            lock.execute("BEGIN EXCLUSIVE")  # one of the processes that find the same empty file goes first
             if not self._file.stat().st_size:
                 made.replace(self._file)
 
 
 def is_there(root: Path) -> bool:
-    """Tell whether a folder has a database; an empty file is one that some program was cut off at."""
+    """Return whether a folder has a database. A program that was killed may have left an empty file."""
     if root.exists() and not root.is_dir():
         raise absent(root)
     file = root / DATABASE_NAME
@@ -153,7 +151,7 @@ def version_of(connection: Connection, root: Path) -> int:
     Raises
     ------
     CatalogError
-        It is the database of another program, or of a newer version.
+        It is the database of another program or of a newer version.
     """
     application_id = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
     version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
@@ -177,7 +175,7 @@ def _check_up_to_date(connection: Connection, root: Path) -> None:
         raise CatalogOutdated(
             f"the catalog {root} was written by an earlier program: its schema has version {version}, "
             f"this program works with {SCHEMA_VERSION}",
-            next_step="bring it up to date, which keeps a backup beside it: rig catalog migrate",
+            next_step="migrate it (a backup is made): rig catalog migrate",
             evidence={"found": version, "known": SCHEMA_VERSION},
         )
 

@@ -1,69 +1,59 @@
-"""From a stored image to the descriptors that the catalog keeps of it."""
+"""From a stored image to the descriptors that the catalog stores with it."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hbr.descriptors import PAPERS, Descriptor, descriptor, names
-from rig.catalog.records import JsonObject, Region
+from rig.catalog.records import JsonObject, PackedDescriptor, Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
 from rig.views.description import ViewDescriber
 
-
-class Reference(NamedTuple):
-    """A sitting's picture of the empty table: where it is, relative to the catalog, and its SHA-256."""
-
-    image: str
-    sha256: str
-
-    @classmethod
-    def of(cls, image: str | None, sha256: str | None) -> "Reference | None":
-        return None if image is None or sha256 is None else cls(image, sha256)
+EmptyTable = tuple[str, str]
+"""Path of an empty-table image relative to the catalog, and its SHA-256."""
 
 
 @lru_cache(maxsize=4)
 def stored_describer(
-    root: Path, names: tuple[str, ...], region: Region | None, reference: Reference | None
+    root: Path, names: tuple[str, ...], region: Region | None, empty_table: EmptyTable | None
 ) -> ViewDescriber:
-    """Return what describes stored images as the bench did that took them: with its picture of the empty table.
+    """Return a describer that describes stored images as the bench did, with the empty-table image of their session.
 
     Raises
     ------
     CatalogError
-        That picture is missing or is not the one that was stored.
+        The empty-table image is missing or is not the stored one.
     """
-    if all(name in PAPERS for name in names):
-        reference = None  # they look for no object
-    empty_table = None if reference is None else images.read(root / reference.image, reference.sha256)
-    return ViewDescriber(ViewConfig(roi=region), names, empty_table)
+    if empty_table is None or all(name in PAPERS for name in names):  # the paper's descriptors need no segmentation
+        return ViewDescriber(ViewConfig(roi=region), names)
+    return ViewDescriber(ViewConfig(roi=region), names, images.read(root / empty_table[0], empty_table[1]))
 
 
 def known_descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name; a `UsageError` lists those there are."""
+    """Return the descriptor of this name. A `UsageError` lists the known ones."""
     try:
         return descriptor(name)
     except ValueError as error:
         raise UsageError(f"there is no descriptor {name!r}", next_step=f"choose one of {', '.join(names())}") from error
 
 
-def settings_of(region: Region | None) -> dict[str, Any]:
+def settings_of(region: Region | None) -> JsonObject:
     """Return the settings of a descriptor as they are stored with it."""
     return {} if region is None else {"region": list(region)}
 
 
 def region_of(settings: JsonObject) -> Region | None:
-    """Return the part of the image that a stored descriptor is of; None for all of it.
+    """Return the part of the image that a stored descriptor describes; None for the whole image.
 
     Raises
     ------
     CatalogError
-        It was described in a way that this program does not know.
+        This program does not know the settings.
     """
     match dict(settings):
         case {} if not settings:
@@ -72,19 +62,30 @@ def region_of(settings: JsonObject) -> Region | None:
             return x, y, width, height
     raise CatalogError(
         f"a view is described with settings that this program does not know: {dict(settings)}",
-        next_step="update hbr-rig on this computer, or describe the views anew: rig catalog redescribe",
+        next_step="update hbr-rig on this computer, or describe the views again: rig catalog redescribe",
     )
 
 
-def packed_rows(
-    levels: NDArray[np.uint8], further: Mapping[str, NDArray[np.uint8]], default: str, region: Region | None
-) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the descriptors of one view, without its id."""
-    for name, found in {default: levels, **further}.items():
-        kind = known_descriptor(name)
-        yield {
-            "name": name,
-            "version": kind.version,
-            "settings": settings_of(region),
-            "packed": kind.pack(found),
-        }
+def is_current(name: str, version: int) -> bool:
+    """Return whether this program computes this version of a descriptor."""
+    return name in names() and descriptor(name).version == version
+
+
+def pack(levels: Mapping[str, NDArray[np.uint8]], region: Region | None) -> list[PackedDescriptor]:
+    """Pack the levels of a view by each descriptor.
+
+    Raises
+    ------
+    UsageError
+        There is no descriptor of one of the names.
+    TypeError, ValueError
+        The levels do not fit their descriptor.
+    """
+    settings = settings_of(region)
+    kinds = ((known_descriptor(name), found) for name, found in levels.items())
+    return [PackedDescriptor(kind.name, kind.version, settings, kind.pack(found)) for kind, found in kinds]
+
+
+def unpack(packed: Iterable[PackedDescriptor]) -> dict[str, NDArray[np.uint8]]:
+    """Return the levels of a view by name. Versions that this program does not compute are left out."""
+    return {one.name: descriptor(one.name).unpack(one.packed) for one in packed if is_current(one.name, one.version)}

@@ -1,4 +1,4 @@
-"""What goes wrong with a catalog, in words."""
+"""Errors of SQLite and of the file system as errors of the catalog."""
 
 import errno
 import sqlite3
@@ -16,20 +16,20 @@ DATABASE_NAME: Final = "catalog.sqlite"
 
 @contextmanager
 def in_words(root: Path, busy_timeout_s: float) -> Iterator[None]:
-    """Turn the errors of SQLite and of the file system into those of the catalog in the folder ``root``."""
+    """Raise errors of SQLite and of the file system as errors of the catalog in the folder ``root``."""
     try:
         yield
     except (DBAPIError, sqlite3.Error) as error:
-        told = _of_sqlite(error.orig if isinstance(error, DBAPIError) else error, root, busy_timeout_s)
-        if told is None:
+        known = _of_sqlite(error.orig if isinstance(error, DBAPIError) else error, root, busy_timeout_s)
+        if known is None:
             raise
-        raise told from error
+        raise known from error
     except OSError as error:
         raise _of_system(error, root) from error
 
 
 def absent(root: Path) -> CatalogError:
-    """Return the error that there is no catalog in a folder."""
+    """Return the error for a folder without a catalog."""
     if root.exists() and not root.is_dir():
         return CatalogError(
             f"{root} is a file, not the folder of a catalog", next_step="give the folder of the catalog"
@@ -42,9 +42,8 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
     match getattr(error, "sqlite_errorcode", 0) & 0xFF:
         case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED | sqlite3.SQLITE_PROTOCOL:
             return CatalogBusy(
-                f"another process is writing to the catalog {root} "
-                f"and was not done after {busy_timeout_s:g} s; nothing was changed",
-                next_step="wait until it is done and try again",
+                f"another process has been writing to the catalog {root} for {busy_timeout_s:g} s; nothing was changed",
+                next_step="wait until it has finished, and try again",
                 evidence=evidence,
             )
         case sqlite3.SQLITE_NOTADB:
@@ -54,7 +53,7 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
         case sqlite3.SQLITE_CORRUPT:
             return CatalogError(
                 f"the catalog {root / DATABASE_NAME} is damaged",
-                next_step="copy the folder as it is, then restore the database from a backup",
+                next_step="copy the folder, then restore the database from a backup",
                 evidence=evidence,
             )
         case sqlite3.SQLITE_FULL:
@@ -71,17 +70,17 @@ def _of_system(error: OSError, root: Path) -> CatalogError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return CatalogError(
             f"the disk of the catalog {root} is full; this change was not stored, all earlier ones are safe",
-            next_step="free some space, then go on with the enrollment",
+            next_step="free some space, then continue",
             evidence=evidence,
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return CatalogError(
             f"no permission to use the catalog {root}",
-            next_step="have the folder and its files made writable for this user, or give another folder",
+            next_step="make the folder and its files writable for this user, or give another folder",
             evidence=evidence,
         )
     return CatalogError(
         f"the catalog {root} cannot be used: {error}",
-        next_step="check the folder and its disk; a catalog belongs on a local disk",
+        next_step="check the folder and its disk; use a local disk for a catalog",
         evidence=evidence,
     )

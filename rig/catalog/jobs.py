@@ -1,4 +1,4 @@
-"""What the long jobs of a catalog share: how far they are, and the images in portions for processes."""
+"""Parts that the long jobs of a catalog share: progress, and portions of images for processes."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -8,12 +8,12 @@ from typing import Final, TypeVar
 _T = TypeVar("_T")
 
 PORTION: Final = 32
-"""Images that a process is given at a time: enough that handing them over costs nothing, and Ctrl+C does not wait."""
+"""Images per call of a process: many enough that the call costs nothing, few enough that Ctrl+C does not wait."""
 
 
 @dataclass(frozen=True, slots=True)
-class Progressed:
-    """A long job has done so many of its items."""
+class JobProgress:
+    """Number of items that a long job has done."""
 
     done: int
     total: int
@@ -26,5 +26,5 @@ def portions(items: Sequence[_T]) -> Iterator[tuple[_T, ...]]:
 
 
 def processes(wanted: int | None, items: int) -> int:
-    """Return how many processes are worth their start for so many images."""
+    """Return how many processes are worth starting for a number of images."""
     return min(wanted or os.cpu_count() or 1, max(1, items // (4 * PORTION)))

@@ -1,4 +1,4 @@
-"""Brings a catalog of an earlier version up to date, with a backup."""
+"""Migrate a catalog of an earlier version, with a backup."""
 
 import sqlite3
 from contextlib import closing
@@ -20,7 +20,7 @@ from rig.core.files import sync_file, sync_folder
 
 @dataclass(frozen=True, slots=True)
 class Migration:
-    """From which version to which; `backup` is the database as it was, None where nothing was to be done."""
+    """The versions before and after; `backup` is the old database, None if nothing had to be done."""
 
     before: int
     after: int
@@ -28,18 +28,18 @@ class Migration:
 
 
 def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 5.0) -> Migration:
-    """Bring the catalog in the folder ``path`` to the version of this program, in one transaction.
+    """Migrate the catalog in the folder ``path`` to the version of this program, in one transaction.
 
-    The database as it was stays beside it, ``catalog-v1-20260131T120000Z.sqlite``; images are not touched.
+    The old database stays beside it, for example as ``catalog-v1-20260131T120000Z.sqlite``. Images are not changed.
 
     Raises
     ------
     CatalogError
         There is no catalog, it is of a newer version, or the disk is full or fails.
     CatalogDamaged
-        Its rows do not refer to each other as they should; nothing was changed.
+        Some rows refer to missing rows. Nothing was changed.
     CatalogBusy
-        Another process kept the catalog for longer than the timeout.
+        Another process locks the catalog for longer than the timeout.
     """
     root = Path(path).expanduser().absolute()
     with in_words(root, busy_timeout_s):
@@ -52,7 +52,7 @@ def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 
             poolclass=NullPool,
         )
         with engine.connect() as connection:
-            connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # tables that others refer to are replaced
+            connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # the steps replace tables that others refer to
             connection.exec_driver_sql("PRAGMA synchronous = FULL")
             connection.exec_driver_sql("BEGIN IMMEDIATE")
             try:
@@ -73,7 +73,7 @@ def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Mi
     _run_steps(connection, before)
     if broken := connection.exec_driver_sql("PRAGMA foreign_key_check").all():
         raise CatalogDamaged(
-            f"{len(broken)} rows of the catalog {root} refer to others that are missing; it was left as it is",
+            f"{len(broken)} rows of the catalog {root} refer to missing rows; nothing was changed",
             next_step="restore the catalog from a backup, or ask for help with a copy of it",
             evidence={"tables": sorted({row[0] for row in broken})},
         )
@@ -93,7 +93,7 @@ def _back_up(file: Path, backup: Path) -> None:
 
 
 def _run_steps(connection: Connection, before: int) -> None:
-    # imported here: alembic is needed once in the life of a catalog
+    # imported here because alembic is needed only for a migration
     from alembic.migration import MigrationContext
     from alembic.operations import Operations
     from alembic.script import ScriptDirectory

@@ -1,57 +1,47 @@
-"""Reading a catalog: from rows to records."""
+"""Read a catalog: from rows to records."""
 
-import json
 from collections import defaultdict
+from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Row, Text, and_, cast, func, select
+from sqlalchemy import ColumnElement, Connection, Row, and_, func, select
 
 import hbr
-from hbr.descriptors import Descriptor, descriptor
-from rig.calibrations.store import CALIBRATIONS
-from rig.catalog.describing import region_of
+from hbr.descriptors import Descriptor
+from rig.catalog.describing import is_current, region_of, unpack
 from rig.catalog.records import (
     EnrollmentStatus,
     EnrollmentSummary,
     ObjectSummary,
+    PackedDescriptor,
     Provenance,
     Region,
-    Sitting,
+    Session,
     StoredView,
     ViewRecord,
     clean_name,
 )
-from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
+from rig.catalog.rows import measured
+from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.core.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
-
-
-class EnrolledBefore(NamedTuple):
-    """What stood behind the enrolled objects.
-
-    ``pictured`` and ``unpictured`` are the objects that were enrolled with a picture of the empty table and without;
-    ``newest`` is the last of the pictures: its place in the catalog and its digest.
-    """
-
-    pictured: tuple[str, ...]
-    unpictured: tuple[str, ...]
-    newest: tuple[str, str] | None
+from rig.views.description import PAPER_DESCRIPTOR
 
 
 def in_use(name: str) -> ColumnElement[bool]:
-    """The condition that an object has a name and is not deleted."""
+    """Return the condition that an object has a name and is not deleted."""
     return and_(objects.c.name == name, objects.c.deleted_utc.is_(None))
 
 
 def find(connection: Connection, name: str, *, deleted: bool = False) -> tuple[int, str]:
-    """Return the id and the name of an object in use, or of the last one ``deleted``.
+    """Return the id and the name of an object in use, or of the last ``deleted`` one.
 
     Raises
     ------
     ObjectNotFound
-        There is none; the next step names those that are spelled alike.
+        There is no such object. The next step lists similar names.
     """
     name = clean_name(name)
     among = objects.c.deleted_utc.is_not(None) if deleted else objects.c.deleted_utc.is_(None)
@@ -73,16 +63,16 @@ def find(connection: Connection, name: str, *, deleted: bool = False) -> tuple[i
 
 
 def check_free(connection: Connection, name: str) -> None:
-    """Refuse a name that an object in use has, with `ObjectExists`."""
+    """Raise `ObjectExists` if an object in use has this name."""
     if connection.scalar(select(objects.c.id).where(in_use(name))) is not None:
         raise ObjectExists(
             f"there is another object {name!r} in the catalog",
-            next_step="choose another name, or rename that one: rig catalog rename",
+            next_step="choose another name, or rename the other object: rig catalog rename",
         )
 
 
 def object_summaries(connection: Connection, where: ColumnElement[bool]) -> list[ObjectSummary]:
-    """Return the objects, in the order in which they came into the catalog."""
+    """Return objects, in the order in which they were added to the catalog."""
     count = (
         select(func.count()).where(views.c.enrollment_id == enrollments.c.id).correlate(enrollments).scalar_subquery()
     )
@@ -123,9 +113,9 @@ def enrollment_summaries(connection: Connection, where: ColumnElement[bool]) -> 
         .order_by(views.c.enrollment_id, views.c.view_index)
     ):
         present[enrollment_id].append(index)
-    sat = defaultdict(list)
-    for row in connection.execute(select(sittings).join(enrollments).where(where).order_by(sittings.c.id)):
-        sat[row.enrollment_id].append(_sitting(row))
+    taken = defaultdict(list)
+    for row in connection.execute(select(sessions).join(enrollments).where(where).order_by(sessions.c.id)):
+        taken[row.enrollment_id].append(_session(row))
     return [
         EnrollmentSummary(
             id=row.id,
@@ -134,43 +124,37 @@ def enrollment_summaries(connection: Connection, where: ColumnElement[bool]) -> 
             finished_utc=row.finished_utc,
             planned_azimuth_deg=tuple(row.planned_azimuth_deg),
             present=tuple(present[row.id]),
-            sittings=tuple(sat[row.id]),
+            sessions=tuple(taken[row.id]),
         )
         for row in connection.execute(select(enrollments).where(where).order_by(enrollments.c.id.desc()))
     ]
 
 
 def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[StoredView]:
-    """Return views, by enrollment and index."""
-    cedd = descriptor(DESCRIPTOR)
+    """Return views, by enrollment and index, with the descriptors that this program computes."""
     rows = connection.execute(
-        select(views, objects.c.name.label("object_name"), descriptors.c.packed, descriptors.c.settings)
+        select(views, objects.c.name.label("object_name"))
         .join(enrollments, views.c.enrollment_id == enrollments.c.id)
         .join(objects)
-        .outerjoin(descriptors, described_by(cedd))
         .where(where)
         .order_by(views.c.enrollment_id, views.c.view_index)
     ).all()
-    sitting_ids = {row.sitting_id for row in rows}
-    sat = {row.id: _sitting(row) for row in connection.execute(select(sittings).where(sittings.c.id.in_(sitting_ids)))}
+    session_ids = {row.session_id for row in rows}
+    taken = {
+        row.id: _session(row) for row in connection.execute(select(sessions).where(sessions.c.id.in_(session_ids)))
+    }
+    packed = packed_descriptors(connection, where)
     return [
         StoredView(
             id=row.id,
             object_name=row.object_name,
             enrollment_id=row.enrollment_id,
-            sitting=sat[row.sitting_id],
+            session=taken[row.session_id],
             record=ViewRecord(
                 index=row.view_index,
-                commanded_deg=row.commanded_deg,
-                encoder_deg=row.encoder_deg,
-                azimuth_deg=row.azimuth_deg,
-                descriptor=None if row.packed is None else cedd.unpack(row.packed),
-                captured_ns=row.captured_ns,
-                imu_deg=row.imu_deg,
-                imu_sigma_deg=row.imu_sigma_deg,
-                evidence=row.evidence,
-                region=None if row.packed is None else region_of(row.settings),
-                segmentation=row.segmentation,
+                **measured(row),
+                descriptors=unpack(packed[row.id]),
+                region=_region(packed[row.id]),
             ),
             captured_utc=row.captured_utc,
             image=row.image,
@@ -181,15 +165,38 @@ def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[Sto
     ]
 
 
+def packed_descriptors(connection: Connection, where: ColumnElement[bool]) -> dict[int, list[PackedDescriptor]]:
+    """Return the descriptors of views by their id, in the order of names and versions; empty for a view without any."""
+    found: dict[int, list[PackedDescriptor]] = defaultdict(list)
+    for view_id, *columns in connection.execute(
+        select(descriptors)
+        .select_from(descriptors)
+        .join(views, descriptors.c.view_id == views.c.id)
+        .join(enrollments, views.c.enrollment_id == enrollments.c.id)
+        .join(objects)
+        .where(where)
+        .order_by(descriptors.c.view_id, descriptors.c.name, descriptors.c.version)
+    ):
+        found[view_id].append(PackedDescriptor(*columns))
+    return found
+
+
+def _region(packed: Sequence[PackedDescriptor]) -> Region | None:
+    """The region of the paper's descriptor, or of the first other one."""
+    current = [one for one in packed if is_current(one.name, one.version)]
+    chosen = next((one for one in current if one.name == PAPER_DESCRIPTOR), next(iter(current), None))
+    return None if chosen is None else region_of(chosen.settings)
+
+
 def described_by(kind: Descriptor) -> ColumnElement[bool]:
-    """The condition that a row of `descriptors` is of a view and comparable to what this program computes."""
+    """Return the condition that a row of `descriptors` describes a view in the version that this program computes."""
     return and_(
         descriptors.c.view_id == views.c.id, descriptors.c.name == kind.name, descriptors.c.version == kind.version
     )
 
 
 def retrieved() -> ColumnElement[bool]:
-    """The condition that an object is retrieved through an enrollment."""
+    """Return the condition that searches use an enrollment: it is complete, and its object is in use."""
     return and_(enrollments.c.status == EnrollmentStatus.COMPLETE, objects.c.deleted_utc.is_(None))
 
 
@@ -199,7 +206,7 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
     Raises
     ------
     DescriptorOutdated
-        Some are not described by this version of the descriptor and cannot be compared.
+        Some views are not described by this version of the descriptor and cannot be compared.
     """
     rows = connection.execute(
         select(objects.c.id, objects.c.name, views.c.id, views.c.azimuth_deg, descriptors.c.packed)
@@ -230,60 +237,21 @@ def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> Desc
     versions = connection.scalars(
         select(descriptors.c.version).where(descriptors.c.name == kind.name).distinct().order_by(descriptors.c.version)
     ).all()
-    found = f"by {kind.name} {', '.join(map(str, versions))}" if versions else f"by no {kind.name} at all"
+    found = f"is described by {kind.name} {', '.join(map(str, versions))}" if versions else f"has no {kind.name}"
     shown = ", ".join(map(repr, sorted(names)[:3]))
-    option = "" if kind.name == DESCRIPTOR else f" --descriptor {kind.name}"
+    option = "" if kind.name == PAPER_DESCRIPTOR else f" --descriptor {kind.name}"
     return DescriptorOutdated(
         f"{shown}{' and others' if len(names) > 3 else ''} cannot be compared: this program compares {kind.name} "
-        f"{kind.version}, the catalog is described {found}",
-        next_step=f"describe the stored images anew: rig catalog redescribe{option}",
+        f"{kind.version}, the catalog {found}",
+        next_step=f"describe the stored images again: rig catalog redescribe{option}",
         evidence={"objects": len(names), "versions": list(versions), "version": kind.version},
     )
 
 
-def enrolled_before(connection: Connection) -> EnrolledBefore:
-    """Return what stood behind the objects that are retrieved."""
-    newest = None
-    pictured: dict[str, bool] = {}
-    for name, image, sha256 in connection.execute(
-        select(objects.c.name, sittings.c.reference_image, sittings.c.reference_image_sha256)
-        .select_from(objects)
-        .join(enrollments)
-        .join(sittings, sittings.c.enrollment_id == enrollments.c.id)
-        .where(retrieved())
-        .order_by(sittings.c.started_utc)
-    ):
-        pictured[name] = pictured.get(name, False) or image is not None
-        newest = newest if image is None else (image, sha256)
-    return EnrolledBefore(
-        tuple(name for name, so in pictured.items() if so),
-        tuple(name for name, so in pictured.items() if not so),
-        newest,
-    )
-
-
-def regions(connection: Connection, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
-    """Return the regions that a bench's retrieved views are described within, and what was calibrated meanwhile."""
-    rows = connection.execute(
-        select(cast(descriptors.c.settings, Text), cast(sittings.c.conditions, Text))
-        .select_from(objects)
-        .join(enrollments)
-        .join(views, views.c.enrollment_id == enrollments.c.id)
-        .join(sittings, views.c.sitting_id == sittings.c.id)
-        .join(descriptors, described_by(descriptor(DESCRIPTOR)))
-        .where(retrieved(), sittings.c.bench == bench)
-        .distinct()
-    )
-    return {
-        (region_of(json.loads(settings)), tuple(json.loads(conditions).get(CALIBRATIONS, ())))
-        for settings, conditions in rows
-    }
-
-
-def _sitting(row: Row[Any]) -> Sitting:
-    return Sitting(
+def _session(row: Row[Any]) -> Session:
+    return Session(
         id=row.id,
         started_utc=row.started_utc,
         provenance=Provenance(bench=row.bench, devices=row.devices, conditions=row.conditions, software=row.software),
-        reference_image=row.reference_image,
+        empty_table_image=row.empty_table_image,
     )

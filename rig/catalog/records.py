@@ -1,4 +1,4 @@
-"""What goes into a catalog and what comes out of it."""
+"""The records that the catalog stores and returns."""
 
 import json
 import math
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
 from importlib import metadata
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ Region = tuple[int, int, int, int]
 
 
 class EnrollmentStatus(StrEnum):
-    """Where an enrollment stands; an object is retrieved through its one complete enrollment."""
+    """State of an enrollment. Searches use the one complete enrollment of each object."""
 
     IN_PROGRESS = "in progress"
     COMPLETE = "complete"
@@ -40,9 +40,29 @@ def this_software() -> str:
         return "hbr-rig, not installed"
 
 
+class PackedDescriptor(NamedTuple):
+    """The levels of a view by one version of one descriptor, packed.
+
+    ``settings`` name the region of the image that is described (`rig.catalog.describing.region_of`).
+    """
+
+    name: str
+    version: int
+    settings: JsonObject
+    packed: bytes
+
+
+class ImageFile(NamedTuple):
+    """An image file of the catalog: its path relative to the catalog's folder, its SHA-256 and its size in bytes."""
+
+    path: str
+    sha256: str
+    size: int
+
+
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What views were taken with.
+    """The bench, devices and settings that took a view.
 
     Parameters
     ----------
@@ -51,14 +71,14 @@ class Provenance:
     devices
         Identities of servo, IMU and camera (models, serials, firmware), as JSON values.
     conditions
-        Noise model, calibrations and settings in use, as JSON values.
+        Noise model, calibrations in force and settings, as JSON values.
     software
         Name and version of the program.
 
     Raises
     ------
     UsageError
-        The devices or conditions are not JSON.
+        The devices or conditions are not JSON values.
     """
 
     bench: str
@@ -72,45 +92,44 @@ class Provenance:
 
 
 @dataclass(frozen=True, slots=True)
-class Sitting:
-    """An uninterrupted part of an enrollment; the bench clock of its views has one origin.
+class Session:
+    """An uninterrupted part of an enrollment. Its views share one origin of the bench clock.
 
-    `reference_image` shows the empty table, relative to the catalog's folder, where one was stored.
+    `empty_table_image` is a path relative to the catalog's folder; None if the session has no empty-table image.
     """
 
     id: int
     started_utc: datetime
     provenance: Provenance
-    reference_image: str | None = None
+    empty_table_image: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewRecord:
-    """A view of an object, its descriptor and the evidence on which it was accepted.
+    """A view of an object, its descriptors and the evidence on which it was accepted.
 
     Parameters
     ----------
     index
-        Place in the plan of the enrollment, from 0.
+        Position in the plan of the enrollment, from 0.
     commanded_deg, encoder_deg
-        Table angle asked for and read, unwrapped; None of views that no bench has taken.
+        Commanded and measured table angle, unwrapped; None for a view that was not taken by a bench.
     azimuth_deg
         Orientation of the camera around the object, in [0, 360).
-    descriptor : uint8 array (144,)
-        CEDD levels 0..7; None of a stored view that has none (`rig catalog redescribe`).
+    descriptors : mapping of name to uint8 array (length,)
+        Levels of each descriptor (`hbr.descriptors`). A new view needs ``cedd``. A stored view has those that this
+        program can compare; `rig catalog redescribe` adds the others.
     captured_ns
-        Start of the exposure on the bench's clock; None of views that no bench has taken.
+        Start of the exposure on the bench's clock; None for a view that was not taken by a bench.
     imu_deg, imu_sigma_deg
-        Table angle by the IMU, unwrapped, and its standard uncertainty; both None where there is none.
+        Table angle measured by the IMU, unwrapped, and its standard uncertainty; both None without an IMU.
     evidence
-        The numbers it was judged by (sharpness, exposure, settling, locks), units in the keys, as JSON values.
+        The numbers that the view was accepted by (sharpness, exposure, settling, locks) as JSON values. The keys
+        contain the units.
     region
-        The part of the image that is described: x, y, width, height in pixels; None for all of it.
+        The part of the image that is described: x, y, width, height in pixels; None for the whole image.
     segmentation
-        What found the object in the image and balanced its colours, or why it did not, as JSON values; None where
-        nothing tried.
-    further : mapping of name to uint8 array
-        Levels by further descriptors (`hbr.descriptors`), to be stored beside CEDD.
+        Result of the segmentation as JSON values (`hbr.Segmentation.evidence`); None if no segmentation was made.
 
     Raises
     ------
@@ -122,14 +141,13 @@ class ViewRecord:
     commanded_deg: float | None
     encoder_deg: float | None
     azimuth_deg: float
-    descriptor: NDArray[np.uint8] | None
+    descriptors: Mapping[str, NDArray[np.uint8]]
     captured_ns: int | None
     imu_deg: float | None = None
     imu_sigma_deg: float | None = None
     evidence: JsonObject = field(default_factory=dict)
     region: Region | None = None
     segmentation: JsonObject | None = None
-    further: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("index", "captured_ns"):
@@ -140,27 +158,25 @@ class ViewRecord:
             if value is None:
                 continue
             if not math.isfinite(value):
-                raise UsageError(
-                    f"view {self.index} has {name} = {value}", next_step="store views with angles that were measured"
-                )
+                raise UsageError(f"view {self.index} has {name} = {value}", next_step="store measured angles")
             object.__setattr__(self, name, float(value))
         if self.index < 0:
             raise UsageError(f"view index {self.index} is negative", next_step="number the views of a plan from 0")
         if (self.imu_deg is None) != (self.imu_sigma_deg is None):
             raise UsageError(
                 f"view {self.index} has an IMU angle of {self.imu_deg} with an uncertainty of {self.imu_sigma_deg}",
-                next_step="give both, or None for both where the IMU has no answer",
+                next_step="give both, or None for both",
             )
         check_azimuth(self.azimuth_deg)
         if self.imu_sigma_deg is not None and self.imu_sigma_deg < 0:
             raise UsageError(
                 f"view {self.index} has imu_sigma_deg = {self.imu_sigma_deg}",
-                next_step="give the standard uncertainty, which is not negative",
+                next_step="give a standard uncertainty of 0 or more",
             )
         object.__setattr__(self, "evidence", as_json(self.evidence, f"the evidence of view {self.index}"))
         if self.segmentation is not None:
             object.__setattr__(
-                self, "segmentation", as_json(self.segmentation, f"what the front end says of view {self.index}")
+                self, "segmentation", as_json(self.segmentation, f"the segmentation of view {self.index}")
             )
         if self.region is not None:
             object.__setattr__(self, "region", tuple(operator.index(number) for number in self.region))
@@ -168,12 +184,12 @@ class ViewRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredView:
-    """A view as the catalog keeps it; `image` is relative to the catalog's folder."""
+    """A view as the catalog stores it. `image` is a path relative to the catalog's folder."""
 
     id: int
     object_name: str
     enrollment_id: int
-    sitting: Sitting
+    session: Session
     record: ViewRecord
     captured_utc: datetime | None
     image: str
@@ -183,7 +199,7 @@ class StoredView:
 
 @dataclass(frozen=True, slots=True)
 class EnrollmentSummary:
-    """An enrollment: `planned_azimuth_deg` of view 0, 1, ..., and which of them are `present`, ascending."""
+    """An enrollment: the planned azimuth of view 0, 1, ..., and the indices of the stored views, ascending."""
 
     id: int
     status: EnrollmentStatus
@@ -191,7 +207,7 @@ class EnrollmentSummary:
     finished_utc: datetime | None
     planned_azimuth_deg: tuple[float, ...]
     present: tuple[int, ...]
-    sittings: tuple[Sitting, ...]
+    sessions: tuple[Session, ...]
 
     @property
     def missing(self) -> tuple[int, ...]:
@@ -201,7 +217,7 @@ class EnrollmentSummary:
 
 @dataclass(frozen=True, slots=True)
 class ObjectSummary:
-    """An object: `views` of its complete enrollment, and those of an `unfinished` one where there is one."""
+    """An object: the number of views of its complete enrollment, and of an unfinished one (None if there is none)."""
 
     name: str
     label: str
@@ -215,7 +231,7 @@ class ObjectSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectDetails:
-    """An object with its enrollments, newest first, and the views of the complete one, by index."""
+    """An object with its enrollments, newest first, and the views of the complete enrollment, by index."""
 
     summary: ObjectSummary
     enrollments: tuple[EnrollmentSummary, ...]
@@ -223,50 +239,50 @@ class ObjectDetails:
 
 
 def clean_name(name: str) -> str:
-    """Return the name of an object as the catalog stores and compares it: composed (NFC), without outer blanks.
+    """Return the name of an object as the catalog stores and compares it: composed (NFC), without outer spaces.
 
     Raises
     ------
     UsageError
-        The name is empty, longer than 100 characters or holds characters that cannot be printed.
+        The name is empty, is longer than 100 characters or contains characters that cannot be printed.
     """
     cleaned = unicodedata.normalize("NFC", name).strip()
     if not cleaned:
         raise UsageError("the name of the object is empty", next_step="give a name, such as mug-white")
     if not cleaned.isprintable():
         raise UsageError(
-            f"the name {cleaned!r} holds characters that cannot be printed", next_step="leave them out of the name"
+            f"the name {cleaned!r} contains characters that cannot be printed", next_step="remove them from the name"
         )
     if len(cleaned) > MAX_NAME_LENGTH:
         raise UsageError(
-            f"the name has {len(cleaned)} characters, {MAX_NAME_LENGTH} are allowed",
+            f"the name has {len(cleaned)} characters; at most {MAX_NAME_LENGTH} are allowed",
             next_step="shorten the name and put the rest into the note",
         )
     return cleaned
 
 
 def check_text(text: str, what: str) -> None:
-    """Refuse text that cannot be stored, such as bytes of another encoding from a terminal, with a `UsageError`."""
+    """Raise `UsageError` for text that cannot be stored, such as bytes of another encoding from a terminal."""
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise UsageError(f"the {what} {text!r} is not text", next_step="type it in UTF-8") from error
+        raise UsageError(f"the {what} {text!r} is not valid text", next_step="type it in UTF-8") from error
 
 
 def check_azimuth(azimuth_deg: float) -> None:
-    """Refuse an azimuth outside [0, 360) with a `UsageError`."""
+    """Raise `UsageError` for an azimuth outside [0, 360)."""
     if not 0 <= azimuth_deg < 360:
-        raise UsageError(f"an azimuth of {azimuth_deg} deg", next_step="wrap azimuths to [0, 360) deg")
+        raise UsageError(f"the azimuth {azimuth_deg}° is not in [0°, 360°)", next_step="wrap azimuths to [0°, 360°)")
 
 
 def as_json(values: JsonObject, what: str) -> dict[str, Any]:
-    """Return the values as they will be read back from JSON; numpy scalars become Python's."""
+    """Return the values as they will be read back from JSON. Numpy scalars become Python scalars."""
     try:
         plain: dict[str, Any] = json.loads(json.dumps(dict(values), allow_nan=False, default=_plain_scalar))
     except (TypeError, ValueError) as error:
         raise UsageError(
-            f"{what} cannot be kept as JSON: {error}",
-            next_step="use text, finite numbers, true, false, lists and mappings, and None for what is unknown",
+            f"{what} cannot be stored as JSON: {error}",
+            next_step="use text, finite numbers, true, false, None, lists and mappings",
         ) from error
     return plain
 

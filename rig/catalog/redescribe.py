@@ -1,4 +1,4 @@
-"""Descriptors anew from the stored images: when the descriptor, its version or its settings have changed."""
+"""Describe the stored images again after a descriptor, its version or its settings have changed."""
 
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -10,24 +10,25 @@ from typing import Any, NamedTuple
 from sqlalchemy import and_, bindparam, delete, insert, select, update
 
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import Reference, known_descriptor, region_of, settings_of, stored_describer
-from rig.catalog.jobs import Progressed, portions, processes
-from rig.catalog.records import EnrollmentStatus, JsonObject, Region
-from rig.catalog.schema import DESCRIPTOR, descriptors, enrollments, objects, sittings, views
+from rig.catalog.describing import EmptyTable, known_descriptor, pack, region_of, settings_of, stored_describer
+from rig.catalog.jobs import JobProgress, portions, processes
+from rig.catalog.records import EnrollmentStatus, JsonObject, PackedDescriptor, Region
+from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import map_in_processes
 from rig.views import image_files as images
+from rig.views.description import PAPER_DESCRIPTOR
 
 
 class Stored(Enum):
-    """The region that a view has been described within so far."""
+    """Marks that each view keeps the region that it is described within."""
 
     REGION = "stored"
 
 
 @dataclass(frozen=True, slots=True)
 class Redescribed:
-    """How many views were described, how many were already, and which images could not be: path and reason."""
+    """Numbers of views that were described now and before, and the images that failed, with the reasons."""
 
     descriptor: str
     version: int
@@ -41,42 +42,40 @@ class _Item(NamedTuple):
     image: str
     sha256: str
     region: Region | None
-    reference: Reference | None
+    empty_table: EmptyTable | None
 
 
-class _Found(NamedTuple):
-    """What a descriptor says of a view, or the reason why it says nothing."""
+class _Described(NamedTuple):
+    """The packed levels of a view, or the reason why it cannot be described."""
 
-    packed: bytes | None
+    packed: PackedDescriptor | None
     segmentation: dict[str, Any] | None = None
     reason: str = ""
 
 
 def redescribe(
     catalog: Catalog,
-    descriptor: str = DESCRIPTOR,
+    descriptor: str = PAPER_DESCRIPTOR,
     *,
     region: Region | Stored | None = Stored.REGION,
     again: bool = False,
     jobs: int | None = None,
-) -> Generator[Progressed, None, Redescribed]:
-    """Describe the views of all objects in use that are not described by this descriptor, in its present version.
+) -> Generator[JobProgress, None, Redescribed]:
+    """Describe the views of all objects in use that are not described by the present version of a descriptor.
 
-    Portions are committed as they are done: whatever ends the call, the next one goes on there. A descriptor that looks
-    for the object does so by the sitting's picture of the empty table, where there is one, and what it found is stored
-    with the view.
+    Results are committed in portions: after an interruption the next call continues there. A descriptor of the object
+    alone uses the empty-table image of the session, if there is one, and its segmentation is stored with the view.
 
     Parameters
     ----------
     descriptor
-        Its name (`hbr.descriptors`); what other descriptors say of a view stays beside it.
+        Its name (`hbr.descriptors`). Other descriptors of a view stay.
     region
-        The part of the images that a bench has taken to describe; None for all of them. Images from elsewhere keep
-        theirs.
+        Part of the images to describe; None for the whole image. Imported images keep their regions.
     again
-        Describe also what is described already.
+        Also describe views that are described already.
     jobs
-        Processes; one for each core otherwise.
+        Number of processes; None for one per core.
 
     Raises
     ------
@@ -89,21 +88,17 @@ def redescribe(
     items, unchanged = _items(catalog, kind.name, kind.version, region, again)
     failed: list[tuple[str, str]] = []
     done = 0
-    yield Progressed(0, len(items))
+    yield JobProgress(0, len(items))
     work = partial(_describe, catalog.path, kind.name)
     for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
-        rows, sightings = [], []
+        rows, segmentations = [], []
         for item, one in zip(portion, found, strict=True):
             if one.packed is None:
                 failed.append((item.image, one.reason))
                 continue
-            settings = settings_of(item.region)
-            rows.append(
-                {"view_id": item.view_id, "name": kind.name, "version": kind.version, "settings": settings}
-                | {"packed": one.packed}
-            )
+            rows.append({"view_id": item.view_id, **one.packed._asdict()})
             if one.segmentation is not None:
-                sightings.append({"seen_id": item.view_id, "seen": one.segmentation})
+                segmentations.append({"of_view": item.view_id, "new": one.segmentation})
         with catalog.database.write() as connection:
             ids = [row["view_id"] for row in rows]
             alive = set(connection.scalars(select(views.c.id).where(views.c.id.in_(ids))))
@@ -118,17 +113,16 @@ def redescribe(
             )
             if alive:
                 connection.execute(insert(descriptors), [row for row in rows if row["view_id"] in alive])
-            if sightings:
+            if segmentations:
                 connection.execute(
-                    update(views).where(views.c.id == bindparam("seen_id")).values(segmentation=bindparam("seen")),
-                    sightings,
+                    update(views).where(views.c.id == bindparam("of_view")).values(segmentation=bindparam("new")),
+                    segmentations,
                 )
         done += len(portion)
-        yield Progressed(done, len(items))
+        yield JobProgress(done, len(items))
     if items:
-        catalog.note(
-            "described anew", descriptor=kind.name, version=kind.version, views=done - len(failed), failed=len(failed)
-        )
+        described = done - len(failed)
+        catalog.note("described again", descriptor=kind.name, version=kind.version, views=described, failed=len(failed))
     return Redescribed(kind.name, kind.version, done - len(failed), unchanged, tuple(failed))
 
 
@@ -142,13 +136,13 @@ def _items(
                 views.c.image,
                 views.c.image_sha256,
                 views.c.encoder_deg,
-                sittings.c.conditions,
-                sittings.c.reference_image,
-                sittings.c.reference_image_sha256,
+                sessions.c.conditions,
+                sessions.c.empty_table_image,
+                sessions.c.empty_table_image_sha256,
             )
             .join(enrollments, views.c.enrollment_id == enrollments.c.id)
             .join(objects)
-            .join(sittings, views.c.sitting_id == sittings.c.id)
+            .join(sessions, views.c.session_id == sessions.c.id)
             .where(
                 objects.c.deleted_utc.is_(None),
                 enrollments.c.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]),
@@ -160,8 +154,8 @@ def _items(
         for view_id, other, its_version, settings in connection.execute(
             select(descriptors.c.view_id, descriptors.c.name, descriptors.c.version, descriptors.c.settings)
         ):
-            # of several, what the views are retrieved by tells their region
-            if view_id not in known or other in (DESCRIPTOR, name):
+            # of several regions, that of the descriptor itself or of the paper's counts
+            if view_id not in known or other in (PAPER_DESCRIPTOR, name):
                 known[view_id] = settings
             if (other, its_version) == (name, version):
                 present[view_id] = settings
@@ -169,33 +163,35 @@ def _items(
     for row in wanted:
         if isinstance(region, Stored) or row.encoder_deg is None:
             settings = known.get(row.id)
-            where = region_of(settings) if settings is not None else _intended(row.conditions)
+            part = region_of(settings) if settings is not None else _configured_region(row.conditions)
         else:
-            where = region
-        if not again and present.get(row.id) == settings_of(where):
+            part = region
+        if not again and present.get(row.id) == settings_of(part):
             unchanged += 1
         else:
-            reference = Reference.of(row.reference_image, row.reference_image_sha256)
-            items.append(_Item(row.id, row.image, row.image_sha256, where, reference))
+            table = row.empty_table_image
+            empty_table = None if table is None else (table, row.empty_table_image_sha256)
+            items.append(_Item(row.id, row.image, row.image_sha256, part, empty_table))
     return items, unchanged
 
 
-def _intended(conditions: JsonObject) -> Region | None:
-    """The region that the configuration of a sitting names; views that are not described have no other trace of it."""
+def _configured_region(conditions: JsonObject) -> Region | None:
+    """The region in the configuration of a session, for views without descriptors."""
     roi = conditions.get("view", {}).get("roi")
     return None if roi is None else region_of({"region": roi})
 
 
-def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[_Found]:
+def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[_Described]:
     kind = known_descriptor(name)
     found = []
     for item in portion:
         try:
             image = images.read(root / item.image, item.sha256)
-            described = stored_describer(root, (kind.name,), item.region, item.reference)(image)
-            found.append(_Found(kind.pack(described.levels[kind.name]), described.segmentation))
+            described = stored_describer(root, (kind.name,), item.region, item.empty_table)(image)
+            (packed,) = pack(described.levels, item.region)
+            found.append(_Described(packed, described.segmentation))
         except (CatalogError, UsageError) as error:
-            found.append(_Found(None, reason=error.what))
-        except (OSError, ValueError) as error:  # ValueError: the descriptor cannot describe such an image
-            found.append(_Found(None, reason=str(error)))
+            found.append(_Described(None, reason=error.what))
+        except (OSError, ValueError) as error:  # ValueError: the descriptor cannot describe this image
+            found.append(_Described(None, reason=str(error)))
     return found

@@ -26,20 +26,16 @@ from sqlalchemy import (
 )
 
 from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
-from rig.views.description import PAPER_DESCRIPTOR
 
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
 
-SCHEMA_VERSION: Final = 2
-"""Version of the tables below (`PRAGMA user_version`); `rig.catalog.migrations` has a step from each one before."""
-
-DESCRIPTOR: Final = PAPER_DESCRIPTOR
-"""What objects are retrieved by where nobody says otherwise (`hbr.descriptors`)."""
+SCHEMA_VERSION: Final = 3
+"""Version of the tables below (`PRAGMA user_version`). `rig.catalog.migrations` has a step for each version."""
 
 
 class Utc(TypeDecorator[datetime]):
-    """Aware civil time, stored as UTC; SQLite itself would drop the zone."""
+    """Time with a time zone, stored as UTC. SQLite itself would drop the zone."""
 
     impl = DateTime
     cache_ok = True
@@ -61,7 +57,7 @@ METADATA: Final = MetaData(
     }
 )
 
-# Ids are named elsewhere (image folders, saved runs), so none is given twice, even after a deletion: autoincrement.
+# Image folders and saved runs refer to ids. Autoincrement gives no id twice, even after a deletion.
 objects = Table(
     "objects",
     METADATA,
@@ -70,7 +66,7 @@ objects = Table(
     Column("label", Text, nullable=False),
     Column("note", Text, nullable=False),
     Column("created_utc", Utc, nullable=False),
-    Column("deleted_utc", Utc),  # what was deleted is kept until it is collected (`gc`)
+    Column("deleted_utc", Utc),  # a deleted object stays until `rig catalog gc`
     sqlite_autoincrement=True,
 )
 
@@ -98,9 +94,9 @@ for _status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS):
         sqlite_where=enrollments.c.status == _status.value,
     )
 
-# A resumed enrollment may go on with another bench, program or calibration, and the bench's clock starts anew.
-sittings = Table(
-    "sittings",
+# A resumed enrollment may use another bench, program or calibration, and the bench clock starts again.
+sessions = Table(
+    "sessions",
     METADATA,
     Column("id", Integer, primary_key=True),
     Column("enrollment_id", ForeignKey("enrollments.id"), nullable=False, index=True),
@@ -109,10 +105,9 @@ sittings = Table(
     Column("software", Text, nullable=False),
     Column("devices", JSON, nullable=False),
     Column("conditions", JSON, nullable=False),
-    # the empty table as this sitting's camera saw it
-    Column("reference_image", Text),
-    Column("reference_image_sha256", String(64)),
-    Column("reference_image_bytes", Integer),
+    Column("empty_table_image", Text),
+    Column("empty_table_image_sha256", String(64)),
+    Column("empty_table_image_bytes", Integer),
 )
 
 views = Table(
@@ -121,8 +116,8 @@ views = Table(
     Column("id", Integer, primary_key=True),
     Column("enrollment_id", ForeignKey("enrollments.id"), nullable=False),
     Column("view_index", Integer, CheckConstraint("view_index >= 0", name="view_index"), nullable=False),
-    Column("sitting_id", ForeignKey("sittings.id"), nullable=False, index=True),
-    Column("commanded_deg", Float),  # NULL: unknown, of views that no bench has taken
+    Column("session_id", ForeignKey("sessions.id"), nullable=False, index=True),
+    Column("commanded_deg", Float),  # NULL: the view was not taken by a bench
     Column("encoder_deg", Float),
     Column("imu_deg", Float),
     Column("imu_sigma_deg", Float),
@@ -138,12 +133,12 @@ views = Table(
     Column("image_sha256", String(64), nullable=False),
     Column("image_bytes", Integer, nullable=False),
     Column("evidence", JSON, nullable=False),
-    Column("front_end", JSON(none_as_null=True), key="segmentation"),
+    Column("segmentation", JSON(none_as_null=True)),
     UniqueConstraint("enrollment_id", "view_index"),
     sqlite_autoincrement=True,
 )
 
-# Levels of different versions must not be compared; `settings` say which part of the image they are of.
+# Levels of different versions must not be compared. `settings` name the region of the image that is described.
 descriptors = Table(
     "descriptors",
     METADATA,

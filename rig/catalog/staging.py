@@ -1,4 +1,4 @@
-"""Where an import keeps its files until all of it is in the catalog: a folder of its own on the catalog's disk."""
+"""Staging folders: an import stores its files there, on the disk of the catalog, until all are in the catalog."""
 
 import fcntl
 import os
@@ -14,25 +14,25 @@ INCOMING: Final = "incoming"
 
 @contextmanager
 def staging(root: Path) -> Iterator[Path]:
-    """Have a new folder that goes with everything in it, however the import ends; a killed one's is `abandoned`."""
-    above = root / INCOMING
-    above.mkdir(exist_ok=True)
-    folder = Path(mkdtemp(dir=above))
+    """Yield a new folder, and delete it with its contents at the end. After a kill, `abandoned` finds it."""
+    parent = root / INCOMING
+    parent.mkdir(exist_ok=True)
+    folder = Path(mkdtemp(dir=parent))
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # the system lets go of it with the process
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the system releases it when the process ends
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         os.close(lock)
-        with suppress(OSError):  # another import is under way
-            above.rmdir()
+        with suppress(OSError):  # another import is running
+            parent.rmdir()
 
 
 def abandoned(root: Path) -> Iterator[Path]:
-    """Yield the folders of imports whose process is gone."""
-    above = root / INCOMING
-    for folder in sorted(above.iterdir()) if above.is_dir() else ():
+    """Yield the folders of imports whose process no longer runs."""
+    parent = root / INCOMING
+    for folder in sorted(parent.iterdir()) if parent.is_dir() else ():
         lock = os.open(folder, os.O_RDONLY)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""What a catalog holds and weighs, and taking out for good what nobody uses."""
+"""Statistics of a catalog, and the final removal of deleted data."""
 
 import shutil
 from collections.abc import Sequence
@@ -14,17 +14,17 @@ from rig.catalog import audit, staging
 from rig.catalog.catalog import Catalog
 from rig.catalog.failures import DATABASE_NAME
 from rig.catalog.records import EnrollmentStatus
-from rig.catalog.schema import SCHEMA_VERSION, descriptors, enrollments, objects, sittings, views
+from rig.catalog.schema import SCHEMA_VERSION, descriptors, enrollments, objects, sessions, views
 
 LOST: Final = "lost+found"
-"""Folder of files that `verify` set aside."""
+"""Folder for files that `verify` moves away."""
 
 _OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
 
 
 @dataclass(frozen=True, slots=True)
 class DescriptorStatistics:
-    """How many views are described by a version of a descriptor; `current` if this program compares it."""
+    """Number of views with a version of a descriptor. `current`: this program can compare it."""
 
     name: str
     version: int
@@ -34,7 +34,7 @@ class DescriptorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Sizes in bytes. `collectable_*`: what `collect_garbage` would free."""
+    """Numbers and sizes in bytes. `collect_garbage` frees `deleted_image_bytes`, and with ``old`` `old_image_bytes`."""
 
     schema_version: int
     objects: int
@@ -53,8 +53,8 @@ class Statistics:
 
 
 @dataclass(frozen=True, slots=True)
-class Collected:
-    """What was taken out for good."""
+class GarbageReport:
+    """What `collect_garbage` removed."""
 
     objects: tuple[str, ...]
     enrollments: int
@@ -64,13 +64,13 @@ class Collected:
 
 
 def statistics(catalog: Catalog) -> Statistics:
-    """Count what the catalog holds."""
+    """Return the statistics of a catalog."""
     known = {name: descriptor(name).version for name in names()}
     with catalog.database.read() as connection:
         total, in_use = connection.execute(
             select(func.count(), func.count(case((objects.c.deleted_utc.is_(None), 1)))).select_from(objects)
         ).one()
-        weights = {
+        sizes = {
             (status, deleted): (count, view_count, size or 0)
             for status, deleted, count, view_count, size in connection.execute(
                 select(
@@ -92,10 +92,10 @@ def statistics(catalog: Catalog) -> Statistics:
             .order_by(objects.c.label)
         ).all()
         benches = connection.execute(
-            select(sittings.c.bench, func.count(views.c.id))
-            .join(views, views.c.sitting_id == sittings.c.id)
-            .group_by(sittings.c.bench)
-            .order_by(sittings.c.bench)
+            select(sessions.c.bench, func.count(views.c.id))
+            .join(views, views.c.session_id == sessions.c.id)
+            .group_by(sessions.c.bench)
+            .order_by(sessions.c.bench)
         ).all()
         described = connection.execute(
             select(descriptors.c.name, descriptors.c.version, func.count())
@@ -104,15 +104,15 @@ def statistics(catalog: Catalog) -> Statistics:
         ).all()
         entries = len(audit.entries(connection))
     counts: dict[str, int] = {}
-    for (status, _), (count, _, _) in weights.items():
+    for (status, _), (count, _, _) in sizes.items():
         counts[status] = counts.get(status, 0) + count
     return Statistics(
         schema_version=SCHEMA_VERSION,
         objects=in_use,
         deleted_objects=total - in_use,
         enrollments=counts,
-        views=sum(view_count for _, view_count, _ in weights.values()),
-        image_bytes=sum(size for _, _, size in weights.values()),
+        views=sum(view_count for _, view_count, _ in sizes.values()),
+        image_bytes=sum(size for _, _, size in sizes.values()),
         database_bytes=sum(file.stat().st_size for file in catalog.path.glob(f"{DATABASE_NAME}*")),
         free_disk_bytes=shutil.disk_usage(catalog.path).free,
         labels=dict(labels),
@@ -121,25 +121,25 @@ def statistics(catalog: Catalog) -> Statistics:
             DescriptorStatistics(name, version, count, known.get(name) == version) for name, version, count in described
         ),
         log_entries=entries,
-        deleted_image_bytes=sum(size for (_, deleted), (_, _, size) in weights.items() if deleted),
+        deleted_image_bytes=sum(size for (_, deleted), (_, _, size) in sizes.items() if deleted),
         old_image_bytes=sum(
-            size for (status, deleted), (_, _, size) in weights.items() if not deleted and status in _OLD
+            size for (status, deleted), (_, _, size) in sizes.items() if not deleted and status in _OLD
         ),
     )
 
 
-def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = False) -> Collected:
-    """Take out for good what was deleted, what `verify` set aside, and what is left of imports that were cut off.
+def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = False) -> GarbageReport:
+    """Remove deleted objects, files that `verify` moved away, and files of interrupted imports.
 
-    The rows go first, in one transaction; a crash in between leaves files without rows, which `verify` finds. Levels of
-    earlier versions of a descriptor go where a view has the present one.
+    The rows are removed first, in one transaction. A crash after that leaves files without rows, which `verify` finds.
+    Levels by earlier versions of a descriptor are removed if the view has the present version.
 
     Parameters
     ----------
     old
-        Also the superseded and abandoned enrollments of objects in use.
+        Also remove the superseded and abandoned enrollments of objects in use.
     dry_run
-        Only tell.
+        Change nothing; only return what would be removed.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     """
     transaction = catalog.database.read if dry_run else catalog.database.write
     with transaction() as connection:
-        doomed = connection.execute(
+        unused = connection.execute(
             select(enrollments.c.id, objects.c.name, objects.c.deleted_utc)
             .join(objects)
             .where(
@@ -158,10 +158,10 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
                 )
             )
         ).all()
-        ids = [row.id for row in doomed]
+        ids = [row.id for row in unused]
         files = _files_of(connection, ids)
         view_count = connection.scalar(select(func.count()).where(views.c.enrollment_id.in_(ids))) or 0
-        gone = tuple(
+        deleted = tuple(
             connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_not(None)).order_by(objects.c.id))
         )
         if not dry_run:
@@ -173,13 +173,13 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     for path in paths:
         with suppress(FileNotFoundError):
             size += path.stat().st_size
-    collected = Collected(gone, len(ids), view_count, len(paths), size)
+    collected = GarbageReport(deleted, len(ids), view_count, len(paths), size)
     if not dry_run:
         with catalog.database.in_words():
             _remove(catalog.path, paths)
-        if ids or gone or paths:
+        if ids or deleted or paths:
             catalog.note(
-                "collected garbage", objects=list(gone), enrollments=len(ids), views=view_count, freed_bytes=size
+                "collected garbage", objects=list(deleted), enrollments=len(ids), views=view_count, freed_bytes=size
             )
     return collected
 
@@ -188,18 +188,18 @@ def _files_of(connection: Connection, ids: Sequence[int]) -> list[str]:
     return [
         *connection.scalars(select(views.c.image).where(views.c.enrollment_id.in_(ids))),
         *connection.scalars(
-            select(sittings.c.reference_image).where(
-                sittings.c.enrollment_id.in_(ids), sittings.c.reference_image.is_not(None)
+            select(sessions.c.empty_table_image).where(
+                sessions.c.enrollment_id.in_(ids), sessions.c.empty_table_image.is_not(None)
             )
         ),
     ]
 
 
 def _delete_rows(connection: Connection, ids: Sequence[int]) -> None:
-    of_them = select(views.c.id).where(views.c.enrollment_id.in_(ids))
-    connection.execute(delete(descriptors).where(descriptors.c.view_id.in_(of_them)))
+    their_views = select(views.c.id).where(views.c.enrollment_id.in_(ids))
+    connection.execute(delete(descriptors).where(descriptors.c.view_id.in_(their_views)))
     connection.execute(delete(views).where(views.c.enrollment_id.in_(ids)))
-    connection.execute(delete(sittings).where(sittings.c.enrollment_id.in_(ids)))
+    connection.execute(delete(sessions).where(sessions.c.enrollment_id.in_(ids)))
     connection.execute(delete(enrollments).where(enrollments.c.id.in_(ids)))
     connection.execute(delete(objects).where(objects.c.deleted_utc.is_not(None)))
     later = descriptors.alias()
@@ -220,7 +220,7 @@ def _remove(root: Path, paths: Sequence[Path]) -> None:
     folders: set[Path] = set()
     for path in paths:
         path.unlink(missing_ok=True)
-        folders.update(above for above in path.parents if above != root and above.is_relative_to(root))
+        folders.update(parent for parent in path.parents if parent != root and parent.is_relative_to(root))
     for folder in sorted(folders, key=lambda path: len(path.parts), reverse=True):
-        with suppress(OSError):  # it is in use
+        with suppress(OSError):  # it is not empty
             folder.rmdir()

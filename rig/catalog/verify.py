@@ -1,7 +1,7 @@
-"""Whether a catalog is as it was stored: rows, images and descriptors; what can be mended is mended when asked."""
+"""Check whether a catalog is as it was stored: rows, images and descriptors. Repair it on request."""
 
 import json
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -11,14 +11,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, delete, null, select, update
+from sqlalchemy import Connection, delete, null, select, true, update
 
-from hbr.descriptors import PAPERS, Descriptor, descriptor, names
+from hbr.descriptors import PAPERS, Descriptor, descriptor
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import Reference, region_of, stored_describer
-from rig.catalog.jobs import Progressed, portions, processes
-from rig.catalog.schema import descriptors, enrollments, objects, sittings, views
+from rig.catalog.describing import EmptyTable, is_current, region_of, stored_describer
+from rig.catalog.jobs import JobProgress, portions, processes
+from rig.catalog.queries import packed_descriptors
+from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.upkeep import LOST
 from rig.core.errors import CatalogError, UsageError
 from rig.core.files import make_folder, write
@@ -26,38 +27,55 @@ from rig.core.processes import map_in_processes
 from rig.views import image_files as images
 
 ROUNDED: Final = 0.02
-"""Share of a view's levels that may be rounded the other way."""
+"""Largest share of a view's levels that another computer may have rounded to the neighbouring level."""
 
 
 class Problem(StrEnum):
-    """What `verify` finds."""
+    """Kind of a problem, with the keys of `Finding.details`."""
 
     DAMAGED_DATABASE = "database damaged"
+    """``message`` of SQLite."""
     ORPHANED_ROW = "orphaned row"
+    """``row`` of ``table`` refers to a missing row of ``parent``."""
     MISSING_IMAGE = "image missing"
+    """``reason`` of the system; ``copy``: path of a file with the stored content, or None."""
     CHANGED_IMAGE = "image changed"
+    """``bytes`` found and ``stored_bytes``; ``copy``: as above."""
     UNREADABLE_IMAGE = "image unreadable"
+    """``reason`` of the decoder."""
     SIZES_DIFFER = "sizes differ"
+    """``size_px`` of the image and of the first view of its enrollment, ``first_size_px``."""
     NOT_DESCRIBED = "not described"
     DESCRIPTOR_DIFFERS = "descriptor differs"
+    """The stored levels of ``descriptor`` are not those of the image."""
     ORPHANED_FILE = "orphaned file"
+    """``moved_to``: path after a repair, or None."""
+
+
+class Repair(StrEnum):
+    """What was done about a problem."""
+
+    RESTORED = "restored from a copy"
+    DESCRIBED = "described again"
+    REMOVED = "removed and recorded in the log"
+    MOVED = "moved to lost+found"
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that is not as it was stored; ``mended`` says what was done about it, None if nothing was."""
+    """A problem of a catalog, and how it was repaired; None if it was not."""
 
     problem: Problem
-    what: str
     object_name: str | None = None
     view_id: int | None = None
     path: str | None = None
-    mended: str | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)
+    repair: Repair | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What was looked at, and everything that was found."""
+    """Numbers of what was checked, and everything that was found."""
 
     objects: int
     views: int
@@ -65,32 +83,36 @@ class Verification:
     findings: tuple[Finding, ...]
 
     @property
-    def unmended(self) -> tuple[Finding, ...]:
-        return tuple(finding for finding in self.findings if finding.mended is None)
+    def unrepaired(self) -> tuple[Finding, ...]:
+        return tuple(finding for finding in self.findings if finding.repair is None)
 
 
 class _Item(NamedTuple):
-    """An image that must be there; ``described`` holds name, version, settings as JSON and packed levels."""
+    """An image that must exist. ``described`` holds name, version, settings as JSON, and packed levels."""
 
     view_id: int | None
-    sitting_id: int | None
+    session_id: int | None
     object_name: str
     enrollment_id: int
     image: str
     sha256: str
     file_bytes: int
-    reference: Reference | None = None
+    empty_table: EmptyTable | None = None
     described: tuple[tuple[str, int, str, bytes], ...] = ()
 
+    def finding(self, problem: Problem, repair: Repair | None = None, **details: Any) -> Finding:
+        return Finding(problem, self.object_name, self.view_id, self.image, details, repair)
 
-class _Looked(NamedTuple):
-    """What became of an item: the SHA-256 of the file that is there, and its pixels' width and height.
 
-    ``different`` holds name and version of descriptors that do not match, and what they should be, if that is known.
+class _Checked(NamedTuple):
+    """What was found for an item: SHA-256 and size of its file, and width and height of the image.
+
+    ``different`` holds name and version of each descriptor with wrong levels, and the right levels if known.
     """
 
     sha256: str | None
-    size: tuple[int, int] | None = None
+    file_bytes: int = 0
+    size_px: tuple[int, int] | None = None
     reason: str = ""
     different: tuple[tuple[str, int, bytes | None], ...] = ()
 
@@ -100,25 +122,25 @@ class _State:
     catalog: Catalog
     repair: bool
     findings: list[Finding] = field(default_factory=list)
-    elsewhere: dict[str, Path] = field(default_factory=dict)
-    """Files that are no view's own, by the SHA-256 of what is in them."""
+    copies: dict[str, Path] = field(default_factory=dict)
+    """A file for each SHA-256."""
 
 
 def verify(
     catalog: Catalog, *, repair: bool = False, quick: bool = False, jobs: int | None = None
-) -> Generator[Progressed, None, Verification]:
-    """Look at every row, image and descriptor.
+) -> Generator[JobProgress, None, Verification]:
+    """Check every row, image and descriptor.
 
     Parameters
     ----------
     repair
-        Mend what can be mended: an image whose bytes are found under another name is put back, descriptors are computed
-        from images that are whole, orphaned rows go into the audit log, orphaned files into ``lost+found``. Nothing is
-        thrown away.
+        Repair what can be repaired, without deleting anything: restore an image whose content is found under another
+        name, compute descriptors from intact images, record orphaned rows in the audit log, and move orphaned files to
+        ``lost+found``.
     quick
-        Compare the files' hashes, but do not describe the images again.
+        Compare the hashes of the files only; do not describe the images again.
     jobs
-        Processes; one for each core otherwise.
+        Number of processes; None for one per core.
 
     Raises
     ------
@@ -126,32 +148,30 @@ def verify(
         The catalog cannot be read, or cannot be written for a repair.
     """
     state = _State(catalog, repair)
+    # The files are listed before the rows: an image whose row is committed in the meantime is not an orphan.
     with catalog.database.in_words():
         files = _files(catalog.path)
     _check_rows(state)
     items, object_count = _items(catalog)
-    yield Progressed(0, len(items))
-    looked: dict[_Item, _Looked] = {}
-    done = 0
-    work = partial(_look, catalog.path, quick)
+
+    yield JobProgress(0, len(items))
+    checked: dict[_Item, _Checked] = {}
+    work = partial(_check_portion, catalog.path, quick)
     for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
-        looked.update(zip(portion, found, strict=True))
-        done += len(portion)
-        yield Progressed(done, len(items))
-    looked = {item: looked[item] for item in items}
-    orphans = _orphans(catalog, files)
-    _collect_elsewhere(state, looked, orphans)
-    _judge_images(state, looked)
-    _judge_sizes(state, looked)
-    _judge_descriptors(state, looked)
-    _judge_orphans(state, orphans)
+        checked.update(zip(portion, found, strict=True))
+        yield JobProgress(len(checked), len(items))
+    checked = {item: checked[item] for item in items}  # in the order of the catalog, whichever process was faster
+
+    with catalog.database.read() as connection:
+        orphans = sorted(files - _referenced(connection))
+    _find_copies(state, checked, orphans)
+    _report_images(state, checked)
+    _report_sizes(state, checked)
+    _report_descriptors(state, checked)
+    _report_orphans(state, orphans)
     if repair and state.findings:
-        mended = [finding for finding in state.findings if finding.mended]
-        catalog.note(
-            "verified and repaired",
-            found=len(state.findings),
-            mended=[f"{finding.problem}: {finding.what} {finding.mended}" for finding in mended],
-        )
+        repaired = [f"{one.problem}: {one.path}, {one.repair}" for one in state.findings if one.repair is not None]
+        catalog.note("verified and repaired", found=len(state.findings), repaired=repaired)
     return Verification(
         object_count,
         sum(item.view_id is not None for item in items),
@@ -167,26 +187,22 @@ def _files(root: Path) -> set[str]:
 
 def _check_rows(state: _State) -> None:
     with state.catalog.database.read() as connection:
-        told = connection.exec_driver_sql("PRAGMA quick_check(20)").scalars().all()
-    if told != ["ok"]:
-        state.findings += [
-            Finding(Problem.DAMAGED_DATABASE, f"SQLite says: {line}; restore it from a backup") for line in told
-        ]
+        messages = connection.exec_driver_sql("PRAGMA quick_check(20)").scalars().all()
+    if messages != ["ok"]:
+        state.findings += [Finding(Problem.DAMAGED_DATABASE, details={"message": message}) for message in messages]
     transaction = state.catalog.database.write if state.repair else state.catalog.database.read
     with transaction() as connection:
         connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
-        # the deletion of an orphan may make others
+        # The deletion of an orphan may make others.
         while broken := connection.exec_driver_sql("PRAGMA foreign_key_check").all():
             for table, rowid, parent, _ in broken:
-                kept = _row(connection, table, rowid)
-                finding = Finding(
-                    Problem.ORPHANED_ROW, f"a row of {table} refers to one of {parent} that is gone: {kept}"
-                )
+                row = _row(connection, table, rowid)
+                finding = Finding(Problem.ORPHANED_ROW, details={"table": table, "parent": parent, "row": row})
                 if state.repair:
-                    if kept and "id" in kept:
+                    if row and "id" in row:
                         connection.exec_driver_sql(f"DELETE FROM {table} WHERE rowid = ?", (rowid,))
-                    audit.append(connection, state.catalog.clock, "took out an orphan", table=table, row=kept)
-                    finding = replace(finding, mended="it was taken out and is kept in the log")
+                    audit.append(connection, state.catalog.clock, "orphaned row removed", table=table, row=row)
+                    finding = replace(finding, repair=Repair.REMOVED)
                 state.findings.append(finding)
             if not state.repair:
                 return
@@ -202,187 +218,157 @@ def _row(connection: Connection, table: str, rowid: int | None) -> dict[str, Any
 
 
 def _items(catalog: Catalog) -> tuple[list[_Item], int]:
+    """Return an item for each view and each empty-table image, and the number of objects."""
     with catalog.database.read() as connection:
         count = len(connection.execute(select(objects.c.id)).all())
-        described: dict[int, list[tuple[str, int, str, bytes]]] = {}
-        for row in connection.execute(select(descriptors)):
-            described.setdefault(row.view_id, []).append(
-                (row.name, row.version, json.dumps(row.settings, sort_keys=True), row.packed)
-            )
+        described = packed_descriptors(connection, true())
+        empty_table = (sessions.c.empty_table_image, sessions.c.empty_table_image_sha256)
+        owner = (objects.c.name, enrollments.c.id)
+        rows = connection.execute(
+            select(views.c.id, null(), *owner, views.c.image, views.c.image_sha256, views.c.image_bytes, *empty_table)
+            .select_from(objects)
+            .join(enrollments)
+            .join(views, views.c.enrollment_id == enrollments.c.id)
+            .join(sessions, views.c.session_id == sessions.c.id)
+            .order_by(views.c.id)
+        ).all()
         items = [
-            _Item._make(
-                (
-                    *row[:7],
-                    Reference.of(row.reference_image, row.reference_image_sha256),
-                    tuple(described.get(row.id, ())),
-                )
+            _Item(*row[:7])._replace(
+                empty_table=None if row[7] is None else (row[7], row[8]),
+                described=tuple(
+                    (one.name, one.version, json.dumps(one.settings, sort_keys=True), one.packed)
+                    for one in described.get(row.id, ())
+                ),
             )
-            for row in connection.execute(
-                select(
-                    views.c.id,
-                    null(),
-                    objects.c.name,
-                    enrollments.c.id,
-                    views.c.image,
-                    views.c.image_sha256,
-                    views.c.image_bytes,
-                    sittings.c.reference_image,
-                    sittings.c.reference_image_sha256,
-                )
-                .select_from(objects)
-                .join(enrollments)
-                .join(views, views.c.enrollment_id == enrollments.c.id)
-                .join(sittings, views.c.sitting_id == sittings.c.id)
-                .order_by(views.c.id)
-            )
+            for row in rows
         ]
         items += [
             _Item(*row)
             for row in connection.execute(
-                select(
-                    null(),
-                    sittings.c.id,
-                    objects.c.name,
-                    enrollments.c.id,
-                    sittings.c.reference_image,
-                    sittings.c.reference_image_sha256,
-                    sittings.c.reference_image_bytes,
-                )
+                select(null(), sessions.c.id, *owner, *empty_table, sessions.c.empty_table_image_bytes)
                 .select_from(objects)
                 .join(enrollments)
-                .join(sittings, sittings.c.enrollment_id == enrollments.c.id)
-                .where(sittings.c.reference_image.is_not(None))
+                .join(sessions, sessions.c.enrollment_id == enrollments.c.id)
+                .where(sessions.c.empty_table_image.is_not(None))
             )
         ]
     return items, count
 
 
-def _look(root: Path, quick: bool, portion: tuple[_Item, ...]) -> list[_Looked]:
-    return [_look_at(root, item, quick) for item in portion]
+def _check_portion(root: Path, quick: bool, portion: tuple[_Item, ...]) -> list[_Checked]:
+    return [_check(root, item, quick) for item in portion]
 
 
-def _look_at(root: Path, item: _Item, quick: bool) -> _Looked:
+def _check(root: Path, item: _Item, quick: bool) -> _Checked:
     try:
         content = (root / item.image).read_bytes()
     except OSError as error:
-        return _Looked(None, reason=error.strerror or str(error))
+        return _Checked(None, reason=error.strerror or str(error))
     sha256 = images.digest(content)
-    if sha256 != item.sha256:
-        return _Looked(sha256, reason=f"{len(content)} bytes, {item.file_bytes} were stored")
-    if quick:
-        return _Looked(sha256)
+    if quick or sha256 != item.sha256:
+        return _Checked(sha256, len(content))
     try:
         image = images.decode(content)
     except images.BadImage as error:
-        return _Looked(sha256, reason=str(error))
+        return _Checked(sha256, len(content), reason=str(error))
     different: list[tuple[str, int, bytes | None]] = []
     for name, version, settings, packed in item.described:
-        if name not in names() or descriptor(name).version != version:
-            continue  # of another program
+        if not is_current(name, version):
+            continue
         kind = descriptor(name)
-        right: NDArray[np.uint8] | None = None
         try:
             region = region_of(json.loads(settings))
         except CatalogError:
             different.append((name, version, None))
             continue
         try:
-            describe = stored_describer(root, (name,), region, item.reference)
+            describe = stored_describer(root, (name,), region, item.empty_table)
         except CatalogError:
-            continue  # the picture of the empty table is damaged, which is told by itself
+            continue  # the empty-table image is damaged: an item of its own
+        levels: NDArray[np.uint8] | None = None
         with suppress(UsageError, ValueError):
-            right = describe(image).levels[name]
-        if right is None or not _as_stored(kind, packed, right):
-            different.append((name, version, None if right is None else kind.pack(right)))
-    return _Looked(sha256, (image.shape[1], image.shape[0]), different=tuple(different))
+            levels = describe(image).levels[name]
+        if levels is None or not _matches(kind, packed, levels):
+            different.append((name, version, None if levels is None else kind.pack(levels)))
+    return _Checked(sha256, len(content), (image.shape[1], image.shape[0]), different=tuple(different))
 
 
-def _as_stored(kind: Descriptor, packed: bytes, right: NDArray[np.uint8]) -> bool:
-    """Whether stored levels are those of the image: to the bit, or of a descriptor that rounds, nearly so.
+def _matches(kind: Descriptor, packed: bytes, levels: NDArray[np.uint8]) -> bool:
+    """Return whether stored levels are those of the image: equal, or for a descriptor that rounds, nearly equal.
 
-    Another computer's arithmetic may have rounded a level the other way.
+    The arithmetic of another computer may have rounded a level the other way.
     """
-    if kind.pack(right) == packed:
+    if kind.pack(levels) == packed:
         return True
     if kind.name in PAPERS or len(packed) != kind.size_bytes:
         return False
-    off = np.abs(kind.unpack(packed).astype(np.int16) - right)
+    off = np.abs(kind.unpack(packed).astype(np.int16) - levels)
     return int(off.max()) <= 1 and float((off > 0).mean()) <= ROUNDED
 
 
-def _orphans(catalog: Catalog, files: Iterable[str]) -> list[str]:
-    # The files were listed before: an image whose row is committed in the meantime is none.
-    with catalog.database.read() as connection:
-        return sorted(set(files) - _wanted(connection))
-
-
-def _wanted(connection: Connection) -> set[str]:
+def _referenced(connection: Connection) -> set[str]:
     return {
         *connection.scalars(select(views.c.image)),
-        *connection.scalars(select(sittings.c.reference_image).where(sittings.c.reference_image.is_not(None))),
+        *connection.scalars(select(sessions.c.empty_table_image).where(sessions.c.empty_table_image.is_not(None))),
     }
 
 
-def _collect_elsewhere(state: _State, looked: dict[_Item, _Looked], orphans: Iterable[str]) -> None:
+def _find_copies(state: _State, checked: Mapping[_Item, _Checked], orphans: Iterable[str]) -> None:
+    """Look for the content of missing and changed images under other names."""
     root = state.catalog.path
-    if not any(found.sha256 != item.sha256 for item, found in looked.items()):
+    if all(found.sha256 == item.sha256 for item, found in checked.items()):
         return
-    for item, found in looked.items():
+    for item, found in checked.items():
         if found.sha256 is not None:
-            state.elsewhere.setdefault(found.sha256, root / item.image)
+            state.copies.setdefault(found.sha256, root / item.image)
     lost = [path for path in (root / LOST).rglob("*") if path.is_file()]
     for path in [*(root / name for name in orphans), *lost]:
         if path.is_file() and not path.is_symlink():
-            state.elsewhere.setdefault(images.digest(path.read_bytes()), path)
+            state.copies.setdefault(images.digest(path.read_bytes()), path)
 
 
-def _judge_images(state: _State, looked: dict[_Item, _Looked]) -> None:
+def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
     root = state.catalog.path
-    wrong = {item: found for item, found in looked.items() if found.sha256 != item.sha256}
-    copies = {item: state.elsewhere[item.sha256] for item in wrong if item.sha256 in state.elsewhere}
-    # all are read before any is written: two images may have changed places
+    wrong = {item: found for item, found in checked.items() if found.sha256 != item.sha256}
+    copies = {item: state.copies[item.sha256] for item in wrong if item.sha256 in state.copies}
+    # Read all before writing any: two images may have been swapped.
     contents = {item: path.read_bytes() for item, path in copies.items()} if state.repair else {}
-    for item, found in looked.items():
-        if item in wrong:
-            missing = found.sha256 is None
-            problem = Problem.MISSING_IMAGE if missing else Problem.CHANGED_IMAGE
-            state_of_it = "is missing" if missing else "is not what was stored"
-            what = f"{item.object_name!r}: {item.image} {state_of_it} ({found.reason})"
-            mended = None
-            if item in contents:
-                make_folder((root / item.image).parent, within=root)
-                if not missing and found.sha256 not in {other.sha256 for other in wrong}:
-                    _set_aside(root, item.image)
-                write(root / item.image, contents[item])
-                mended = f"it was put back from {copies[item].relative_to(root)}"
-            elif item in copies:
-                what += f"; {copies[item].relative_to(root)} has it: --repair puts it back"
-            else:
-                what += "; restore it from a backup, or enroll the object again with --replace"
-            state.findings.append(_finding(problem, what, item, mended))
-        elif found.reason:
-            what = f"{item.object_name!r}: {item.image} cannot be decoded: {found.reason}"
-            state.findings.append(_finding(Problem.UNREADABLE_IMAGE, what, item))
-
-
-def _judge_sizes(state: _State, looked: dict[_Item, _Looked]) -> None:
-    first: dict[int, tuple[int, int]] = {}
-    for item, found in looked.items():
-        if found.size is None:
+    for item, found in checked.items():
+        if item not in wrong:
+            if found.reason:
+                state.findings.append(item.finding(Problem.UNREADABLE_IMAGE, reason=found.reason))
             continue
-        size = first.setdefault(item.enrollment_id, found.size)
-        if found.size != size:
-            what = (
-                f"{item.object_name!r}: {item.image} has {found.size[0]}x{found.size[1]} pixels, the first view of its "
-                f"enrollment {size[0]}x{size[1]}; enroll the object again with --replace"
-            )
-            state.findings.append(_finding(Problem.SIZES_DIFFER, what, item))
+        repair = None
+        if item in contents:
+            make_folder((root / item.image).parent, within=root)
+            if found.sha256 is not None and found.sha256 not in {other.sha256 for other in wrong}:
+                _set_aside(root, item.image)
+            write(root / item.image, contents[item])
+            repair = Repair.RESTORED
+        copy = copies[item].relative_to(root).as_posix() if item in copies else None
+        if found.sha256 is None:
+            finding = item.finding(Problem.MISSING_IMAGE, repair, reason=found.reason, copy=copy)
+        else:
+            sizes = {"bytes": found.file_bytes, "stored_bytes": item.file_bytes}
+            finding = item.finding(Problem.CHANGED_IMAGE, repair, **sizes, copy=copy)
+        state.findings.append(finding)
 
 
-def _judge_descriptors(state: _State, looked: dict[_Item, _Looked]) -> None:
-    for item, found in looked.items():
+def _report_sizes(state: _State, checked: Mapping[_Item, _Checked]) -> None:
+    first: dict[int, tuple[int, int]] = {}
+    for item, found in checked.items():
+        if found.size_px is None:
+            continue
+        first_size = first.setdefault(item.enrollment_id, found.size_px)
+        if found.size_px != first_size:
+            finding = item.finding(Problem.SIZES_DIFFER, size_px=found.size_px, first_size_px=first_size)
+            state.findings.append(finding)
+
+
+def _report_descriptors(state: _State, checked: Mapping[_Item, _Checked]) -> None:
+    for item, found in checked.items():
         for name, version, packed in found.different:
-            mended = None
+            repair = None
             if state.repair and packed is not None:
                 with state.catalog.database.write() as connection:
                     connection.execute(
@@ -394,25 +380,23 @@ def _judge_descriptors(state: _State, looked: dict[_Item, _Looked]) -> None:
                         )
                         .values(packed=packed)
                     )
-                mended = "it was described anew"
-            what = f"{item.object_name!r}: what {name} says of {item.image} is not what it shows"
-            state.findings.append(_finding(Problem.DESCRIPTOR_DIFFERS, what, item, mended))
+                repair = Repair.DESCRIBED
+            state.findings.append(item.finding(Problem.DESCRIPTOR_DIFFERS, repair, descriptor=name))
         if item.view_id is not None and not item.described:
-            what = f"{item.object_name!r}: {item.image} is not described: rig catalog redescribe"
-            state.findings.append(_finding(Problem.NOT_DESCRIBED, what, item))
+            state.findings.append(item.finding(Problem.NOT_DESCRIBED))
 
 
-def _judge_orphans(state: _State, orphans: Iterable[str]) -> None:
+def _report_orphans(state: _State, orphans: Iterable[str]) -> None:
     root = state.catalog.path
     for name in orphans:
-        mended = None
+        repair = moved_to = None
         if state.repair:
             with state.catalog.database.write() as connection:
-                if name in _wanted(connection) or not (root / name).is_file():
+                if name in _referenced(connection) or not (root / name).is_file():
                     continue
-                mended = f"it was moved to {_set_aside(root, name)}"
-        what = f"{name} belongs to no view"
-        state.findings.append(Finding(Problem.ORPHANED_FILE, what, path=name, mended=mended))
+                moved_to = _set_aside(root, name)
+            repair = Repair.MOVED
+        state.findings.append(Finding(Problem.ORPHANED_FILE, path=name, details={"moved_to": moved_to}, repair=repair))
 
 
 def _set_aside(root: Path, name: str) -> str:
@@ -424,7 +408,3 @@ def _set_aside(root: Path, name: str) -> str:
         number += 1
     (root / name).rename(target)
     return target.relative_to(root).as_posix()
-
-
-def _finding(problem: Problem, what: str, item: _Item, mended: str | None = None) -> Finding:
-    return Finding(problem, what, item.object_name, item.view_id, item.image, mended)

@@ -19,7 +19,7 @@ from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Viewer, image_similarity
-from rig.views.description import DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
+from rig.views.description import DESCRIPTORS, ViewDescriber
 from rig.views.empty_table import empty_table_status
 
 SAME_SIMILARITY = 0.97
@@ -101,7 +101,7 @@ def enroll(
             raise
         empty_table = None if status.table is None else status.table.image_bgr
         if empty_table is not None:
-            enrollment.set_reference_image(empty_table)
+            enrollment.store_empty_table(empty_table)
         retakes = yield from _take_views(
             bench, enrollment, to_go, ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
         )
@@ -133,20 +133,18 @@ def _take_views(
             attempt = yield from capture(index, viewer, table, move.settled_ns)
             retakes += attempt.number - 1
             described = describe(attempt.image_bgr)
-            levels = dict(described.levels)
             record = ViewRecord(
                 index=index,
                 commanded_deg=move.commanded_deg,
                 encoder_deg=move.encoder_deg,
                 azimuth_deg=float(wrap360(sign * (imu.angle_deg if move.by_gyro else move.encoder_deg))),
-                descriptor=levels.pop(PAPER_DESCRIPTOR),
+                descriptors=described.levels,
                 captured_ns=attempt.evidence.exposed_ns,
                 imu_deg=imu.angle_deg,
                 imu_sigma_deg=imu.sigma_deg,
                 evidence=plain(attempt.evidence),
                 region=bench.config.view.roi,
                 segmentation=described.segmentation,
-                further=levels,
             )
             enrollment.add(record, attempt.image_bgr)
             yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)

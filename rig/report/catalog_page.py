@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from rig.catalog.exchange.batch import Enrollment, ExportedObject, Object, Session, region_of_view
 from rig.catalog.exchange.bundle import checked
 from rig.catalog.exchange.new_folder import new_folder
-from rig.catalog.exchange.package import Enrollment, Object, Sitting, region_of_view
 from rig.catalog.records import EnrollmentStatus
 from rig.core.errors import ExportFailed
 from rig.events.wording import counted
@@ -20,7 +20,6 @@ from rig.report.page import JPEG_QUALITY
 from rig.report.records import TILE
 from rig.views.image_files import decode
 
-Collected = Iterable[tuple[Object, dict[str, Path]]]
 SHEETS: Final = "sheets"
 _STAMP: Final = (56, 56)
 
@@ -34,7 +33,7 @@ class _Shown(NamedTuple):
     items_: list[tuple[str, str]]
 
 
-def write_sheets(folder: Path, objects: Collected) -> int:
+def write_sheets(folder: Path, objects: Iterable[ExportedObject]) -> int:
     """Write a contact sheet of every object, ``0001-mug-white.jpg``, and return their number.
 
     Raises
@@ -46,7 +45,7 @@ def write_sheets(folder: Path, objects: Collected) -> int:
         return sum(1 for _ in _shown(made, made, objects))
 
 
-def write_catalog_page(folder: Path, objects: Collected) -> int:
+def write_catalog_page(folder: Path, objects: Iterable[ExportedObject]) -> int:
     """Write ``index.html`` and the contact sheets, and return the number of objects.
 
     Raises
@@ -72,7 +71,7 @@ def write_catalog_page(folder: Path, objects: Collected) -> int:
     return len(shown)
 
 
-def _shown(folder: Path, above: Path, objects: Collected) -> Iterator[_Shown]:
+def _shown(folder: Path, above: Path, objects: Iterable[ExportedObject]) -> Iterator[_Shown]:
     for number, (item, files) in enumerate(objects, start=1):
         complete = [e for e in item.enrollments if e.status == EnrollmentStatus.COMPLETE]
         if not complete:
@@ -119,14 +118,14 @@ def _items(item: Object, enrollment: Enrollment) -> Iterator[tuple[str, str]]:
     sharpness = [view.evidence["sharpness"] for view in enrollment.views if "sharpness" in view.evidence]
     if sharpness:
         yield "sharpness", f"median {median(sharpness):.0f}; {min(sharpness):.0f} to {max(sharpness):.0f}"
-    for sitting in enrollment.sittings:
-        yield "taken", _taken(sitting)
+    for session in enrollment.sessions:
+        yield "taken", _taken(session)
 
 
-def _taken(sitting: Sitting) -> str:
-    devices = ", ".join(f"{name} {_identity(identity)}" for name, identity in sitting.devices.items())
-    where = f"bench {sitting.bench}" if sitting.bench else ""
-    words = (f"{sitting.started_utc:%Y-%m-%d %H:%M} UTC", where, sitting.software, devices)
+def _taken(session: Session) -> str:
+    devices = ", ".join(f"{name} {_identity(identity)}" for name, identity in session.devices.items())
+    where = f"bench {session.bench}" if session.bench else ""
+    words = (f"{session.started_utc:%Y-%m-%d %H:%M} UTC", where, session.software, devices)
     return "; ".join(word for word in words if word)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 import hbr
 from rig.bench import Bench
 from rig.catalog import Catalog
+from rig.catalog.descriptions import empty_tables, has_descriptor, read_empty_table
 from rig.core.errors import CatalogError, DescriptorOutdated
 from rig.search.stopping_rules import rules_of
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
@@ -82,7 +83,7 @@ def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
     """
     notes: tuple[str, ...] = ()
     if descriptor is None:
-        if catalog.describes(BENCH_DESCRIPTOR):
+        if has_descriptor(catalog, BENCH_DESCRIPTOR):
             try:
                 return _dense(catalog)
             except DescriptorOutdated as error:
@@ -101,9 +102,9 @@ def _dense(catalog: Catalog) -> Model:
         return Model(hbr.ViewIndex(hbr.Views.empty()))  # the search says so
     index = hbr.DenseIndex(views)
     rules, notes = rules_of(catalog.path, index)
-    before = catalog.empty_tables()
-    pictured = len(before.pictured) >= len(before.unpictured)
-    others = before.unpictured if pictured else before.pictured
+    before = empty_tables(catalog)
+    pictured = len(before.with_image) >= len(before.without_image)
+    others = before.without_image if pictured else before.with_image
     if others:
         notes += (
             f"{_few(others)} {'was' if len(others) == 1 else 'were'} enrolled {'without' if pictured else 'with'} a "
@@ -113,7 +114,7 @@ def _dense(catalog: Catalog) -> Model:
     table = None
     if pictured and before.newest is not None:
         with suppress(CatalogError):  # rig catalog verify tells of it; the bench has a picture of its own
-            table = catalog.read_empty_table(before.newest)
+            table = read_empty_table(catalog, before.newest)
     return Model(index, rules, notes, pictured, table)
 
 

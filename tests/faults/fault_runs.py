@@ -189,7 +189,7 @@ def check_stored(
             assert abs(wrap180(view.record.azimuth_deg - planned_deg)) <= 1.0
             x, y, width, height = load_config(None, rig.settings).view.roi or (0, 0, 320, 240)
             region = image[y : y + height, x : x + width]
-            assert np.array_equal(hbr.describe(region), view.record.descriptor)
+            assert np.array_equal(hbr.describe(region), view.record.descriptors["cedd"])
 
 
 def newest_views(catalog: Catalog) -> list[StoredView]:

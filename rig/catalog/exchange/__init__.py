@@ -1,10 +1,10 @@
-"""Catalogs in open formats: what leaves one, and what comes into one."""
+"""Export a catalog to open formats, and import objects from them."""
 
-from rig.catalog.exchange.bundle import open_bundle, write_bundle
-from rig.catalog.exchange.collect import collect, package_of
+from rig.catalog.exchange.batch import Gap, ImportBatch, RejectedFile
+from rig.catalog.exchange.bundle import read_bundle, write_bundle
+from rig.catalog.exchange.catalog_reader import read_catalog, read_objects
 from rig.catalog.exchange.folder import DEFAULT_PATTERN, read_folder, write_folder
-from rig.catalog.exchange.intake import Imported, bring_in, preview_import
-from rig.catalog.exchange.package import Gap, Package, Refused
+from rig.catalog.exchange.importing import Imported, import_objects, preview_import
 from rig.catalog.exchange.plan import Conflict, Plan, plan_import
 from rig.catalog.exchange.table import read_table, write_parquet, write_table
 
@@ -12,17 +12,17 @@ __all__ = [
     "DEFAULT_PATTERN",
     "Conflict",
     "Gap",
+    "ImportBatch",
     "Imported",
-    "Package",
     "Plan",
-    "Refused",
-    "bring_in",
-    "collect",
-    "open_bundle",
-    "package_of",
+    "RejectedFile",
+    "import_objects",
     "plan_import",
     "preview_import",
+    "read_bundle",
+    "read_catalog",
     "read_folder",
+    "read_objects",
     "read_table",
     "write_bundle",
     "write_folder",

@@ -1,7 +1,9 @@
-"""A catalog in one file, ``.rigcat.zip``: images as they are, and JSON Lines beside them.
+"""Bundles: a catalog in one file, ``.rigcat.zip``, with the stored image files and JSON Lines.
 
-The same objects give the same bytes: no dates but those of the objects, and one order. Nothing of what a bundle says is
-believed: names stay within it, sizes within limits, and every image has to hash to what its object says.
+The same objects give the same bytes: one order, and no dates but those of the objects. A reader trusts nothing in a
+bundle: it checks names against paths outside, sizes against limits, and every image against its SHA-256.
+
+Version 2 says session, empty table and segmentation for what version 1 called sitting, reference and front end.
 """
 
 import hashlib
@@ -16,14 +18,14 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from pydantic import ValidationError
 
-from rig.catalog.exchange.package import ImageSource, Object, Package
+from rig.catalog.exchange.batch import ExportedObject, ImageSource, ImportBatch, Object
 from rig.core.errors import ExportFailed, ImportRejected, RigError
 from rig.core.files import sync_file, sync_folder
 from rig.views import image_files as images
 
 SUFFIX: Final = ".rigcat.zip"
 FORMAT: Final = "rigcat"
-VERSION: Final = 1
+VERSION: Final = 2
 MANIFEST: Final = "rigcat.json"
 OBJECTS: Final = "objects.jsonl"
 
@@ -31,18 +33,18 @@ MAX_MEMBERS: Final = 2_000_000
 MAX_OBJECTS_BYTES: Final = 1_000_000_000
 MAX_LINE_BYTES: Final = 64_000_000
 MAX_RATIO: Final = 250
-"""Of sizes unpacked and packed; text of records like these reaches 40."""
+"""Largest ratio of the sizes unpacked and packed. The text of such records reaches 40."""
 
 _DATE: Final = (1980, 1, 1, 0, 0, 0)
 
 
-def write_bundle(path: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) -> int:
-    """Write objects with their files (`collect`) into a new file, whole or not at all, and return how many there are.
+def write_bundle(path: Path, objects: Iterable[ExportedObject]) -> int:
+    """Write objects with their files (`read_objects`) into a new file, all or nothing, and return their number.
 
     Raises
     ------
     ExportFailed
-        The file is there already or cannot be written, or an image is not the one that was stored.
+        The file exists already or cannot be written, or an image is not the stored one.
     """
     count = views = 0
     lines = []
@@ -53,7 +55,7 @@ def write_bundle(path: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) 
                 for enrollment in item.enrollments
                 for name, sha256 in (
                     *((view.image, view.image_sha256) for view in enrollment.views),
-                    *((sitting.reference_image, sitting.reference_image_sha256) for sitting in enrollment.sittings),
+                    *((session.empty_table_image, session.empty_table_image_sha256) for session in enrollment.sessions),
                 )
                 if name is not None
             }
@@ -77,15 +79,15 @@ def write_bundle(path: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[IO[bytes]]:
-    """Have a file to write that gets its name when all of it is on the disk.
+    """Yield a file to write. It gets its name when all of it is on the disk.
 
     Raises
     ------
     ExportFailed
-        It is there already or cannot be written.
+        It exists already or cannot be written.
     """
     if path.exists():
-        raise ExportFailed(f"{path} is there already", next_step="give another name, or remove it")
+        raise ExportFailed(f"{path} exists already", next_step="give another name, or remove it")
     part = path.with_name(f"{path.name}.part")
     try:
         with part.open("wb") as file:
@@ -96,7 +98,7 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
     except OSError as error:
         raise ExportFailed(
             f"{path} cannot be written: {error.strerror or error}",
-            next_step="give a path that you may write to, with space on its disk",
+            next_step="give a path with write permission, on a disk with free space",
         ) from error
     finally:
         with suppress(OSError):
@@ -104,32 +106,32 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
 
 
 def checked(path: Path, sha256: str | None) -> bytes:
-    """Return the bytes of an image of the catalog, if it is the one that was stored; else raise `ExportFailed`."""
-    mend = "look at the catalog: rig catalog verify --repair"
+    """Return the bytes of an image of the catalog. `ExportFailed` if it is not the stored one."""
+    fix = "check the catalog: rig catalog verify --repair"
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise ExportFailed(f"the image {path} cannot be read: {error.strerror}", next_step=mend) from error
+        raise ExportFailed(f"the image {path} cannot be read: {error.strerror}", next_step=fix) from error
     if images.digest(content) != sha256:
-        raise ExportFailed(f"the image {path} is not the one that was stored", next_step=mend)
+        raise ExportFailed(f"the image {path} is not the stored one", next_step=fix)
     return content
 
 
-def open_bundle(path: Path) -> Package:
-    """Read what a bundle says, and check that its images are there; they are read when they are brought in.
+def read_bundle(path: Path) -> ImportBatch:
+    """Read the objects of a bundle, and check that their images are in it. `import_objects` reads the images.
 
     Raises
     ------
     ImportRejected
-        It is no bundle, is damaged, of a newer version, or says something that cannot be; nothing was unpacked.
+        The file is not a bundle, is damaged, of a newer version, or contains invalid data. Nothing was unpacked.
     """
     try:
         with ZipFile(path) as archive:
             members = _members(path, archive)
             objects = _objects(path, archive, members)
     except (BadZipFile, OSError, EOFError, NotImplementedError, ValueError, RuntimeError, zlib.error) as error:
-        raise refuse(path, f"it cannot be read: {error}") from error
-    return Package(
+        raise rejected(path, f"it cannot be read: {error}") from error
+    return ImportBatch(
         str(path),
         objects,
         {name: ImageSource(str(path), name) for name in members if name not in (MANIFEST, OBJECTS)},
@@ -137,41 +139,41 @@ def open_bundle(path: Path) -> Package:
     )
 
 
-def refuse(path: Path, why: str) -> ImportRejected:
-    """Return the error that a bundle is not taken."""
+def rejected(path: Path, why: str) -> ImportRejected:
+    """Return the error for a bundle that is not imported."""
     return ImportRejected(
-        f"{path} is not taken: {why}",
-        next_step="export the bundle anew where it comes from; do not unpack it by hand if you do not know its origin",
+        f"{path} was not imported: {why}",
+        next_step="export the bundle again at its origin; do not unpack it by hand if you do not know its origin",
     )
 
 
 def _member(name: str) -> ZipInfo:
     info = ZipInfo(name, _DATE)
     info.external_attr = (stat.S_IFREG | 0o644) << 16
-    info.create_system = 3  # the mode is one of Unix on every computer
+    info.create_system = 3  # Unix, on every computer: external_attr is a Unix mode
     return info
 
 
 def _members(path: Path, archive: ZipFile) -> dict[str, ZipInfo]:
     infos = archive.infolist()
     if len(infos) > MAX_MEMBERS:
-        raise refuse(path, f"{len(infos)} files are in it")
+        raise rejected(path, f"it contains {len(infos)} files")
     packed = sum(info.compress_size for info in infos)
     if packed > path.stat().st_size:
-        raise refuse(path, "its files overlap")
+        raise rejected(path, "its files overlap")
     members: dict[str, ZipInfo] = {}
     for info in infos:
         name = info.filename
         if info.is_dir() and not info.file_size:
             continue
         if why := _suspicious(info):
-            raise refuse(path, f"{name!r} in it {why}")
+            raise rejected(path, f"its file {name!r} {why}")
         if name in members:
-            raise refuse(path, f"{name!r} is in it twice")
+            raise rejected(path, f"it contains {name!r} twice")
         members[name] = info
     for name in (MANIFEST, OBJECTS):
         if name not in members:
-            raise refuse(path, f"{name} is not in it")
+            raise rejected(path, f"it does not contain {name}")
     return members
 
 
@@ -186,20 +188,20 @@ def _suspicious(info: ZipInfo) -> str:
         or ":" in name
         or "\0" in info.orig_filename
     ):
-        return "would leave the folder"
+        return "has a path outside the catalog"
     if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
         return "is a link or a device"
     if info.flag_bits & 0x1:
         return "is encrypted"
     if info.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
-        return "is packed in an unusual way"
+        return "is compressed by an unknown method"
     limit = MAX_OBJECTS_BYTES if name in (MANIFEST, OBJECTS) else images.MAX_FILE_BYTES
     if info.file_size > limit:
         return f"has {info.file_size} bytes, more than {limit}"
     if info.file_size > MAX_RATIO * max(info.compress_size, 100):
-        return f"grows to {info.file_size} bytes from {info.compress_size}"
+        return f"grows from {info.compress_size} to {info.file_size} bytes"
     if name not in (MANIFEST, OBJECTS) and pure.parts[0] != images.IMAGE_FOLDER:
-        return "is no part of a bundle"
+        return "does not belong to a bundle"
     return ""
 
 
@@ -207,7 +209,7 @@ def _objects(path: Path, archive: ZipFile, members: dict[str, ZipInfo]) -> tuple
     with archive.open(MANIFEST) as file:
         manifest = json.loads(file.read(100_000))
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise refuse(path, f"{MANIFEST} is not that of a bundle")
+        raise rejected(path, f"its {MANIFEST} is not the manifest of a bundle")
     version = manifest.get("version")
     if not isinstance(version, int) or version > VERSION:
         raise ImportRejected(
@@ -223,15 +225,15 @@ def _objects(path: Path, archive: ZipFile, members: dict[str, ZipInfo]) -> tuple
             number += 1
             digest.update(line)
             if len(line) > MAX_LINE_BYTES:
-                raise refuse(path, f"line {number} of {OBJECTS} is longer than {MAX_LINE_BYTES} bytes")
+                raise rejected(path, f"line {number} of {OBJECTS} is longer than {MAX_LINE_BYTES} bytes")
             found.append(_object(path, number, line))
             images_of |= _images_of(path, number, found[-1], members)
     if digest.hexdigest() != manifest.get("objects_sha256"):
-        raise refuse(path, f"{OBJECTS} is not what the bundle was written with")
+        raise rejected(path, f"its {OBJECTS} was changed after it was written")
     if len({item.name for item in found}) < len(found):
-        raise refuse(path, "two objects have the same name")
+        raise rejected(path, "two objects have the same name")
     if unused := sorted(members.keys() - images_of - {MANIFEST, OBJECTS}):
-        raise refuse(path, f"{unused[0]!r} in it belongs to no view")
+        raise rejected(path, f"its file {unused[0]!r} belongs to no view")
     return tuple(found)
 
 
@@ -241,9 +243,9 @@ def _object(path: Path, number: int, line: bytes) -> Object:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
-        raise refuse(path, f"line {number} of {OBJECTS}, {where or 'the object'}: {first['msg']}") from error
+        raise rejected(path, f"line {number} of {OBJECTS}, {where or 'the object'}: {first['msg']}") from error
     except RigError as error:
-        raise refuse(path, f"line {number} of {OBJECTS}: {error.what}") from error
+        raise rejected(path, f"line {number} of {OBJECTS}: {error.what}") from error
 
 
 def _images_of(path: Path, number: int, item: Object, members: dict[str, ZipInfo]) -> set[str]:
@@ -252,16 +254,16 @@ def _images_of(path: Path, number: int, item: Object, members: dict[str, ZipInfo
         for name, size, sha256 in (
             *((view.image, view.image_bytes, view.image_sha256) for view in enrollment.views),
             *(
-                (sitting.reference_image, sitting.reference_image_bytes, sitting.reference_image_sha256)
-                for sitting in enrollment.sittings
-                if sitting.reference_image is not None
+                (session.empty_table_image, session.empty_table_image_bytes, session.empty_table_image_sha256)
+                for session in enrollment.sessions
+                if session.empty_table_image is not None
             ),
         ):
             if name in names:
-                raise refuse(path, f"line {number} of {OBJECTS}: {name!r} is the image of two views")
+                raise rejected(path, f"line {number} of {OBJECTS}: {name!r} is the image of two views")
             if name not in members or name in (MANIFEST, OBJECTS):
-                raise refuse(path, f"line {number} of {OBJECTS}: its image {name!r} is not in it")
+                raise rejected(path, f"line {number} of {OBJECTS}: the image {name!r} is missing")
             if sha256 is None or size != members[name].file_size:
-                raise refuse(path, f"line {number} of {OBJECTS}: {name!r} is not of the size it was stored with")
+                raise rejected(path, f"line {number} of {OBJECTS}: {name!r} has another size than when it was stored")
             names.add(name)
     return names

@@ -12,16 +12,16 @@ from rig.core.files import sync_folder, sync_tree
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Have a folder to fill that becomes ``path`` at the end, or goes with everything in it after an exception.
+    """Yield a folder to fill. It becomes ``path`` at the end; after an exception it is deleted with its contents.
 
     Raises
     ------
     ExportFailed
-        ``path`` is there already and not an empty folder, or cannot be written.
+        ``path`` exists already and is not an empty folder, or cannot be written.
     """
     try:
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise ExportFailed(f"{path} is there already", next_step="give another name, or remove it")
+            raise ExportFailed(f"{path} exists already", next_step="give another name, or remove it")
         path.parent.mkdir(parents=True, exist_ok=True)
         made = Path(mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         try:
@@ -35,5 +35,5 @@ def new_folder(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise ExportFailed(
             f"{path} cannot be written: {error.strerror or error}",
-            next_step="give a path that you may write to, with space on its disk",
+            next_step="give a path with write permission, on a disk with free space",
         ) from error

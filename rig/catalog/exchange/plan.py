@@ -1,4 +1,4 @@
-"""What an import would do to a catalog."""
+"""Plan an import: which objects are new, replace others, or are skipped."""
 
 from collections.abc import Set
 from dataclasses import dataclass
@@ -7,24 +7,28 @@ from enum import StrEnum
 from sqlalchemy import Connection, select
 
 from rig.catalog.catalog import Catalog
-from rig.catalog.exchange.package import Object, Package
+from rig.catalog.exchange.batch import ImportBatch, Object
 from rig.catalog.schema import objects
 from rig.core.errors import ObjectExists
 
 
 class Conflict(StrEnum):
-    """What to do about an object whose name is in the catalog already."""
+    """What to do with an object whose name is in the catalog already."""
 
-    REFUSE = "refuse"
+    REJECT = "reject"
     SKIP = "skip"
     REPLACE = "replace"
+
+    @classmethod
+    def _missing_(cls, value: object) -> "Conflict | None":
+        return cls.REJECT if value == "refuse" else None  # its name in version 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What an import would do: objects that are new, that replace others, or are left out."""
+    """What an import would do, with the names of the new, the replaced and the skipped objects."""
 
-    package: Package
+    batch: ImportBatch
     conflict: Conflict
     new: tuple[str, ...]
     replaced: tuple[str, ...]
@@ -32,23 +36,23 @@ class Plan:
 
     @property
     def wanted(self) -> tuple[Object, ...]:
-        """The objects that are to come in."""
-        return tuple(item for item in self.package.objects if item.name not in self.skipped)
+        """The objects to import."""
+        return tuple(item for item in self.batch.objects if item.name not in self.skipped)
 
 
-def plan_import(catalog: Catalog | None, package: Package, conflict: Conflict = Conflict.REFUSE) -> Plan:
-    """Look which objects of a package are in the catalog already; None is a catalog that is yet to be made.
+def plan_import(catalog: Catalog | None, batch: ImportBatch, conflict: Conflict = Conflict.REJECT) -> Plan:
+    """Plan the import of a batch into a catalog; None is a catalog that does not exist yet.
 
     Raises
     ------
     ObjectExists
-        Some are, and conflicts are refused.
+        Some objects are in the catalog already, and conflicts are rejected.
     """
     known: set[str] = set()
     if catalog is not None:
         with catalog.database.read() as connection:
             known = names_in_use(connection)
-    return make_plan(package, conflict, known)
+    return make_plan(batch, conflict, known)
 
 
 def names_in_use(connection: Connection) -> set[str]:
@@ -56,15 +60,15 @@ def names_in_use(connection: Connection) -> set[str]:
     return set(connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_(None))))
 
 
-def make_plan(package: Package, conflict: Conflict, known: Set[str]) -> Plan:
-    """Plan to bring a package into a catalog that has these names in use; see `plan_import`."""
-    both = tuple(item.name for item in package.objects if item.name in known)
-    if both and conflict == Conflict.REFUSE:
+def make_plan(batch: ImportBatch, conflict: Conflict, known: Set[str]) -> Plan:
+    """Plan the import of a batch into a catalog with these names in use; see `plan_import`."""
+    both = tuple(item.name for item in batch.objects if item.name in known)
+    if both and conflict == Conflict.REJECT:
         raise ObjectExists(
-            f"{len(both)} of the {len(package.objects)} objects are in the catalog already; nothing was imported",
-            next_step="leave them out (--on-conflict skip), or take them as new enrollments (--on-conflict replace)",
+            f"{len(both)} of the {len(batch.objects)} objects are in the catalog already; nothing was imported",
+            next_step="skip them (--on-conflict skip), or import them as new enrollments (--on-conflict replace)",
             evidence={"objects": list(both[:20])},
         )
     skipped, replaced = (both, ()) if conflict == Conflict.SKIP else ((), both)
-    new = tuple(item.name for item in package.objects if item.name not in known)
-    return Plan(package, conflict, new, replaced, skipped)
+    new = tuple(item.name for item in batch.objects if item.name not in known)
+    return Plan(batch, conflict, new, replaced, skipped)

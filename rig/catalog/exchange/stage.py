@@ -1,4 +1,4 @@
-"""Images on their way into a catalog: checked, copied aside and described, by several processes."""
+"""Stage images for an import: check, copy and describe them, in several processes."""
 
 import os
 import zlib
@@ -8,19 +8,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
-from rig.catalog.describing import known_descriptor
-from rig.catalog.exchange.package import ImageSource
+from rig.catalog.describing import pack
+from rig.catalog.exchange.batch import ImageSource
 from rig.catalog.exchange.plan import Plan
-from rig.catalog.records import Region
-from rig.catalog.schema import DESCRIPTOR
+from rig.catalog.records import PackedDescriptor, Region
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views import image_files as images
-from rig.views.description import ViewDescriber
+from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
 
 
 class Item(NamedTuple):
-    """An image to be staged; ``image`` is its name in the package."""
+    """An image to be staged; ``image`` is its name in the batch."""
 
     image: str
     source: ImageSource
@@ -31,70 +30,71 @@ class Item(NamedTuple):
     region: Region | None = None
 
 
-class Staged(NamedTuple):
-    """An image that is staged as ``file``, or the reason why not; ``packed`` are its levels by each descriptor."""
+class StagedImage(NamedTuple):
+    """An image that is staged as ``file``, with its descriptors, or the reason why it is rejected."""
 
     file: str
     sha256: str = ""
     size: int = 0
-    packed: tuple[tuple[str, bytes], ...] = ()
+    packed: tuple[PackedDescriptor, ...] = ()
     segmentation: dict[str, Any] | None = None
     reason: str = ""
 
 
-def items_of(plan: Plan, further: tuple[str, ...] = ()) -> Iterator[Item]:
-    """Yield every image that a plan takes; those of one enrollment go into one folder.
+def items_of(plan: Plan, descriptors: tuple[str, ...] = ()) -> Iterator[Item]:
+    """Yield every image of a plan. Those of one enrollment go into one folder.
 
-    Views that come without descriptors are described by the paper's and the ``further`` ones.
+    Views without descriptors are described by the paper's descriptor and by ``descriptors``.
     """
-    wanted = tuple(dict.fromkeys((DESCRIPTOR, *further)))
-    sources = plan.package.sources
+    wanted = tuple(dict.fromkeys((PAPER_DESCRIPTOR, *descriptors)))
+    batch = plan.batch
     for i, item in enumerate(plan.wanted):
         for j, enrollment in enumerate(item.enrollments):
             folder = f"{i}-{j}"
             for view in enrollment.views:
                 yield Item(
                     view.image,
-                    sources[view.image],
+                    batch.sources[view.image],
                     view.image_sha256,
                     folder,
                     f"{view.index:03d}",
                     () if view.descriptors else wanted,
-                    plan.package.regions.get(view.image),
+                    batch.regions.get(view.image),
                 )
-            for k, sitting in enumerate(enrollment.sittings):
-                image, sha256 = sitting.reference_image, sitting.reference_image_sha256
+            for k, session in enumerate(enrollment.sessions):
+                image, sha256 = session.empty_table_image, session.empty_table_image_sha256
                 if image is not None:
-                    yield Item(image, sources[image], sha256, folder, f"empty-{k:03d}")
+                    yield Item(image, batch.sources[image], sha256, folder, f"empty-{k:03d}")
 
 
-def stage(root: Path | None, portion: tuple[Item, ...]) -> list[Staged]:
-    """Check images, and copy them into ``root`` and describe them unless it is None; the work of a process."""
+def stage(root: Path | None, portion: tuple[Item, ...]) -> list[StagedImage]:
+    """Check images; if ``root`` is not None, copy them there and describe them. Runs in a worker process."""
     return [_stage_one(root, item) for item in portion]
 
 
-def _stage_one(root: Path | None, item: Item) -> Staged:
+def _stage_one(root: Path | None, item: Item) -> StagedImage:
     try:
         content = _read(item.source)
         image = images.decode(content)
     except images.BadImage as error:
-        return Staged("", reason=str(error))
+        return StagedImage("", reason=str(error))
     except (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
-        return Staged("", reason=f"cannot be read: {error}")
+        return StagedImage("", reason=f"cannot be read: {error}")
     sha256 = images.digest(content)
     if item.sha256 is not None and sha256 != item.sha256:
-        return Staged("", reason="is not the image that was stored")
+        return StagedImage("", reason="is not the stored image")
     if root is None:
-        return Staged("", sha256, len(content))
-    packed, segmentation = [], None
+        return StagedImage("", sha256, len(content))
+    packed: list[PackedDescriptor] = []
+    segmentation = None
     if item.descriptors:
         try:
             described = ViewDescriber(ViewConfig(roi=item.region), item.descriptors)(image)
         except UsageError as error:
-            return Staged("", reason=error.what)
+            return StagedImage("", reason=error.what)
         except ValueError as error:
-            return Staged("", reason=str(error))
-        packed = [(name, known_descriptor(name).pack(levels)) for name, levels in described.levels.items()]
+            return StagedImage("", reason=str(error))
+        packed = pack(described.levels, item.region)
         segmentation = described.segmentation
     file = f"{item.folder}/{item.stem}{images.suffix(content)}"
     try:
@@ -102,13 +102,13 @@ def _stage_one(root: Path | None, item: Item) -> Staged:
     except FileNotFoundError:
         (root / item.folder).mkdir(exist_ok=True)
         (root / file).write_bytes(content)
-    return Staged(file, sha256, len(content), tuple(packed), segmentation)
+    return StagedImage(file, sha256, len(content), tuple(packed), segmentation)
 
 
 def _read(source: ImageSource) -> bytes:
     if source.member is None:
         with Path(source.file).open("rb") as file:
-            # a limit far above the size would have as much memory set aside
+            # read() allocates its limit at once, so the limit is the size of the file
             return file.read(min(os.fstat(file.fileno()).st_size, images.MAX_FILE_BYTES) + 1)
     with _archive(source.file).open(source.member) as member:
         return member.read(images.MAX_FILE_BYTES + 1)

@@ -1,4 +1,4 @@
-"""Views as rows: a CSV file with the images beside it, and Parquet."""
+"""Views as rows of a table: a CSV file with the images beside it, or a Parquet file."""
 
 import csv
 import json
@@ -9,23 +9,24 @@ from typing import Any, Final
 
 from hbr.core.angles import wrap360
 from hbr.descriptors import descriptor
-from rig.catalog.exchange.bundle import checked, new_file
-from rig.catalog.exchange.new_folder import new_folder
-from rig.catalog.exchange.package import (
+from rig.catalog.exchange.batch import (
     Enrollment,
+    ExportedObject,
+    ImportBatch,
     Object,
-    Package,
     Photograph,
-    Refused,
+    RejectedFile,
     View,
     assemble,
     parse_region,
     region_of_view,
-    region_words,
+    region_text,
 )
+from rig.catalog.exchange.bundle import checked, new_file
+from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus, this_software
-from rig.catalog.schema import DESCRIPTOR
 from rig.core.errors import ExportFailed, ImportRejected
+from rig.views.description import PAPER_DESCRIPTOR
 
 TABLE: Final = "views.csv"
 _NUMBERS: Final = ("commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
@@ -38,52 +39,52 @@ _COLUMNS: Final = (
 _MAX_BYTES: Final = 1_000_000_000
 
 
-def read_table(path: Path, *, now: datetime) -> Package:
-    """Read a CSV file with a row a view: ``object``, ``azimuth_deg``, ``image`` (a path beside it) and more.
+def read_table(path: Path, *, now: datetime) -> ImportBatch:
+    """Read a CSV file with one row per view: ``object``, ``azimuth_deg``, ``image`` (a relative path) and more.
 
-    Columns of other names are left alone.
+    Unknown columns are ignored. A row that cannot be used is rejected; the others are imported.
 
     Raises
     ------
     ImportRejected
-        It is no such file; a row that cannot be used is refused by itself.
+        The file is not such a table.
     """
     folder = path.parent.resolve()
-    photographs, refused = [], []
+    photographs, rejected = [], []
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise ImportRejected(f"{path} is absurdly large", next_step="split it")
+            raise ImportRejected(f"{path} is larger than {_MAX_BYTES} bytes", next_step="split it")
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, strict=True)
-            if lacking := [name for name in _NEEDED if name not in (rows.fieldnames or ())]:
+            if missing := [name for name in _NEEDED if name not in (rows.fieldnames or ())]:
                 raise ImportRejected(
-                    f"{path} has no column {' nor '.join(lacking)}",
-                    next_step=f"name the columns in the first line: {', '.join(_NEEDED)}",
+                    f"{path} has no column {' or '.join(missing)}",
+                    next_step=f"write the names of the columns into the first line: {', '.join(_NEEDED)}",
                     evidence={"columns": list(rows.fieldnames or ())},
                 )
             for row in rows:
                 try:
                     photographs.append(_photograph(row, folder))
                 except ValueError as error:
-                    refused.append(Refused(f"{path.name}, line {rows.line_num}", str(error)))
+                    rejected.append(RejectedFile(f"{path.name}, line {rows.line_num}", str(error)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ImportRejected(f"{path} cannot be read: {error}", next_step="save it as CSV in UTF-8") from error
     if not photographs:
         raise ImportRejected(
             f"{path} has no row that can be used",
-            next_step="mend the rows listed" if refused else "add a row a view",
-            evidence={"refused": [f"{file.path}: {file.reason}" for file in refused[:5]]},
+            next_step="fix the listed rows" if rejected else "add one row per view",
+            evidence={"rejected": [f"{file.path}: {file.reason}" for file in rejected[:5]]},
         )
-    return assemble(str(path), photographs, refused, now, this_software())
+    return assemble(str(path), photographs, rejected, now, this_software())
 
 
-def write_table(folder: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) -> int:
-    """Write the views that objects are retrieved by as ``views.csv``, with their images beside it, to the byte.
+def write_table(folder: Path, objects: Iterable[ExportedObject]) -> int:
+    """Write the views that searches use as ``views.csv``, with copies of their images beside it.
 
     Raises
     ------
     ExportFailed
-        The folder is not empty or cannot be written, or an image is not the one that was stored.
+        The folder is not empty or cannot be written, or an image is not the stored one.
     """
     count = 0
     with new_folder(folder) as made, (made / TABLE).open("w", encoding="utf-8", newline="") as file:
@@ -99,13 +100,13 @@ def write_table(folder: Path, objects: Iterable[tuple[Object, dict[str, Path]]])
     return count
 
 
-def write_parquet(path: Path, objects: Iterable[tuple[Object, dict[str, Path]]]) -> int:
-    """Write the views that objects are retrieved by as a Parquet table, with their levels, without their images.
+def write_parquet(path: Path, objects: Iterable[ExportedObject]) -> int:
+    """Write the views that searches use as a Parquet table, with their CEDD levels, without their images.
 
     Raises
     ------
     ExportFailed
-        The file is there already or cannot be written, or pyarrow is not installed.
+        The file exists already or cannot be written, or pyarrow is not installed.
     """
     try:
         import pyarrow as pa
@@ -145,20 +146,20 @@ def _rows(item: Object) -> Iterator[tuple[dict[str, Any], View]]:
 
 
 def _row(item: Object, enrollment: Enrollment, view: View) -> dict[str, Any]:
-    sitting = enrollment.sittings[view.sitting]
-    kind = descriptor(DESCRIPTOR)
+    session = enrollment.sessions[view.session]
+    kind = descriptor(PAPER_DESCRIPTOR)
     levels = next((d for d in view.descriptors if (d.name, d.version) == (kind.name, kind.version)), None)
     return {
         "object": item.name,
         "label": item.label,
         "note": item.note,
         **{name: getattr(view, name) for name in ("azimuth_deg", *_NUMBERS, "captured_utc", "image", "image_sha256")},
-        "bench": sitting.bench,
-        "software": sitting.software,
-        "devices": json.dumps(sitting.devices, ensure_ascii=False),
-        "conditions": json.dumps(sitting.conditions, ensure_ascii=False),
+        "bench": session.bench,
+        "software": session.software,
+        "devices": json.dumps(session.devices, ensure_ascii=False),
+        "conditions": json.dumps(session.conditions, ensure_ascii=False),
         "evidence": json.dumps(view.evidence, ensure_ascii=False),
-        "region": region_words(region_of_view(view)),
+        "region": region_text(region_of_view(view)),
         "descriptor": levels.name if levels else None,
         "descriptor_version": levels.version if levels else None,
         "packed": levels.packed if levels else None,
@@ -167,23 +168,22 @@ def _row(item: Object, enrollment: Enrollment, view: View) -> dict[str, Any]:
 
 
 def _photograph(row: Mapping[str, str | None], folder: Path) -> Photograph:
-    """Raises ValueError in words where the row cannot be used."""
+    """Return the photograph of a row. ValueError says why a row cannot be used."""
     texts = {key: value.strip() for key, value in row.items() if isinstance(key, str) and isinstance(value, str)}
-    lacking = [name for name in _NEEDED if not texts.get(name)]
-    if lacking:
-        raise ValueError(f"{' and '.join(lacking)} not given")
+    if missing := [name for name in _NEEDED if not texts.get(name)]:
+        raise ValueError(f"{' and '.join(missing)} missing")
     path = folder / texts["image"]
     if not path.resolve().is_relative_to(folder):
-        raise ValueError(f"the image {texts['image']} is not beside the table")
+        raise ValueError(f"the image {texts['image']} is not in the folder of the table")
     if not path.is_file():
         raise ValueError(f"there is no image {texts['image']}")
     values: dict[str, Any] = {name: _number(texts[name], name) for name in _NUMBERS if texts.get(name)}
     if (values.get("imu_deg") is None) != (values.get("imu_sigma_deg") is None):
-        raise ValueError("imu_deg and imu_sigma_deg: both or none")
+        raise ValueError("imu_deg and imu_sigma_deg: give both or none")
     if texts.get("captured_utc"):
         values["captured_utc"] = datetime.fromisoformat(texts["captured_utc"])
         if values["captured_utc"].tzinfo is None:
-            raise ValueError(f"captured_utc {texts['captured_utc']} without a zone")
+            raise ValueError(f"captured_utc {texts['captured_utc']} has no time zone")
     azimuth_deg = _number(texts["azimuth_deg"], "azimuth_deg")
     return Photograph(
         path,

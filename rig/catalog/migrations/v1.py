@@ -1,4 +1,4 @@
-"""The first tables: where the chain begins. No catalog is older."""
+"""The first version of the tables. No catalog is older."""
 
 revision = "1"
 down_revision = None

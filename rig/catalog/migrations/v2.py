@@ -1,7 +1,7 @@
-"""Deletion that can be taken back, several descriptors of a view, views that no bench has taken, and the audit log.
+"""Deletion that can be undone, several descriptors per view, views that were not taken by a bench, and the audit log.
 
-The tables are rebuilt as SQLite's manual says ("Making Other Kinds Of Table Schema Changes"): made under another name,
-filled, and renamed when the old one is gone.
+The tables are rebuilt as in SQLite's manual ("Making Other Kinds Of Table Schema Changes"): created under another name,
+filled, and renamed after the old one is dropped.
 """
 
 from typing import Final
@@ -78,10 +78,10 @@ _KEPT: Final = (
 
 
 def upgrade() -> None:
-    """Rebuild objects and views; move what views are described by into a table of its own."""
+    """Rebuild objects and views; move descriptors into a table of their own."""
     for statement in (
         _DESCRIPTORS,
-        # an image was described within the region that the configuration of its sitting named
+        # images were described within the region in the configuration of their sitting
         """
         INSERT INTO descriptors
         SELECT views.id, descriptor_kind, descriptor_version,
@@ -97,7 +97,7 @@ def upgrade() -> None:
     ):
         op.execute(statement)
     for table in ("objects", "views"):
-        # no id that was given once may be given again
+        # an id that was given once must not be given again
         op.execute(
             f"UPDATE sqlite_sequence SET seq = max(seq, (SELECT seq FROM sqlite_sequence WHERE name = '{table}')) "
             f"WHERE name = 'new_{table}'"

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.catalog import Catalog
 
-app = typer.Typer(help="Look after the enrolled objects.", no_args_is_help=True)
+app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the object.", autocompletion=object_names)]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 
 
 @app.command("list")
@@ -28,20 +28,24 @@ YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 def list_(
     settings: Settings,
     match: Annotated[
-        str | None, typer.Argument(metavar="[PATTERN]", help="Names like this alone, e.g. 'mug-*'.")
+        str | None, typer.Argument(metavar="[PATTERN]", help="Only names that match, e.g. 'mug-*'.")
     ] = None,
-    label: Annotated[str | None, typer.Option(help="Objects of this label alone.")] = None,
-    unfinished: Annotated[bool, typer.Option("--unfinished", help="Those with an interrupted enrollment.")] = False,
-    deleted: Annotated[bool, typer.Option("--deleted", help="Those that were deleted and can be taken back.")] = False,
+    label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
+    unfinished: Annotated[bool, typer.Option("--unfinished", help="Only unfinished enrollments.")] = False,
+    deleted: Annotated[bool, typer.Option("--deleted", help="List deleted objects instead.")] = False,
 ) -> None:
     """List the enrolled objects.
 
+    Columns: name of the object, its label, its number of views (in brackets those of an unfinished enrollment), and the
+    time when its enrollment was complete.
+
     Example: rig catalog list 'mug-*' --label kitchen --bench sim
     """
+    from rig.catalog.edit import deleted_objects
     from rig.events.events import plain
 
     with settings.open_catalog(read_only=True) as catalog:
-        found = catalog.deleted() if deleted else catalog.objects()
+        found = deleted_objects(catalog) if deleted else catalog.objects()
         path = catalog.path
     objects = [
         item
@@ -54,8 +58,8 @@ def list_(
         settings.print_json({"catalog": str(path), "objects": plain(objects)})
         return
     if not objects:
-        none_at_all = "Nothing was deleted." if deleted else "No objects yet: rig enroll NAME."
-        print(f"None of the {len(found)} objects is like that." if found else none_at_all)
+        empty = "No deleted objects." if deleted else "No objects yet. Enroll one: rig enroll NAME"
+        print(f"None of the {len(found)} objects matches." if found else empty)
         return
     rows = []
     for item in objects:
@@ -70,7 +74,9 @@ def list_(
 @app.command("show")
 @command
 def show(settings: Settings, name: NameArgument) -> None:
-    """Show an object: its enrollments, what they were taken with, and the angles and evidence of its views.
+    """Show an object: its enrollments with their sessions, and the angles of its views.
+
+    Columns: index of the view, azimuth of the camera, table angle by the servo's encoder and by the IMU, and sharpness.
 
     Example: rig catalog show mug-white --bench sim
     """
@@ -82,12 +88,12 @@ def show(settings: Settings, name: NameArgument) -> None:
     if settings.json:
         from rig.events.events import plain
 
-        told = plain(details)
-        for view, told_view in zip(details.views, told["views"], strict=True):
-            levels = view.record.descriptor
-            told_view["record"]["descriptor"] = None if levels is None else levels.tolist()
-        told["segmentation"] = plain(SegmentationSummary.of(view.record.segmentation for view in details.views))
-        settings.print_json(told)
+        shown = plain(details)
+        for view, shown_view in zip(details.views, shown["views"], strict=True):
+            levels = {name: found.tolist() for name, found in view.record.descriptors.items()}
+            shown_view["record"]["descriptors"] = levels
+        shown["segmentation"] = plain(SegmentationSummary.of(view.record.segmentation for view in details.views))
+        settings.print_json(shown)
         return
     summary = details.summary
     print("  ".join(text for text in (summary.name, summary.label) if text))
@@ -96,17 +102,17 @@ def show(settings: Settings, name: NameArgument) -> None:
     for enrollment in details.enrollments:
         print(
             f"enrollment {enrollment.id}: {enrollment.status}, {len(enrollment.present)} of "
-            f"{len(enrollment.planned_azimuth_deg)} views, begun {enrollment.started_utc:%Y-%m-%d %H:%M} UTC"
+            f"{len(enrollment.planned_azimuth_deg)} views, started {enrollment.started_utc:%Y-%m-%d %H:%M} UTC"
         )
-        for sitting in enrollment.sittings:
-            provenance = sitting.provenance
-            taken_with = _facts({"bench": provenance.bench, "software": provenance.software, **provenance.devices})
-            print(f"  {sitting.started_utc:%Y-%m-%d %H:%M} UTC: {taken_with}")
-            print(f"    {_facts(provenance.conditions)}")
+        for session in enrollment.sessions:
+            provenance = session.provenance
+            source = {"bench": provenance.bench, "software": provenance.software, **provenance.devices}
+            print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: {_in_one_line(source)}")
+            print(f"    {_in_one_line(provenance.conditions)}")
     if not details.views:
         return
-    if text := SegmentationSummary.of(view.record.segmentation for view in details.views).text:
-        print(text)
+    if segmentation := SegmentationSummary.of(view.record.segmentation for view in details.views).text:
+        print(segmentation)
     print(f"images in {(folder / details.views[0].image).parent}")
     print("view  azimuth  encoder      IMU   sharpness")
     for view in details.views:
@@ -119,18 +125,20 @@ def show(settings: Settings, name: NameArgument) -> None:
 
 @app.command("rename")
 @command
-def rename(
+def rename_(
     settings: Settings,
     name: NameArgument,
-    new_name: Annotated[str, typer.Argument(metavar="NEW_NAME", help="What it is to be called.")],
+    new_name: Annotated[str, typer.Argument(metavar="NEW_NAME", help="New name.")],
 ) -> None:
-    """Give an object another name.
+    """Rename an object.
 
     Example: rig catalog rename mug-whit mug-white --bench sim
     """
+    from rig.catalog.edit import rename
+
     with settings.open_catalog() as catalog:
-        catalog.rename(name, new_name)
-    settings.say(f"{name} is now called {new_name}.", {"name": new_name, "before": name})
+        rename(catalog, name, new_name)
+    settings.say(f"Renamed {name} to {new_name}.", {"name": new_name, "before": name})
 
 
 @app.command("label")
@@ -138,21 +146,20 @@ def rename(
 def label_(
     settings: Settings,
     name: NameArgument,
-    label: Annotated[
-        str | None, typer.Argument(metavar="[LABEL]", help="To sort and filter by; '' takes it away.")
-    ] = None,
-    note: Annotated[str | None, typer.Option(help="A remark; '' takes it away.")] = None,
+    label: Annotated[str | None, typer.Argument(metavar="[LABEL]", help="Text to filter by; '' removes it.")] = None,
+    note: Annotated[str | None, typer.Option(help="Any text; '' removes it.")] = None,
 ) -> None:
     """Change the label or the note of an object.
 
     Example: rig catalog label mug-white kitchen --note "a chip at the rim" --bench sim
     """
+    from rig.catalog.edit import set_texts
     from rig.core.errors import UsageError
 
     if label is None and note is None:
         raise UsageError("neither a label nor a note is given", next_step="give a label, --note, or both")
     with settings.open_catalog() as catalog:
-        catalog.describe(name, label=label, note=note)
+        set_texts(catalog, name, label=label, note=note)
         summary = catalog.object(name).summary
     settings.say(
         f"{summary.name}: label {summary.label or '–'}, note {summary.note or '–'}",
@@ -162,17 +169,18 @@ def label_(
 
 @app.command("delete")
 @command
-def delete(
+def delete_(
     settings: Settings,
     names: Annotated[
         list[str], typer.Argument(metavar="NAME...", help="Names of the objects.", autocompletion=object_names)
     ],
     yes: YesOption = False,
 ) -> None:
-    """Take objects out of use; `rig catalog undelete` takes that back, until `rig catalog gc`.
+    """Delete objects. `rig catalog undelete` restores them until `rig catalog gc` removes them for good.
 
     Example: rig catalog delete mug-white --yes --bench sim
     """
+    from rig.catalog.edit import delete
     from rig.events.wording import counted
 
     with settings.open_catalog() as catalog:
@@ -183,30 +191,33 @@ def delete(
             yes=yes,
             settings=settings,
         )
-        catalog.delete(*names)
+        delete(catalog, *names)
     deleted = [item.name for item in found]
-    settings.say(f"Deleted: {', '.join(deleted)}. Taken back by rig catalog undelete, until gc.", {"deleted": deleted})
+    settings.say(f"Deleted {', '.join(deleted)}. To restore: rig catalog undelete NAME", {"deleted": deleted})
 
 
 @app.command("undelete")
 @command
-def undelete(settings: Settings, name: Annotated[str, typer.Argument(metavar="NAME")]) -> None:
-    """Take the deletion of an object back.
+def undelete_(
+    settings: Settings, name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the deleted object.")]
+) -> None:
+    """Restore a deleted object.
 
     Example: rig catalog undelete mug-white --bench sim
     """
+    from rig.catalog.edit import undelete
     from rig.events.wording import counted
 
     with settings.open_catalog() as catalog:
-        catalog.undelete(name)
+        undelete(catalog, name)
         views = catalog.object(name).summary.views
-    settings.say(f"{name} is back, with {counted(views, 'view')}.", {"name": name, "views": views})
+    settings.say(f"Restored {name} with {counted(views, 'view')}.", {"name": name, "views": views})
 
 
 @app.command("stats")
 @command
 def stats(settings: Settings) -> None:
-    """Say what the catalog holds and weighs.
+    """Show what the catalog contains, and its size.
 
     Example: rig catalog stats --bench sim --json
     """
@@ -232,45 +243,46 @@ def stats(settings: Settings) -> None:
         + (", ".join(f"{bench or '(imported)'} {count}" for bench, count in found.benches.items()) or "none")
     )
     for kind in found.descriptors:
-        state = "" if kind.current else ", which this program does not compare"
-        print(f"described    {kind.views} views by {kind.name} {kind.version}{state}")
+        state = "" if kind.current else ", a version that this program cannot compare"
+        print(f"descriptor   {kind.name} {kind.version}: {kind.views} views{state}")
     print(f"log          {found.log_entries} entries")
     if found.deleted_image_bytes or found.old_image_bytes:
         print(
-            f"to collect   {size_words(found.deleted_image_bytes)} of deleted objects (rig catalog gc), "
-            f"{size_words(found.old_image_bytes)} of earlier enrollments (gc --old)"
+            f"removable    {size_words(found.deleted_image_bytes)} of deleted objects (rig catalog gc), "
+            f"{size_words(found.old_image_bytes)} of earlier enrollments (rig catalog gc --old)"
         )
 
 
-def tell_other_regions(settings: Settings, catalog: "Catalog", bench: "Bench") -> None:
-    """Say on stderr where the bench looks at another part of its images than when the objects were enrolled.
+def report_other_regions(settings: Settings, catalog: "Catalog", bench: "Bench") -> None:
+    """Report on stderr if objects were enrolled with another region of the images than the bench uses now.
 
-    Regions that followed the object then and now, by calibrations of the axis, show the same of it wherever they are.
+    Two regions that both follow from a calibration of the axis show the same part of an object. They are not reported.
     """
     from rig.calibrations import CalibrationStore
     from rig.calibrations.store import CALIBRATIONS
+    from rig.catalog.descriptions import described_regions
 
     known = CalibrationStore(bench.config.calibration_path(bench.name)).history("table.axis")
-    followed = {(fact.id, tuple(fact.settings["view.roi"])) for fact in known if "view.roi" in fact.settings}
+    calibrated = {(one.id, tuple(one.settings["view.roi"])) for one in known if "view.roi" in one.settings}
 
-    def follows(region: Any, calibrations: "Iterable[str]") -> bool:
-        return any((id_, region) in followed for id_ in calibrations)
+    def is_calibrated(region: Any, calibrations: "Iterable[str]") -> bool:
+        return any((id_, region) in calibrated for id_ in calibrations)
 
     region = bench.config.view.roi
-    follows_now = follows(region, bench.conditions.get(CALIBRATIONS, ()))
+    calibrated_now = is_calibrated(region, bench.conditions.get(CALIBRATIONS, ()))
     others = {
         other
-        for other, calibrations in catalog.regions(settings.bench_name)
-        if other != region and not (follows_now and follows(other, calibrations))
+        for other, calibrations in described_regions(catalog, settings.bench_name)
+        if other != region and not (calibrated_now and is_calibrated(other, calibrations))
     }
     if others:
-        seen = " and ".join(sorted("the whole image" if other is None else str(list(other)) for other in others))
+        enrolled = " and ".join(sorted("the whole image" if other is None else str(list(other)) for other in others))
         argument = "whole" if region is None else ",".join(map(str, region))
         print(
-            f"Note: objects of this bench are described within {seen}, view.roi is "
+            f"Note: objects of this bench were enrolled with view.roi = {enrolled}; now it is "
             f"{'the whole image' if region is None else list(region)}"
-            f"{' since the axis was calibrated' if follows_now else ''}. If the camera stands where it stood: "
-            f"rig catalog redescribe --region {argument}. If it was moved: enroll those objects again, with --replace.",
+            f"{' (axis calibration)' if calibrated_now else ''}. If the camera was not moved: "
+            f"rig catalog redescribe --region {argument}. If it was moved: enroll these objects again (--replace).",
             file=sys.stderr,
         )
 
@@ -279,14 +291,14 @@ def _number(value: Any, width: int, digits: int) -> str:
     return f"{value:{width}.{digits}f}" if isinstance(value, int | float) else "–".rjust(width)
 
 
-def _facts(values: Any) -> str:
-    """Nested facts in one line: servo (model xl430, id 1), ..."""
+def _in_one_line(values: Any) -> str:
+    """Return nested values in one line: servo (model xl430, id 1), ..."""
     if isinstance(values, dict):
         return ", ".join(
-            f"{key} ({_facts(value)})" if isinstance(value, dict) else f"{key} {_facts(value)}"
+            f"{key} ({_in_one_line(value)})" if isinstance(value, dict) else f"{key} {_in_one_line(value)}"
             for key, value in values.items()
             if value not in (None, "", [], {})
         )
     if isinstance(values, list):
-        return "[" + " ".join(_facts(value) for value in values) + "]"
+        return "[" + " ".join(_in_one_line(value) for value in values) + "]"
     return f"{values:g}" if isinstance(values, float) else str(values)

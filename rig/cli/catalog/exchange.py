@@ -15,14 +15,14 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rig.catalog.exchange import Imported, Package
+    from rig.catalog.exchange import ImportBatch, Imported
 
 SHOWN = 20
-"""Refused files and gaps that are listed; with --json all of them are."""
+"""Number of rejected files and of gaps that are listed. With --json all of them are."""
 
 
 class Format(StrEnum):
-    """How a catalog is exported."""
+    """Format of an export."""
 
     BUNDLE = "bundle"
     COIL = "coil"
@@ -36,63 +36,66 @@ class Format(StrEnum):
 def import_(
     settings: Settings,
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="A folder of photographs, a .rigcat.zip, or a .csv with images.")
+        Path,
+        typer.Argument(metavar="SOURCE", help="Folder of photographs, bundle (.rigcat.zip), or table (.csv)."),
     ],
     pattern: Annotated[
         str | None,
-        typer.Option(help="How a folder's photographs are named, e.g. '{object}/view-{angle}'; '{object}__{angle}'."),
+        typer.Option(help="Names of the files in a folder, e.g. '{object}/view-{angle}'. Default: {object}__{angle}."),
     ] = None,
     table_angles: Annotated[
-        bool, typer.Option("--table-angles", help="Angles in names are the turning table's: azimuths run against them.")
+        bool,
+        typer.Option(
+            "--table-angles", help="The angles in the names are table angles. Azimuths run in the opposite direction."
+        ),
     ] = False,
-    label: Annotated[str | None, typer.Option(help="Label of the objects that have none.")] = None,
+    label: Annotated[str | None, typer.Option(help="Label for objects without a label.")] = None,
     on_conflict: Annotated[
-        str, typer.Option(metavar="refuse|skip|replace", help="What to do about objects that are enrolled already.")
-    ] = "refuse",
-    strict: Annotated[bool, typer.Option("--strict", help="Take nothing if one file is refused.")] = False,
+        str, typer.Option(metavar="reject|skip|replace", help="What to do with objects that are enrolled already.")
+    ] = "reject",
+    strict: Annotated[bool, typer.Option("--strict", help="Import nothing if one file is rejected.")] = False,
     descriptor: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Describe the images by this, too, such as edges+colours; rig catalog redescribe does so later. "
-            "Repeatable.",
+            help="Also compute this descriptor, such as edges+colours. Repeatable. "
+            "rig catalog redescribe can do it later.",
         ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would come in.")] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; one for each core otherwise.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")] = None,
 ) -> None:
-    """Bring photographs of known angles, or another bench's objects, into the catalog; all of it or nothing.
+    """Import photographs with known angles, or objects of another bench; all or nothing.
 
     Example: rig import coil-100 --label coil --bench sim
     """
-    package = _package(source, pattern, table_angles)
-    take_in(
+    run_import(
         settings,
-        package,
+        _read_batch(source, pattern, table_angles),
         on_conflict=on_conflict,
         label=label,
-        further=descriptor or (),
+        descriptors=descriptor or (),
         strict=strict,
         dry_run=dry_run,
         jobs=jobs,
     )
 
 
-def take_in(
+def run_import(
     settings: Settings,
-    package: "Package",
+    batch: "ImportBatch",
     *,
     on_conflict: str,
     label: str | None,
-    further: "Sequence[str]" = (),
+    descriptors: "Sequence[str]" = (),
     strict: bool,
     dry_run: bool,
     jobs: int | None,
 ) -> None:
-    """Import a package, or preview it, and report."""
+    """Import a batch, or check it, and report."""
     from contextlib import nullcontext
 
-    from rig.catalog.exchange import Conflict, bring_in, plan_import, preview_import
+    from rig.catalog.exchange import Conflict, import_objects, plan_import, preview_import
     from rig.core.clock import SystemClock, seconds_between
     from rig.core.errors import UsageError
 
@@ -100,43 +103,43 @@ def take_in(
         conflict = Conflict(on_conflict)
     except ValueError as error:
         raise UsageError(
-            f"--on-conflict {on_conflict!r} is unknown", next_step="give refuse, skip or replace"
+            f"--on-conflict {on_conflict!r} is unknown", next_step="give reject, skip or replace"
         ) from error
     clock = SystemClock()
     begin_ns = clock.now_ns()
     nothing = "Interrupted; nothing was imported."
     if dry_run:
         with settings.catalog_there() or nullcontext() as there:
-            plan = plan_import(there, package, conflict)
-        done = run_job("looking", preview_import(plan, strict=strict, jobs=jobs), interrupted=nothing)
+            plan = plan_import(there, batch, conflict)
+        done = run_job("checking", preview_import(plan, strict=strict, jobs=jobs), interrupted=nothing)
     else:
         with settings.open_catalog(create=True) as catalog:
-            plan = plan_import(catalog, package, conflict)
-            job = bring_in(catalog, plan, label=label, further=further, strict=strict, jobs=jobs)
+            plan = plan_import(catalog, batch, conflict)
+            job = import_objects(catalog, plan, label=label, descriptors=descriptors, strict=strict, jobs=jobs)
             done = run_job("importing", job, interrupted=nothing)
     _report(settings, done, seconds_between(begin_ns, clock.now_ns()), dry_run=dry_run)
 
 
-def _package(source: Path, pattern: str | None, table_angles: bool) -> "Package":
-    from rig.catalog.exchange import DEFAULT_PATTERN, open_bundle, read_folder, read_table
+def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "ImportBatch":
+    from rig.catalog.exchange import DEFAULT_PATTERN, read_bundle, read_folder, read_table
     from rig.core.clock import SystemClock
     from rig.core.errors import ImportRejected, UsageError
 
     now = SystemClock().utc()
     if source.is_dir():
         if (source / "catalog.sqlite").exists():
-            raise UsageError(f"{source} is a catalog", next_step=f"bring it in by rig catalog merge {source}")
+            raise UsageError(f"{source} is a catalog", next_step=f"import it with rig catalog merge {source}")
         return read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=now)
     if pattern is not None or table_angles:
-        raise UsageError(f"{source} is no folder", next_step="--pattern and --table-angles are for folders")
+        raise UsageError(f"{source} is not a folder", next_step="use --pattern and --table-angles only with a folder")
     if not source.exists():
-        raise ImportRejected(f"there is no {source}", next_step="check the path")
+        raise ImportRejected(f"{source} does not exist", next_step="check the path")
     if source.suffix.lower() == ".zip":
-        return open_bundle(source)
+        return read_bundle(source)
     if source.suffix.lower() == ".csv":
         return read_table(source, now=now)
     raise ImportRejected(
-        f"{source} is neither a folder, a .zip nor a .csv", next_step="give one of those: rig import --help"
+        f"{source} is not a folder, a .zip file or a .csv file", next_step="give one of these: rig import --help"
     )
 
 
@@ -154,11 +157,11 @@ def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bo
         f"{counted(done.views, 'view')}, {size_words(done.bytes)}, in {seconds:.1f} s{per_second}."
     )
     if done.replaced:
-        print(f"Enrolled anew: {', '.join(done.replaced[:SHOWN])}")
+        print(f"Enrolled again: {', '.join(done.replaced[:SHOWN])}")
     if done.skipped:
-        print(f"Left out, in the catalog already: {', '.join(done.skipped[:SHOWN])}")
+        print(f"Skipped, already in the catalog: {', '.join(done.skipped[:SHOWN])}")
     if done.gaps:
-        print(f"{counted(len(done.gaps), 'gap')}, views that lack in the even spacing of the others:")
+        print(f"{counted(len(done.gaps), 'missing view')} in the even spacing of the others:")
         by_object: dict[str, list[str]] = {}
         for gap in done.gaps:
             by_object.setdefault(gap.object_name, []).append(f"{gap.azimuth_deg:g}°")
@@ -166,32 +169,35 @@ def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bo
             print(f"  {name}: {', '.join(angles)}")
         if len(by_object) > SHOWN:
             print(f"  and {len(by_object) - SHOWN} other objects (--json lists all)")
-    if done.refused:
-        print(f"{counted(len(done.refused), 'file')} refused:", file=sys.stderr)
-        for file in done.refused[:SHOWN]:
+    if done.rejected:
+        print(f"{counted(len(done.rejected), 'file')} rejected:", file=sys.stderr)
+        for file in done.rejected[:SHOWN]:
             print(f"  {file.path}: {file.reason}", file=sys.stderr)
-        if len(done.refused) > SHOWN:
-            print(f"  and {len(done.refused) - SHOWN} others (--json lists all)", file=sys.stderr)
+        if len(done.rejected) > SHOWN:
+            print(f"  and {len(done.rejected) - SHOWN} others (--json lists all)", file=sys.stderr)
 
 
 @command
 def export(
     settings: Settings,
-    target: Annotated[Path, typer.Argument(metavar="TARGET", help="File or folder to write; it must not be there.")],
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="File or folder to write. It must not exist.")],
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Objects; all otherwise.", autocompletion=object_names),
+        typer.Argument(metavar="[NAME]...", help="Names of the objects. Default: all.", autocompletion=object_names),
     ] = None,
     format_: Annotated[
-        Format | None, typer.Option("--format", help="As the target's suffix says otherwise; coil for a folder.")
+        Format | None, typer.Option("--format", help="Format. Default: by the suffix of the target, coil for a folder.")
     ] = None,
-    label: Annotated[str | None, typer.Option(help="Objects of this label alone.")] = None,
+    label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
 ) -> None:
-    """Write objects in an open format: a bundle that holds everything, or images, tables and pages to look at.
+    """Export objects in an open format.
+
+    Formats: bundle (everything, for rig import), coil (folder of images), csv (table and images), parquet (table
+    without images), sheets (contact sheets), html (page with contact sheets).
 
     Example: rig export tray.rigcat.zip --label kitchen --bench sim
     """
-    from rig.catalog.exchange import collect, write_bundle, write_folder, write_parquet, write_table
+    from rig.catalog.exchange import read_objects, write_bundle, write_folder, write_parquet, write_table
     from rig.core.errors import ExportFailed
     from rig.events.wording import counted
     from rig.report.catalog_page import write_catalog_page, write_sheets
@@ -204,7 +210,7 @@ def export(
             wanted = [name for name in labelled if not wanted or name in wanted]
         if label is not None and not wanted:
             raise ExportFailed(f"no object has the label {label!r}", next_step="list the objects: rig catalog list")
-        objects = collect(catalog, wanted)
+        objects = read_objects(catalog, wanted)
         match form:
             case Format.BUNDLE:
                 count = write_bundle(target, objects)
@@ -231,6 +237,6 @@ def _format(target: Path) -> Format:
     known = {".zip": Format.BUNDLE, ".parquet": Format.PARQUET, "": Format.COIL}
     if suffix not in known:
         raise UsageError(
-            f"what to write into {target} is not clear", next_step=f"give --format, one of {', '.join(Format)}"
+            f"the format of {target} is not clear from its name", next_step=f"give --format, one of {', '.join(Format)}"
         )
     return known[suffix]

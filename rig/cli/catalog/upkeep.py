@@ -13,7 +13,7 @@ from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
 from rig.cli.ui.settings import Settings
 
-JobsOption = Annotated[int | None, typer.Option(min=1, help="Processes; one for each core otherwise.")]
+JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")]
 EXIT_CATALOG = 7
 
 
@@ -21,15 +21,16 @@ EXIT_CATALOG = 7
 @command
 def verify(
     settings: Settings,
-    repair: Annotated[bool, typer.Option("--repair", help="Mend what can be mended; nothing is thrown away.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Compare hashes; do not describe the images again.")] = False,
+    repair: Annotated[bool, typer.Option("--repair", help="Repair what can be repaired. Nothing is deleted.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Only compare the hashes of the files.")] = False,
     jobs: JobsOption = None,
 ) -> None:
-    """Look whether everything is as it was stored; exit code 7 if something is not and was not mended.
+    """Check whether everything is as it was stored. The exit code is 7 if a problem is left.
 
     Example: rig catalog verify --repair --bench sim
     """
     from rig.catalog.verify import verify as job
+    from rig.cli.catalog.findings import finding_text
     from rig.events.events import plain
     from rig.events.wording import counted
 
@@ -37,23 +38,22 @@ def verify(
         found = run_job(
             "verifying",
             job(catalog, repair=repair, quick=quick, jobs=jobs),
-            interrupted="Interrupted; what was looked at was not changed.",
+            interrupted="Interrupted; nothing was changed.",
         )
     if settings.json:
         settings.print_json(plain(found))
     else:
         for finding in found.findings:
-            mended = "" if finding.mended is None else f"; {finding.mended}"
-            print(f"{finding.problem}: {finding.what}{mended}")
-        mended_count = len(found.findings) - len(found.unmended)
+            print(finding_text(finding))
         outcome = "everything is as it was stored"
         if found.findings:
-            outcome = f"{counted(len(found.findings), 'problem')}, {mended_count} mended"
+            repaired = len(found.findings) - len(found.unrepaired)
+            outcome = f"{counted(len(found.findings), 'problem')}, {repaired} repaired"
             if not repair:
-                outcome += "; rig catalog verify --repair mends what can be mended"
-        looked = f"{counted(found.objects, 'object')}, {counted(found.views, 'view')}"
-        print(f"{looked}, {size_words(found.image_bytes)} of images: {outcome}")
-    if found.unmended:
+                outcome += ". To repair what can be repaired: rig catalog verify --repair"
+        checked = f"{counted(found.objects, 'object')}, {counted(found.views, 'view')}"
+        print(f"{checked}, {size_words(found.image_bytes)} of images: {outcome}")
+    if found.unrepaired:
         raise typer.Exit(EXIT_CATALOG)
 
 
@@ -65,13 +65,15 @@ def redescribe(
     region: Annotated[
         str,
         typer.Option(
-            help="Part of a bench's images: stored (as they are), config (view.roi), whole, or X,Y,WIDTH,HEIGHT."
+            help="Region of the images: stored (unchanged), config (view.roi), whole, or X,Y,WIDTH,HEIGHT in pixels."
         ),
     ] = "stored",
-    again: Annotated[bool, typer.Option("--again", help="Also what is described already.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Also describe views that are described already.")] = False,
     jobs: JobsOption = None,
 ) -> None:
-    """Describe the stored images anew, after the descriptor or its settings have changed; goes on where it was stopped.
+    """Describe the stored images again, after a descriptor or its settings have changed.
+
+    After an interruption, the same command continues.
 
     Example: rig catalog redescribe --region config --bench sim
 
@@ -79,20 +81,21 @@ def redescribe(
     """
     from rig.catalog.redescribe import redescribe as job
     from rig.events.events import plain
+    from rig.events.wording import counted
 
     part = _region(settings, region)
     with settings.open_catalog() as catalog:
         done = run_job(
             "describing",
             job(catalog, descriptor, region=part, again=again, jobs=jobs),
-            interrupted="Interrupted; what is described is kept, the same command goes on.",
+            interrupted="Interrupted; the results so far are stored. The same command continues.",
         )
     if settings.json:
         settings.print_json(plain(done))
     else:
         print(
-            f"{done.descriptor} {done.version}: {done.described} views described, {done.unchanged} were already, "
-            f"{len(done.failed)} could not be"
+            f"{done.descriptor} {done.version}: {counted(done.described, 'view')} described, "
+            f"{done.unchanged} unchanged, {len(done.failed)} failed"
         )
         for path, reason in done.failed[:20]:
             print(f"  {path}: {reason}", file=sys.stderr)
@@ -104,21 +107,19 @@ def redescribe(
 @command
 def gc(
     settings: Settings,
-    old: Annotated[
-        bool, typer.Option("--old", help="Also enrollments that were replaced or abandoned, of objects in use.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would go.")] = False,
+    old: Annotated[bool, typer.Option("--old", help="Also remove replaced and abandoned enrollments.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be removed.")] = False,
     yes: YesOption = False,
 ) -> None:
-    """Remove for good what was deleted, what verify set aside, and what is left of imports that were cut off.
+    """Remove deleted objects for good, files that verify moved to lost+found, and files of interrupted imports.
 
     Example: rig catalog gc --dry-run --bench sim
     """
-    from rig.catalog.upkeep import Collected, collect_garbage
+    from rig.catalog.upkeep import GarbageReport, collect_garbage
     from rig.events.events import plain
     from rig.events.wording import counted
 
-    def words(found: Collected) -> str:
+    def words(found: GarbageReport) -> str:
         names = ", ".join(found.objects[:10]) + (" and others" if len(found.objects) > 10 else "")
         return (
             f"{counted(len(found.objects), 'deleted object')}{f' ({names})' if names else ''}, "
@@ -128,11 +129,12 @@ def gc(
 
     with settings.open_catalog() as catalog:
         found = collect_garbage(catalog, old=old, dry_run=True)
-        nothing = found == Collected((), 0, 0, 0, 0)
+        nothing = found == GarbageReport((), 0, 0, 0, 0)
         if not dry_run:
             if not nothing:
-                confirm(f"Remove {words(found)}, for good?", yes=yes, settings=settings)
-            found = collect_garbage(catalog, old=old)  # levels of earlier versions go unasked: they can be computed
+                confirm(f"Remove {words(found)} for good?", yes=yes, settings=settings)
+            # Levels by earlier versions of a descriptor are removed without a question: they can be computed again.
+            found = collect_garbage(catalog, old=old)
     text = f"{'Would remove' if dry_run else 'Removed'} {words(found)}."
     settings.say("There is nothing to remove." if nothing else text, {"dry_run": dry_run, **plain(found)})
 
@@ -140,18 +142,18 @@ def gc(
 @app.command("migrate")
 @command
 def migrate(settings: Settings) -> None:
-    """Bring the catalog of an earlier program up to date; the database as it was is kept beside it.
+    """Migrate the catalog of an earlier version of the program. A backup of the database stays beside it.
 
     Example: rig catalog migrate --bench sim
     """
-    from rig.catalog import migrate as bring_up_to_date
+    from rig.catalog import migrate as job
     from rig.core.clock import SystemClock
 
     path = settings.load().catalog_path(settings.bench_name)
-    done = bring_up_to_date(path, clock=SystemClock())
+    done = job(path, clock=SystemClock())
     text = f"{path} is up to date, version {done.after}."
     if done.backup is not None:
-        text = f"{path}: version {done.before} became {done.after}. As it was: {done.backup}"
+        text = f"Migrated {path} from version {done.before} to {done.after}. Backup: {done.backup}"
     backup = None if done.backup is None else str(done.backup)
     settings.say(text, {"catalog": str(path), "before": done.before, "after": done.after, "backup": backup})
 
@@ -161,13 +163,18 @@ def log(
     settings: Settings,
     since: Annotated[
         str | None,
-        typer.Option(metavar="WHEN", help="2026-01-31, 2026-01-31T14:00 (UTC), or 30m, 12h, 7d, 4w ago."),
+        typer.Option(
+            metavar="WHEN", help="Only entries since 2026-01-31, 2026-01-31T14:00 (UTC), or 30m, 12h, 7d, 4w ago."
+        ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--object", metavar="NAME", help="Of this object alone.", autocompletion=object_names)
+        str | None,
+        typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names),
     ] = None,
 ) -> None:
-    """Say who did what with the catalog and the table, and when, oldest first.
+    """Show who did what with the catalog and the table, oldest first.
+
+    Columns: time, user, action, object, details.
 
     Example: rig log --since 7d --bench sim
     """
@@ -181,7 +188,7 @@ def log(
             settings.print_json(plain(entry) | {"time_utc": entry.time_utc.isoformat()})
         return
     if not entries:
-        print("Nothing since then." if since else "Nothing yet.")
+        print("No entries since then." if since else "No entries yet.")
         return
     rows = [
         (
@@ -193,7 +200,7 @@ def log(
         )
         for entry in entries
     ]
-    print_table(("time (UTC)", "who", "what", "object", ""), rows)
+    print_table(("time (UTC)", "user", "action", "object", "details"), rows)
 
 
 def _short(value: Any) -> str:
@@ -202,7 +209,7 @@ def _short(value: Any) -> str:
 
 
 def _region(settings: Settings, text: str) -> Any:
-    from rig.catalog.exchange.package import parse_region
+    from rig.catalog.exchange.batch import parse_region
     from rig.catalog.redescribe import Stored
     from rig.core.errors import UsageError
 
@@ -234,7 +241,7 @@ def _since(text: str | None) -> datetime | None:
         when = datetime.fromisoformat(text)
     except (ValueError, OverflowError) as error:
         raise UsageError(
-            f"--since {text!r} is no time", next_step="give a date such as 2026-01-31, or 12h for twelve hours ago"
+            f"--since {text!r} is not a time", next_step="give a date such as 2026-01-31, or 12h for 12 hours ago"
         ) from error
     return when.replace(tzinfo=UTC) if when.tzinfo is None else when
 
@@ -243,22 +250,22 @@ def _since(text: str | None) -> datetime | None:
 @command
 def merge(
     settings: Settings,
-    other: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the other catalog, which is only read.")],
+    other: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the other catalog. It is not changed.")],
     on_conflict: Annotated[
-        str, typer.Option(metavar="refuse|skip|replace", help="What to do about objects that both have.")
-    ] = "refuse",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would come in.")] = False,
+        str, typer.Option(metavar="reject|skip|replace", help="What to do with objects that are in both.")
+    ] = "reject",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
     jobs: JobsOption = None,
 ) -> None:
-    """Bring the objects of another catalog into this one, with all their enrollments; all of it or nothing.
+    """Import the objects of another catalog with all their enrollments; all or nothing.
 
     Example: rig catalog merge /media/stick/catalog --on-conflict skip --bench sim
     """
     from rig.catalog import Catalog
-    from rig.catalog.exchange import package_of
-    from rig.cli.catalog.exchange import take_in
+    from rig.catalog.exchange import read_catalog
+    from rig.cli.catalog.exchange import run_import
     from rig.core.clock import SystemClock
 
     with Catalog.open(other, clock=SystemClock(), create=False, read_only=True) as source:
-        package = package_of(source)
-    take_in(settings, package, on_conflict=on_conflict, label=None, strict=True, dry_run=dry_run, jobs=jobs)
+        batch = read_catalog(source)
+    run_import(settings, batch, on_conflict=on_conflict, label=None, strict=True, dry_run=dry_run, jobs=jobs)

@@ -87,13 +87,13 @@ def enroll(
 
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
         from rig.bench import ObjectAlreadyPlaced
-        from rig.cli.catalog.catalog import tell_other_regions
+        from rig.cli.catalog.catalog import report_other_regions
         from rig.cli.objects.empty_table import ensure_empty_table_image
         from rig.cli.ui.operator_prompts import OperatorPrompts
         from rig.plans.enroll import enroll as enroll_one
         from rig.plans.tray import AutomaticOperator, enroll_tray
 
-        tell_other_regions(settings, catalog, bench)
+        report_other_regions(settings, catalog, bench)
         ensure_empty_table_image(settings, bench, ask=not yes, then=name)
         job = _Job(settings, bench, catalog)
         if name is not None:

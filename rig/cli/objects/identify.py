@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.catalog.catalog import tell_other_regions
+from rig.cli.catalog.catalog import report_other_regions
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import strategy_names
 from rig.cli.ui.exit_codes import EXIT_UNKNOWN
@@ -80,7 +80,7 @@ def identify(
         known = model()  # report a catalog that cannot be searched before the bench is opened
         with settings.open_bench() as bench, IdentifyView(screen) as view:
             # Prepare: notes about the catalog, the operator, the empty-table image.
-            tell_other_regions(settings, catalog, bench)
+            report_other_regions(settings, catalog, bench)
             seed = settings.seed or 0
             if watch and isinstance(bench.operator, ObjectAlreadyPlaced):
                 bench.operator = TableWatcher(bench)  # the camera sees when the operator has put an object there

@@ -10,12 +10,12 @@ from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
-    from rig.catalog.jobs import Progressed
+    from rig.catalog.jobs import JobProgress
 
 _T = TypeVar("_T")
 
 
-def run_job(title: str, job: "Generator[Progressed, None, _T]", *, interrupted: str) -> _T:
+def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted: str) -> _T:
     """Run a job with a progress bar on stderr and return its result; Ctrl+C prints ``interrupted``."""
     from rig.cli.ui.present import Progress
 

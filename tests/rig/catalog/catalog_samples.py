@@ -9,7 +9,7 @@ image, rename, sync of the folder, commit; then those of the next view).
 import os
 import signal
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -21,7 +21,7 @@ from sqlalchemy import Engine, event
 
 import hbr
 from rig.catalog import Catalog, Provenance, ViewRecord
-from rig.catalog.jobs import Progressed
+from rig.catalog.jobs import JobProgress
 from rig.core.clock import SystemClock
 from rig.views.description import within
 
@@ -50,7 +50,7 @@ def record(index: int, /, **changes: Any) -> ViewRecord:
         "commanded_deg": -5.0 * index,
         "encoder_deg": -5.0 * index + 0.03,
         "azimuth_deg": 5.0 * index % 360,
-        "descriptor": np.random.default_rng(index).integers(0, 8, 144, np.uint8),
+        "descriptors": {"cedd": np.random.default_rng(index).integers(0, 8, 144, np.uint8)},
         "captured_ns": 0,
     }
     return ViewRecord(**values | changes)
@@ -63,10 +63,16 @@ def fill(catalog: Catalog, name: str, views: int, **begin: Any) -> None:
     enrollment.finish()
 
 
-def described(index: int, seed: int, region: tuple[int, int, int, int] | None = None, **changes: Any) -> ViewRecord:
-    """A view whose descriptor is that of ``image(seed)``."""
-    levels = hbr.describe(within(image(seed), region))
-    return record(index, descriptor=levels, region=region, **changes)
+def described(
+    index: int,
+    seed: int,
+    region: tuple[int, int, int, int] | None = None,
+    names: Sequence[str] = ("cedd",),
+    **changes: Any,
+) -> ViewRecord:
+    """A view whose descriptors are those of ``image(seed)``."""
+    levels = {name: hbr.describe(within(image(seed), region), descriptor=name) for name in names}
+    return record(index, descriptors=levels, region=region, **changes)
 
 
 def true_fill(
@@ -79,7 +85,7 @@ def true_fill(
     enrollment.finish()
 
 
-def finished(job: Generator[Progressed, None, _T]) -> _T:
+def finished(job: Generator[JobProgress, None, _T]) -> _T:
     """Carry a job of the catalog out and return its result."""
     while True:
         try:

@@ -1,4 +1,4 @@
-"""What goes into a catalog comes out of it, and only complete enrollments are retrieved."""
+"""A catalog returns what was stored, and searches use complete enrollments only."""
 
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta, timezone
@@ -56,7 +56,7 @@ def begin(catalog: Catalog, name: str, views: int = 3, **options: object) -> Enr
     evidence=EVIDENCE,
     image_bgr=IMAGES,
 )
-def test_a_view_comes_back_as_it_was_stored(
+def test_view_is_read_as_it_was_stored(
     name: str,
     commanded_deg: float,
     encoder_deg: float,
@@ -75,7 +75,7 @@ def test_a_view_comes_back_as_it_was_stored(
         commanded_deg=commanded_deg,
         encoder_deg=encoder_deg,
         azimuth_deg=azimuth_deg,
-        descriptor=descriptor,
+        descriptors={"cedd": descriptor},
         captured_ns=captured_ns,
         imu_deg=imu_deg,
         imu_sigma_deg=imu_sigma_deg,
@@ -94,15 +94,15 @@ def test_a_view_comes_back_as_it_was_stored(
     for field in ("index", "commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg", "captured_ns"):
         assert getattr(stored.record, field) == getattr(given_record, field)
     assert stored.record.evidence == evidence
-    assert np.array_equal(stored.record.descriptor, descriptor)
-    assert stored.sitting.provenance == PROVENANCE
+    assert np.array_equal(stored.record.descriptors["cedd"], descriptor)
+    assert stored.session.provenance == PROVENANCE
     assert model.object_names == (name,)
     assert np.array_equal(model.descriptors, descriptor[None])
     assert model.azimuth_deg.tolist() == [azimuth_deg]
     assert view_ids.tolist() == [stored.id]
 
 
-def test_models_are_ordered_by_object_and_index(catalog: Catalog) -> None:
+def test_views_are_ordered_by_object_and_index(catalog: Catalog) -> None:
     fill(catalog, "tin", 3)
     begin(catalog, "unfinished").add(record(0), image(0))
     mug = begin(catalog, "mug", 4)
@@ -117,12 +117,12 @@ def test_models_are_ordered_by_object_and_index(catalog: Catalog) -> None:
     assert {catalog.view(view_id).object_name for view_id in view_ids[3:]} == {"mug"}
 
 
-def test_an_empty_catalog_has_no_models(catalog: Catalog) -> None:
+def test_empty_catalog_has_no_views(catalog: Catalog) -> None:
     model, view_ids = catalog.views()
     assert (len(model), len(view_ids), catalog.objects()) == (0, 0, [])
 
 
-def test_times_are_those_of_the_injected_clock(catalog: Catalog, clock: VirtualClock) -> None:
+def test_times_come_from_the_injected_clock(catalog: Catalog, clock: VirtualClock) -> None:
     enrollment = begin(catalog, "mug", 1)
     clock.sleep(2.0)
     exposed_ns = clock.now_ns()
@@ -137,18 +137,18 @@ def test_times_are_those_of_the_injected_clock(catalog: Catalog, clock: VirtualC
     assert details.views[0].captured_utc.tzinfo is UTC
 
 
-def test_other_zones_are_stored_as_utc(tmp_path: Path) -> None:
+def test_times_of_other_zones_are_stored_as_utc(tmp_path: Path) -> None:
     noon = datetime(2026, 7, 1, 12, tzinfo=timezone(timedelta(hours=2)))
     with Catalog.open(tmp_path, clock=VirtualClock(noon)) as catalog:
         begin(catalog, "mug")
         assert catalog.objects()[0].created_utc == datetime(2026, 7, 1, 10, tzinfo=UTC)
 
 
-def test_reenrollment_keeps_the_old_views_until_it_is_complete(catalog: Catalog) -> None:
+def test_replacement_keeps_the_old_views_until_it_is_complete(catalog: Catalog) -> None:
     fill(catalog, "mug", 2, label="cup", note="chipped")
-    with pytest.raises(ObjectExists, match="2 views") as refused:
+    with pytest.raises(ObjectExists, match="2 views") as error:
         begin(catalog, "mug")
-    assert "--replace" in refused.value.next_step
+    assert "--replace" in error.value.next_step
     again = begin(catalog, "mug", 3, replace=True, label="mug")
     for index in range(3):
         assert len(catalog.views().views) == 2
@@ -160,7 +160,7 @@ def test_reenrollment_keeps_the_old_views_until_it_is_complete(catalog: Catalog)
     assert len(catalog.views().views) == 3
 
 
-def test_abandoned_replacement_leaves_the_old_views(catalog: Catalog) -> None:
+def test_abandoned_replacement_keeps_the_old_views(catalog: Catalog) -> None:
     fill(catalog, "mug", 2)
     again = begin(catalog, "mug", 3, replace=True)
     again.add(record(0), image(0))
@@ -171,15 +171,15 @@ def test_abandoned_replacement_leaves_the_old_views(catalog: Catalog) -> None:
     begin(catalog, "mug", replace=True)
 
 
-def test_an_interrupted_enrollment_is_found_and_resumed_elsewhere(tmp_path: Path, clock: VirtualClock) -> None:
+def test_unfinished_enrollment_is_resumed_on_another_bench(tmp_path: Path, clock: VirtualClock) -> None:
     with Catalog.open(tmp_path, clock=clock) as catalog:
         enrollment = begin(catalog, "mug", 4)
         enrollment.add(record(0), image(0))
         enrollment.add(record(2), image(2))
     with Catalog.open(tmp_path, clock=clock) as catalog:
-        with pytest.raises(CatalogError, match="2 of 4") as refused:
+        with pytest.raises(CatalogError, match="2 of 4") as error:
             begin(catalog, "mug", 4)
-        assert "--resume" in refused.value.next_step
+        assert "--resume" in error.value.next_step
         unfinished = catalog.resumable("mug")
         assert unfinished is not None
         assert (unfinished.present, unfinished.missing) == ((0, 2), (1, 3))
@@ -191,26 +191,26 @@ def test_an_interrupted_enrollment_is_found_and_resumed_elsewhere(tmp_path: Path
             enrollment.add(record(index), image(index))
         enrollment.finish()
         assert catalog.resumable("mug") is None
-        benches = [view.sitting.provenance.bench for view in catalog.object("mug").views]
+        benches = [view.session.provenance.bench for view in catalog.object("mug").views]
     assert benches == ["bench-1", "bench-2", "bench-1", "bench-2"]
 
 
-def test_nothing_to_resume(catalog: Catalog) -> None:
+def test_resume_rejects_complete_enrollment(catalog: Catalog) -> None:
     fill(catalog, "mug", 1)
     with pytest.raises(CatalogError, match="no unfinished"):
         catalog.resume("mug", provenance=PROVENANCE)
 
 
-def test_an_enrollment_is_not_finished_with_views_missing(catalog: Catalog) -> None:
+def test_finish_rejects_missing_views(catalog: Catalog) -> None:
     enrollment = begin(catalog, "mug", 3)
     enrollment.add(record(1), image(1))
-    with pytest.raises(CatalogError, match="2 of the 3") as refused:
+    with pytest.raises(CatalogError, match="2 of the 3") as error:
         enrollment.finish()
-    assert refused.value.evidence == {"missing_views": [0, 2]}
+    assert error.value.evidence == {"missing_views": [0, 2]}
     assert len(catalog.views().views) == 0
 
 
-def test_a_stored_view_is_never_overwritten(catalog: Catalog) -> None:
+def test_add_rejects_stored_view(catalog: Catalog) -> None:
     begin(catalog, "mug").add(record(0), image(0))
     rival = catalog.resume("mug", provenance=PROVENANCE)
     with pytest.raises(CatalogError, match="stored already"):
@@ -224,20 +224,20 @@ def test_a_stored_view_is_never_overwritten(catalog: Catalog) -> None:
 @pytest.mark.parametrize(
     ("asked", "known"), [("mug-whit", "mug-white"), ("MUG-WHITE", "mug-white"), ("tea tin", "Tea-Tin")]
 )
-def test_unknown_names_are_answered_with_near_ones(catalog: Catalog, asked: str, known: str) -> None:
+def test_unknown_name_suggests_similar_names(catalog: Catalog, asked: str, known: str) -> None:
     fill(catalog, known, 1)
-    with pytest.raises(ObjectNotFound) as refused:
+    with pytest.raises(ObjectNotFound) as error:
         catalog.object(asked)
-    assert repr(known) in refused.value.next_step
+    assert repr(known) in error.value.next_step
 
 
-def test_names_are_compared_composed_and_without_outer_blanks(catalog: Catalog) -> None:
+def test_names_are_composed_and_stripped(catalog: Catalog) -> None:
     fill(catalog, " Ta\u0308sse ", 1)
     assert catalog.object("T\u00e4sse").summary.views == 1
 
 
 @pytest.mark.parametrize("name", ["../../etc/passwd", "a/b", "..", ".", "CON", "杯子", "x" * 100, "a\\b", "~", "-rf"])
-def test_any_name_makes_a_safe_file_name(catalog: Catalog, name: str) -> None:
+def test_any_name_gives_a_safe_file_name(catalog: Catalog, name: str) -> None:
     fill(catalog, name, 1)
     stored = catalog.object(name).views[0]
     path = catalog.image_path(stored)
@@ -248,7 +248,7 @@ def test_any_name_makes_a_safe_file_name(catalog: Catalog, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "a\x00b", "\ud800", "x" * 101])
-def test_names_that_are_refused(catalog: Catalog, name: str) -> None:
+def test_begin_rejects_invalid_names(catalog: Catalog, name: str) -> None:
     with pytest.raises(UsageError):
         begin(catalog, name)
     assert catalog.objects() == []
@@ -269,18 +269,18 @@ def test_names_that_are_refused(catalog: Catalog, name: str) -> None:
         {"evidence": {"frame": np.zeros(3)}},
     ],
 )
-def test_views_that_are_refused(changes: dict[str, object]) -> None:
+def test_view_record_rejects_invalid_values(changes: dict[str, object]) -> None:
     with pytest.raises(UsageError):
         record(0, **changes)
 
 
-def test_text_that_cannot_be_stored_is_refused(catalog: Catalog) -> None:
+def test_begin_rejects_invalid_text(catalog: Catalog) -> None:
     with pytest.raises(UsageError, match="label"):
         begin(catalog, "mug", label="\udcff")
     assert catalog.objects() == []
 
 
-def test_a_view_may_be_numpy_scalars(catalog: Catalog) -> None:
+def test_view_record_accepts_numpy_scalars(catalog: Catalog) -> None:
     given_record = record(
         0,
         azimuth_deg=np.float32(0.5),
@@ -295,7 +295,7 @@ def test_a_view_may_be_numpy_scalars(catalog: Catalog) -> None:
     assert (stored.azimuth_deg, stored.captured_ns, stored.imu_deg, stored.imu_sigma_deg) == (0.5, 7, 2.0, 1.0)
 
 
-def test_evidence_may_hold_numpy_scalars() -> None:
+def test_evidence_accepts_numpy_scalars() -> None:
     assert record(0, evidence={"locked": np.bool_(True), "gain": np.float32(0.5)}).evidence == {
         "locked": True,
         "gain": 0.5,
@@ -306,19 +306,19 @@ def test_evidence_may_hold_numpy_scalars() -> None:
     "bad",
     [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4, 3))],
 )
-def test_images_that_are_refused(catalog: Catalog, bad: np.ndarray) -> None:
+def test_add_rejects_invalid_images(catalog: Catalog, bad: np.ndarray) -> None:
     enrollment = begin(catalog, "mug")
     with pytest.raises(UsageError):
         enrollment.add(record(0), bad)
     assert enrollment.missing() == (0, 1, 2)
 
 
-def test_views_outside_the_plan_and_bad_descriptors_are_refused(catalog: Catalog) -> None:
+def test_add_rejects_unplanned_views_and_invalid_descriptors(catalog: Catalog) -> None:
     enrollment = begin(catalog, "mug", 3)
     with pytest.raises(UsageError, match="3 planned"):
         enrollment.add(record(3), image(3))
     with pytest.raises(ValueError, match=r"0\.\.7"):
-        enrollment.add(record(0, descriptor=np.full(144, 8, np.uint8)), image(0))
+        enrollment.add(record(0, descriptors={"cedd": np.full(144, 8, np.uint8)}), image(0))
     assert enrollment.missing() == (0, 1, 2)
     with pytest.raises(UsageError):
         begin(catalog, "bowl", 0)
@@ -326,24 +326,24 @@ def test_views_outside_the_plan_and_bad_descriptors_are_refused(catalog: Catalog
         catalog.begin("bowl", planned_azimuth_deg=[360.0], provenance=PROVENANCE)
 
 
-def test_changed_and_missing_images_are_noticed(catalog: Catalog) -> None:
+def test_read_image_rejects_changed_and_missing_images(catalog: Catalog) -> None:
     fill(catalog, "mug", 2)
     first, second = catalog.object("mug").views
     catalog.image_path(first).write_bytes(catalog.image_path(second).read_bytes())
-    with pytest.raises(CatalogError, match="not the one"):
+    with pytest.raises(CatalogError, match="not the stored one"):
         catalog.read_image(first)
     catalog.image_path(second).unlink()
     with pytest.raises(CatalogError, match="missing"):
         catalog.read_image(second)
 
 
-def test_an_unknown_view_is_refused(catalog: Catalog) -> None:
+def test_view_rejects_unknown_id(catalog: Catalog) -> None:
     with pytest.raises(CatalogError, match="no view 5"):
         catalog.view(5)
 
 
 class CatalogMachine(RuleBasedStateMachine):
-    """Any order of enrolling, abandoning, resuming and reopening, against a model in two dictionaries."""
+    """Enroll, abandon, resume and reopen in any order, and compare with a model of two dictionaries."""
 
     names = st.sampled_from(["mug", "tin"])
 
@@ -406,7 +406,7 @@ class CatalogMachine(RuleBasedStateMachine):
         self.catalog = Catalog.open(self.folder.name, clock=self.clock)
 
     @invariant()
-    def agrees_with_the_model(self) -> None:
+    def agrees_with_the_dictionaries(self) -> None:
         summaries = {summary.name: summary for summary in self.catalog.objects()}
         assert {name: s.views for name, s in summaries.items() if s.enrolled_utc} == self.complete
         assert {name: s.unfinished_views for name, s in summaries.items() if s.unfinished_views is not None} == {
@@ -421,7 +421,7 @@ TestCatalogMachine = CatalogMachine.TestCase
 TestCatalogMachine.settings = settings(max_examples=20, stateful_step_count=20, deadline=None)
 
 
-def test_only_an_enrollment_without_views_can_be_taken_back(catalog: Catalog) -> None:
+def test_discard_rejects_enrollment_with_views(catalog: Catalog) -> None:
     begin(catalog, "typo").discard()
     assert catalog.objects() == []
     fill(catalog, "mug", 3)
@@ -429,5 +429,5 @@ def test_only_an_enrollment_without_views_can_be_taken_back(catalog: Catalog) ->
     assert catalog.object("mug").summary.views == 3
     again = begin(catalog, "mug", replace=True)
     again.add(record(0), image(0))
-    with pytest.raises(CatalogError, match="holds views"):
+    with pytest.raises(CatalogError, match="has views"):
         again.discard()

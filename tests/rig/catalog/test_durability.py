@@ -1,4 +1,4 @@
-"""A stored view survives a killed process, a full disk and other processes at the same catalog."""
+"""A stored view survives a killed process, a full disk and other processes that use the same catalog."""
 
 import errno
 import os
@@ -48,14 +48,14 @@ def assert_resumes_whole(path: Path, name: str, reported: set[int]) -> None:
         assert [view.record.index for view in views] == list(range(VIEWS))
         for view in views:
             assert np.array_equal(catalog.read_image(view), image(view.record.index))
-            assert np.array_equal(view.record.descriptor, record(view.record.index).descriptor)
+            assert np.array_equal(view.record.descriptors["cedd"], record(view.record.index).descriptors["cedd"])
         assert {file.name for file in catalog.image_path(views[0]).parent.iterdir()} == {
             f"{index:03d}.png" for index in range(VIEWS)
         }
 
 
 @pytest.mark.parametrize("die_before", [5, 6, 7, 8], ids=["sync-image", "rename", "sync-folder", "commit"])
-def test_a_process_killed_inside_add_loses_only_that_view(tmp_path: Path, die_before: int) -> None:
+def test_process_killed_in_add_loses_only_that_view(tmp_path: Path, die_before: int) -> None:
     with spawn(tmp_path, "mug", die_before=die_before) as child:
         out, err = child.communicate()
     assert child.returncode == -signal.SIGKILL, err
@@ -64,7 +64,7 @@ def test_a_process_killed_inside_add_loses_only_that_view(tmp_path: Path, die_be
 
 
 @pytest.mark.parametrize("reports", [1, 4, 9])
-def test_a_process_killed_at_any_moment_keeps_what_it_reported(tmp_path: Path, reports: int) -> None:
+def test_process_killed_between_views_keeps_reported_views(tmp_path: Path, reports: int) -> None:
     with spawn(tmp_path, "mug") as child:
         assert child.stdout is not None
         reported = {int(child.stdout.readline()) for _ in range(reports)}
@@ -73,7 +73,7 @@ def test_a_process_killed_at_any_moment_keeps_what_it_reported(tmp_path: Path, r
     assert_resumes_whole(tmp_path, "mug", reported)
 
 
-def test_the_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
     fsync, replace = os.fsync, os.replace
 
@@ -100,7 +100,7 @@ def test_the_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest
     assert steps == ["sync 000.png.part", "rename 000.png.part 000.png", f"sync {enrollment.folder.name}", "commit"]
 
 
-def test_commits_are_durable_and_references_are_kept(tmp_path: Path) -> None:
+def test_database_commits_durably_and_checks_foreign_keys(tmp_path: Path) -> None:
     database = Database(tmp_path, create=True, read_only=False, busy_timeout_s=1.0)
     with database.write() as connection:
         settings = {
@@ -120,7 +120,7 @@ def fail_replace(_source: Path, _target: Path) -> None:
 
 
 @pytest.mark.parametrize(("call", "failure"), [("fsync", fail_fsync), ("replace", fail_replace)])
-def test_a_full_disk_loses_only_the_view_at_hand(
+def test_full_disk_loses_only_the_present_view(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, failure: Callable[..., Any]
 ) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
@@ -128,19 +128,19 @@ def test_a_full_disk_loses_only_the_view_at_hand(
         enrollment.add(record(0), image(0))
         with monkeypatch.context() as patch:
             patch.setattr(os, call, failure)
-            with pytest.raises(CatalogError, match=r"full.*earlier ones are safe") as refused:
+            with pytest.raises(CatalogError, match=r"full.*earlier ones are safe") as error:
                 enrollment.add(record(1), image(1))
-        assert "free some space" in refused.value.next_step
+        assert "free some space" in error.value.next_step
         assert enrollment.missing() == (1,)
         assert [file.name for file in (tmp_path / enrollment.folder).iterdir()] == ["000.png"]
         enrollment.add(record(1), image(1))
         enrollment.finish()
 
 
-def test_a_database_that_cannot_grow_is_a_full_disk(tmp_path: Path) -> None:
+def test_database_that_cannot_grow_is_reported_as_full_disk(tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
         enrollment = begin(catalog, "mug", 1)
-        with catalog._database.write() as connection:
+        with catalog.database.write() as connection:
             pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
             connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
         with pytest.raises(CatalogError, match="full"):
@@ -148,7 +148,7 @@ def test_a_database_that_cannot_grow_is_a_full_disk(tmp_path: Path) -> None:
         assert enrollment.missing() == (0,)
 
 
-def test_an_object_whose_folder_cannot_be_made_is_not_begun(tmp_path: Path) -> None:
+def test_begin_fails_if_the_folder_cannot_be_created(tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
         (tmp_path / "images").write_text("in the way")
         with pytest.raises(CatalogError):
@@ -156,21 +156,21 @@ def test_an_object_whose_folder_cannot_be_made_is_not_begun(tmp_path: Path) -> N
         assert catalog.objects() == []
 
 
-def test_a_second_writer_waits_and_is_then_told(tmp_path: Path) -> None:
+def test_second_writer_gets_busy_error_after_the_timeout(tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock(), busy_timeout_s=0.02) as catalog:
         fill(catalog, "tin", 1)
         enrollment = begin(catalog, "mug", 1)
         with closing(sqlite3.connect(tmp_path / "catalog.sqlite", isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
-            with pytest.raises(CatalogBusy, match=r"0\.02 s; nothing was changed") as refused:
+            with pytest.raises(CatalogBusy, match=r"0\.02 s; nothing was changed") as error:
                 enrollment.add(record(0), image(0))
-            assert refused.value.exit_code == 9
+            assert error.value.exit_code == 9
             assert len(catalog.views().views) == 1  # readers do not wait
         assert not (tmp_path / enrollment.folder / "000.png").exists()
         enrollment.add(record(0), image(0))
 
 
-def test_processes_create_enroll_and_read_one_catalog_together(tmp_path: Path) -> None:
+def test_several_processes_share_one_catalog(tmp_path: Path) -> None:
     path = tmp_path / "new" / "catalog"
     children = {name: spawn(path, name) for name in ("mug", "tin")}
     for child in children.values():

@@ -1,4 +1,4 @@
-"""What is not a usable catalog is refused in words, and left as it is."""
+"""A folder that is not a usable catalog is rejected with a reason, and not changed."""
 
 import os
 import sqlite3
@@ -34,28 +34,28 @@ def enrolled(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_new_catalog_is_marked_with_its_kind_and_version(enrolled: Path) -> None:
+def test_new_catalog_has_application_id_and_version(enrolled: Path) -> None:
     assert pragma(enrolled, "application_id") == (APPLICATION_ID,)
     assert pragma(enrolled, "user_version") == (SCHEMA_VERSION,)
     assert {file.name for file in enrolled.iterdir()} == {"catalog.sqlite", "images"}
 
 
-def test_a_newer_catalog_is_refused_in_words(enrolled: Path) -> None:
+def test_newer_catalog_is_rejected(enrolled: Path) -> None:
     pragma(enrolled, f"user_version = {SCHEMA_VERSION + 1}")
-    with pytest.raises(CatalogError, match="newer program") as refused:
+    with pytest.raises(CatalogError, match="newer program") as error:
         open_catalog(enrolled)
-    assert refused.value.evidence == {"found": SCHEMA_VERSION + 1, "known": SCHEMA_VERSION}
-    assert "update" in refused.value.next_step
+    assert error.value.evidence == {"found": SCHEMA_VERSION + 1, "known": SCHEMA_VERSION}
+    assert "update" in error.value.next_step
 
 
 @pytest.mark.parametrize(("create", "read_only"), [(False, False), (True, True)])
-def test_a_missing_catalog_is_not_made_unasked(tmp_path: Path, create: bool, read_only: bool) -> None:
+def test_missing_catalog_is_not_created_unasked(tmp_path: Path, create: bool, read_only: bool) -> None:
     with pytest.raises(CatalogError, match="no catalog"):
         open_catalog(tmp_path / "nothing", create=create, read_only=read_only)
     assert not (tmp_path / "nothing").exists()
 
 
-def test_a_creation_that_was_cut_off_is_done_again(tmp_path: Path) -> None:
+def test_interrupted_creation_is_repeated(tmp_path: Path) -> None:
     (tmp_path / "catalog.sqlite").touch()
     with pytest.raises(CatalogError, match="no catalog"):
         open_catalog(tmp_path, read_only=True)
@@ -63,20 +63,20 @@ def test_a_creation_that_was_cut_off_is_done_again(tmp_path: Path) -> None:
         fill(catalog, "mug", 1)
 
 
-def test_a_file_is_not_a_catalog_folder(tmp_path: Path) -> None:
+def test_file_is_rejected_as_catalog_folder(tmp_path: Path) -> None:
     path = tmp_path / "catalog.sqlite"
     path.touch()
     with pytest.raises(CatalogError, match="is a file"):
         open_catalog(path)
 
 
-def test_another_file_is_not_a_catalog(tmp_path: Path) -> None:
+def test_file_of_another_kind_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "catalog.sqlite").write_text("dear diary\n" * 100)
     with pytest.raises(CatalogError, match="not a catalog"):
         open_catalog(tmp_path)
 
 
-def test_the_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
+def test_database_of_another_program_is_not_changed(tmp_path: Path) -> None:
     file = tmp_path / "catalog.sqlite"
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("CREATE TABLE bookmarks (url)")
@@ -86,17 +86,17 @@ def test_the_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
     assert file.read_bytes() == before
 
 
-def test_a_damaged_catalog_is_told_with_the_way_out(enrolled: Path) -> None:
+def test_damaged_catalog_is_reported_with_the_fix(enrolled: Path) -> None:
     file = enrolled / "catalog.sqlite"
     content = bytearray(file.read_bytes())
     content[4096 * 2 :] = b"\xa5" * (len(content) - 4096 * 2)
     file.write_bytes(content)
-    with pytest.raises(CatalogError, match="damaged") as refused, open_catalog(enrolled) as catalog:
+    with pytest.raises(CatalogError, match="damaged") as error, open_catalog(enrolled) as catalog:
         catalog.object("mug")
-    assert "backup" in refused.value.next_step
+    assert "backup" in error.value.next_step
 
 
-def test_read_only_reads_and_writes_nothing(enrolled: Path) -> None:
+def test_read_only_catalog_is_not_changed(enrolled: Path) -> None:
     before = (enrolled / "catalog.sqlite").read_bytes()
     with open_catalog(enrolled, read_only=True) as catalog:
         assert len(catalog.views().views) == 36
@@ -106,7 +106,7 @@ def test_read_only_reads_and_writes_nothing(enrolled: Path) -> None:
 
 
 @needs_permissions
-def test_a_catalog_without_write_permission_can_be_read(enrolled: Path) -> None:
+def test_catalog_without_write_permission_can_be_read(enrolled: Path) -> None:
     (enrolled / "catalog.sqlite").chmod(0o400)
     enrolled.chmod(0o500)
     with open_catalog(enrolled, read_only=True) as catalog:
@@ -117,7 +117,7 @@ def test_a_catalog_without_write_permission_can_be_read(enrolled: Path) -> None:
 
 
 @needs_permissions
-def test_a_folder_that_may_not_be_used_is_told(tmp_path: Path) -> None:
+def test_folder_without_permission_is_reported(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(CatalogError, match="no permission"):
         open_catalog(tmp_path / "catalog")

@@ -188,7 +188,7 @@ def test_the_catalog_is_evaluated_where_no_folder_is_named(tmp_path: Path, monke
                 name, planned_azimuth_deg=list(range(0, 360, 30)), provenance=Provenance("bench", {}, {})
             )
             for index in range(12):
-                record = ViewRecord(index, 0.0, 0.0, 30.0 * index + 0.25, np.zeros(144, np.uint8), 0)
+                record = ViewRecord(index, 0.0, 0.0, 30.0 * index + 0.25, {"cedd": np.zeros(144, np.uint8)}, 0)
                 enrollment.add(record, cv2.copyMakeBorder(drawing(number, 30 * index), 0, 0, 4, 4, 0))
             enrollment.finish()
     done = run(*QUICK, "--out", "out")

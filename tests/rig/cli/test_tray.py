@@ -119,7 +119,7 @@ def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identifi
         for name in NAMES[7], killed["name"]:
             details = catalog.object(name)
             assert [view.record.index for view in details.views] == list(range(VIEWS))
-            assert len({view.sitting.id for view in details.views}) == 2
+            assert len({view.session.id for view in details.views}) == 2
             for view in details.views:
                 catalog.read_image(view)  # whole, and the one that was stored
 

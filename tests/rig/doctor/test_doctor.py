@@ -438,7 +438,7 @@ def test_a_catalog_with_rows_of_nobody_is_damaged():
         enroll(path, 4)
         with sqlite3.connect(path / "catalog.sqlite") as connection:
             connection.execute("PRAGMA foreign_keys = off")
-            connection.execute("DELETE FROM sittings")
+            connection.execute("DELETE FROM sessions")
         connection.close()
         assert any("damaged" in text for text in bench.problems("catalog"))
 

@@ -62,7 +62,7 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
         assert record.evidence["exposed_ns"] >= record.evidence["settled_ns"]
         x, y, width, height = s.bench.config.view.roi
         stored = catalog.read_image(view)[y : y + height, x : x + width]
-        assert (hbr.describe(stored) == record.descriptor).all()
+        assert (hbr.describe(stored) == record.descriptors["cedd"]).all()
     assert torque(s) == 0
 
 
@@ -106,7 +106,7 @@ def test_what_a_view_was_taken_under_is_kept_with_it(simulated, catalog):
     """Also on a bench without a noise model: the calibration in force, the camera's settings, what opening it found."""
     s = simulated("imu.scale=1.007")
     list(enroll(s.bench, catalog, "dice", views=4))
-    provenance = catalog.object("dice").views[0].sitting.provenance
+    provenance = catalog.object("dice").views[0].session.provenance
     assert provenance.conditions["imu"]["scale"] == 1.007
     assert provenance.conditions["table"]["zero_deg"] == s.bench.config.table.zero_deg
     assert provenance.conditions["camera"]["exposure_us"] == s.bench.config.camera.exposure_us

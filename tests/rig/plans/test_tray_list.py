@@ -161,7 +161,7 @@ def test_an_interrupted_object_that_was_moved_is_enrolled_anew(simulated, catalo
     events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, operator=Scripted([TrayDecision.RESTART])))
     assert actions(events) == [("lamp", "replace")]
     assert sum(isinstance(e, Accepted) for e in events) == 4
-    assert len({view.sitting.id for view in catalog.object("lamp").views}) == 1
+    assert len({view.session.id for view in catalog.object("lamp").views}) == 1
 
 
 def test_somebody_may_leave_objects_out_or_stop(simulated, catalog):

@@ -226,15 +226,15 @@ def test_enrolled_views_have_both_descriptors_evidence_and_the_image(simulated: 
         events = list(enroll(s.bench, catalog, "toy-car", views=4))
         details = catalog.object("toy-car")
         loaded = catalog.views(BENCH_DESCRIPTOR).views
-        (sitting,) = details.enrollments[0].sittings
-        assert sitting.reference_image is not None
-        assert (tmp_path / sitting.reference_image).exists()
+        (session,) = details.enrollments[0].sessions
+        assert session.empty_table_image is not None
+        assert (tmp_path / session.empty_table_image).exists()
     assert loaded.descriptor == BENCH_DESCRIPTOR
     assert len(loaded) == 4
     summary = SegmentationSummary.of(view.record.segmentation for view in details.views)
     assert (summary.views, summary.found, summary.guessed, summary.corrected) == (4, 4, 0, 4)
     assert summary.text.startswith("object found in 4 of 4 views, illumination corrected in 4")
-    assert f"{taken.taken_utc:.10}" in sitting.provenance.conditions["empty_table"]["taken_utc"]
+    assert f"{taken.taken_utc:.10}" in session.provenance.conditions["empty_table"]["taken_utc"]
     assert not any(isinstance(event, Warned) for event in events)
 
 

@@ -1,4 +1,4 @@
-"""Objects on their way into or out of a catalog; in JSON one line of a bundle's ``objects.jsonl`` each."""
+"""Objects that are exported or imported. In a bundle each one is a line of ``objects.jsonl``."""
 
 import math
 import re
@@ -10,10 +10,18 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import AliasChoices, AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from hbr.descriptors import descriptor, names
-from rig.catalog.describing import region_of
-from rig.catalog.records import EnrollmentStatus, Region, as_json, check_azimuth, check_text, clean_name
+from rig.catalog.describing import region_of, unpack
+from rig.catalog.records import (
+    EnrollmentStatus,
+    PackedDescriptor,
+    Region,
+    as_json,
+    check_azimuth,
+    check_text,
+    clean_name,
+)
 from rig.core.errors import UsageError
+from rig.views.segmentation_evidence import upgrade_evidence
 
 Degrees = Annotated[float, Field(allow_inf_nan=False)]
 Azimuth = Annotated[float, Field(ge=0, lt=360)]
@@ -21,22 +29,27 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Json = dict[str, Any]
 
 MAX_VIEWS = 10_000
-"""Of one enrollment: a view every 0.036°."""
+"""Most views of one enrollment: one every 0.036°."""
 
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def _renamed(name: str, old: str) -> Any:
+    """Return an optional field that bundles of version 1 have under another name."""
+    return Field(default=None, validation_alias=AliasChoices(name, old))
+
+
 class ImageSource(NamedTuple):
-    """Where the bytes of an image are: a file, or a member of a bundle."""
+    """Source of an image: a file, or a member of a bundle."""
 
     file: str
     member: str | None = None
 
 
-class Levels(_Part):
-    """What one version of one descriptor says of a view; ``packed`` in hexadecimal digits."""
+class BundledDescriptor(_Part):
+    """A `PackedDescriptor` in JSON: ``packed`` as hexadecimal digits."""
 
     name: Annotated[str, Field(min_length=1, max_length=100)]
     version: Annotated[int, Field(ge=1)]
@@ -44,18 +57,20 @@ class Levels(_Part):
     packed: Annotated[str, Field(pattern=r"^([0-9a-f]{2})+$", max_length=100_000)]
 
     @model_validator(mode="after")
-    def _is_of_its_descriptor(self) -> Self:
-        if self.name in names() and descriptor(self.name).version == self.version:
-            descriptor(self.name).unpack(bytes.fromhex(self.packed))
+    def _is_valid(self) -> Self:
+        unpack([self.as_packed()])
         as_json(self.settings, "the settings of a descriptor")
         return self
 
+    def as_packed(self) -> PackedDescriptor:
+        return PackedDescriptor(self.name, self.version, self.settings, bytes.fromhex(self.packed))
+
 
 class View(_Part):
-    """A view; ``image`` is where its image is in the bundle, ``sitting`` the place of its sitting in the enrollment."""
+    """A view; ``image`` is the path of its image in the bundle, ``session`` the index of its session."""
 
     index: Annotated[int, Field(ge=0, lt=MAX_VIEWS)]
-    sitting: Annotated[int, Field(ge=0)]
+    session: Annotated[int, Field(ge=0)] = Field(validation_alias=AliasChoices("session", "sitting"))
     azimuth_deg: Azimuth
     commanded_deg: Degrees | None = None
     encoder_deg: Degrees | None = None
@@ -69,32 +84,39 @@ class View(_Part):
     evidence: Json = {}
     segmentation: Json | None = Field(
         default=None,
-        validation_alias=AliasChoices("segmentation", "front_end"),  # bundles before version 2
+        validation_alias=AliasChoices("segmentation", "front_end"),
     )
-    descriptors: tuple[Levels, ...] = ()
+    descriptors: tuple[BundledDescriptor, ...] = ()
+
+    @field_validator("segmentation")
+    @classmethod
+    def _has_codes(cls, segmentation: Json | None) -> Json | None:
+        return None if segmentation is None else upgrade_evidence(segmentation)
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
         if (self.imu_deg is None) != (self.imu_sigma_deg is None):
-            raise ValueError("imu_deg and imu_sigma_deg: both or none")
-        if len({(levels.name, levels.version) for levels in self.descriptors}) < len(self.descriptors):
-            raise ValueError("the same version of a descriptor is there twice")
+            raise ValueError("imu_deg and imu_sigma_deg: give both or none")
+        if len({(one.name, one.version) for one in self.descriptors}) < len(self.descriptors):
+            raise ValueError("a descriptor is listed twice in the same version")
         as_json(self.evidence, "the evidence")
         as_json(self.segmentation or {}, "the segmentation")
         return self
 
 
-class Sitting(_Part):
-    """What views were taken with."""
+class Session(_Part):
+    """A session: `rig.catalog.Session` in JSON."""
 
     started_utc: AwareDatetime
     bench: str
     software: str
     devices: Json = {}
     conditions: Json = {}
-    reference_image: str | None = None
-    reference_image_sha256: Sha256 | None = None
-    reference_image_bytes: Annotated[int, Field(ge=1)] | None = None
+    empty_table_image: str | None = _renamed("empty_table_image", "reference_image")
+    empty_table_image_sha256: Sha256 | None = _renamed("empty_table_image_sha256", "reference_image_sha256")
+    empty_table_image_bytes: Annotated[int | None, Field(ge=1)] = _renamed(
+        "empty_table_image_bytes", "reference_image_bytes"
+    )
 
     @model_validator(mode="after")
     def _is_json(self) -> Self:
@@ -104,30 +126,32 @@ class Sitting(_Part):
 
 
 class Enrollment(_Part):
-    """An enrollment with its sittings and views."""
+    """An enrollment with its sessions and views."""
 
     status: EnrollmentStatus
     started_utc: AwareDatetime
     finished_utc: AwareDatetime | None = None
     planned_azimuth_deg: Annotated[tuple[Azimuth, ...], Field(min_length=1, max_length=MAX_VIEWS)]
-    sittings: Annotated[tuple[Sitting, ...], Field(max_length=MAX_VIEWS)]
+    sessions: Annotated[tuple[Session, ...], Field(max_length=MAX_VIEWS)] = Field(
+        validation_alias=AliasChoices("sessions", "sittings")
+    )
     views: Annotated[tuple[View, ...], Field(max_length=MAX_VIEWS)]
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
         indices = {view.index for view in self.views}
         if len(indices) < len(self.views):
-            raise ValueError("a view is there twice")
+            raise ValueError("a view is listed twice")
         if not indices <= set(range(len(self.planned_azimuth_deg))):
             raise ValueError(f"a view is not one of the {len(self.planned_azimuth_deg)} planned ones")
-        if any(view.sitting >= len(self.sittings) for view in self.views):
-            raise ValueError("a view is of a sitting that is not there")
+        if any(view.session >= len(self.sessions) for view in self.views):
+            raise ValueError("the session of a view is missing")
         if self.status == EnrollmentStatus.COMPLETE and len(indices) < len(self.planned_azimuth_deg):
             raise ValueError(
-                f"it is said to be complete, with {len(indices)} of {len(self.planned_azimuth_deg)} planned views"
+                f"its status is complete, but it has {len(indices)} of {len(self.planned_azimuth_deg)} planned views"
             )
         if (self.finished_utc is None) != (self.status == EnrollmentStatus.IN_PROGRESS):
-            raise ValueError("an enrollment has a time of its end unless it is in progress")
+            raise ValueError("finished_utc is missing, or the enrollment is in progress and has one")
         return self
 
 
@@ -144,7 +168,7 @@ class Object(_Part):
     @classmethod
     def _is_clean(cls, name: str) -> str:
         if clean_name(name) != name:
-            raise ValueError("the name has outer blanks or is not composed (NFC)")
+            raise ValueError("the name has outer spaces or is not composed (NFC)")
         return name
 
     @model_validator(mode="after")
@@ -153,13 +177,17 @@ class Object(_Part):
         check_text(self.note, "note")
         for status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS):
             if sum(enrollment.status == status for enrollment in self.enrollments) > 1:
-                raise ValueError(f"two enrollments are {status}")
+                raise ValueError(f"two enrollments have the status {status}")
         return self
 
 
+ExportedObject = tuple[Object, dict[str, Path]]
+"""An object, and the files of its images by their paths in the export."""
+
+
 @dataclass(frozen=True, slots=True)
-class Refused:
-    """A file that is not taken, and why."""
+class RejectedFile:
+    """A file that is not imported, and why."""
 
     path: str
     reason: str
@@ -167,36 +195,44 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A view that lacks in the even spacing of the others."""
+    """A view that is missing in the even spacing of the others."""
 
     object_name: str
     azimuth_deg: float
 
 
 @dataclass(frozen=True, slots=True)
-class Package:
-    """Objects that are to come into a catalog.
+class ImportBatch:
+    """Objects to be imported.
 
-    ``sources`` has for every ``image`` of theirs where its bytes are, ``regions`` which part of those to describe that
-    are not described yet, where that is not all; ``strict`` says that one bad image spoils all: a bundle is whole or it
-    is not one.
+    Attributes
+    ----------
+    origin
+        The file, folder or catalog that they come from.
+    sources
+        Source of each image of the objects.
+    regions
+        Part of the image to describe, for images without descriptors; the whole image if there is none.
+    strict
+        One rejected image rejects the whole batch, as for a bundle.
     """
 
     origin: str
     objects: tuple[Object, ...]
     sources: dict[str, ImageSource]
     regions: dict[str, Region] = field(default_factory=dict)
-    refused: tuple[Refused, ...] = ()
+    rejected: tuple[RejectedFile, ...] = ()
     gaps: tuple[Gap, ...] = ()
     strict: bool = False
 
     @property
     def views(self) -> int:
+        """Number of views of all objects."""
         return sum(len(enrollment.views) for item in self.objects for enrollment in item.enrollments)
 
 
 class Photograph(NamedTuple):
-    """A file that shows an object from an azimuth, and what else is known: fields of `View`, and these texts."""
+    """An image file of an object at an azimuth. ``values`` are other fields of `View`."""
 
     path: Path
     name: str
@@ -210,25 +246,25 @@ class Photograph(NamedTuple):
 
 
 def assemble(
-    origin: str, photographs: Iterable[Photograph], refused: Sequence[Refused], now: datetime, software: str
-) -> Package:
-    """Make a package of photographs: each object one complete enrollment, its views by rising azimuth.
+    origin: str, photographs: Iterable[Photograph], rejected: Sequence[RejectedFile], now: datetime, software: str
+) -> ImportBatch:
+    """Return a batch of photographs. Each object becomes one complete enrollment with views by ascending azimuth.
 
-    Two photographs of one object from one azimuth: the first is taken, the other refused.
+    If two photographs show an object from the same azimuth, the second one is rejected.
     """
     by_name: dict[str, dict[float, Photograph]] = {}
-    spoiled = list(refused)
+    all_rejected = list(rejected)
     for photograph in photographs:
         try:
             name = clean_name(photograph.name)
             check_azimuth(photograph.azimuth_deg)
         except UsageError as error:
-            spoiled.append(Refused(str(photograph.path), error.what))
+            all_rejected.append(RejectedFile(str(photograph.path), error.what))
             continue
         taken = by_name.setdefault(name, {})
         if photograph.azimuth_deg in taken:
             other = taken[photograph.azimuth_deg].path.name
-            spoiled.append(Refused(str(photograph.path), f"shows {name!r} from the same azimuth as {other}"))
+            all_rejected.append(RejectedFile(str(photograph.path), f"shows {name!r} from the same azimuth as {other}"))
             continue
         taken[photograph.azimuth_deg] = photograph
     objects = tuple(
@@ -236,31 +272,31 @@ def assemble(
         for name, taken in by_name.items()
     )
     used = [photograph for taken in by_name.values() for photograph in taken.values()]
-    return Package(
+    return ImportBatch(
         origin,
         objects,
         {str(photograph.path): ImageSource(str(photograph.path)) for photograph in used},
         {str(photograph.path): photograph.region for photograph in used if photograph.region is not None},
-        tuple(spoiled),
+        tuple(all_rejected),
         tuple(gaps(objects)),
     )
 
 
 def _object(name: str, photographs: Sequence[Photograph], origin: str, now: datetime, software: str) -> Object:
-    sat = list(dict.fromkeys((photograph.bench, photograph.software) for photograph in photographs))
+    taken_with = list(dict.fromkeys((photograph.bench, photograph.software) for photograph in photographs))
     enrollment = Enrollment(
         status=EnrollmentStatus.COMPLETE,
         started_utc=now,
         finished_utc=now,
         planned_azimuth_deg=tuple(photograph.azimuth_deg for photograph in photographs),
-        sittings=tuple(
-            Sitting(started_utc=now, bench=bench, software=by or software, conditions={"imported_from": origin})
-            for bench, by in sat
+        sessions=tuple(
+            Session(started_utc=now, bench=bench, software=by or software, conditions={"imported_from": origin})
+            for bench, by in taken_with
         ),
         views=tuple(
             View(
                 index=index,
-                sitting=sat.index((photograph.bench, photograph.software)),
+                session=taken_with.index((photograph.bench, photograph.software)),
                 azimuth_deg=photograph.azimuth_deg,
                 image=str(photograph.path),
                 **photograph.values,
@@ -278,12 +314,12 @@ def _object(name: str, photographs: Sequence[Photograph], origin: str, now: date
 
 
 def region_of_view(view: View) -> Region | None:
-    """Return the part of its image that a view is described within; None for all of it."""
+    """Return the part of its image that a view is described within; None for the whole image."""
     return region_of(view.descriptors[0].settings) if view.descriptors else None
 
 
 def gaps(objects: Sequence[Object]) -> list[Gap]:
-    """Return the views that lack where an object is to be seen all around at the usual step of all."""
+    """Return the missing views of objects that are seen all around at the usual step between views."""
     rings = {item.name: sorted(item.enrollments[-1].planned_azimuth_deg) for item in objects}
     steps = sorted(
         step
@@ -298,29 +334,29 @@ def gaps(objects: Sequence[Object]) -> list[Gap]:
     if slots < 4 or abs(360 / slots - step_deg) > 0.1 * step_deg:
         return []  # no even spacing
     step_deg = 360 / slots
-    lacking = []
+    missing = []
     for name, ring in rings.items():
         if len(ring) < 2:
             continue
         start_deg = ring[0] % step_deg
         seen = {round((azimuth_deg - start_deg) / step_deg) % slots for azimuth_deg in ring}
-        lacking += [
+        missing += [
             Gap(name, math.fmod(start_deg + slot * step_deg, 360.0)) for slot in range(slots) if slot not in seen
         ]
-    return lacking
+    return missing
 
 
-def region_words(region: Region | None) -> str:
-    """Write a region as it stands in a table: x y width height; nothing for the whole image."""
+def region_text(region: Region | None) -> str:
+    """Return a region as text for a table: x y width height; empty for the whole image."""
     return "" if region is None else " ".join(map(str, region))
 
 
 def parse_region(text: str) -> Region | None:
-    """Read a region from a table; ValueError where it is none."""
+    """Parse the text of `region_text`. ValueError if it is not a region."""
     if not text.strip():
         return None
     numbers = re.split(r"[ ,]+", text.strip())
     if len(numbers) != 4 or not all(re.fullmatch("[0-9]{1,6}", number) for number in numbers):
-        raise ValueError(f"region {text!r} is not x y width height in pixels")
+        raise ValueError(f"the region {text!r} is not of the form x y width height, in pixels")
     x, y, width, height = map(int, numbers)
     return x, y, width, height

@@ -1,0 +1,90 @@
+"""Questions about how the enrolled views are described: by which descriptors, within which region, with which table."""
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Text, cast, select
+
+from hbr.descriptors import descriptor
+from rig.calibrations.store import CALIBRATIONS
+from rig.catalog.catalog import Catalog
+from rig.catalog.describing import EmptyTable, region_of
+from rig.catalog.queries import described_by, retrieved
+from rig.catalog.records import Region
+from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
+from rig.views import image_files as images
+from rig.views.description import PAPER_DESCRIPTOR
+
+
+class EmptyTables(NamedTuple):
+    """Names of the objects that were enrolled with an empty-table image and without, and the newest of these images."""
+
+    with_image: tuple[str, ...]
+    without_image: tuple[str, ...]
+    newest: EmptyTable | None
+
+
+def has_descriptor(catalog: Catalog, name: str) -> bool:
+    """Return whether any view is described by a descriptor. `Catalog.views` checks that all views in use are."""
+    with catalog.database.read() as connection:
+        described = select(descriptors.c.view_id).where(descriptors.c.name == name).limit(1)
+        return connection.scalar(described) is not None
+
+
+def empty_tables(catalog: Catalog) -> EmptyTables:
+    """Return which of the objects in use were enrolled with an empty-table image."""
+    newest = None
+    with_image: dict[str, bool] = {}
+    with catalog.database.read() as connection:
+        for name, image, sha256 in connection.execute(
+            select(objects.c.name, sessions.c.empty_table_image, sessions.c.empty_table_image_sha256)
+            .select_from(objects)
+            .join(enrollments)
+            .join(sessions, sessions.c.enrollment_id == enrollments.c.id)
+            .where(retrieved())
+            .order_by(sessions.c.started_utc)
+        ):
+            with_image[name] = with_image.get(name, False) or image is not None
+            newest = newest if image is None else (image, sha256)
+    return EmptyTables(
+        tuple(name for name, has_image in with_image.items() if has_image),
+        tuple(name for name, has_image in with_image.items() if not has_image),
+        newest,
+    )
+
+
+def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.uint8]:
+    """Return the pixels of an empty-table image, uint8 (H, W, 3) BGR.
+
+    Raises
+    ------
+    CatalogError
+        The file is missing, is not the stored one, or the system denies access.
+    """
+    path, sha256 = empty_table
+    with catalog.database.in_words():
+        return images.read(catalog.path / path, sha256)
+
+
+def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
+    """Return the regions that the views of a bench are described within; None is the whole image.
+
+    Each region comes with the ids of the calibration results in force when its views were taken.
+    """
+    with catalog.database.read() as connection:
+        rows = connection.execute(
+            select(cast(descriptors.c.settings, Text), cast(sessions.c.conditions, Text))
+            .select_from(objects)
+            .join(enrollments)
+            .join(views, views.c.enrollment_id == enrollments.c.id)
+            .join(sessions, views.c.session_id == sessions.c.id)
+            .join(descriptors, described_by(descriptor(PAPER_DESCRIPTOR)))
+            .where(retrieved(), sessions.c.bench == bench)
+            .distinct()
+        )
+        return {
+            (region_of(json.loads(settings)), tuple(json.loads(conditions).get(CALIBRATIONS, ())))
+            for settings, conditions in rows
+        }

@@ -1,0 +1,127 @@
+"""Read objects from a catalog, one after the other, with everything that is stored of them."""
+
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+from sqlalchemy import Connection, select
+
+from rig.catalog.catalog import Catalog
+from rig.catalog.exchange.batch import (
+    BundledDescriptor,
+    Enrollment,
+    ExportedObject,
+    ImageSource,
+    ImportBatch,
+    Object,
+    Session,
+    View,
+)
+from rig.catalog.queries import find, packed_descriptors
+from rig.catalog.rows import measured
+from rig.catalog.schema import enrollments, objects, sessions, views
+from rig.views import image_files as images
+
+
+def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Iterator[ExportedObject]:
+    """Yield objects in use in their order, each with the files of its images by their paths in the export.
+
+    The paths number the objects and enrollments from 1. They do not depend on what else was in the catalog.
+
+    Parameters
+    ----------
+    names
+        Names of the objects; empty for all objects.
+
+    Raises
+    ------
+    ObjectNotFound
+        There is no object of one of these names.
+    """
+    with catalog.database.read() as connection:
+        wanted = [objects.c.deleted_utc.is_(None)]
+        if names:
+            wanted.append(objects.c.id.in_([find(connection, name)[0] for name in names]))
+        enrollment_numbers = iter(range(1, 1 << 62))
+        rows = connection.execute(select(objects).where(*wanted).order_by(objects.c.id)).all()
+        for number, row in enumerate(rows, start=1):
+            files: dict[str, Path] = {}
+            found = []
+            for enrollment in connection.execute(
+                select(enrollments).where(enrollments.c.object_id == row.id).order_by(enrollments.c.id)
+            ).all():
+                folder = images.folder(number, row.name, next(enrollment_numbers))
+                by_id = _sessions(connection, enrollment.id, folder, catalog.path, files)
+                found.append(
+                    Enrollment(
+                        status=enrollment.status,
+                        started_utc=enrollment.started_utc,
+                        finished_utc=enrollment.finished_utc,
+                        planned_azimuth_deg=tuple(enrollment.planned_azimuth_deg),
+                        sessions=tuple(by_id.values()),
+                        views=tuple(_views(connection, enrollment.id, list(by_id), folder, catalog.path, files)),
+                    )
+                )
+            texts = {"name": row.name, "label": row.label, "note": row.note}
+            yield Object(**texts, created_utc=row.created_utc, enrollments=tuple(found)), files
+
+
+def read_catalog(catalog: Catalog, names: Collection[str] = ()) -> ImportBatch:
+    """Return objects of a catalog, to be imported into another one."""
+    found, sources = [], {}
+    for item, files in read_objects(catalog, names):
+        found.append(item)
+        sources.update({name: ImageSource(str(path)) for name, path in files.items()})
+    return ImportBatch(str(catalog.path), tuple(found), sources, strict=True)
+
+
+def _sessions(
+    connection: Connection, enrollment_id: int, folder: Path, root: Path, files: dict[str, Path]
+) -> dict[int, Session]:
+    found = {}
+    rows = connection.execute(
+        select(sessions).where(sessions.c.enrollment_id == enrollment_id).order_by(sessions.c.id)
+    ).all()
+    for number, row in enumerate(rows):
+        exported = None
+        if row.empty_table_image is not None:
+            exported = (folder / f"empty-{number:03d}{Path(row.empty_table_image).suffix}").as_posix()
+            files[exported] = root / row.empty_table_image
+        found[row.id] = Session(
+            started_utc=row.started_utc,
+            bench=row.bench,
+            software=row.software,
+            devices=row.devices,
+            conditions=row.conditions,
+            empty_table_image=exported,
+            empty_table_image_sha256=row.empty_table_image_sha256,
+            empty_table_image_bytes=row.empty_table_image_bytes,
+        )
+    return found
+
+
+def _views(
+    connection: Connection,
+    enrollment_id: int,
+    session_ids: Sequence[int],
+    folder: Path,
+    root: Path,
+    files: dict[str, Path],
+) -> Iterator[View]:
+    of_enrollment = views.c.enrollment_id == enrollment_id
+    packed = packed_descriptors(connection, of_enrollment)
+    for row in connection.execute(select(views).where(of_enrollment).order_by(views.c.view_index)).all():
+        exported = (folder / f"{row.view_index:03d}{Path(row.image).suffix}").as_posix()
+        files[exported] = root / row.image
+        yield View(
+            index=row.view_index,
+            session=session_ids.index(row.session_id),
+            captured_utc=row.captured_utc,
+            image=exported,
+            image_sha256=row.image_sha256,
+            image_bytes=row.image_bytes,
+            descriptors=tuple(
+                BundledDescriptor(name=one.name, version=one.version, settings=one.settings, packed=one.packed.hex())
+                for one in packed[row.id]
+            ),
+            **measured(row),
+        )

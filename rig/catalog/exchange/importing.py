@@ -1,0 +1,158 @@
+"""Import objects: check and describe their images in a staging folder, then insert all of them at once."""
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from rig.catalog.catalog import Catalog
+from rig.catalog.describing import known_descriptor
+from rig.catalog.exchange.batch import Gap, ImportBatch, Object, RejectedFile
+from rig.catalog.exchange.insert import insert_objects
+from rig.catalog.exchange.plan import Plan
+from rig.catalog.exchange.stage import StagedImage, items_of, stage
+from rig.catalog.jobs import JobProgress, portions, processes
+from rig.catalog.staging import staging
+from rig.core.errors import ImportRejected
+from rig.core.files import sync_tree
+from rig.core.processes import map_in_processes
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """Result of an import: what was imported, what was rejected, and which views are missing."""
+
+    objects: int
+    views: int
+    bytes: int
+    skipped: tuple[str, ...]
+    replaced: tuple[str, ...]
+    rejected: tuple[RejectedFile, ...]
+    gaps: tuple[Gap, ...]
+
+
+def import_objects(
+    catalog: Catalog,
+    plan: Plan,
+    *,
+    label: str | None = None,
+    descriptors: Sequence[str] = (),
+    strict: bool = False,
+    jobs: int | None = None,
+) -> Generator[JobProgress, None, Imported]:
+    """Import the objects of a plan, all or nothing.
+
+    Several processes copy the images into a staging folder and describe them. When all are on the disk, one transaction
+    inserts them. If the call ends before that, the catalog is unchanged.
+
+    Parameters
+    ----------
+    label
+        For new objects without a label.
+    descriptors
+        Descriptors (`hbr.descriptors`) to compute besides CEDD, for views without descriptors.
+    strict
+        Import nothing if one image is rejected. This is always so for a bundle.
+    jobs
+        Number of processes; None for one per core.
+
+    Raises
+    ------
+    UsageError
+        There is no such descriptor.
+    ImportRejected
+        Nothing is left to import, or an image was rejected and the import is strict.
+    ObjectExists
+        Another process has inserted one of the objects since the plan was made.
+    CatalogError, CatalogBusy
+        The catalog cannot be written.
+    """
+    for name in descriptors:
+        known_descriptor(name)
+    batch = plan.batch
+    strict = strict or batch.strict
+    rejected = list(batch.rejected)
+    if strict and rejected:
+        raise _import_error(batch, rejected)
+    with catalog.database.in_words(), staging(catalog.path) as folder:
+        items = list(items_of(plan, tuple(descriptors)))
+        staged: dict[str, StagedImage] = {}
+        yield JobProgress(0, len(items))
+        work = partial(stage, folder)
+        for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
+            for item, one in zip(portion, found, strict=True):
+                staged[item.image] = one
+                if one.reason:
+                    rejected.append(RejectedFile(item.image, one.reason))
+            if strict and rejected:
+                raise _import_error(batch, rejected)
+            yield JobProgress(len(staged), len(items))
+        wanted = [left for left in (_without_rejected(item, staged) for item in plan.wanted) if left.enrollments]
+        if not wanted and items:
+            raise _import_error(batch, rejected)
+        sync_tree(folder)
+        insert_objects(catalog, plan, wanted, staged, folder, label)
+    return Imported(
+        len(wanted),
+        sum(len(enrollment.views) for item in wanted for enrollment in item.enrollments),
+        sum(one.size for one in staged.values()),
+        plan.skipped,
+        plan.replaced,
+        tuple(rejected),
+        batch.gaps,
+    )
+
+
+def preview_import(
+    plan: Plan, *, strict: bool = False, jobs: int | None = None
+) -> Generator[JobProgress, None, Imported]:
+    """Check every image of a plan, and return what `import_objects` would return. Nothing is written.
+
+    Raises
+    ------
+    ImportRejected
+        An image was rejected and the import is strict.
+    """
+    batch = plan.batch
+    rejected = list(batch.rejected)
+    items = list(items_of(plan))
+    size = done = 0
+    yield JobProgress(0, len(items))
+    for portion, found in map_in_processes(partial(stage, None), portions(items), processes(jobs, len(items))):
+        for item, one in zip(portion, found, strict=True):
+            size += one.size
+            if one.reason:
+                rejected.append(RejectedFile(item.image, one.reason))
+        done += len(portion)
+        yield JobProgress(done, len(items))
+    if rejected and (strict or batch.strict):
+        raise _import_error(batch, rejected)
+    bad = {file.path for file in rejected}
+    left = [
+        sum(view.image not in bad for enrollment in item.enrollments for view in enrollment.views)
+        for item in plan.wanted
+    ]
+    return Imported(
+        sum(count > 0 for count in left), sum(left), size, plan.skipped, plan.replaced, tuple(rejected), batch.gaps
+    )
+
+
+def _import_error(batch: ImportBatch, rejected: list[RejectedFile]) -> ImportRejected:
+    return ImportRejected(
+        f"{batch.origin} was not imported: {len(rejected)} of its files cannot be used",
+        next_step="fix or remove the listed files and import it again",
+        evidence={"rejected": [f"{file.path}: {file.reason}" for file in rejected[:20]]},
+    )
+
+
+def _without_rejected(item: Object, staged: dict[str, StagedImage]) -> Object:
+    """The object without the views whose images were rejected."""
+    if not any(staged[view.image].reason for enrollment in item.enrollments for view in enrollment.views):
+        return item
+    left = []
+    for enrollment in item.enrollments:
+        good = [view for view in enrollment.views if not staged[view.image].reason]
+        if good:
+            views_left = tuple(view.model_copy(update={"index": index}) for index, view in enumerate(good))
+            planned = tuple(enrollment.planned_azimuth_deg[view.index] for view in good)
+            left.append(enrollment.model_copy(update={"views": views_left, "planned_azimuth_deg": planned}))
+    return item.model_copy(update={"enrollments": tuple(left)})

@@ -1,0 +1,119 @@
+"""Insert sessions and views into the tables. Enrolled and imported views take the same path."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Final
+
+from sqlalchemy import ColumnElement, Connection, and_, insert, select, update
+
+from rig.catalog.database import insert_row
+from rig.catalog.records import EnrollmentStatus, ImageFile, PackedDescriptor, Provenance
+from rig.catalog.schema import descriptors, enrollments, sessions, views
+
+MEASURED: Final = (
+    *("azimuth_deg", "commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg"),
+    *("captured_ns", "evidence", "segmentation"),
+)
+"""Columns of a view that `ViewRecord` and the views of a bundle have under the same names."""
+
+
+def measured(view: object) -> dict[str, Any]:
+    """Return the columns `MEASURED` of a view, from its attributes of these names."""
+    return {name: getattr(view, name) for name in MEASURED}
+
+
+@dataclass(frozen=True, slots=True)
+class NewView:
+    """A view to be inserted; `measured` holds the columns of `MEASURED`. Its image file is in its place already."""
+
+    index: int
+    measured: Mapping[str, Any]
+    session_id: int
+    captured_utc: datetime | None
+    image: ImageFile
+    descriptors: Sequence[PackedDescriptor]
+
+
+def insert_session(
+    connection: Connection,
+    enrollment_id: int,
+    started_utc: datetime,
+    provenance: Provenance,
+    empty_table: ImageFile | None = None,
+) -> int:
+    """Insert a session and return its id."""
+    return insert_row(
+        connection,
+        sessions,
+        enrollment_id=enrollment_id,
+        started_utc=started_utc,
+        bench=provenance.bench,
+        software=provenance.software,
+        devices=provenance.devices,
+        conditions=provenance.conditions,
+        **empty_table_columns(empty_table),
+    )
+
+
+def empty_table_columns(image: ImageFile | None) -> dict[str, Any]:
+    """Return the columns of a session that its empty-table image takes."""
+    path, sha256, size = image or (None, None, None)
+    return {"empty_table_image": path, "empty_table_image_sha256": sha256, "empty_table_image_bytes": size}
+
+
+def insert_views(connection: Connection, enrollment_id: int, new: Sequence[NewView]) -> list[int]:
+    """Insert views of an enrollment with their descriptors, and return their ids in the same order."""
+    if not new:
+        return []
+    connection.execute(
+        insert(views),
+        [
+            {
+                **one.measured,
+                "enrollment_id": enrollment_id,
+                "view_index": one.index,
+                "session_id": one.session_id,
+                "captured_utc": one.captured_utc,
+                "image": one.image.path,
+                "image_sha256": one.image.sha256,
+                "image_bytes": one.image.size,
+            }
+            for one in new
+        ],
+    )
+    stored = select(views.c.view_index, views.c.id).where(views.c.enrollment_id == enrollment_id)
+    by_index = {row.view_index: row.id for row in connection.execute(stored)}
+    ids = [by_index[one.index] for one in new]
+    connection.execute(
+        insert(descriptors),
+        [
+            {"view_id": view_id, **packed._asdict()}
+            for view_id, one in zip(ids, new, strict=True)
+            for packed in one.descriptors
+        ],
+    )
+    return ids
+
+
+def of_status(object_id: int, status: EnrollmentStatus) -> ColumnElement[bool]:
+    """Return the condition that an enrollment of an object has a status."""
+    return and_(enrollments.c.object_id == object_id, enrollments.c.status == status)
+
+
+def supersede(connection: Connection, object_id: int) -> None:
+    """Mark the complete enrollment of an object as superseded, if there is one."""
+    connection.execute(
+        update(enrollments)
+        .where(of_status(object_id, EnrollmentStatus.COMPLETE))
+        .values(status=EnrollmentStatus.SUPERSEDED)
+    )
+
+
+def abandon_unfinished(connection: Connection, object_id: int, now: datetime) -> None:
+    """Mark the unfinished enrollment of an object as abandoned, if there is one."""
+    connection.execute(
+        update(enrollments)
+        .where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))
+        .values(status=EnrollmentStatus.ABANDONED, finished_utc=now)
+    )

@@ -1,0 +1,54 @@
+"""The findings of `rig catalog verify` in words."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rig.catalog.verify import Finding
+
+
+def finding_text(finding: "Finding") -> str:
+    """Return a finding in one line: the problem, the object and the file, the evidence, and the fix."""
+    place = ": ".join(text for text in (finding.object_name and repr(finding.object_name), finding.path) if text)
+    parts = [f"{finding.problem}: {place}" if place else str(finding.problem), *_evidence(finding)]
+    fix = f"repaired: {finding.repair}" if finding.repair else _fix(finding)
+    return "; ".join(part for part in (*parts, fix) if part)
+
+
+def _evidence(finding: "Finding") -> list[str]:
+    from rig.catalog.verify import Problem
+
+    details = finding.details
+    match finding.problem:
+        case Problem.DAMAGED_DATABASE:
+            return [f"SQLite reports: {details['message']}"]
+        case Problem.ORPHANED_ROW:
+            return [f"a row of {details['table']} refers to a missing row of {details['parent']}: {details['row']}"]
+        case Problem.MISSING_IMAGE | Problem.UNREADABLE_IMAGE:
+            return [details["reason"]]
+        case Problem.CHANGED_IMAGE:
+            return [f"{details['bytes']} bytes now, {details['stored_bytes']} when it was stored"]
+        case Problem.SIZES_DIFFER:
+            size, first = ("{} x {}".format(*details[key]) for key in ("size_px", "first_size_px"))
+            return [f"{size} pixels, the first view of its enrollment has {first}"]
+        case Problem.DESCRIPTOR_DIFFERS:
+            return [f"the stored {details['descriptor']} is not that of the image"]
+        case _:
+            return []
+
+
+def _fix(finding: "Finding") -> str:
+    from rig.catalog.verify import Problem
+
+    match finding.problem:
+        case Problem.DAMAGED_DATABASE:
+            return "restore it from a backup"
+        case Problem.MISSING_IMAGE | Problem.CHANGED_IMAGE:
+            if copy := finding.details["copy"]:
+                return f"to restore it from {copy}: rig catalog verify --repair"
+            return "restore it from a backup, or enroll the object again: rig enroll --replace"
+        case Problem.UNREADABLE_IMAGE | Problem.SIZES_DIFFER:
+            return "enroll the object again: rig enroll --replace"
+        case Problem.NOT_DESCRIBED:
+            return "describe it: rig catalog redescribe"
+        case _:
+            return "to repair it: rig catalog verify --repair"
