@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import stat
 import struct
 import zipfile
@@ -69,10 +70,17 @@ def open_catalog(tmp_path: Path) -> Iterator[Callable[[str], Catalog]]:
         catalog.close()
 
 
-@pytest.fixture
-def full(open_catalog: Callable[[str], Catalog]) -> Catalog:
+@pytest.fixture(scope="session")
+def full_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A catalog with replaced and unfinished enrollments, regions, a segmentation and an empty-table image."""
-    catalog = open_catalog("full")
+    folder = tmp_path_factory.mktemp("exchange") / "full"
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(folder, clock=VirtualClock(NOW)) as catalog:
+        without_waiting(patch)
+        fill_full(catalog)
+    return folder
+
+
+def fill_full(catalog: Catalog) -> None:
     true_fill(catalog, "gone", 1, 90)
     true_fill(catalog, "mug-white", 3, 0, (2, 0, 12, 12), label="kitchen", note='a chip,\n"at" the rim')
     true_fill(catalog, "Tässe =2+2", 2, 10)
@@ -86,7 +94,13 @@ def full(open_catalog: Callable[[str], Catalog]) -> Catalog:
     )
     tin = catalog.resume("tin", provenance=PROVENANCE)
     tin.add(described(2, 32, evidence={"sharpness": 12.5, "locks": {"gain": None}}), image(32))
-    return catalog
+
+
+@pytest.fixture
+def full(full_folder: Path, open_catalog: Callable[[str], Catalog], tmp_path: Path) -> Catalog:
+    """A copy of that catalog."""
+    shutil.copytree(full_folder, tmp_path / "full")
+    return open_catalog("full")
 
 
 def run_import(catalog: Catalog, batch: ImportBatch, conflict: Conflict = Conflict.REJECT, **options: Any) -> Imported:
@@ -459,12 +473,18 @@ class TestImages:
         assert images.decode(content).shape == (12, 16, 3)
 
 
+@pytest.fixture(scope="session")
+def good_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bundle")
+    with Catalog.open(folder / "source", clock=VirtualClock(NOW)) as catalog:
+        true_fill(catalog, "mug", 2, 0)
+        write_bundle(folder / "mug.rigcat.zip", read_objects(catalog))
+    return folder / "mug.rigcat.zip"
+
+
 @pytest.fixture
-def bundle(open_catalog: Callable[[str], Catalog], tmp_path: Path) -> Path:
-    catalog = open_catalog("source")
-    true_fill(catalog, "mug", 2, 0)
-    write_bundle(tmp_path / "mug.rigcat.zip", read_objects(catalog))
-    return tmp_path / "mug.rigcat.zip"
+def bundle(good_bundle: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(good_bundle, tmp_path))
 
 
 def rewritten(bundle: Path, change: Callable[[dict[str, Any]], None] | None = None, **more: bytes) -> Path:

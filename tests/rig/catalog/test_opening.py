@@ -1,6 +1,7 @@
 """A folder that is not a usable catalog is rejected with a reason, and not changed."""
 
 import os
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -25,13 +26,18 @@ def pragma(path: Path, statement: str) -> object:
         return connection.execute(f"PRAGMA {statement}").fetchone()
 
 
-@pytest.fixture
-def enrolled(tmp_path: Path) -> Path:
-    path = tmp_path / "catalog #1?"
+@pytest.fixture(scope="session")
+def three_objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("opening") / "catalog"
     with open_catalog(path) as catalog:
         for name in ("mug", "tin", "box"):
             fill(catalog, name, 12)
     return path
+
+
+@pytest.fixture
+def enrolled(tmp_path: Path, three_objects: Path) -> Path:
+    return Path(shutil.copytree(three_objects, tmp_path / "catalog #1?"))
 
 
 def test_new_catalog_has_application_id_and_version(enrolled: Path) -> None:

@@ -1,4 +1,4 @@
-"""The catalog's commands as technicians call them, in processes of their own where that matters."""
+"""The commands of the catalog as a technician calls them."""
 
 import json
 import os
@@ -35,7 +35,7 @@ Rig = Callable[..., Result]
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
-    """Return a function that runs `rig ...` in an empty folder with a catalog of its own."""
+    """Return a function that runs `rig ...` in an empty folder with its own catalog."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
 
@@ -45,7 +45,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
     return run
 
 
-def told(done: Result) -> Any:
+def result(done: Result) -> Any:
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)
 
@@ -59,16 +59,26 @@ def photographs(folder: Path, *objects: str, step_deg: int = 90, side: int = 24)
     return folder
 
 
+@pytest.fixture(scope="session")
+def two_objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with photographs of two objects and their catalog."""
+    folder = tmp_path_factory.mktemp("two")
+    photographs(folder / "photographs", "mug", "tin")
+    catalog = ("--bench", "sim", "--set", f"catalog.path={folder / 'catalog'}")
+    done = CliRunner().invoke(app, ["import", str(folder / "photographs"), "--label", "kitchen", *catalog])
+    assert done.exit_code == 0, done.output
+    return folder
+
+
 @pytest.fixture
-def two(rig: Rig, tmp_path: Path) -> Rig:
-    """The same, with two objects in the catalog."""
-    photographs(tmp_path / "photographs", "mug", "tin")
-    assert rig("import", "photographs", "--label", "kitchen").exit_code == 0
+def two(rig: Rig, tmp_path: Path, two_objects: Path) -> Rig:
+    """The same with two objects in the catalog."""
+    shutil.copytree(two_objects, tmp_path, dirs_exist_ok=True)
     return rig
 
 
 def names(rig: Rig, *options: str) -> list[str]:
-    return [item["name"] for item in told(rig("catalog", "list", "--json", *options))["objects"]]
+    return [item["name"] for item in result(rig("catalog", "list", "--json", *options))["objects"]]
 
 
 @pytest.mark.parametrize(
@@ -79,23 +89,23 @@ def names(rig: Rig, *options: str) -> list[str]:
         *(f"catalog {name}" for name in ["verify", "redescribe", "gc", "merge", "migrate"]),
     ],
 )
-def test_every_command_has_an_example_in_its_help(rig: Rig, name: str) -> None:
+def test_help_of_every_command_has_an_example(rig: Rig, name: str) -> None:
     done = rig(*name.split(), "--help")
     assert done.exit_code == 0
     assert f"Example: rig {name}" in " ".join(done.output.split())
 
 
-def test_objects_are_listed_by_name_label_and_state(two: Rig) -> None:
+def test_list_filters_by_name_label_and_state(two: Rig) -> None:
     assert names(two) == ["mug", "tin"]
     assert names(two, "m*") == ["mug"]
     assert names(two, "--label", "kitchen") == ["mug", "tin"]
     assert names(two, "--label", "lab") == []
     assert names(two, "--unfinished") == []
-    assert "None of the 2 objects is like that" in two("catalog", "list", "x*").stdout
+    assert "None of the 2 objects matches" in two("catalog", "list", "x*").stdout
     assert two("catalog", "list").stdout.splitlines()[1].split()[:3] == ["mug", "kitchen", "4"]
 
 
-def test_a_list_in_a_pipe_is_not_cut_and_takes_nothing_for_markup(rig: Rig, tmp_path: Path) -> None:
+def test_list_in_a_pipe_is_complete_and_without_markup(rig: Rig, tmp_path: Path) -> None:
     name = f"[red]{'long ' * 18}name"
     folder = photographs(tmp_path / "in", "x")
     (folder / "objects.csv").write_text(f"object,name\nx,{name}\n")
@@ -103,7 +113,7 @@ def test_a_list_in_a_pipe_is_not_cut_and_takes_nothing_for_markup(rig: Rig, tmp_
     assert name in rig("catalog", "list").stdout
 
 
-def test_a_day_with_the_catalog(two: Rig) -> None:
+def test_catalog_is_edited_and_every_change_is_logged(two: Rig) -> None:
     assert two("catalog", "rename", "mug", "cup").exit_code == 0
     assert two("catalog", "label", "cup", "lab", "--note", "a chip").exit_code == 0
     shown = two("catalog", "show", "cup").stdout
@@ -111,34 +121,34 @@ def test_a_day_with_the_catalog(two: Rig) -> None:
     assert "a chip" in shown
     assert two("catalog", "label", "cup").exit_code == 2
     assert two("catalog", "rename", "cup", "tin").exit_code == 7
-    refused = two("catalog", "delete", "cup")  # nobody is at the terminal
-    assert refused.exit_code == 2
-    assert "--yes" in refused.stderr
+    rejected = two("catalog", "delete", "cup")  # no operator is at the terminal
+    assert rejected.exit_code == 2
+    assert "--yes" in rejected.stderr
     assert two("catalog", "delete", "cup", "--yes").exit_code == 0
     assert names(two) == ["tin"]
     assert names(two, "--deleted") == ["cup"]
     assert two("catalog", "undelete", "cup").exit_code == 0
     assert two("catalog", "delete", "tin", "--yes").exit_code == 0
-    assert told(two("catalog", "gc", "--dry-run", "--json"))["objects"] == ["tin"]
+    assert result(two("catalog", "gc", "--dry-run", "--json"))["objects"] == ["tin"]
     assert two("catalog", "gc").exit_code == 2
-    assert told(two("catalog", "gc", "--yes", "--json"))["views"] == 4
+    assert result(two("catalog", "gc", "--yes", "--json"))["views"] == 4
     assert two("catalog", "undelete", "tin").exit_code == 7
     assert "nothing to remove" in two("catalog", "gc").stdout
-    stats = told(two("catalog", "stats", "--json"))
+    stats = result(two("catalog", "stats", "--json"))
     assert (stats["objects"], stats["views"], stats["deleted_objects"]) == (1, 4, 0)
-    assert "described    4 views by cedd 1" in two("catalog", "stats").stdout
+    assert "descriptor   cedd 1: 4 views" in two("catalog", "stats").stdout
     log = [json.loads(line) for line in two("log", "--json").stdout.splitlines()]
     assert [entry["action"] for entry in log] == [
         *("imported", "renamed", "labelled", "deleted", "undeleted", "deleted", "collected garbage")
     ]
     assert all(entry["user"] for entry in log)
     assert two("log", "--since", "1h").stdout.count("deleted") == 3
-    assert "Nothing since then" in two("log", "--since", "2999-01-01").stdout
+    assert "No entries since then" in two("log", "--since", "2999-01-01").stdout
     assert two("log", "--since", "yesterdayish").exit_code == 2
 
 
 @pytest.mark.parametrize(("answer", "left"), [("n\n", ["mug", "tin"]), ("y\n", ["tin"])])
-def test_a_deletion_asks(two: Rig, monkeypatch: pytest.MonkeyPatch, answer: str, left: list[str]) -> None:
+def test_delete_asks_for_confirmation(two: Rig, monkeypatch: pytest.MonkeyPatch, answer: str, left: list[str]) -> None:
     monkeypatch.setattr("rig.cli.ui.jobs.is_interactive", lambda: True)
     done = CliRunner().invoke(app, ["catalog", "delete", "mug"], input=answer)
     assert "Delete mug with 4 views?" in done.output
@@ -146,7 +156,7 @@ def test_a_deletion_asks(two: Rig, monkeypatch: pytest.MonkeyPatch, answer: str,
     assert names(two) == left
 
 
-def test_moves_are_in_the_log_and_one_that_was_refused_too(two: Rig) -> None:
+def test_log_has_moves_and_rejected_moves(two: Rig) -> None:
     assert two("goto", "30").exit_code == 0
     assert two("goto", "5000").exit_code == 5
     moves = [json.loads(line)["details"] for line in two("log", "--json").stdout.splitlines()][1:]
@@ -154,9 +164,9 @@ def test_moves_are_in_the_log_and_one_that_was_refused_too(two: Rig) -> None:
     assert "cable" in moves[1]["ended"]
 
 
-def test_verify_mends_and_its_exit_code_tells(two: Rig) -> None:
-    assert told(two("catalog", "verify", "--json"))["findings"] == []
-    folder = Path(told(two("catalog", "show", "mug", "--json"))["views"][0]["image"]).parent
+def test_verify_repairs_and_sets_the_exit_code(two: Rig) -> None:
+    assert result(two("catalog", "verify", "--json"))["findings"] == []
+    folder = Path(result(two("catalog", "show", "mug", "--json"))["views"][0]["image"]).parent
     first, second = (Path("catalog") / folder / name for name in ("000.png", "001.png"))
     first.rename(first.with_name("moved.png"))
     found = two("catalog", "verify")
@@ -169,30 +179,30 @@ def test_verify_mends_and_its_exit_code_tells(two: Rig) -> None:
     assert two("catalog", "verify", "--repair", "--quick").exit_code == 7
 
 
-def test_a_new_descriptor_stops_identify_with_the_way_out(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identify_names_redescribe_for_a_new_descriptor(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
     stopped = two("identify", "--max-views", "2")
     assert stopped.exit_code == 7
-    assert "Next step: describe the stored images anew: rig catalog redescribe" in stopped.stderr
-    assert told(two("catalog", "redescribe", "--json"))["described"] == 8
+    assert "Next step: describe the stored images again: rig catalog redescribe" in stopped.stderr
+    assert result(two("catalog", "redescribe", "--json"))["described"] == 8
     assert two("identify", "--max-views", "2").exit_code in (0, 8)
     assert two("catalog", "redescribe", "--descriptor", "sift").exit_code == 2
     assert two("catalog", "redescribe", "--region", "1,2,3").exit_code == 2
 
 
-def test_another_part_of_the_image_is_told(rig: Rig) -> None:
+def test_identify_reports_another_region(rig: Rig) -> None:
     assert rig("enroll", "dice", "--views", "4").exit_code == 0
     moved = ("--set", "view.roi=[90, 0, 460, 480]", "--set", "bench.sim.object=dice", "--max-views", "2")
-    assert "view.roi is [90, 0, 460, 480]" in rig("identify", *moved).stderr
+    assert "now it is [90, 0, 460, 480]" in rig("identify", *moved).stderr
     assert rig("catalog", "redescribe", "--region", "config", *moved[:2]).exit_code == 0
     assert "view.roi" not in rig("identify", *moved).stderr
 
 
-def test_a_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:
+def test_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:
     folder = photographs(tmp_path / "in", "mug")
     (folder / "mug__5.png").write_bytes(b"x")
-    done = told(rig("import", "in", "--dry-run", "--json"))
-    assert (done["objects"], done["views"], len(done["refused"])) == (1, 4, 1)
+    done = result(rig("import", "in", "--dry-run", "--json"))
+    assert (done["objects"], done["views"], len(done["rejected"])) == (1, 4, 1)
     assert not Path("catalog").exists()
 
 
@@ -200,24 +210,24 @@ def test_a_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:
     ("target", "options"),
     [("out.rigcat.zip", ()), ("out", ()), ("out", ("--format", "csv")), ("out", ("--format", "coil"))],
 )
-def test_what_is_exported_is_imported(two: Rig, target: str, options: tuple[str, ...]) -> None:
-    assert told(two("export", target, "--json", *options))["objects"] == 2
+def test_export_can_be_imported(two: Rig, target: str, options: tuple[str, ...]) -> None:
+    assert result(two("export", target, "--json", *options))["objects"] == 2
     source = f"{target}/views.csv" if "csv" in options else target
     other = ("--set", "catalog.path=other")
     assert two("import", source, *other).exit_code == 0
     assert two("catalog", "verify", *other).exit_code == 0
-    shown = [told(two("catalog", "show", "tin", "--json", *where))["views"] for where in ((), other)]
+    shown = [result(two("catalog", "show", "tin", "--json", *where))["views"] for where in ((), other)]
     assert next([v["image_sha256"] for v in views] for views in shown) == [v["image_sha256"] for v in shown[1]]
-    assert [v["record"]["descriptor"] for v in shown[0]] == [v["record"]["descriptor"] for v in shown[1]]
+    assert [v["record"]["descriptors"] for v in shown[0]] == [v["record"]["descriptors"] for v in shown[1]]
     again = two("import", source, *other)
     assert again.exit_code == 7
     assert "--on-conflict skip" in again.stderr
-    assert told(two("import", source, "--on-conflict", "skip", "--json", *other))["skipped"] == ["mug", "tin"]
-    assert two("export", target, *options).exit_code == 7  # it is there already
+    assert result(two("import", source, "--on-conflict", "skip", "--json", *other))["skipped"] == ["mug", "tin"]
+    assert two("export", target, *options).exit_code == 7  # it exists already
 
 
-def test_some_objects_are_exported_and_pages_to_look_at(two: Rig) -> None:
-    assert told(two("export", "mug.rigcat.zip", "mug", "--json"))["objects"] == 1
+def test_export_of_some_objects_and_of_pages(two: Rig) -> None:
+    assert result(two("export", "mug.rigcat.zip", "mug", "--json"))["objects"] == 1
     assert two("export", "none.rigcat.zip", "jug").exit_code == 7
     assert two("export", "none.rigcat.zip", "--label", "lab").exit_code == 7
     assert two("export", "out.tar").exit_code == 2
@@ -231,41 +241,41 @@ def test_some_objects_are_exported_and_pages_to_look_at(two: Rig) -> None:
     assert all((Path("page") / f"sheets/{name}").is_file() for name in ("0001-mug.jpg", "0001-mug-small.jpg"))
 
 
-def test_catalogs_merge_all_or_nothing(two: Rig) -> None:
+def test_merge_is_all_or_nothing(two: Rig) -> None:
     other = ("--set", "catalog.path=other")
     assert two("import", "photographs", *other).exit_code == 0
     assert two("catalog", "rename", "tin", "jar", *other).exit_code == 0
     assert two("catalog", "merge", "other").exit_code == 7
     assert names(two) == ["mug", "tin"]
-    assert two("import", "other").exit_code == 2  # merge is meant
-    assert told(two("catalog", "merge", "other", "--on-conflict", "skip", "--json"))["objects"] == 1
+    assert two("import", "other").exit_code == 2  # use rig catalog merge
+    assert result(two("catalog", "merge", "other", "--on-conflict", "skip", "--json"))["objects"] == 1
     assert names(two) == ["mug", "tin", "jar"]
 
 
-def test_an_old_catalog_is_migrated_by_one_command(rig: Rig) -> None:
+def test_old_catalog_is_migrated_by_one_command(rig: Rig) -> None:
     shutil.copytree(SAMPLE / "images", "catalog/images")
     with closing(sqlite3.connect("catalog/catalog.sqlite", isolation_level=None)) as connection:
         connection.executescript((SAMPLE / "catalog.sql").read_text(encoding="utf-8"))
     stopped = rig("catalog", "list")
     assert stopped.exit_code == 7
     assert "rig catalog migrate" in stopped.stderr
-    done = told(rig("catalog", "migrate", "--json"))
+    done = result(rig("catalog", "migrate", "--json"))
     assert Path(done["backup"]).is_file()
     assert names(rig) == ["mug-white", "Tässe 2", "tin"]
     assert rig("catalog", "verify").exit_code == 0
     assert "is up to date" in rig("catalog", "migrate").stdout
 
 
-def test_a_bad_source_is_refused_in_words(rig: Rig, tmp_path: Path) -> None:
+def test_import_rejects_bad_source(rig: Rig, tmp_path: Path) -> None:
     with zipfile.ZipFile("evil.rigcat.zip", "w") as archive:
         archive.writestr("../../evil.png", b"x")
     Path("notes.txt").write_text("x")
     Path("empty").mkdir()
     for source, words in (
-        ("evil.rigcat.zip", "leave the folder"),
-        ("notes.txt", "neither a folder"),
+        ("evil.rigcat.zip", "outside the catalog"),
+        ("notes.txt", "is not a folder"),
         ("empty", "no photograph"),
-        ("nowhere", "there is no"),
+        ("nowhere", "does not exist"),
     ):
         done = rig("import", source)
         assert done.exit_code == 7, source
@@ -274,22 +284,22 @@ def test_a_bad_source_is_refused_in_words(rig: Rig, tmp_path: Path) -> None:
     assert rig("import", "empty", "--on-conflict", "merge").exit_code in (2, 7)
 
 
-def test_a_busy_catalog_is_told_and_not_waited_for_forever(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_busy_catalog_is_reported_after_the_timeout(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(Catalog.open.__func__.__kwdefaults__, "busy_timeout_s", 0.05)
     with closing(sqlite3.connect("catalog/catalog.sqlite", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
-        assert names(two) == ["mug", "tin"]  # who only looks does not wait
+        assert names(two) == ["mug", "tin"]  # readers do not wait
         done = two("catalog", "rename", "mug", "cup")
     assert done.exit_code == 9
-    assert "another process is writing" in done.stderr
+    assert "another process has been writing" in done.stderr
     assert two("catalog", "rename", "mug", "cup").exit_code == 0
 
 
-def test_ctrl_c_leaves_nothing_of_an_import(tmp_path: Path) -> None:
+def test_interrupted_import_leaves_nothing(tmp_path: Path) -> None:
     photographs(tmp_path / "in", *(f"obj{n}" for n in range(12)), step_deg=5, side=80)
     (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
     incoming = tmp_path / "catalog" / "incoming"
-    # like a terminal: the whole group of processes hears it
+    # as in a terminal, the whole process group gets the signal
     with subprocess.Popen(
         [*RIG, "import", "in", "--jobs", "2"],
         cwd=tmp_path,
@@ -311,8 +321,8 @@ def test_ctrl_c_leaves_nothing_of_an_import(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not COIL.is_dir(), reason="no COIL-100 at ../shared/data nor where RIG_TEST_DATA points")
-def test_all_of_coil_100_is_found_with_its_gaps() -> None:
-    package = read_folder(COIL, now=datetime(2026, 1, 1, tzinfo=UTC))
-    assert (len(package.objects), package.views, package.refused) == (100, 7178, ())
+def test_coil_100_is_read_with_its_gaps() -> None:
+    batch = read_folder(COIL, now=datetime(2026, 1, 1, tzinfo=UTC))
+    assert (len(batch.objects), batch.views, batch.rejected) == (100, 7178, ())
     missing = (COIL / "MISSING.txt").read_text().split()
-    assert [f"{gap.object_name}__{gap.azimuth_deg:g}.png" for gap in package.gaps] == missing
+    assert [f"{gap.object_name}__{gap.azimuth_deg:g}.png" for gap in batch.gaps] == missing
