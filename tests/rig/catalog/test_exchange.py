@@ -439,8 +439,8 @@ class TestImages:
             (png_of(2**31, 2**31), "pixels"),
             (b"GIF89a" + bytes(100), "neither a PNG nor a JPEG"),
             (b"", "neither a PNG nor a JPEG"),
-            (b"\x89PNG\r\n\x1a\n", "cut off"),
-            (b"\xff\xd8\xff\xe0\x00\x00" * 9 + b"\xff\xd9", "cut off"),
+            (b"\x89PNG\r\n\x1a\n", "truncated"),
+            (b"\xff\xd8\xff\xe0\x00\x00" * 9 + b"\xff\xd9", "truncated"),
         ],
     )
     def test_invalid_images_are_rejected(self, content: bytes, reason: str) -> None:
