@@ -84,12 +84,12 @@ def angles_off(events: Iterator[Any], operator: ShelfOperator, orientation: str)
 
 def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder: Path) -> Told:
     """Return the figures of one bench and the other: right, unknown and confirmed answers, errors in degrees, views."""
-    things = shelf()
-    names = np.random.default_rng(seed).permutation(sorted(things))[: OBJECTS + UNKNOWN].tolist()
+    objects = shelf()
+    names = np.random.default_rng(seed).permutation(sorted(objects))[: OBJECTS + UNKNOWN].tolist()
     config = load_config(None, (f"table.orientation={orientation}",))
     told: Told = defaultdict(list)
     for bench_seed in (seed, seed + OTHER_BENCH):
-        operator = ShelfOperator(World(noise=noise, seed=bench_seed), things)
+        operator = ShelfOperator(World(noise=noise, seed=bench_seed), objects)
         with open_sim_bench(config, operator) as bench:
             if calibrated:
                 calibrated_on(bench, CalibrationStore(folder / f"results {bench_seed}"), told, names[0])

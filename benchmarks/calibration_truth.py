@@ -47,7 +47,7 @@ Truth = Mapping[str, tuple[float, str]]
 def opened(seed: int, noise: NoiseModel | None = None, *settings: str) -> Iterator[tuple[Any, Any]]:
     operator = ShelfOperator(World(noise=noise, seed=seed), shelf())
     with open_sim_bench(load_config(None, settings), operator) as bench:
-        yield bench, operator.parts
+        yield bench, operator.devices
 
 
 def last(events: Iterator[Any]) -> CalibrationResult:

@@ -1,4 +1,4 @@
-"""The simulated bench: one world, and the real drivers on simulated wires."""
+"""The simulated bench: one simulated world, and the real drivers connected to simulated devices."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,40 +16,38 @@ from rig.config import RigConfig, Section
 from rig.core.clock import SystemClock
 from rig.core.errors import ObjectNotFound, UsageError
 from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
-from sim.calibration_board import utensils
+from sim.calibration_board import calibration_targets
 from sim.change import Change
 from sim.clock import VirtualClock
 from sim.computer import simulated_computer
+from sim.devices import SimDevices
 from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.noise import NoiseModel
-from sim.objects.photographs import Photographed, photographs
+from sim.objects.photographs import PhotographedObject, photographs
 from sim.objects.shelf import shelf
 from sim.optics import Optics
-from sim.parts import SimParts
-from sim.world import Thing, World
+from sim.world import SimObject, World
 
 
 class SimOptions(Section):
     """The section ``[bench.sim]``."""
 
-    objects: Path | None = Field(None, description="folder of photographs obj{N}__{A}.png; none: the built-in objects")
+    objects: Path | None = Field(None, description="folder of photographs obj{N}__{A}.png; default: built-in objects")
     object: str | list[str] | None = Field(
         None,
-        description="what stands on the table to be identified; of several, one after the other and round again; "
-        "none: drawn by the seed",
+        description="object on the table to identify, or a list that is repeated; default: random, from the seed",
     )
-    yaw_deg: float | None = Field(None, ge=-360, le=360, description="how it stands; none: drawn by the seed")
-    noise: dict[str, float] = Field(default_factory=dict, description="values of the noise model that differ")
+    yaw_deg: float | None = Field(None, ge=-360, le=360, description="its rotation; default: random, from the seed")
+    noise: dict[str, float] = Field(default_factory=dict, description="noise model: values to change")
     head: Literal["memory", "avr"] = Field(
         "memory",
-        description="the rig head of imu.connection = head: the firmware built for this computer, or the AVR binary in "
-        "an emulated ATmega328P",
+        description="rig head if imu.connection = head: memory, the firmware built for this computer, or avr, the AVR "
+        "binary in an emulated ATmega328P",
     )
-
     faults: list[Any] = Field(
-        default_factory=list, description='what goes wrong, e.g. ["jam@move3+2s"]; rig faults lists what can'
+        default_factory=list, description='simulated faults, e.g. ["jam@move3+2s"]; rig faults lists them'
     )
 
     @field_validator("faults")
@@ -68,30 +66,42 @@ class SimOptions(Section):
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ValueError(f"unknown: {', '.join(unknown)}; there are {', '.join(known)}")
-        NoiseModel(**values)  # its own check of the ranges
+        NoiseModel(**values)  # checks the ranges
         return values
 
 
 class ShelfOperator:
-    """The hand that takes things from the shelf: to be enrolled they stand by the platter's mark, to be found anyhow.
+    """The simulated operator: puts objects on the table, on the mark to enroll, in any orientation to identify.
 
-    Every placement misses the table's axis by a little, as hands do. Once a bench is open, ``parts`` is what it is made
-    of, and ``faults`` what goes wrong with that. ``state`` is what benches in this world remember of the table; whoever
-    sets a new one up looks at its cable, and says that it hangs free. The things in ``queue`` are put up to be
-    identified one after the other, and round again. Calibration boards and a grey card are at hand, too; the boards
-    are seen through the ``optics`` of a camera that the world's seed draws.
+    Each object stands a little off the table's axis. Calibration boards and a grey card are available, too.
+
+    Attributes
+    ----------
+    queue
+        Objects to identify, one after the other; the queue repeats.
+    devices, faults
+        The simulated devices and faults of the bench, once it is open.
+    state
+        What the benches of this world store about the table.
+    optics
+        Through which the camera sees the boards, drawn from the world's seed.
     """
 
     def __init__(
-        self, world: World, things: Mapping[str, Thing], *, next_object: str | None = None, yaw_deg: float | None = None
+        self,
+        world: World,
+        objects: Mapping[str, SimObject],
+        *,
+        next_object: str | None = None,
+        yaw_deg: float | None = None,
     ) -> None:
         self.world = world
-        self.things = things
+        self.objects = objects
         self.next_object = next_object
         self.yaw_deg = yaw_deg
         self.queue: deque[str] = deque()
         self.change: Change | None = None
-        self.parts: SimParts | None = None
+        self.devices: SimDevices | None = None
         self.faults: Faults | None = None
         self.state: StateStore = MemoryStore()
         self.optics = Optics.of(world)
@@ -99,47 +109,47 @@ class ShelfOperator:
         self._days = world.rng("days")
 
     def place(self, name: str | None) -> None:
-        """Put the thing called ``name`` on the table, or the next one to be identified.
+        """Put the object called ``name`` on the table, or the next one to identify.
 
         Raises
         ------
         ObjectNotFound
-            There is no such thing on the shelf.
+            No object has that name.
         """
         dx_mm, dy_mm = self._rng.normal(0.0, self.world.noise.placement_mm, 2).tolist()
         yaw_deg = 0.0
         if name is None:
-            drawn, drawn_deg = str(self._rng.choice(sorted(self.things))), float(self._rng.uniform(0.0, 360.0))
+            drawn, drawn_deg = str(self._rng.choice(sorted(self.objects))), float(self._rng.uniform(0.0, 360.0))
             if self.queue:
                 self.next_object = self.queue[0]
                 self.queue.rotate(-1)
             name = self.next_object or drawn
             yaw_deg = drawn_deg if self.yaw_deg is None else self.yaw_deg
-        if name in (at_hand := utensils(self.optics)):
+        if name in (at_hand := calibration_targets(self.optics)):
             self.world.put(at_hand[name])
             return
-        if name not in self.things:
+        if name not in self.objects:
             raise ObjectNotFound(
-                f"There is no {name!r} on the simulated shelf.",
-                next_step="Choose one of those listed, or give a folder of photographs: --set bench.sim.objects=FOLDER",
-                evidence={"objects": list(self.things)},
+                f"The simulated bench has no object {name!r}.",
+                next_step="Choose a listed object, or give a folder of photographs: --set bench.sim.objects=FOLDER",
+                evidence={"objects": list(self.objects)},
             )
         if self.change is not None:
             self.world.change(light=self.change.light(self._days))
             further_mm = self.change.offset_mm(self._days)
             dx_mm, dy_mm = dx_mm + further_mm[0], dy_mm + further_mm[1]
-        self.world.put(self.things[name], yaw_deg, (dx_mm, dy_mm))
+        self.world.put(self.objects[name], yaw_deg, (dx_mm, dy_mm))
 
-    def another_day(self, change: Change) -> None:
-        """Have the bench changed from now on; it must be open."""
-        assert self.parts is not None
+    def change_bench(self, change: Change) -> None:
+        """Change the bench from now on; it must be open."""
+        assert self.devices is not None
         self.change = change
         self.world.change(light=change.light(self._days))
-        change.come_about(self.parts)
+        change.apply_to(self.devices)
 
     def clear(self) -> bool:
-        """Take what is there off the table; a photograph holds its own table, which nobody can clear."""
-        if any(isinstance(thing, Photographed) for thing in self.things.values()):
+        """Clear the table and return whether that is possible: a photograph shows its own table."""
+        if any(isinstance(thing, PhotographedObject) for thing in self.objects.values()):
             return False
         self.world.put(None)
         return True
@@ -150,59 +160,58 @@ def open_sim_bench(
     operator: ShelfOperator,
     *,
     faults: Iterable[Fault] = (),
-    heard: Callable[[Occurrence], None] | None = None,
-    parts: SimParts | None = None,
+    on_fault: Callable[[Occurrence], None] | None = None,
+    devices: SimDevices | None = None,
 ) -> Bench:
-    """Put the real drivers on the simulated wires of the operator's world, by the lines that open a real bench.
+    """Open a bench whose real drivers are connected to simulated devices, by the code that opens a real bench.
 
     Parameters
     ----------
     config
-        The configuration. Where it is given no ``parts``, the simulated servo comes as from the factory and is set up
-        over its wire.
+        The configuration. Without ``devices``, the simulated servo has factory settings and is configured over its bus.
     operator
-        The hands; they get hold of the ``parts``.
+        The simulated operator, in whose world the devices are.
     faults
-        What will go wrong, and when.
-    heard
-        Called when one of them begins or ends.
-    parts
-        The devices that an earlier bench in this world was opened with; whoever made them takes them away.
+        Simulated faults with their times.
+    on_fault
+        Called when a simulated fault begins or ends.
+    devices
+        Devices of an earlier bench in this world; the caller closes them.
 
     Raises
     ------
     ConfigError
-        There is no simulated servo of that model, or it does not know the baud rate.
+        The simulator has no servo of that model, or the model does not support the baud rate.
     DeviceNotFound, DeviceMismatch, DeviceSilent
-        A device was made to fail from the start.
+        A simulated fault affects a device from the start.
     """
     world = operator.world
     config = config.model_copy(update={"servo": config.servo.model_copy(update={"write_settings": True})})
     with ExitStack() as wires:
-        owned = parts is None
-        if parts is None:
-            parts = wires.enter_context(SimParts.connected(config, world))
-        operator.parts, operator.faults = parts, Faults(parts)
-        if heard:
-            operator.faults.listeners.append(heard)
+        owned = devices is None
+        if devices is None:
+            devices = wires.enter_context(SimDevices.connected(config, world))
+        operator.devices, operator.faults = devices, Faults(devices)
+        if on_fault:
+            operator.faults.listeners.append(on_fault)
         if owned:
             wires.callback(operator.faults.clear)
-        parts.open_wires()
+        devices.open_connections()
         operator.faults.schedule(*faults)
         bench = assemble(
             "sim",
             config,
             world.clock,
-            wire=parts.adapter,
-            reopen_serial=parts.reopen_adapter,
-            i2c_bus=parts.i2c.path,
-            capture=parts.camera,
-            reopen_camera=parts.reopen_camera,
+            wire=devices.adapter,
+            reopen_serial=devices.reopen_adapter,
+            i2c_bus=devices.i2c.path,
+            capture=devices.camera,
+            reopen_camera=devices.reopen_camera,
             state=operator.state,
-            head_port=parts.head_port,
+            head_port=devices.head_port,
         )
         if operator.state.load().table is None and bench.safety.fault is None:
-            if bench.servo.turn_deg < 360.0:  # behind a gear somebody has to look at the table
+            if bench.servo.turn_deg < 360.0:  # with a gear, the servo alone does not know the table's angle
                 bench.safety.set_angle(world.table_deg())
             else:
                 bench.safety.set_revolutions(0)
@@ -213,18 +222,18 @@ def open_sim_bench(
 
 
 class SimBenchKind:
-    """Opens a simulated bench with a world of its own, which begins now: what it stores carries today's date."""
+    """Opens a simulated bench in a new world whose clock starts at the computer's time."""
 
     options: type[BaseModel] = SimOptions
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
         assert isinstance(options, SimOptions)
-        things = photographs(options.objects) if options.objects else shelf()
+        objects = photographs(options.objects) if options.objects else shelf()
         with ExitStack() as held:
             state = _state(config, held)
             world = _world(options, seed, _stands_at_deg(config, state))
             single = options.object if isinstance(options.object, str) else None
-            operator = ShelfOperator(world, things, next_object=single, yaw_deg=options.yaw_deg)
+            operator = ShelfOperator(world, objects, next_object=single, yaw_deg=options.yaw_deg)
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
             bench = open_sim_bench(config, operator, faults=read_faults(options.faults))
@@ -233,10 +242,13 @@ class SimBenchKind:
 
     @contextmanager
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:
-        """Yield the simulated computer; the devices' faults that need no motion happen there, too."""
+        """Yield the simulated computer with the faults that need no motion."""
         assert isinstance(options, SimOptions)
-        with SimParts.connected(config, _world(options, seed)) as parts, simulated_computer(config, parts) as computer:
-            faults = Faults(parts)
+        with (
+            SimDevices.connected(config, _world(options, seed)) as devices,
+            simulated_computer(config, devices) as computer,
+        ):
+            faults = Faults(devices)
             faults.schedule(*read_faults(options.faults))
             try:
                 yield computer
@@ -250,7 +262,7 @@ def _world(options: SimOptions, seed: int | None, start_deg: float = 0.0) -> Wor
 
 
 def _state(config: RigConfig, held: ExitStack) -> StateStore:
-    """Return where the bench's state is kept: in memory, unless the configuration says where it should outlive us."""
+    """Return the store of the bench's state: in memory, unless the configuration names a folder."""
     if config.state_dir is None:
         return MemoryStore()
     path = config.state_path("sim")
@@ -259,12 +271,12 @@ def _state(config: RigConfig, held: ExitStack) -> StateStore:
 
 
 def _stands_at_deg(config: RigConfig, state: StateStore) -> float:
-    """Return where the last simulated run left the table: as on a real bench, only the supply was off meanwhile."""
+    """Return the angle at which the last simulated run left the table, as if only the supply had been off since."""
     table = state.load().table
     if table is None:
         return 0.0
     turn_deg = 360.0 / config.servo.gear_ratio
-    turns = round(table.shift_deg / turn_deg)  # the rest of the shift is a zero that a person declared
+    turns = round(table.shift_deg / turn_deg)  # the rest of the shift is a home that the operator set
     return table.position_deg + (turns - 0.5) * turn_deg
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rig.views.charuco_board import Board
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 from sim.optics import SUPERSAMPLING, Optics
-from sim.world import Thing
+from sim.world import SimObject
 
 TEXTURE_PX_MM = 10
 
@@ -113,7 +113,7 @@ class GreyCard:
         image[:] = self.level
 
 
-def utensils(optics: Optics, board: Board | None = None) -> dict[str, Thing]:
+def calibration_targets(optics: Optics, board: Board | None = None) -> dict[str, SimObject]:
     """Return what the calibrations of the camera ask to be put up, by name: the grey card, and the board's stands."""
     return {GreyCard().name: GreyCard(), **boards(optics, board)}
 

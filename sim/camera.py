@@ -16,7 +16,7 @@ from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
 from sim.sensor import Gains, Sensor, white_balance
-from sim.world import HISTORY_S, Happening, Scene, World
+from sim.world import HISTORY_S, Activity, Scene, World
 
 FPS = 30
 NOMINAL_EXPOSURE = 100
@@ -76,7 +76,7 @@ class SimCapture:
         Of how many frames one is exposed: a camera that has become slow.
     latency_ns
         How much later than `READOUT_NS` a frame arrives.
-    falters
+    grab_failures
         Asked at each `grab` whether it fails.
     hangs
         Whether no frame arrives although the camera is there: `grab` gives up after `SELECT_S`.
@@ -85,25 +85,25 @@ class SimCapture:
     blur_px
         Width of the blur of a lens that was knocked; the camera does not know.
     backdrop
-        What is behind and below the things: wall, table and platter, uint8 (480, 640, 3).
-    tampers
+        What is behind and below the objects: wall, table and platter, uint8 (480, 640, 3).
+    filters
         Called with each frame that is fetched and its number, one after the other; returns the one that goes on.
     """
 
     def __init__(self, world: World) -> None:
         self.every = 1
         self.latency_ns = 0
-        self.falters: list[Callable[[], bool]] = []
+        self.grab_failures: list[Callable[[], bool]] = []
         self.hangs = False
         self.orbits = False
         self.blur_px = 0.0
-        self.tampers: list[Callable[[Image, int], Image]] = []
+        self.filters: list[Callable[[Image, int], Image]] = []
         self._world = world
         self._clock = world.clock
         self._binning = 1
         self._sensor = Sensor(world.noise, world.rng("camera"))
         self.backdrop = empty_platter()
-        # A camera that was mounted with care sees the things as they are drawn; boards are drawn through its lens.
+        # A camera that was mounted with care sees the objects as they are drawn; boards are drawn through its lens.
         self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
         self._open = self._plugged = True
         self._queue: deque[int] = deque()
@@ -160,7 +160,7 @@ class SimCapture:
 
     def grab(self) -> bool:
         """Take the oldest waiting frame, or wait for the next one."""
-        if not self._open or any(fails() for fails in self.falters):
+        if not self._open or any(fails() for fails in self.grab_failures):
             return False
         self._receive()
         if self.hangs and not self._queue:
@@ -176,9 +176,9 @@ class SimCapture:
         """Return the frame that was grabbed last, uint8 (480, 640, 3)."""
         if self._grabbed is None or not self._open:
             return False, None
-        self._world.tell(Happening.SEEN)
+        self._world.notify(Activity.FRAME_FETCHED)
         image = self._frame(self._grabbed)
-        for tamper in self.tampers:
+        for tamper in self.filters:
             image = tamper(image, self._grabbed)
         return True, image
 
@@ -307,14 +307,14 @@ class SimCapture:
         """Return what the lens sees of a scene under nominal light."""
         table_deg = -table_deg if self.orbits else table_deg
         image = self.backdrop.copy()
-        if scene.thing is None:
+        if scene.object is None:
             return self._as_mounted(image)
-        if not isinstance(scene.thing, Visible):
-            raise TypeError(f"{scene.thing!r} cannot be seen: put something with a method draw on the platter")
+        if not isinstance(scene.object, Visible):
+            raise TypeError(f"{scene.object!r} cannot be seen: put something with a method draw on the platter")
         x, y = scene.offset_mm
         c, s = cos(radians(table_deg)), sin(radians(table_deg))
-        scene.thing.draw(image, table_deg + scene.yaw_deg, (c * x - s * y, s * x + c * y))
-        return image if isinstance(scene.thing, BoardOnPlatter) else self._as_mounted(image)
+        scene.object.draw(image, table_deg + scene.yaw_deg, (c * x - s * y, s * x + c * y))
+        return image if isinstance(scene.object, BoardOnPlatter) else self._as_mounted(image)
 
     def _as_mounted(self, image: Image) -> Image:
         """Return what is drawn as the camera sees it from where it stands."""

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from rig.core.errors import UsageError
+from sim.devices import SimDevices
 from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, SIN, WIDTH, Image
-from sim.parts import SimParts
 from sim.sensor import Gains
 
 
@@ -65,9 +65,9 @@ class Change:
         x, y = (self.placement_mm * rng.uniform(-1, 1, 2)).tolist()
         return x, y
 
-    def come_about(self, parts: SimParts) -> None:
+    def apply_to(self, devices: SimDevices) -> None:
         """Change the camera's settings and what stands around, from now on."""
-        rng, camera = parts.world.rng("another day"), parts.camera
+        rng, camera = devices.world.rng("another day"), devices.camera
         exposure, kelvin = rng.uniform(-1, 1, 2).tolist()
         camera.drift(
             exposure=camera.exposure * (1 + self.exposure * exposure),

@@ -14,8 +14,8 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.devices.opencv_camera import Capture
+from sim.devices import SimDevices
 from sim.i2c import SimI2cBus
-from sim.parts import SimParts
 
 
 class ComputerFiles:
@@ -94,32 +94,32 @@ class ComputerFiles:
 class SimComputer(LinuxComputer):
     """A laid-out computer with the simulated devices at the places where ``config`` looks for them."""
 
-    def __init__(self, root: Path, parts: SimParts, config: RigConfig, user: User | None = None) -> None:
-        super().__init__(root, parts.world.clock, user or User.current())
-        self.parts = parts
+    def __init__(self, root: Path, devices: SimDevices, config: RigConfig, user: User | None = None) -> None:
+        super().__init__(root, devices.world.clock, user or User.current())
+        self.devices = devices
         self._port = config.servo.port
         self._head_port = config.head.port
         self._bus = self.i2c_name(config.imu.bus)
 
     def open_serial(self, path: str, baud: int) -> SerialConnection:
-        if self.parts.head is not None and self.same_file(path, self._head_port):
-            return self.parts.head_port()
+        if self.devices.head is not None and self.same_file(path, self._head_port):
+            return self.devices.head_port()
         if not self.same_file(path, self._port):
             raise DeviceNotFound(f"There is no port {path}.", next_step="Plug the adapter in.", evidence={"port": path})
-        adapter = self.parts.reopen_adapter()
+        adapter = self.devices.reopen_adapter()
         adapter.baudrate = baud
         return adapter
 
     def i2c_path(self, bus: int | str) -> str:
-        wired = isinstance(self.parts.i2c, SimI2cBus) and self.i2c_name(bus) == self._bus
-        return self.parts.i2c.path if wired else self.i2c_name(bus)
+        wired = isinstance(self.devices.i2c, SimI2cBus) and self.i2c_name(bus) == self._bus
+        return self.devices.i2c.path if wired else self.i2c_name(bus)
 
     def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one
-        return self.parts.reopen_camera()
+        return self.devices.reopen_camera()
 
 
 @contextmanager
-def simulated_computer(config: RigConfig, parts: SimParts) -> Iterator[SimComputer]:
+def simulated_computer(config: RigConfig, devices: SimDevices) -> Iterator[SimComputer]:
     """Yield the computer of a simulated bench, its servo set up as the bench does when it is opened."""
     with TemporaryDirectory(prefix="sim-host-") as folder:
         computer = ComputerFiles(Path(folder))
@@ -131,7 +131,7 @@ def simulated_computer(config: RigConfig, parts: SimParts) -> Iterator[SimComput
             computer.serial_port(by_id=config.servo.port if stable else None)
             if not stable:
                 computer.link(config.servo.port, Path(folder, "dev/ttyUSB0"))
-        if parts.head is None:
+        if devices.head is None:
             number = re.search(r"(\d+)$", str(config.imu.bus))
             computer.i2c_bus(int(number[1]) if number else 1)
         elif SERIAL_NAMES.fullmatch(Path(config.head.port).name):
@@ -142,11 +142,11 @@ def simulated_computer(config: RigConfig, parts: SimParts) -> Iterator[SimComput
         computer.camera(int(number[1]) if number else 0)
         computer.keeps_time()
         with suppress(RigError):  # no supply, a fault: the doctor tells
-            _set_up(parts, config.servo.id, config.servo.model)
-        yield SimComputer(Path(folder), parts, config)
+            _set_up(devices, config.servo.id, config.servo.model)
+        yield SimComputer(Path(folder), devices, config)
 
 
-def _set_up(parts: SimParts, bus_id: int, model: str) -> None:
-    bus = DynamixelBus(ClockedPort(parts.adapter, parts.world.clock), protocol=protocol_of(model))
+def _set_up(devices: SimDevices, bus_id: int, model: str) -> None:
+    bus = DynamixelBus(ClockedPort(devices.adapter, devices.world.clock), protocol=protocol_of(model))
     table = control_table(model)
     settings.write(bus, bus_id, table, settings.compare(bus, bus_id, table))

@@ -1,7 +1,7 @@
 """A simulated I2C bus underneath the unmodified smbus2.
 
-smbus2 opens a path and speaks `ioctl` to it; the seam is the name ``smbus2.smbus2.ioctl``. While a simulated bus is
-open, calls on its file go to the bus and all others to the kernel, so that a real bus works beside it.
+smbus2 opens a path and calls `ioctl` on it; the simulator replaces the name ``smbus2.smbus2.ioctl``. While a simulated
+bus is open, calls on its file go to the bus and all others to the kernel, so a real bus works beside it.
 
 Transactions follow the kernel's user interface (Documentation/i2c/{dev-interface,smbus-protocol,fault-codes}.rst). Not
 simulated: ten-bit addresses, packet error checking, clock stretching, several masters.
@@ -25,24 +25,21 @@ from sim.clock import VirtualClock
 BIT_NS = 2_500
 """One bit at 400 kHz (fast mode); a byte takes nine, with its acknowledge."""
 TIMEOUT_S = 1.0
-"""How long the kernel waits for a bus that does not move (the default of ``i2c_adapter.timeout``)."""
+"""How long the kernel waits for a bus that hangs (the default of ``i2c_adapter.timeout``)."""
 
 _MAX_MESSAGES = 42
 _MAX_MESSAGE_LENGTH = 8192
 
 
 class I2cDevice(Protocol):
-    """A device on the bus as its pins see the traffic.
-
-    One that does not always acknowledge its address has a property ``answers``.
-    """
+    """A device on the bus. If it does not always acknowledge its address, it has a property ``answers``."""
 
     def start(self, reading: bool) -> None:
-        """Take notice of a (repeated) start with this device's address."""
+        """Receive a (repeated) start with this device's address."""
         ...
 
     def write(self, data: bytes) -> int:
-        """Take the bytes that the master sends and return how many were acknowledged."""
+        """Receive the master's bytes and return how many are acknowledged."""
         ...
 
     def read(self, count: int) -> bytes:
@@ -54,7 +51,7 @@ class I2cDevice(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What crossed the wire between a start and the next start or stop; ``time_ns`` is its end."""
+    """The bytes on the wire between a start and the next start or stop; ``time_ns`` is its end."""
 
     time_ns: int
     address: int
@@ -65,8 +62,8 @@ class Message:
 class SimI2cBus:
     """A bus with a path that ``smbus2.SMBus(path)`` opens.
 
-    Bus side: `path`. World side: `attach`, `detach` (a pulled cable), `nack`, `refusals` (asked, with the address,
-    whether nobody acknowledges it now), `cut_read`, `stuck`, and `wire`, the last messages that were acknowledged.
+    Tests use `attach`, `detach` (unplug), `nack`, `nack_conditions` (called with an address; True: no acknowledge),
+    `cut_read`, `stuck`, and `wire`, the last acknowledged messages.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
@@ -76,7 +73,7 @@ class SimI2cBus:
         self._nacks = 0
         self._cut: int | None = None
         self.stuck = False
-        self.refusals: list[Callable[[int], bool]] = []
+        self.nack_conditions: list[Callable[[int], bool]] = []
         self.wire: deque[Message] = deque(maxlen=1000)
         handle, self.path = tempfile.mkstemp(prefix="sim-i2c-")
         self._key = _file_key(handle)
@@ -217,7 +214,7 @@ class SimI2cBus:
             device is None
             or self._nacks
             or not getattr(device, "answers", True)
-            or any(refuses(address) for refuses in self.refusals)
+            or any(refuses(address) for refuses in self.nack_conditions)
         ):
             self._nacks = max(self._nacks - 1, 0)
             raise _os_error(ENXIO)

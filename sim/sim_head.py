@@ -31,9 +31,9 @@ def sim_head(
     Example: rig sim-head --spin 30
     """
     from rig.core.errors import UsageError
+    from sim.devices import SimDevices
     from sim.head.realtime import HeadPty, PacedClock
     from sim.motion import to_velocity
-    from sim.parts import SimParts
     from sim.world import World
 
     config = settings.load()
@@ -41,8 +41,8 @@ def sim_head(
     config = config.model_copy(update={"imu": imu, "bench": {**config.bench, "sim": {"head": kind}}})
     world = World(seed=settings.seed or 0)
     with ExitStack() as ends:
-        parts = ends.enter_context(SimParts.connected(config, world))
-        head = parts.head
+        devices = ends.enter_context(SimDevices.connected(config, world))
+        head = devices.head
         assert head is not None
         head.listeners.append(
             lambda change: print(f"{change.time_ns * 1e-9:.4f} s: {change.pin} {change.value:g}", file=sys.stderr)

@@ -1,6 +1,6 @@
-"""The one world behind the simulated servo, IMU and camera: what is really there, and when it changed.
+"""The simulated world: the true state behind the simulated servo, IMU and camera, and its recent past.
 
-The emulators have two sides: the bus, on which unchanged drivers talk to them, and this world, which tests set.
+Drivers reach the emulated devices through their buses. Tests set and read this world.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,11 +18,11 @@ from sim.motion import Floats, Platter, Trajectory, rest
 from sim.noise import NoiseModel
 
 HISTORY_S = 12.0
-"""How far back the past is kept: longer than the IMU's FIFO and the camera's buffers reach."""
+"""How far back the past is stored: longer than the IMU's FIFO and the camera's buffers."""
 
 
-class Thing(Protocol):
-    """Something that can stand on the platter; `sim.camera` knows how to draw the kinds there are."""
+class SimObject(Protocol):
+    """An object that can stand on the platter. The camera draws it if it is `sim.objects.projection.Visible`."""
 
     @property
     def name(self) -> str: ...
@@ -30,32 +30,31 @@ class Thing(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What the camera would see, but for the table's angle.
+    """What the camera can see, apart from the table's angle.
 
-    ``yaw_deg`` is how far the thing was turned, counter-clockwise, against the platter when it was put there;
-    ``offset_mm`` where its axis stands in the platter's frame; ``light`` relative to the nominal light, as B, G, R.
+    ``yaw_deg`` is the object's counter-clockwise rotation against the platter, ``offset_mm`` where its axis stands in
+    the platter's frame, ``light`` the light relative to the nominal light, as B, G, R.
     """
 
-    thing: Thing | None = None
+    object: SimObject | None = None
     yaw_deg: float = 0.0
     offset_mm: tuple[float, float] = (0.0, 0.0)
     light: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-class Happening(Enum):
-    """What a fault may wait for."""
+class Activity(Enum):
+    """An activity that a simulated fault can wait for."""
 
-    SET_OFF = "the shaft begins to turn"
-    SEEN = "a frame is fetched from the camera"
+    MOTION_STARTED = "the shaft starts to rotate"
+    FRAME_FETCHED = "a frame is fetched from the camera"
 
 
 class World:
     """True state of the simulated bench on its virtual clock.
 
-    Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. With ``noise`` and ``seed`` the
-    whole run is determined: each emulator draws from its own stream (`rng`), so one more reading of one device does not
-    change what another one sees. Whoever is in ``watchers`` is told what happens. At first the table
-    stands at ``start_deg``.
+    Angles are the table's, in degrees, unwrapped, counter-clockwise seen from above. The table starts at ``start_deg``.
+    ``noise`` and ``seed`` determine the whole run: each emulator draws from its own stream (`rng`), so one more reading
+    of one device does not change another device. ``listeners`` are called with each `Activity`.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class World:
         self.clock = clock or VirtualClock()
         self.noise = noise or NoiseModel()
         self.seed = seed
-        self.watchers: list[Callable[[Happening], None]] = []
+        self.listeners: list[Callable[[Activity], None]] = []
         self._scenes: list[tuple[int, Scene]] = [(0, Scene())]
         first = self._platter()
         first.follow(rest(0.0, start_deg), None)
@@ -83,7 +82,7 @@ class World:
     # -- the table ------------------------------------------------------------------------------------------------
 
     def drive(self, shaft: Trajectory) -> None:
-        """Let the servo's shaft follow ``shaft`` from now on."""
+        """Make the servo's shaft follow ``shaft`` from now on."""
         now_ns = self.clock.now_ns()
         standing = self.shaft()[1] == 0
         platter = self._platter()
@@ -91,15 +90,15 @@ class World:
         self._motions.append((now_ns, platter))
         self._forget(self._motions, now_ns)
         if standing and shaft.end_s > shaft.start_s[0]:
-            self.tell(Happening.SET_OFF)
+            self.notify(Activity.MOTION_STARTED)
 
-    def tell(self, happening: Happening) -> None:
-        """Tell the watchers."""
-        for watcher in tuple(self.watchers):
-            watcher(happening)
+    def notify(self, activity: Activity) -> None:
+        """Call the listeners."""
+        for listener in tuple(self.listeners):
+            listener(activity)
 
     def slip(self, angle_deg: float, seconds: float = 0.001) -> None:
-        """Turn the platter by ``angle_deg`` against the shaft, evenly from now on: a loose platter, a bumped table."""
+        """Rotate the platter by ``angle_deg`` against the shaft at a constant rate, as when it is loose or pushed."""
         self._slips.append((self.clock.now_ns() * 1e-9, seconds, angle_deg))
 
     def shaft(self, time_ns: int | None = None) -> tuple[float, float]:
@@ -131,7 +130,7 @@ class World:
             rate += np.where((share >= 0) & (share < 1), slip_deg / seconds, 0.0)
         return angle, rate
 
-    # -- what stands on it ----------------------------------------------------------------------------------------
+    # -- the object on it -----------------------------------------------------------------------------------------
 
     @property
     def scene(self) -> Scene:
@@ -146,13 +145,13 @@ class World:
         self._scenes.append((now_ns, replace(self.scene, **values)))
         self._forget(self._scenes, now_ns)
 
-    def put(self, thing: Thing | None, yaw_deg: float = 0.0, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Put ``thing`` (or nothing) on the platter, turned by ``yaw_deg`` against the platter's mark."""
-        self.change(thing=thing, yaw_deg=yaw_deg, offset_mm=offset_mm)
+    def put(self, object: SimObject | None, yaw_deg: float = 0.0, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Put ``object`` (or nothing) on the platter, rotated by ``yaw_deg`` against the platter's mark."""
+        self.change(object=object, yaw_deg=yaw_deg, offset_mm=offset_mm)
 
     @contextmanager
     def changed(self, **values: Any) -> Iterator[None]:
-        """Change fields of the scene for the length of a `with` block."""
+        """Change fields of the scene during a `with` block."""
         before = self.scene
         self.change(**values)
         try:
@@ -173,7 +172,7 @@ class World:
 
     @staticmethod
     def _forget(history: list[Any], now_ns: int) -> None:
-        """Drop what ended before the history's horizon; the entry in force there stays."""
+        """Remove the entries that ended before the history's horizon."""
         horizon = now_ns - round(HISTORY_S * 1e9)
         while len(history) > 1 and history[1][0] <= horizon:
             del history[0]

@@ -12,11 +12,11 @@ def faults(settings: Settings) -> None:
 
     Example: rig faults; then rig demo --fault jam@move3+2s --fault crc_flip:rate=0.2
     """
-    from sim.faults import kinds
+    from sim.faults import fault_kinds
     from sim.faults.schedule import NOTATION
 
     if settings.json:
-        for kind in kinds().values():
+        for kind in fault_kinds().values():
             settings.print_json(
                 {
                     "fault": kind.name,
@@ -25,8 +25,8 @@ def faults(settings: Settings) -> None:
                 }
             )
         return
-    width = max(map(len, kinds()))
-    for kind in kinds().values():
+    width = max(map(len, fault_kinds()))
+    for kind in fault_kinds().values():
         typer.echo(f"{kind.name:<{width}}  {kind.what}")
         for name, parameter in kind.parameters.items():
             typer.echo(f"{'':<{width}}    {name}={parameter.default:g}  {parameter.meaning}")

@@ -37,7 +37,7 @@ from sim.demo.lines import MoveLines
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import Fault, read_faults
 from sim.noise import NoiseModel
-from sim.objects.photographs import Photographed, photographs
+from sim.objects.photographs import PhotographedObject, photographs
 from sim.objects.shelf import shelf
 from sim.objects.solid import Solid
 from sim.world import World
@@ -71,7 +71,7 @@ COUNT_OF_FOLDER = 20
 GOOD_SHARE = 0.8
 """Share of right answers below which the demo fails; of two very similar objects, an answer can be wrong."""
 
-Thing = Solid | Photographed
+SimObject = Solid | PhotographedObject
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,14 +155,14 @@ def run_demo(
     heard = None if settings.json else _say_fault
     with (
         _folder_within(out) as folder,
-        open_sim_bench(config, operator, faults=[*read_faults(options.faults), *faults], heard=heard) as bench,
+        open_sim_bench(config, operator, faults=[*read_faults(options.faults), *faults], on_fault=heard) as bench,
     ):
         _photograph(bench, operator)
         with Catalog.open(folder, clock=bench.clock) as catalog:
             enrollments = _enroll_all(bench, catalog, list(enrolled), say=not settings.json)
             model = load_model(catalog, descriptor=None if chosen is None else descriptor_for(chosen))
         if change is not None:
-            operator.another_day(change)
+            operator.change_bench(change)
             _photograph(bench, operator)
         trials = [
             _identify(
@@ -209,9 +209,9 @@ def _say_fault(occurrence: Occurrence) -> None:
     print(f"{occurrence.time_ns * 1e-9:8.2f} s  fault {begins}: {occurrence.fault.kind.name}", file=sys.stderr)
 
 
-def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, Thing], Mapping[str, Thing]]:
+def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, SimObject], Mapping[str, SimObject]]:
     """Return the objects to enroll and the unknown ones; if a whole folder is enrolled, those come from the shelf."""
-    built_in: dict[str, Thing] = dict(shelf())
+    built_in: dict[str, SimObject] = dict(shelf())
     known = dict(photographs(folder)) if folder else {k: v for k, v in built_in.items() if k not in UNKNOWN_OBJECTS}
     names = list(known) if folder else list(dict.fromkeys([*ENROLLED, *known]))
     wanted = count or min(COUNT_OF_FOLDER if folder else len(ENROLLED), len(names))
@@ -268,7 +268,7 @@ def _identify(
     model: Model,
     strategy: AnyStrategy | None,
     operator: ShelfOperator,
-    thing: Thing,
+    thing: SimObject,
     *,
     enrolled: bool,
     say: bool,

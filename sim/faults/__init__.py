@@ -1,12 +1,11 @@
-"""What can go wrong on a bench, for the simulated one to suffer: in its world, on its wires, in its devices.
+"""Simulated faults: they change the simulated world, buses and devices, never a driver.
 
-Nothing here touches a driver. `kinds` is the vocabulary, `Fault` one entry of it with its parameters and its time,
-`Faults` makes them happen.
+`fault_kinds` lists them, `Fault` is one with its parameters and its time, `Faults` lets them happen.
 """
 
 from sim.faults.injector import Faults
-from sim.faults.kind import Kind
+from sim.faults.kind import FaultKind
+from sim.faults.lookup import fault_kinds
 from sim.faults.schedule import Fault, load_faults
-from sim.faults.vocabulary import kinds
 
-__all__ = ["Fault", "Faults", "Kind", "kinds", "load_faults"]
+__all__ = ["Fault", "FaultKind", "Faults", "fault_kinds", "load_faults"]

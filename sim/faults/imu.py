@@ -1,105 +1,111 @@
-"""What goes wrong with the gyro on the platter, and on its I2C bus."""
+"""Simulated faults of the gyro on the platter and of its I2C bus."""
 
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from sim.faults.kind import End, Parameter, kind, repeatedly, share
+from sim.devices import SimDevices
+from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
 from sim.imu.mpu6050 import Words
-from sim.parts import SimParts
 
 Values = Mapping[str, float]
 
 
-def _distort(parts: SimParts, change: Callable[[Words], Words]) -> End:
-    parts.imu.distortions.append(change)
-    return lambda: parts.imu.distortions.remove(change)
+def _distort(devices: SimDevices, change: Callable[[Words], Words]) -> End:
+    devices.imu.distortions.append(change)
+    return lambda: devices.imu.distortions.remove(change)
 
 
-@kind("imu.off", "The gyro is off the bus: a pulled plug; put in again, it has forgotten its settings.")
-def _off(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    address = parts.imu.address
-    device = parts.i2c.detach(address)
+@simulated_fault("imu.off", "The gyro is unplugged. After it is plugged in, its settings are lost.")
+def _off(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    address = devices.imu.address
+    device = devices.i2c.detach(address)
 
     def restore() -> None:
-        parts.imu.power_cycle()
-        parts.i2c.attach(address, device)
+        devices.imu.power_cycle()
+        devices.i2c.attach(address, device)
 
     return restore
 
 
-@kind("imu.stuck", "The gyro delivers the same sample for ever.")
-def _stuck(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    kept: list[Words] = []
+@simulated_fault("imu.stuck", "The gyro repeats one sample.")
+def _stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    samples: list[Words] = []
 
     def hold(words: Words) -> Words:
-        kept.append(words[:1])
-        return np.repeat(kept[0], len(words), axis=0)
+        samples.append(words[:1])
+        return np.repeat(samples[0], len(words), axis=0)
 
-    return _distort(parts, hold)
-
-
-@kind("imu.garbage", "The gyro delivers random samples.")
-def _garbage(parts: SimParts, _values: Values, rng: np.random.Generator) -> End:
-    return _distort(parts, lambda words: rng.integers(-32768, 32768, words.shape).astype(">i2"))
+    return _distort(devices, hold)
 
 
-@kind("imu.wrong", "The gyro's scale is wrong.", factor=Parameter(1.3, "its gain against the true one", 0, 10))
-def _wrong(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    inertial = parts.imu.inertial
+@simulated_fault("imu.garbage", "The gyro delivers random samples.")
+def _garbage(devices: SimDevices, _values: Values, rng: np.random.Generator) -> End:
+    return _distort(devices, lambda words: rng.integers(-32768, 32768, words.shape).astype(">i2"))
+
+
+@simulated_fault(
+    "imu.wrong", "The gyro's scale is wrong.", factor=Parameter(1.3, "gain divided by the true gain", 0, 10)
+)
+def _wrong(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    inertial = devices.imu.inertial
     inertial.gyro_gain = inertial.gyro_gain * values["factor"]
     return lambda: setattr(inertial, "gyro_gain", inertial.gyro_gain / values["factor"])
 
 
-@kind("imu.slow", "The gyro's clock runs slow: it takes fewer samples.", factor=Parameter(0.5, "its rate", 0.01, 1))
-def _slow(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    parts.imu.run_clock(values["factor"] - 1)
-    return lambda: parts.imu.run_clock(0.0)
+@simulated_fault(
+    "imu.slow",
+    "The gyro's clock is slow, so it takes fewer samples.",
+    factor=Parameter(0.5, "rate divided by the true rate", 0.01, 1),
+)
+def _slow(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    devices.imu.run_clock(values["factor"] - 1)
+    return lambda: devices.imu.run_clock(0.0)
 
 
-@kind("imu.delayed", "The gyro's samples are old.", seconds=Parameter(0.3, "how old, s", 0, 10))
-def _delayed(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
+@simulated_fault("imu.delayed", "The gyro's samples arrive late.", seconds=Parameter(0.3, "delay, s", 0, 10))
+def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
     waiting: list[Words] = []
 
     def delay(words: Words) -> Words:
         if not waiting:
-            held = round(values["seconds"] * parts.imu.rate_hz)
-            waiting.append(np.resize(words, (held, words.shape[1])))  # what was before, again
-        line = np.concatenate([waiting[0], words])
-        waiting[0] = line[len(words) :]
-        return line[: len(words)]
+            count = round(values["seconds"] * devices.imu.rate_hz)
+            waiting.append(np.resize(words, (count, words.shape[1])))  # the first samples are repeated
+        queue = np.concatenate([waiting[0], words])
+        waiting[0] = queue[len(words) :]
+        return queue[: len(words)]
 
-    return _distort(parts, delay)
+    return _distort(devices, delay)
 
 
-@kind(
+@simulated_fault(
     "imu.intermittent",
-    "A loose contact: the gyro loses its supply again and again, and with it its settings.",
-    period=Parameter(2.0, "from one loss to the next, s", 0.01, 1000),
+    "A contact is loose. The gyro loses its supply and its settings again and again.",
+    period=Parameter(2.0, "time between losses, s", 0.01, 1000),
 )
-def _intermittent(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    return repeatedly(parts.world.clock, values["period"], parts.imu.power_cycle)
+def _intermittent(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    return repeatedly(devices.world.clock, values["period"], devices.imu.power_cycle)
 
 
-@kind("i2c_nack", "The gyro does not acknowledge now and then: a long cable.", rate=share(0.02, "the transfers"))
-def _nack(parts: SimParts, values: Values, rng: np.random.Generator) -> End:
-    def refuses(_address: int) -> bool:
+@simulated_fault("i2c_nack", "The cable is long. Some transfers are not acknowledged.", rate=share(0.02, "transfers"))
+def _nack(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+    def nacks(_address: int) -> bool:
         return bool(rng.random() < values["rate"])
 
-    parts.i2c.refusals.append(refuses)
-    return lambda: parts.i2c.refusals.remove(refuses)
+    devices.i2c.nack_conditions.append(nacks)
+    return lambda: devices.i2c.nack_conditions.remove(nacks)
 
 
-@kind("i2c_stuck", "A wire of the I2C bus is held low: nothing goes through.")
-def _i2c_stuck(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    parts.i2c.stuck = True
-    return lambda: setattr(parts.i2c, "stuck", False)
+@simulated_fault("i2c_stuck", "A wire of the I2C bus is held low. No transfer is possible.")
+def _i2c_stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    devices.i2c.stuck = True
+    return lambda: setattr(devices.i2c, "stuck", False)
 
 
-@kind("imu_saturated", "The gyro's rate is at the end of its range.")
-def _saturated(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
+@simulated_fault("imu_saturated", "The gyro reports the maximum of its range.")
+def _saturated(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
     def clip(words: Words) -> Words:
         words[:, 4:] = 32767
         return words
 
-    return _distort(parts, clip)
+    return _distort(devices, clip)

@@ -1,21 +1,21 @@
-"""Makes faults happen at their time."""
+"""Lets simulated faults happen at their times."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from sim.clock import Timer
+from sim.devices import SimDevices
 from sim.faults.kind import End
 from sim.faults.schedule import Fault, Trigger
-from sim.parts import SimParts
-from sim.world import Happening
+from sim.world import Activity
 
 DURING_S = 0.1
-"""A fault "during" a move begins so long after the shaft has set off: a step of 5° takes 0.3 s."""
+"""A fault "during" a move begins this long after the shaft has started; a step of 5° takes 0.3 s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Occurrence:
-    """That a fault began or ended, and when on the bench's clock."""
+    """The beginning or the end of a simulated fault, with its time on the bench's clock."""
 
     fault: Fault
     began: bool
@@ -23,25 +23,24 @@ class Occurrence:
 
 
 class Faults:
-    """The faults of one bench.
+    """The simulated faults of one bench.
 
-    Views and moves are counted from 0 as the world sees them: move k is the first time that the shaft sets off before
-    view k, and view k the first frame that is fetched after it. So the numbers are those of a plan's events, for the
-    first plan on a bench.
+    Moves and views are counted from 0 in the simulated world: move k is the first start of the shaft before view k, and
+    view k is the first frame that is fetched after it. For the first plan on a bench these are the plan's numbers.
 
     Attributes
     ----------
     history
-        What has happened so far.
+        Every `Occurrence` so far.
     listeners
         Called with each `Occurrence`.
     """
 
-    def __init__(self, parts: SimParts) -> None:
+    def __init__(self, devices: SimDevices) -> None:
         self.history: list[Occurrence] = []
         self.listeners: list[Callable[[Occurrence], None]] = []
-        self._parts = parts
-        self._clock = parts.world.clock
+        self._parts = devices
+        self._clock = devices.world.clock
         self._waiting: list[Fault] = []
         self._timers: list[Timer] = []
         self._active: dict[int, tuple[Fault, End]] = {}
@@ -49,10 +48,10 @@ class Faults:
         self._moved = True
         self._set_off_for = -1
         self._begun = 0
-        parts.world.watchers.append(self._notice)
+        devices.world.listeners.append(self._notice)
 
     def schedule(self, *faults: Fault) -> None:
-        """Let faults happen at their time; those whose time has come happen now."""
+        """Let faults happen at their times; a time that has passed means now."""
         for fault in faults:
             if fault.trigger is not Trigger.AT:
                 self._waiting.append(fault)
@@ -63,11 +62,11 @@ class Faults:
 
     @property
     def active(self) -> tuple[Fault, ...]:
-        """What is wrong now."""
+        """The faults that have begun and not ended."""
         return tuple(fault for fault, _ in self._active.values())
 
     def clear(self) -> None:
-        """End what is wrong and forget what was to come: somebody has mended the bench."""
+        """End the active faults and cancel the scheduled ones, as if the bench had been repaired."""
         self._waiting.clear()
         for timer in self._timers:
             timer.cancel()
@@ -77,15 +76,15 @@ class Faults:
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
-    def _notice(self, happening: Happening) -> None:
+    def _notice(self, activity: Activity) -> None:
         now_ns = self._clock.now_ns()
-        if happening is Happening.SET_OFF:
+        if activity is Activity.MOTION_STARTED:
             self._moved = True
             if self._set_off_for == self._views:
-                return  # another stop on the way of the same move
+                return  # the same move in several steps
             self._set_off_for = self._views
             self._due(Trigger.MOVE, self._views, now_ns + round(DURING_S * 1e9))
-        elif self._moved:  # not a frame that is taken again
+        elif self._moved:  # the first frame of this view, not a repeated one
             self._moved = False
             self._due(Trigger.VIEW, self._views, now_ns + 1)
             self._views += 1
@@ -103,7 +102,7 @@ class Faults:
         number = self._begun
         self._begun += 1
         rng = self._parts.world.rng(f"fault {number} {fault.kind.name}")
-        self._tell(fault, began=True)
+        self._report(fault, began=True)
         self._active[number] = fault, fault.kind.begin(self._parts, fault.values, rng)
         if fault.for_s is not None:
             at_ns = self._clock.now_ns() + round(fault.for_s * 1e9)
@@ -113,9 +112,9 @@ class Faults:
         if number in self._active:
             fault, end = self._active.pop(number)
             end()
-            self._tell(fault, began=False)
+            self._report(fault, began=False)
 
-    def _tell(self, fault: Fault, *, began: bool) -> None:
+    def _report(self, fault: Fault, *, began: bool) -> None:
         occurrence = Occurrence(fault, began, self._clock.now_ns())
         self.history.append(occurrence)
         for listener in self.listeners:

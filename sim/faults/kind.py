@@ -1,4 +1,4 @@
-"""An entry of the vocabulary: a name, what it does, its parameters, and how it begins and ends."""
+"""A kind of simulated fault: its name, description, parameters, beginning and end."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,17 +9,17 @@ import numpy as np
 from rig.core.clock import seconds_between
 from rig.core.errors import UsageError
 from sim.clock import Timer, VirtualClock
-from sim.parts import SimParts
+from sim.devices import SimDevices
 
 DEVICES = ("servo", "imu", "camera")
 
 End = Callable[[], None]
-"""Takes the cause away; what it has done stays done."""
+"""Removes the cause of a fault; its consequences remain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number that a fault takes: its default, what it means (with its unit), and its range."""
+    """A number that a fault takes: its default, its meaning with the unit, and its range."""
 
     default: float
     meaning: str
@@ -32,15 +32,19 @@ def share(default: float, of: str) -> Parameter:
     return Parameter(default, f"share of {of}", 0.0, 1.0)
 
 
-Begin = Callable[[SimParts, Mapping[str, float], np.random.Generator], End]
+Begin = Callable[[SimDevices, Mapping[str, float], np.random.Generator], End]
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
-    """What can go wrong.
+class FaultKind:
+    """A kind of simulated fault.
 
-    ``begin`` makes it happen in the given parts and returns what ends it. ``momentary`` faults are over at once; to end
-    one undoes it as far as a person at the bench would.
+    Attributes
+    ----------
+    what
+        A sentence that describes it.
+    begin
+        Starts the fault in the given devices and returns the function that ends it.
     """
 
     name: str
@@ -54,13 +58,13 @@ class Kind:
         Raises
         ------
         UsageError
-            There is no such parameter, or its value is out of range.
+            The fault has no such parameter, or its value is out of range.
         """
         for name, value in given.items():
             if name not in self.parameters:
                 raise UsageError(
                     f"The fault {self.name} has no parameter {name!r}.",
-                    next_step=f"Choose of {', '.join(self.parameters)}." if self.parameters else "Leave it out.",
+                    next_step=f"Use {', '.join(self.parameters)}." if self.parameters else "Remove the parameter.",
                 )
             parameter = self.parameters[name]
             if not parameter.low <= value <= parameter.high:
@@ -71,22 +75,22 @@ class Kind:
         return {name: given.get(name, parameter.default) for name, parameter in self.parameters.items()}
 
 
-registry: dict[str, Kind] = {}
-"""Every fault that was entered by `kind`."""
+registry: dict[str, FaultKind] = {}
+"""All kinds that `simulated_fault` registered, by name."""
 
 
-def kind(name: str, what: str, **parameters: Parameter) -> Callable[[Begin], Begin]:
-    """Enter a function into the vocabulary as the beginning of the fault ``name``."""
+def simulated_fault(name: str, what: str, **parameters: Parameter) -> Callable[[Begin], Begin]:
+    """Register a function as the beginning of the fault ``name``."""
 
-    def enter(begin: Begin) -> Begin:
-        registry[name] = Kind(name, what, MappingProxyType(parameters), begin)
+    def register(begin: Begin) -> Begin:
+        registry[name] = FaultKind(name, what, MappingProxyType(parameters), begin)
         return begin
 
-    return enter
+    return register
 
 
 def repeatedly(clock: VirtualClock, period_s: float, action: Callable[[], None]) -> End:
-    """Call ``action`` now and every ``period_s`` from now on; return what stops that."""
+    """Call ``action`` now and every ``period_s`` from now on; return the function that stops it."""
     timer: Timer | None = None
 
     def act() -> None:
@@ -103,17 +107,17 @@ def repeatedly(clock: VirtualClock, period_s: float, action: Callable[[], None])
 
 
 class Delay:
-    """Holds things back for a time on the clock: `put` now, `newest` of those that are old enough."""
+    """Delays values by a time on the clock."""
 
     def __init__(self, clock: VirtualClock, seconds: float) -> None:
         self._clock = clock
         self._seconds = seconds
-        self._kept: list[tuple[int, bytes]] = []
+        self._values: list[tuple[int, bytes]] = []
 
-    def through(self, value: bytes) -> bytes:
-        """Put ``value`` in and return the newest that is old enough, or the oldest there is."""
+    def delayed(self, value: bytes) -> bytes:
+        """Add ``value`` and return the newest value that is old enough, or else the oldest."""
         now_ns = self._clock.now_ns()
-        self._kept.append((now_ns, value))
-        while len(self._kept) > 1 and seconds_between(self._kept[1][0], now_ns) >= self._seconds:
-            del self._kept[0]
-        return self._kept[0][1]
+        self._values.append((now_ns, value))
+        while len(self._values) > 1 and seconds_between(self._values[1][0], now_ns) >= self._seconds:
+            del self._values[0]
+        return self._values[0][1]

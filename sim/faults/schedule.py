@@ -1,4 +1,4 @@
-"""When a fault happens: in short words (``jam@move3+2s``), or in a TOML file."""
+"""Simulated faults with their times, in a short notation (``jam@move3+2s``) or in a TOML file."""
 
 import re
 import tomllib
@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Self
 
 from rig.core.errors import UsageError
-from sim.faults.kind import Kind
-from sim.faults.vocabulary import find_kind
+from sim.faults.kind import FaultKind
+from sim.faults.lookup import find_fault
 
-NOTATION = "NAME[:PARAMETER=VALUE...][@TIME], TIME being 12s, move3 or view10, with +2s behind it for how long"
+NOTATION = "NAME[:PARAMETER=VALUE...][@TIME[+DURATION]], for example jam@12s, jam@move3 or blur@view10+2s"
 
 _SHORT = re.compile(r"(?P<name>[a-z0-9_.]+)(?P<values>(?::[^:@]*)*)(?:@(?P<when>.*))?")
 _WHEN = re.compile(r"(?:(?P<at>[\d.]+)s|move(?P<move>\d+)|view(?P<view>\d+))(?:\+(?P<length>[\d.]+)s)?")
@@ -20,7 +20,7 @@ _KEYS = ("name", "at_s", "during_move", "after_view", "for_s")
 
 
 class Trigger(Enum):
-    """What a fault waits for."""
+    """What starts a fault."""
 
     AT = "at_s"
     MOVE = "during_move"
@@ -29,22 +29,22 @@ class Trigger(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault with its time.
+    """A simulated fault with its time.
 
     Attributes
     ----------
     kind
-        What happens.
+        Its kind.
     values
-        Its parameters, all of them.
+        The values of all its parameters.
     trigger, mark
-        It begins at ``mark`` seconds of the bench's clock, or during the move or after the view with that number,
-        counted from 0 since the faults were scheduled: `sim.faults.injector.Faults`.
+        It begins at ``mark`` seconds of the bench's clock, or during the move or after the view with that number.
+        `sim.faults.injector.Faults` counts moves and views from 0.
     for_s
-        How long it lasts; None: until somebody ends it.
+        Its duration; None: it lasts until it is ended.
     """
 
-    kind: Kind
+    kind: FaultKind
     values: Mapping[str, float] = field(default_factory=dict)
     trigger: Trigger = Trigger.AT
     mark: float = 0.0
@@ -60,12 +60,12 @@ class Fault:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Return what the short notation says.
+        """Return the fault that a text in the short notation describes.
 
         Raises
         ------
         UsageError
-            It cannot be read, or there is no such fault or parameter.
+            The text cannot be read, or the fault or a parameter does not exist.
         """
         match = _SHORT.fullmatch(text.strip())
         if not match:
@@ -95,8 +95,10 @@ class Fault:
         """
         name = table.get("name")
         if not isinstance(name, str):
-            raise UsageError("A fault has no name.", next_step='Write name = "jam", or another: rig faults lists them.')
-        kind = find_kind(name)
+            raise UsageError(
+                "A fault has no name.", next_step='Add a name, for example name = "jam". List the names: rig faults'
+            )
+        kind = find_fault(name)
         triggers = [trigger for trigger in Trigger if trigger.value in table]
         if len(triggers) > 1:
             raise UsageError(
@@ -108,9 +110,12 @@ class Fault:
         trigger = triggers[0] if triggers else Trigger.AT
         mark = numbers.pop(trigger.value, 0.0)
         if mark < 0 or (for_s is not None and for_s <= 0):
-            raise UsageError(f"The time of the fault {name} is negative.", next_step="Give a time from 0 on.")
+            raise UsageError(f"The time of the fault {name} is negative.", next_step="Give a time of 0 or later.")
         if trigger is not Trigger.AT and mark != int(mark):
-            raise UsageError(f"{trigger.value} = {mark:g} of the fault {name}.", next_step="Give a whole number.")
+            raise UsageError(
+                f"{trigger.value} = {mark:g} of the fault {name} is not a whole number.",
+                next_step="Give a whole number.",
+            )
         return cls(kind, kind.values(numbers), trigger, mark, for_s)
 
 
@@ -120,7 +125,7 @@ def load_faults(path: Path) -> list[Fault]:
     Raises
     ------
     UsageError
-        The file cannot be read, or one of its faults is none; the message says which.
+        The file or one of its faults cannot be read; the message says which one.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -132,7 +137,7 @@ def load_faults(path: Path) -> list[Fault]:
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(
-            f"{path} is not a TOML file.", next_step="Mend the line named.", evidence={"reason": str(error)}
+            f"{path} is not a TOML file.", next_step="Correct the line.", evidence={"reason": str(error)}
         ) from error
     entries = content.pop("faults", None)
     if content or not isinstance(entries, list):
@@ -168,7 +173,9 @@ def _number(name: str, key: str, value: Any) -> float:
         if number != number:
             raise ValueError
     except (TypeError, ValueError):
-        raise UsageError(f"{key} = {value!r} of the fault {name}.", next_step="Give a number.") from None
+        raise UsageError(
+            f"{key} = {value!r} of the fault {name} is not a number.", next_step="Give a number."
+        ) from None
     return number
 
 

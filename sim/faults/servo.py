@@ -1,12 +1,12 @@
-"""What goes wrong with the servo, its gears and its line."""
+"""Simulated faults of the servo, its gears and its bus."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from sim.faults.kind import Delay, End, Parameter, kind, repeatedly, share
-from sim.parts import SimParts
+from sim.devices import SimDevices
+from sim.faults.kind import Delay, End, Parameter, repeatedly, share, simulated_fault
 from sim.servo import Ax12Servo, Frame, XSeriesServo
 from sim.servo.configured import SimulatedServo
 from sim.servo.control_table import Memory
@@ -16,20 +16,20 @@ from sim.world import World
 Values = Mapping[str, float]
 
 LOWEST_SUPPLY_V = 4.5
-"""Below it the servo's controller resets; the e-manual gives no number."""
+"""Below this voltage the servo's controller resets. The e-manual states no value."""
 _OTHER_MODEL = 1020
 """Model Number of an XM430-W350."""
-_ANOTHER = 1060
+_XL430_MODEL = 1060
 
 
-def _tamper(parts: SimParts, change: Callable[[Frame], Frame | None]) -> End:
-    parts.servo_bus.tampers.append(change)
-    return lambda: parts.servo_bus.tampers.remove(change)
+def _filter(devices: SimDevices, change: Callable[[Frame], Frame | None]) -> End:
+    devices.servo_bus.filters.append(change)
+    return lambda: devices.servo_bus.filters.remove(change)
 
 
-def _distort(parts: SimParts, change: Callable[[Memory], None]) -> End:
-    parts.servo.distortions.append(change)
-    return lambda: parts.servo.distortions.remove(change)
+def _distort(devices: SimDevices, change: Callable[[Memory], None]) -> End:
+    devices.servo.distortions.append(change)
+    return lambda: devices.servo.distortions.remove(change)
 
 
 def _later(frame: Frame, seconds: float) -> Frame:
@@ -39,67 +39,67 @@ def _later(frame: Frame, seconds: float) -> Frame:
 # -- the device -------------------------------------------------------------------------------------------------------
 
 
-@kind("servo.off", "The servo has no supply; afterwards it boots, and has forgotten its turns.")
-def _off(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    parts.servo.power_off()
-    return parts.servo.power_on
+@simulated_fault("servo.off", "The servo loses its supply. When it starts again, its count of revolutions is lost.")
+def _off(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    devices.servo.power_off()
+    return devices.servo.power_on
 
 
-@kind("servo.stuck", "The servo's status registers stay as they are, whatever the shaft does.")
-def _stuck(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    kept: list[bytes] = []
+@simulated_fault("servo.stuck", "The servo's status registers do not change while the shaft moves.")
+def _stuck(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    readings: list[bytes] = []
 
     def hold(memory: Memory) -> None:
-        kept.append(memory.live())
-        memory.set_live(kept[0])
+        readings.append(memory.live())
+        memory.set_live(readings[0])
 
-    return _distort(parts, hold)
-
-
-@kind("servo.garbage", "The servo's status registers hold random bytes, under a valid CRC.")
-def _garbage(parts: SimParts, _values: Values, rng: np.random.Generator) -> End:
-    return _distort(parts, lambda memory: memory.set_live(rng.bytes(len(memory.live()))))
+    return _distort(devices, hold)
 
 
-@kind(
+@simulated_fault("servo.garbage", "The servo's status registers contain random bytes, with a valid CRC.")
+def _garbage(devices: SimDevices, _values: Values, rng: np.random.Generator) -> End:
+    return _distort(devices, lambda memory: memory.set_live(rng.bytes(len(memory.live()))))
+
+
+@simulated_fault(
     "servo.wrong",
-    "The encoder's magnet slips on the shaft: the servo goes where it should not.",
-    angle=Parameter(5.0, "by how much, °", -90, 90),
+    "The encoder's magnet slips on the shaft, so the servo goes to wrong angles.",
+    angle=Parameter(5.0, "slip, °", -90, 90),
 )
-def _wrong(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    parts.servo.slip_encoder(values["angle"])
+def _wrong(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    devices.servo.slip_encoder(values["angle"])
     return lambda: None
 
 
-@kind(
+@simulated_fault(
     "servo.slow",
-    "Each answer comes late, but in time: a USB adapter with its latency timer at 16 ms.",
-    seconds=Parameter(0.01, "how late, s", 0, 10),
+    "Each answer is late but within the timeout, as with a USB latency timer of 16 ms.",
+    seconds=Parameter(0.01, "delay, s", 0, 10),
 )
-def _slow(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    return _tamper(parts, lambda frame: _later(frame, values["seconds"]))
+def _slow(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    return _filter(devices, lambda frame: _later(frame, values["seconds"]))
 
 
-@kind(
+@simulated_fault(
     "servo.delayed",
-    "The servo reports how it was a while ago.",
-    seconds=Parameter(0.3, "how long ago, s", 0, 10),
+    "The servo reports old readings.",
+    seconds=Parameter(0.3, "age of the readings, s", 0, 10),
 )
-def _delayed(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    delay = Delay(parts.world.clock, values["seconds"])
-    return _distort(parts, lambda memory: memory.set_live(delay.through(memory.live())))
+def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    delay = Delay(devices.world.clock, values["seconds"])
+    return _distort(devices, lambda memory: memory.set_live(delay.delayed(memory.live())))
 
 
-@kind("servo.intermittent", "A loose contact: answers get lost.", rate=share(0.05, "the answers"))
-def _intermittent(parts: SimParts, values: Values, rng: np.random.Generator) -> End:
-    return _tamper(parts, lambda frame: None if rng.random() < values["rate"] else frame)
+@simulated_fault("servo.intermittent", "A contact is loose. Some answers are lost.", rate=share(0.05, "answers"))
+def _intermittent(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+    return _filter(devices, lambda frame: None if rng.random() < values["rate"] else frame)
 
 
-# -- its line ---------------------------------------------------------------------------------------------------------
+# -- its bus ----------------------------------------------------------------------------------------------------------
 
 
-@kind("crc_flip", "Single bits of the servo's answers flip on the line.", rate=share(0.1, "the answers"))
-def _crc_flip(parts: SimParts, values: Values, rng: np.random.Generator) -> End:
+@simulated_fault("crc_flip", "Single bits of some answers flip on the servo bus.", rate=share(0.1, "answers"))
+def _crc_flip(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
     def flip(frame: Frame) -> Frame:
         if rng.random() >= values["rate"]:
             return frame
@@ -107,72 +107,72 @@ def _crc_flip(parts: SimParts, values: Values, rng: np.random.Generator) -> End:
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
         return replace(frame, data=bytes(data))
 
-    return _tamper(parts, flip)
+    return _filter(devices, flip)
 
 
-@kind(
+@simulated_fault(
     "late_reply",
-    "Answers come after the host has given them up, while it waits for the next one.",
-    rate=share(0.1, "the answers"),
-    seconds=Parameter(0.05, "how late, s", 0, 10),
+    "Some answers arrive after the timeout, while the computer waits for the next answer.",
+    rate=share(0.1, "answers"),
+    seconds=Parameter(0.05, "delay, s", 0, 10),
 )
-def _late_reply(parts: SimParts, values: Values, rng: np.random.Generator) -> End:
-    return _tamper(parts, lambda frame: _later(frame, values["seconds"]) if rng.random() < values["rate"] else frame)
+def _late_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+    return _filter(devices, lambda frame: _later(frame, values["seconds"]) if rng.random() < values["rate"] else frame)
 
 
-@kind(
+@simulated_fault(
     "babble",
-    "Random bytes on the line all the time: an open line, another master.",
-    period=Parameter(0.004, "from one burst of 8 bytes to the next, s", 0.0005, 10),
+    "Random bytes appear on the servo bus, as from an open wire or a second controller.",
+    period=Parameter(0.004, "time between bursts of 8 bytes, s", 0.0005, 10),
 )
-def _babble(parts: SimParts, values: Values, rng: np.random.Generator) -> End:
-    bus, adapter = parts.servo_bus, parts.adapter
-    return repeatedly(parts.world.clock, values["period"], lambda: bus.disturb(rng.bytes(8), adapter.baudrate))
+def _babble(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+    bus, adapter = devices.servo_bus, devices.adapter
+    return repeatedly(devices.world.clock, values["period"], lambda: bus.disturb(rng.bytes(8), adapter.baudrate))
 
 
-@kind("echo", "The adapter hears what it sends itself.")
-def _echo(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    parts.servo_bus.echo = True
-    return lambda: setattr(parts.servo_bus, "echo", False)
+@simulated_fault("echo", "The adapter receives its own bytes.")
+def _echo(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    devices.servo_bus.echo = True
+    return lambda: setattr(devices.servo_bus, "echo", False)
 
 
-@kind("unplug", "The servo's USB adapter is pulled out of the computer; put in again, it must be opened anew.")
-def _unplug(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    parts.adapter.unplug()
-    return parts.adapter.replug
+@simulated_fault("unplug", "The servo's USB adapter is unplugged. After it is plugged in, it must be opened again.")
+def _unplug(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    devices.adapter.unplug()
+    return devices.adapter.replug
 
 
-@kind("duplicate_id", "A second servo with the same id answers on the line.")
-def _duplicate_id(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    there = parts.servo
-    elsewhere = World(noise=parts.world.noise, seed=parts.world.seed + 1, clock=parts.world.clock)
+@simulated_fault("duplicate_id", "A second servo with the same id answers.")
+def _duplicate_id(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    first = devices.servo
+    world = World(noise=devices.world.noise, seed=devices.world.seed + 1, clock=devices.world.clock)
     twin: SimulatedServo
-    if isinstance(there, XSeriesServo):
-        twin = XSeriesServo(elsewhere, there.model.name, bus_id=there.bus_id, baudrate=there.baudrate)
+    if isinstance(first, XSeriesServo):
+        twin = XSeriesServo(world, first.model.name, bus_id=first.bus_id, baudrate=first.baudrate)
     else:
-        twin = Ax12Servo(elsewhere, bus_id=there.bus_id, baudrate=there.baudrate)
-    parts.servo_bus.attach(twin)
-    return lambda: parts.servo_bus.detach(twin)
+        twin = Ax12Servo(world, bus_id=first.bus_id, baudrate=first.baudrate)
+    devices.servo_bus.attach(twin)
+    return lambda: devices.servo_bus.detach(twin)
 
 
-@kind("wrong_model", "Another model answers at the servo's id.")
-def _wrong_model(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    memory = parts.servo.memory
+@simulated_fault("wrong_model", "A servo of another model answers at the id.")
+def _wrong_model(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    memory = devices.servo.memory
     number = memory["Model Number"]
-    memory["Model Number"] = _ANOTHER if number == _OTHER_MODEL else _OTHER_MODEL
+    memory["Model Number"] = _XL430_MODEL if number == _OTHER_MODEL else _OTHER_MODEL
     return lambda: memory.__setitem__("Model Number", number)
 
 
 # -- its supply, load and heat ----------------------------------------------------------------------------------------
 
 
-@kind(
+@simulated_fault(
     "brownout",
-    "The servo's supply breaks down; below 4.5 V the servo resets.",
-    volts=Parameter(4.0, "what is left, V", 0, 30),
+    "The servo's supply voltage drops. Below 4.5 V the servo resets.",
+    volts=Parameter(4.0, "supply voltage, V", 0, 30),
 )
-def _brownout(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    servo, volts = parts.servo, values["volts"]
+def _brownout(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    servo, volts = devices.servo, values["volts"]
     if volts < LOWEST_SUPPLY_V:
         servo.power_off()
     servo.set_voltage(volts)
@@ -184,56 +184,56 @@ def _brownout(parts: SimParts, values: Values, _rng: np.random.Generator) -> End
     return restore
 
 
-@kind("overload", "The servo shuts itself down for overload; only a reboot brings it back.")
-def _overload(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    parts.servo.fail(OVERLOAD_ERROR)
+@simulated_fault("overload", "The servo shuts down because of an overload, until it is rebooted.")
+def _overload(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    devices.servo.fail(OVERLOAD_ERROR)
     return lambda: None
 
 
-@kind(
+@simulated_fault(
     "overheat",
-    "The servo's case is hot; above its limit it shuts itself down until it is rebooted.",
+    "The servo is hot. Above its limit it shuts down until it is rebooted.",
     celsius=Parameter(85.0, "temperature of the case, °C", -20, 150),
 )
-def _overheat(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    cool_c = parts.servo.motor.temperature_c(0.0)
-    parts.servo.set_temperature(values["celsius"])
-    return lambda: parts.servo.set_temperature(cool_c)
+def _overheat(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    cool_c = devices.servo.motor.temperature_c(0.0)
+    devices.servo.set_temperature(values["celsius"])
+    return lambda: devices.servo.set_temperature(cool_c)
 
 
-@kind("watchdog_trip", "The servo's Bus Watchdog trips while the table turns, as after a pause of the host.")
-def _watchdog_trip(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    parts.servo.trip_watchdog()
+@simulated_fault("watchdog_trip", "The servo's Bus Watchdog stops the table, as after a pause of the computer.")
+def _watchdog_trip(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    devices.servo.trip_watchdog()
     return lambda: None
 
 
 # -- its gears and the platter ----------------------------------------------------------------------------------------
 
 
-@kind(
+@simulated_fault(
     "backlash",
-    "The gears are worn: free play between shaft and platter.",
-    degrees=Parameter(4.0, "play, full width, °", 0, 90),
+    "The gears are worn and have a large backlash.",
+    degrees=Parameter(4.0, "backlash, full width, °", 0, 90),
 )
-def _backlash(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    world = parts.world
+def _backlash(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    world = devices.world
     noise = world.noise
     world.noise = noise.with_values(backlash_deg=values["degrees"])
     return lambda: setattr(world, "noise", noise)
 
 
-@kind(
+@simulated_fault(
     "slip",
     "The platter slips on the shaft.",
-    angle=Parameter(-6.0, "by how much, °", -360, 360),
-    seconds=Parameter(0.1, "how long it takes, s", 0.001, 10),
+    angle=Parameter(-6.0, "slip, °", -360, 360),
+    seconds=Parameter(0.1, "duration of the slip, s", 0.001, 10),
 )
-def _slip(parts: SimParts, values: Values, _rng: np.random.Generator) -> End:
-    parts.world.slip(values["angle"], values["seconds"])
+def _slip(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    devices.world.slip(values["angle"], values["seconds"])
     return lambda: None
 
 
-@kind("jam", "The shaft is blocked.")
-def _jam(parts: SimParts, _values: Values, _rng: np.random.Generator) -> End:
-    parts.servo.jam()
-    return parts.servo.free
+@simulated_fault("jam", "The shaft is blocked.")
+def _jam(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
+    devices.servo.jam()
+    return devices.servo.free

@@ -1,8 +1,7 @@
-"""A rig head in the world: the firmware, what hangs on its pins, and its line to the host.
+"""A simulated rig head: the firmware, the devices on its pins, and its serial connection to the host.
 
-The board is run up to the virtual clock's time whenever somebody looks, and every few milliseconds by itself. What it
-asks of the world meanwhile (a register over I2C) is answered as of the board's own time, so that nothing depends on how
-often it was run.
+The board runs up to the virtual clock's time whenever its state is read, and every few milliseconds. The world answers
+its requests, such as reading a register over I2C, as of the board's own time. So nothing depends on how often it runs.
 """
 
 import ctypes
@@ -23,9 +22,9 @@ from sim.world import World
 
 BYTE_NS = 10 * 1_000_000_000 // BAUD
 QUANTUM_S = 0.005
-"""How far the board may lag behind the clock while nobody looks: bounds how late the world feels its outputs."""
+"""Longest time between two runs of the board: limits how late its outputs change the world."""
 RECEIVER_BYTES = 4096
-"""What the host's operating system keeps of what arrives (N_TTY); later bytes are lost."""
+"""Size of the host's receive buffer (N_TTY); later bytes are lost."""
 ABI = 1
 _NEVER = 2**64 - 1
 _ROOM = 1024
@@ -38,27 +37,27 @@ _I2c = CFUNCTYPE(c_int32, c_uint64, c_int32, POINTER(c_uint8), c_int32)
 _Edge = CFUNCTYPE(c_uint64, c_uint64)
 
 
-class _Outside(Structure):
+class _Environment(Structure):
     _fields_ = (("i2c", _I2c), ("edge", _Edge))
 
 
 class EdgeSource(Protocol):
-    """A device with an interrupt pin, which is wired to the head's data-ready input."""
+    """A device whose interrupt pin is connected to the head's data-ready input."""
 
     def next_edge_ns(self, after_ns: int) -> int | None: ...
 
 
 @dataclass(frozen=True, slots=True)
 class PinChange:
-    """An output changed: ``pin`` is light (duty, 0 to 1), relay or trigger (0 or 1)."""
+    """A change of an output: ``pin`` is light (duty, 0 to 1), relay or trigger (0 or 1)."""
 
     time_ns: int
     pin: str
     value: float
 
 
-class _ThenClock:
-    """The virtual clock as the board sees it: its own time."""
+class _BoardClock:
+    """The board's own time as a clock."""
 
     def __init__(self, head: "SimHead") -> None:
         self._head = head
@@ -67,11 +66,11 @@ class _ThenClock:
         return self._head.now_ns
 
 
-class _WorldThen:
-    """The world at the board's time; everything else is the world's."""
+class _WorldAtBoardTime:
+    """The world at the board's time; all other attributes are the world's."""
 
     def __init__(self, head: "SimHead", world: World) -> None:
-        self.clock = _ThenClock(head)
+        self.clock = _BoardClock(head)
         self._world = world
 
     def table_deg(self, time_ns: int | None = None) -> float:
@@ -84,40 +83,40 @@ class _WorldThen:
 class SimHead:
     """A simulated rig head.
 
-    Bus side: `sim.head.wire.HeadSerial` is its line, devices are attached to its I2C bus. World side: `estop_open`,
-    `stuck`, `nack`, `refusals`, `attach`, `detach` (as of `sim.i2c.SimI2cBus`), `reset`, `hang`, `unplugged` (its cable
-    is out of the computer; it goes on alone), the outputs and their history, and the tampers.
+    Drivers use `sim.head.serial_port.HeadSerial`. Tests use `estop_open`, `stuck`, `nack`, `nack_conditions`, `attach`
+    and `detach` (as of `sim.i2c.SimI2cBus`), `reset`, `hang`, `unplugged` (the board runs without its cable), the
+    outputs and their history, and the filters.
 
     Parameters
     ----------
     world
-        In which it stands.
+        The simulated world.
     kind
-        ``memory``: the portable core, on this computer; ``avr``: the binary that is flashed, in an emulated ATmega328P.
+        ``memory``: the portable core on this computer; ``avr``: the flashed binary in an emulated ATmega328P.
     clock_error
-        How much too fast its clock runs, relatively.
+        Relative error of its clock; positive is too fast.
     serial
-        The number it was given when it was flashed.
+        The serial number in its flash.
     image
         Flash to run instead of the built one (``avr``).
 
     Attributes
     ----------
-    world_then
-        The world at the board's own time: what its sensors are made in.
-    tampers
-        Each is given a byte on the line (``to_head``, the byte) and returns what arrives, or None to lose it.
+    world_at_board_time
+        The world at the board's own time, for its sensors.
+    filters
+        Called with (``to_head``, byte) for each byte; returns the byte that arrives, or None if it is lost.
     listeners
         Called with each `PinChange`.
 
     Raises
     ------
     ConfigError
-        This machine cannot build the firmware.
+        The firmware cannot be built on this computer.
     """
 
     path = ""
-    """Its bus has none: it is not the computer's."""
+    """Empty: its I2C bus is not one of the computer's."""
 
     def __init__(
         self,
@@ -131,15 +130,15 @@ class SimHead:
     ) -> None:
         self.clock: VirtualClock = world.clock
         self.kind = kind
-        self.world_then = cast(World, _WorldThen(self, world))
+        self.world_at_board_time = cast(World, _WorldAtBoardTime(self, world))
         self.light = 0.0
         self.relay_closed = False
         self.trigger_on = False
         self.changes: deque[PinChange] = deque(maxlen=10_000)
-        self.tampers: list[Callable[[bool, int], int | None]] = []
+        self.filters: list[Callable[[bool, int], int | None]] = []
         self.listeners: list[Callable[[PinChange], None]] = []
         self.resets: list[Reset] = []
-        self.refusals: list[Callable[[int], bool]] = []
+        self.nack_conditions: list[Callable[[int], bool]] = []
         self.unplugged = False
         self._devices: dict[int, I2cDevice] = {}
         self._addressed: I2cDevice | None = None
@@ -155,24 +154,24 @@ class SimHead:
 
         self._library = _load(library or (build.avr_library() if kind == "avr" else build.host_library()))
         flash = image if image is not None else build.avr_image() if kind == "avr" else b""
-        self._outside = _Outside(_I2c(self._i2c), _Edge(self._edge))
+        self._environment = _Environment(_I2c(self._i2c), _Edge(self._edge))
         self._outputs = ctypes.create_string_buffer(_ROOM * _OUTPUT.itemsize)
-        self._board = self._library.board_open(self._outside, flash, len(flash), serial)
+        self._board = self._library.board_open(self._environment, flash, len(flash), serial)
         if not self._board:
-            raise MemoryError("no board")
+            raise MemoryError("The board cannot be created.")
         self._cancel = self.clock.every(QUANTUM_S, self.catch_up)
 
     def close(self) -> None:
-        """Take the board away; a second call does nothing."""
+        """Free the board; a second call does nothing."""
         self._cancel()
         board, self._board = self._board, None
         if board:
             self._library.board_close(board)
 
-    # -- world side -------------------------------------------------------------------------------------------------
+    # -- for tests --------------------------------------------------------------------------------------------------
 
     def attach(self, address: int, device: I2cDevice) -> None:
-        """Put a device on the head's I2C bus; its data-ready pin, if it has one, is wired."""
+        """Connect a device to the head's I2C bus, with its data-ready pin if it has one."""
         self._devices[address] = device
 
     def detach(self, address: int) -> I2cDevice:
@@ -181,7 +180,7 @@ class SimHead:
         return self._devices.pop(address)
 
     def nack(self, count: int = 1) -> None:
-        """Let nobody acknowledge the next ``count`` addresses."""
+        """Leave the next ``count`` addresses without an acknowledge."""
         self.catch_up()
         self._nacks = count
 
@@ -197,7 +196,7 @@ class SimHead:
 
     @property
     def stuck(self) -> int:
-        """How often SCL must be clocked until the sensor lets SDA go; 255 or True: for ever; 0: the bus is free."""
+        """Number of SCL clocks until the sensor releases SDA; 255 or True: never; 0: the bus is free."""
         return self._stuck
 
     @stuck.setter
@@ -208,13 +207,13 @@ class SimHead:
         self._library.board_set_stuck(self._board, clocks)
 
     def reset(self, cause: Reset) -> None:
-        """Restart the board: a brown-out, its button, its supply."""
+        """Restart the board, as after a brown-out, its button or its supply."""
         self.catch_up()
         self._library.board_reset(self._board, cause)
         self._drain()
 
     def hang(self, hangs: bool = True) -> None:
-        """Let the firmware's main loop stand still; its interrupts go on."""
+        """Stop the firmware's main loop, but not its interrupts."""
         self.catch_up()
         self._library.board_hang(self._board, hangs)
 
@@ -223,25 +222,25 @@ class SimHead:
         self.catch_up()
         return [(c.time_ns, c.value) for c in self.changes if c.pin == pin]
 
-    # -- the line ---------------------------------------------------------------------------------------------------
+    # -- serial connection-------------------------------------------------------------------------------------------
 
     def send(self, data: bytes) -> int:
-        """Put the host's bytes on the line; return when the last of them has arrived (ns)."""
+        """Send the host's bytes to the head; return when the last one arrives (ns)."""
         self.catch_up()
         at_ns = max(self.clock.now_ns(), self._line_free_ns)
         for byte in data:
             at_ns += BYTE_NS
-            if (arriving := self._tampered(True, byte)) is not None:
+            if (arriving := self._filtered(True, byte)) is not None:
                 self._library.board_receive(self._board, self._to_board(at_ns), arriving)
         self._line_free_ns = at_ns
         return at_ns
 
     def babble(self, data: bytes) -> None:
-        """Let the host hear ``data``, as if the head had sent it now."""
+        """Send ``data`` to the host as if the head had sent it now."""
         self.catch_up()
         now_ns = self.clock.now_ns()
-        heard = [(now_ns + (i + 1) * BYTE_NS, byte) for i, byte in enumerate(data)]
-        self._coming = deque(sorted([*self._coming, *heard], key=lambda arriving: arriving[0]))
+        added = [(now_ns + (i + 1) * BYTE_NS, byte) for i, byte in enumerate(data)]
+        self._coming = deque(sorted([*self._coming, *added], key=lambda arriving: arriving[0]))
 
     def take(self, until_ns: int) -> bytes:
         """Return the bytes that have arrived at the host by ``until_ns``."""
@@ -251,13 +250,13 @@ class SimHead:
         return bytes(arrived)
 
     def arrival_ns(self, count: int) -> int | None:
-        """Return when the ``count``-th byte, or the last, of those on the line arrives; a byte is when it has begun."""
+        """Return when the ``count``-th byte on its way to the host arrives, or the last one; None if there is none."""
         return self._coming[min(count, len(self._coming)) - 1][0] if self._coming else None
 
     # -- time -------------------------------------------------------------------------------------------------------
 
     def catch_up(self) -> None:
-        """Run the board up to now."""
+        """Run the board up to the current time."""
         now_ns = self.clock.now_ns()
         if self._running or self._board is None or now_ns == self.now_ns:
             return
@@ -279,13 +278,13 @@ class SimHead:
     def _to_world(self, board_ns: int) -> int:
         return self._born_ns + board_ns - board_ns * self._error_ppb // (1_000_000_000 + self._error_ppb)
 
-    # -- what the board asks and tells --------------------------------------------------------------------------------
+    # -- requests and outputs of the board----------------------------------------------------------------------------
 
     def _i2c(self, board_ns: int, operation: int, data: Any, length: int) -> int:
         try:
             self.now_ns = self._to_world(board_ns)
             return self._transfer(operation, data, length)
-        except BaseException as error:  # a C function calls this: keep it until that one returns
+        except BaseException as error:  # a C function calls this; catch_up raises the error
             self._failure = error
             return 0
 
@@ -297,7 +296,7 @@ class SimHead:
                 device is None
                 or self._nacks
                 or not getattr(device, "answers", True)
-                or any(refuses(data[0]) for refuses in self.refusals)
+                or any(refuses(data[0]) for refuses in self.nack_conditions)
             ):
                 self._nacks = max(self._nacks - 1, 0)
                 self._addressed = None
@@ -328,7 +327,7 @@ class SimHead:
             return _NEVER
 
     def _drain(self) -> None:
-        """Take what has left the board: bytes on their way to the host, and changes of its pins."""
+        """Collect the board's outputs: bytes to the host and changes of its pins."""
         while taken := self._library.board_take(self._board, self._outputs, _ROOM):
             outputs = np.frombuffer(memoryview(self._outputs), _OUTPUT, taken)
             ns = outputs["ns"].astype(np.int64)
@@ -337,7 +336,7 @@ class SimHead:
             times = (ns + self._born_ns).tolist()
             for time_ns, event, value in zip(times, outputs["event"].tolist(), outputs["value"].tolist(), strict=True):
                 if event == _BYTE:
-                    arriving = self._tampered(False, value) if self.tampers else value
+                    arriving = self._filtered(False, value) if self.filters else value
                     if arriving is not None:
                         self._coming.append((time_ns, arriving))
                 else:
@@ -363,20 +362,20 @@ class SimHead:
         for listener in self.listeners:
             listener(change)
 
-    def _tampered(self, to_head: bool, byte: int) -> int | None:
-        passing: int | None = byte
-        for tamper in self.tampers:
-            if passing is None:
+    def _filtered(self, to_head: bool, byte: int) -> int | None:
+        passed: int | None = byte
+        for change in self.filters:
+            if passed is None:
                 return None
-            passing = tamper(to_head, passing)
-        return passing
+            passed = change(to_head, passed)
+        return passed
 
 
 def _load(path: Path) -> Any:
     library = ctypes.CDLL(str(path))
     board = c_void_p
     library.board_abi.restype = c_uint32
-    library.board_open.argtypes = [_Outside, ctypes.c_char_p, c_uint32, c_uint32]
+    library.board_open.argtypes = [_Environment, ctypes.c_char_p, c_uint32, c_uint32]
     library.board_open.restype = board
     library.board_run.argtypes = [board, c_uint64]
     library.board_take.argtypes = [board, ctypes.c_char_p, c_uint32]
@@ -391,5 +390,5 @@ def _load(path: Path) -> Any:
         getattr(library, name).restype = None
     library.board_close.restype = None
     if library.board_abi() != ABI:
-        raise RuntimeError(f"{path} has another interface than {ABI}")
+        raise RuntimeError(f"{path} does not have interface version {ABI}")
     return library

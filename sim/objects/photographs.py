@@ -1,6 +1,6 @@
-"""A folder of photographs in COIL layout, ``obj{N}__{A}.png`` or ``.jpg``, as things on the platter.
+"""A folder of photographs in COIL layout, ``obj{N}__{A}.png`` or ``.jpg``, as objects on the platter.
 
-N names the object, A is the table's angle in degrees, which may have decimals. A turned thing shows its nearest
+N names the object, A is the table's angle in degrees, which may have decimals. A turned object shows its nearest
 photograph.
 """
 
@@ -23,7 +23,7 @@ _KEPT = 96  # decoded photographs, 0.9 MB each
 
 
 @dataclass(frozen=True)
-class Photographed:
+class PhotographedObject:
     """One object of a folder.
 
     Attributes
@@ -50,7 +50,7 @@ class Photographed:
         return int(apart.argmin())
 
 
-def photographs(folder: str | Path) -> Mapping[str, Photographed]:
+def photographs(folder: str | Path) -> Mapping[str, PhotographedObject]:
     """Return the objects of a folder by name, ``obj2`` before ``obj10``; the photographs are read when they are seen.
 
     Raises
@@ -80,9 +80,9 @@ def photographs(folder: str | Path) -> Mapping[str, Photographed]:
     return MappingProxyType({f"obj{number}": _object(f"obj{number}", views[number]) for number in sorted(views)})
 
 
-def _object(name: str, views: Mapping[float, Path]) -> Photographed:
+def _object(name: str, views: Mapping[float, Path]) -> PhotographedObject:
     azimuths = sorted(views)
-    return Photographed(name, np.array(azimuths), tuple(views[a] for a in azimuths))
+    return PhotographedObject(name, np.array(azimuths), tuple(views[a] for a in azimuths))
 
 
 @lru_cache(maxsize=_KEPT)

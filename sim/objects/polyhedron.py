@@ -61,9 +61,9 @@ def triangle(corners: Sequence[Sequence[float]] | Floats, colour: Colour) -> Fac
 class Polyhedron:
     """A convex solid made of faces; ``layer`` as in `sim.objects.revolution.Revolution`.
 
-    Of two parts in a layer the one whose ``depth_at`` (x, y in the thing's frame; the middle if not given) is nearer to
-    the camera covers the other. That is exact where the line between these points crosses a plane that separates the
-    parts at a right angle.
+    Of two parts in a layer, the one whose ``depth_at`` (x, y in the object's frame; default: the middle) is nearer to
+    the camera covers the other. That is exact if the line between these points crosses a plane between the parts at a
+    right angle.
     """
 
     faces: tuple[Face, ...]
@@ -231,7 +231,7 @@ def roof(
 
 
 def moved(solid: Polyhedron, at: tuple[float, float, float], turned_deg: float) -> Polyhedron:
-    """Return ``solid`` turned about its own axis and put at ``at`` in the thing's frame."""
+    """Return ``solid`` turned about its own axis and put at ``at`` in the object's frame."""
     turn = Pose(turned_deg)
 
     def there(points: Floats) -> Floats:

@@ -1,8 +1,8 @@
-"""How the simulated camera looks at the platter: geometry, light, and what a thing must offer to be seen.
+"""How the simulated camera looks at the platter: geometry, light, and what a object must offer to be seen.
 
 Room frame, millimetres: origin at the centre of the platter's top, x to the camera's right, y away from it, z up. The
 camera stands at the front (-y), `ELEVATION_DEG` above the horizon. Turning counter-clockwise seen from above moves the
-front of a thing to the right of the image. The projection is weak perspective: parallel, at the scale of the platter's
+front of a object to the right of the image. The projection is weak perspective: parallel, at the scale of the platter's
 centre, as through a long lens.
 """
 
@@ -36,15 +36,15 @@ AMBIENT = 0.42
 
 @runtime_checkable
 class Visible(Protocol):
-    """A `sim.world.Thing` that the simulated camera can see."""
+    """A `sim.world.SimObject` that the simulated camera can see."""
 
     @property
     def name(self) -> str: ...
 
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
-        """Draw the thing into ``image``, uint8 (480, 640, 3), which shows the empty platter.
+        """Draw the object into ``image``, uint8 (480, 640, 3), which shows the empty platter.
 
-        ``azimuth_deg`` is how far the thing is turned, counter-clockwise seen from above; ``offset_mm`` where its axis
+        ``azimuth_deg`` is how far the object is turned, counter-clockwise seen from above; ``offset_mm`` where its axis
         stands in the room.
         """
         ...
@@ -59,14 +59,14 @@ class Drawing(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a thing stands: turned by ``azimuth_deg``, its axis at (``x_mm``, ``y_mm``) in the room."""
+    """Where a object stands: turned by ``azimuth_deg``, its axis at (``x_mm``, ``y_mm``) in the room."""
 
     azimuth_deg: float = 0.0
     x_mm: float = 0.0
     y_mm: float = 0.0
 
     def to_room(self, points_mm: Floats) -> Floats:
-        """Return points (n, 3) of the thing as the room sees them."""
+        """Return points (n, 3) of the object as the room sees them."""
         turned = self.turn(points_mm)
         turned[:, :2] += self.x_mm, self.y_mm
         return turned
@@ -77,16 +77,16 @@ class Pose:
         return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
     def depth(self, x_mm: float, y_mm: float) -> float:
-        """Return how far a point of the thing stands to the front of the room, whatever its height."""
+        """Return how far a point of the object stands to the front of the room, whatever its height."""
         a = radians(self.azimuth_deg)
         return -(self.y_mm + x_mm * sin(a) + y_mm * cos(a))
 
     def facing(self, x_mm: float, y_mm: float) -> float:
-        """Return how much the side of the thing at (x, y) of its frame looks towards the camera: 0 (not) to 1."""
+        """Return how much the side of the object at (x, y) of its frame looks towards the camera: 0 (not) to 1."""
         return max((self.depth(x_mm, y_mm) + self.y_mm) / max(hypot(x_mm, y_mm), 1e-9), 0.0)
 
     def to_image(self, points_mm: Floats) -> Floats:
-        """Return pixel coordinates (n, 2) of points (n, 3) of the thing; whole numbers are pixel centres."""
+        """Return pixel coordinates (n, 2) of points (n, 3) of the object; whole numbers are pixel centres."""
         x, y, z = self.to_room(points_mm).T
         return np.column_stack([CENTRE_PX[0] + PX_PER_MM * x, CENTRE_PX[1] - PX_PER_MM * (y * SIN + z * COS)])
 

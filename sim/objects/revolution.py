@@ -42,7 +42,7 @@ class Revolution:
     lining
         Colour of the inside, B, G, R.
     at
-        Where the axis stands in the thing's frame, in millimetres.
+        Where the axis stands in the object's frame, in millimetres.
     shine
         Strength of the highlight, 0..1.
     layer

@@ -23,4 +23,4 @@ CONFUSABLE: tuple[tuple[str, str], ...] = (
 @cache
 def shelf() -> Mapping[str, Solid]:
     """Return the built-in objects by name. Their textures are painted when they are first seen."""
-    return MappingProxyType({thing.name: thing for thing in (*pottery(), *packs(), *toys())})
+    return MappingProxyType({solid.name: solid for solid in (*pottery(), *packs(), *toys())})

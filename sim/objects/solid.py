@@ -1,4 +1,4 @@
-"""A thing made of parts, as it stands on the platter."""
+"""A object made of parts, as it stands on the platter."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,7 +24,7 @@ class Part(Protocol):
 
 @dataclass(frozen=True)
 class Solid:
-    """A thing of the built-in shelf.
+    """A object of the built-in shelf.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Solid:
     symmetry_deg: float = 360.0
 
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Draw the thing into ``image`` as `sim.objects.projection.Visible` describes."""
+        """Draw the object into ``image`` as `sim.objects.projection.Visible` describes."""
         pose = Pose(azimuth_deg, *offset_mm)
         clear, foot = self._shadow
         place(image, np.zeros_like(clear), clear, pose.to_image(np.zeros((1, 3)))[0] - foot)
@@ -64,7 +64,7 @@ class Solid:
 
 
 def empty_platter() -> Image:
-    """Return what the camera sees without a thing: a plain backdrop and the platter, uint8 (480, 640, 3)."""
+    """Return what the camera sees without a object: a plain backdrop and the platter, uint8 (480, 640, 3)."""
     image = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
     image[:] = (44, 40, 38)
     x, y = CENTRE_PX

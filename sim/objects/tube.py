@@ -31,7 +31,7 @@ class Tube:
     Parameters
     ----------
     path
-        (x, y, z, radius) in millimetres in the thing's frame; the curve runs straight between the points.
+        (x, y, z, radius) in millimetres in the object's frame; the curve runs straight between the points.
     colour
         B, G, R.
     joints

@@ -97,7 +97,7 @@ class ServoBus:
     ----------
     taps
         Called with each frame that is sent, both ways, as the host sees it.
-    tampers
+    filters
         Called with each frame of a device on its way to the host, one after the other; a tamper returns the frame that
         goes on in its place (other bytes, another time), or None to lose it.
     echo
@@ -109,7 +109,7 @@ class ServoBus:
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
         self.taps: list[Callable[[Frame], None]] = []
-        self.tampers: list[Callable[[Frame], Frame | None]] = []
+        self.filters: list[Callable[[Frame], Frame | None]] = []
         self.echo = False
         self.deaf = False
         self._devices: list[Device] = []
@@ -215,7 +215,7 @@ class ServoBus:
         return frames
 
     def _reply(self, frame: Frame) -> None:
-        for tamper in self.tampers:
+        for tamper in self.filters:
             changed = tamper(frame)
             if changed is None:
                 return

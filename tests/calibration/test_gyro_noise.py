@@ -72,7 +72,7 @@ def test_simulated_noise_is_found(simulated):
     noise = s.world.noise
     for name, true in (
         ("angle_random_walk", noise.gyro_noise_dps_rthz / sqrt(2)),
-        ("bias_slope", float(s.operator.parts.imu.inertial.gyro_slope_dps_c[2])),
+        ("bias_slope", float(s.operator.devices.imu.inertial.gyro_slope_dps_c[2])),
     ):
         estimate = result.estimates[name]
         assert abs(estimate.value - true) < 3 * estimate.uncertainty, name

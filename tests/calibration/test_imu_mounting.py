@@ -55,7 +55,7 @@ def test_simulated_sensor_lies_within_the_stated_uncertainty(simulated):
         s = simulated(seed=seed)
         *_, result = ImuMounting().live(s.bench)
         assert result.passed, result.refusals
-        part, found = s.operator.parts.imu.inertial, result.estimates
+        part, found = s.operator.devices.imu.inertial, result.estimates
         for i, name in enumerate("xyz"):
             z.append(
                 (found[f"accel_zero_{name}"].value - part.accel_bias_g[i]) / found[f"accel_zero_{name}"].uncertainty

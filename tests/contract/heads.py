@@ -15,7 +15,7 @@ from rig.devices.head.sensors import HeadSensor, head_sensor
 from sim.head.board import SimHead
 from sim.head.build import missing
 from sim.head.realtime import HeadPty, PacedClock
-from sim.head.wire import HeadSerial
+from sim.head.serial_port import HeadSerial
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
@@ -78,7 +78,9 @@ def opened_head(
     """Yield a driver on a simulated head with its sensor."""
     with simulated_head(kind, noise, clock_error=clock_error) as (head, world):
         settings = sensor()
-        device = SimMpu6050(head.world_then) if settings.name == "MPU-6050" else SimBno055(head.world_then)
+        device = (
+            SimMpu6050(head.world_at_board_time) if settings.name == "MPU-6050" else SimBno055(head.world_at_board_time)
+        )
         head.attach(device.address, device)
         wire = HeadSerial(head)
         again = (lambda: reopen(head)) if reopen else None
@@ -96,7 +98,7 @@ def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterat
     world = World(noise=noise, seed=1)
     clock = PacedClock(world.clock, speed)
     head = SimHead(world, clock_error=CLOCK_ERROR)
-    device = SimMpu6050(head.world_then)
+    device = SimMpu6050(head.world_at_board_time)
     head.attach(device.address, device)
     terminal = HeadPty(head)
     try:

@@ -10,8 +10,8 @@ from rig.config import load_config
 from rig.events.events import Enrolled
 from rig.safety.state_machine import TableState
 from sim.bench import ShelfOperator
+from sim.devices import SimDevices
 from sim.objects.shelf import shelf
-from sim.parts import SimParts
 from sim.world import World
 from tests.docs.pages import blocks, run
 
@@ -39,13 +39,13 @@ class VendorCamera:
 def test_new_camera_takes_the_views_of_an_enrollment(monkeypatch, tmp_path):
     world = World(seed=1)
     config = load_config(None, [f"state_dir={tmp_path}/state", "servo.write_settings=true"])
-    with SimParts.connected(config, world) as parts:
+    with SimDevices.connected(config, world) as devices:
         vendor = ModuleType("vendor")
-        vendor.open = lambda _serial_number: VendorCamera(parts.camera)
+        vendor.open = lambda _serial_number: VendorCamera(devices.camera)
         monkeypatch.setitem(sys.modules, "vendor", vendor)
         page = run("\n".join(blocks("add-a-camera")))
-        page |= {"open_serial": lambda *_: parts.adapter, "SystemClock": lambda: world.clock}
-        config = config.model_copy(update={"imu": config.imu.model_copy(update={"bus": parts.i2c.path})})
+        page |= {"open_serial": lambda *_: devices.adapter, "SystemClock": lambda: world.clock}
+        config = config.model_copy(update={"imu": config.imu.model_copy(update={"bus": devices.i2c.path})})
         options = page["VendorOptions"](serial_number="17")
         with (
             page["VENDOR"].open(config, options, None) as bench,

@@ -5,7 +5,7 @@ import pytest
 from rig.catalog import Catalog
 from rig.config import load_config
 from sim.bench import ShelfOperator, open_sim_bench
-from sim.faults import Fault, kind, kinds
+from sim.faults import Fault, fault_kinds, kind
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.docs.pages import blocks, run
@@ -14,13 +14,13 @@ from tests.docs.pages import blocks, run
 @pytest.fixture
 def page():
     before = dict(kind.registry)
-    kinds.cache_clear()
+    fault_kinds.cache_clear()
     code, test = blocks("add-a-simulated-fault")
     run(code)
     yield run(test)
     kind.registry.clear()
     kind.registry.update(before)
-    kinds.cache_clear()
+    fault_kinds.cache_clear()
 
 
 def test_new_fault_happens_on_the_simulated_bench(page, tmp_path):
@@ -33,4 +33,4 @@ def test_new_fault_happens_on_the_simulated_bench(page, tmp_path):
         Catalog.open(tmp_path, clock=bench.clock) as catalog,
     ):
         test(bench, catalog)
-    assert "lamp_dims" in kinds()
+    assert "lamp_dims" in fault_kinds()

@@ -10,9 +10,9 @@ from rig.config import load_config
 from rig.core.errors import DeviceMismatch
 from rig.events.events import Moved
 from sim.bench import ShelfOperator, open_sim_bench
+from sim.devices import SimDevices
 from sim.i2c import SimI2cBus
 from sim.objects.shelf import shelf
-from sim.parts import SimParts
 from sim.world import World
 from tests.docs.pages import DOCS, blocks, run
 
@@ -27,13 +27,13 @@ def test_new_imu_measures_the_rotations_of_an_enrollment(page, monkeypatch, tmp_
     plain = load_config()
     config = plain.model_copy(update={"imu": plain.imu.model_copy(update={"model": "mpu6500"})})
     world = World(seed=1)
-    with SimParts.connected(config, world) as parts:
-        parts.i2c.detach(config.imu.address)
-        parts.imu = page["SimMpu6500"](world)
-        parts.i2c.attach(config.imu.address, parts.imu)
+    with SimDevices.connected(config, world) as devices:
+        devices.i2c.detach(config.imu.address)
+        devices.imu = page["SimMpu6500"](world)
+        devices.i2c.attach(config.imu.address, devices.imu)
         operator = ShelfOperator(world, shelf())
         with (
-            open_sim_bench(config, operator, parts=parts) as bench,
+            open_sim_bench(config, operator, devices=devices) as bench,
             Catalog.open(tmp_path, clock=bench.clock) as catalog,
         ):
             assert bench.imu.identity.model == "MPU-6500"

@@ -9,9 +9,9 @@ from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.events.events import Enrolled, Moved
 from rig.safety.state_machine import TableState
 from sim.bench import ShelfOperator, open_sim_bench
+from sim.devices import SimDevices
 from sim.motion import to_position, to_velocity
 from sim.objects.shelf import shelf
-from sim.parts import SimParts
 from sim.servo import models
 from sim.world import World
 from tests.docs.pages import blocks, run
@@ -61,12 +61,12 @@ class Controller:
 def test_new_servo_turns_the_table_for_an_enrollment(tmp_path):
     world = World(seed=1)
     config = load_config(None, ["table.zero_deg=0"])
-    with SimParts.connected(config, world) as parts:
+    with SimDevices.connected(config, world) as devices:
 
         def open_my_devices(config):
-            imu = Mpu6050(parts.i2c.path, clock=world.clock)
+            imu = Mpu6050(devices.i2c.path, clock=world.clock)
             settings = CameraSettings(**config.camera.model_dump(exclude={"source"}))
-            camera = OpenCvCamera(parts.camera, clock=world.clock, settings=settings, name="camera")
+            camera = OpenCvCamera(devices.camera, clock=world.clock, settings=settings, name="camera")
             return world.clock, imu, camera, Controller(world)
 
         page = run(DRIVER + BENCH)

@@ -1,8 +1,8 @@
-"""A thing whose picture carries the angle it is seen at: proof that a stored view belongs to its stored azimuth.
+"""An object whose images contain the angle at which they are taken: evidence that a stored view has the right azimuth.
 
-Twenty bits stand one above the other at the frame's left edge, outside the region that is described: 16 of the angle in
-hundredths of a degree, 4 of a checksum. Each is a bright and a dark half, so that exposure, flicker and blur leave them
-legible, and an average of two angles does not.
+The code is 20 bits, one above the other at the left edge of the frame, outside the region that is described: 16 bits
+for the angle in hundredths of a degree, and a checksum of 4 bits. Each bit is a bright and a dark half, so exposure,
+flicker and blur do not change it, and an average of two angles cannot be read.
 """
 
 from dataclasses import dataclass
@@ -21,16 +21,16 @@ CONTRAST = 12
 
 @dataclass(frozen=True)
 class Coded:
-    """``thing`` with the code of its angle."""
+    """``solid`` with the code of its angle."""
 
-    thing: Solid
+    solid: Solid
 
     @property
     def name(self) -> str:
-        return self.thing.name
+        return self.solid.name
 
     def draw(self, image: NDArray[np.uint8], azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
-        self.thing.draw(image, azimuth_deg, offset_mm)
+        self.solid.draw(image, azimuth_deg, offset_mm)
         code = round(azimuth_deg * 100) % 36000
         code |= checksum(code) << 16
         for bit in range(BITS):

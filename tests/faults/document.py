@@ -1,8 +1,8 @@
-"""`docs/faults.md`: written by this program, and held against what the tests measure.
+"""Write `docs/faults.md` from measurements; a test compares the page with new measurements.
 
     python tests/faults/document.py [FAULT ...]
 
-Without names every row is measured anew, which takes a minute.
+Without names the program measures all rows, which takes half a minute.
 """
 
 import re
@@ -11,43 +11,47 @@ from math import ceil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from sim.faults import kinds
+from sim.faults import fault_kinds
 from tests.faults.fault_runs import SHORT, VIEWS, Outcome, answer, enrollment, identification, new_rig
 from tests.faults.scenarios import SCENARIOS, Scenario
 
 PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
 SLACK_S = 0.1
-"""A measured time is rounded up by as much; a test takes it for too long beyond twice that."""
+"""Measured times are rounded up to a multiple of this; the test allows once more of it."""
 COLUMNS = (
     "fault",
     "what happens",
-    "how it is found",
+    "how it is detected",
     "within",
-    "what the operator reads",
-    "how it goes on",
-    "an identification",
+    "message",
+    "recovery",
+    "identification",
     "test",
 )
 
 HEAD = f"""# Faults
 
-What can go wrong on a bench, how the rig finds it, and what the person beside it reads.
+This page lists the faults that the simulator can produce. For each fault it shows how the rig detects it, the message,
+and how to recover.
 
-Every row is a test (`pytest tests/faults/test_every_fault.py -k jam`): an enrollment of {VIEWS} views, and an
-identification, under the fault, with the real drivers on the simulated bench. Each is completed, or stopped with the
-code that is given here. The table stands then, its torque off; only a servo that cannot be told any more holds it. No
-view that was reported as stored is lost or damaged, and each shows the object at the angle that is stored with it: the
-pictures carry their true angle. Afterwards the cause is taken away, and the enrollment goes on as the row says.
+Each row is a test (`pytest tests/faults/test_every_fault.py -k jam`). With the real drivers on the simulated bench, the
+test runs an enrollment of {VIEWS} views ({SHORT} if the fault does not stop it) and an identification. Both complete or
+stop with the error code in the row. Afterwards:
 
-*Within* is the time from the beginning of the fault until the table is without torque, on the bench's own clock, for a
-fault that begins during move 3. A dash: the work goes on, and nobody needs to do anything.
+- The table stands still and the servo's torque is off. Only a servo that cannot be reached holds the table.
+- No view that was reported as stored is lost or damaged.
+- Each stored view shows the object at its stored angle. The test images contain the true angle.
+- When the cause is removed, the enrollment continues as the row says.
 
-Faults happen on any simulated bench: `rig demo --fault jam@move3+2s`, `rig demo --faults FILE`, or
-`faults = ["jam@move3+2s"]` under `[bench.sim]` in `rig.toml`. `rig faults` lists their parameters. Such a fault is
-written `NAME:PARAMETER=VALUE@TIME`, where the time is `12s`, `move3` or `view10`, and `+2s` behind it is how long;
-moves and views count from 0.
+*Within* is the time from the beginning of the fault until the torque is off, on the bench's clock, for a fault that
+begins during move 3. A dash means that the enrollment continues and the operator does nothing.
 
-This page is written by `python tests/faults/document.py`; a test holds it against what is measured.
+You can produce the faults on any simulated bench: `rig demo --fault jam@move3+2s`, `rig demo --faults FILE`, or
+`faults = ["jam@move3+2s"]` under `[bench.sim]` in `rig.toml`. `rig faults` lists the parameters. The notation is
+`NAME:PARAMETER=VALUE@TIME`. The time is `12s`, `move3` or `view10`, optionally with a duration: `12s+2s`. Moves and
+views are counted from 0.
+
+`python tests/faults/document.py` writes this page. A test compares it with measurements.
 
 """
 
@@ -56,20 +60,20 @@ def row(scenario: Scenario, outcome: Outcome, identified: Outcome) -> tuple[str,
     """Return the cells of a fault."""
     return (
         f"`{scenario.name}`",
-        kinds()[scenario.name].what,
+        fault_kinds()[scenario.name].what,
         sentence(scenario.found),
         "–" if outcome.error is None else f"{ceil(outcome.found_s / SLACK_S) * SLACK_S:.1f} s",
         message(outcome),
-        goes_on(scenario),
+        recovery(scenario),
         identification_cell(identified),
         f"`test_every_fault.py[{scenario.name}]`",
     )
 
 
 def message(outcome: Outcome) -> str:
-    """Return what the operator reads, without the paths of this computer."""
+    """Return the error message without the paths of this computer."""
     if outcome.error is None:
-        return "Nothing: all views are taken."
+        return "None: all views are stored."
     error = outcome.error
     words = re.sub(r"/\S*sim-i2c-\w+", "/dev/i2c-1", error.what)
     words = re.sub(r"catalog /\S+?(?=[ ,;]|$)", "catalog", words)
@@ -77,22 +81,22 @@ def message(outcome: Outcome) -> str:
 
 
 def masked(words: str) -> str:
-    """Return ``words`` with all numbers alike: they may differ by a count from one version to the next."""
+    """Return ``words`` with each number replaced: it may change a little from version to version."""
     return re.sub(r"[+−-]?\d+(\.\d+)?", "#", words)
 
 
-def goes_on(scenario: Scenario) -> str:
+def recovery(scenario: Scenario) -> str:
     if scenario.code is None:
-        return "By itself."
-    deeds = [scenario.then, *([scenario.step.value] if scenario.step else []), scenario.after.value]
-    return sentence(", ".join(deed for deed in deeds if deed))
+        return "Automatic."
+    actions = [scenario.then, *([scenario.step.value] if scenario.step else []), scenario.after.value]
+    return sentence(", ".join(action for action in actions if action))
 
 
 def identification_cell(outcome: Outcome) -> str:
     if outcome.error is not None:
         return f"{outcome.error.code}"
     identified = answer(outcome)
-    return "finds it" if identified and identified.name else "unknown"
+    return "found" if identified and identified.name else "unknown"
 
 
 def sentence(words: str) -> str:
@@ -125,8 +129,11 @@ def measure(name: str) -> tuple[str, ...]:
 
 
 def main() -> None:
-    kept = documented() if sys.argv[1:] else {}
-    rows = [measure(name) if name in sys.argv[1:] or name not in kept else kept[name] for name in kinds()]
+    rows_before = documented() if sys.argv[1:] else {}
+    rows = [
+        measure(name) if name in sys.argv[1:] or name not in rows_before else rows_before[name]
+        for name in fault_kinds()
+    ]
     lines = [" | ".join(("", *COLUMNS, "")).strip(), "|" + "---|" * len(COLUMNS)]
     lines += [f"| {' | '.join(cells)} |" for cells in rows]
     PAGE.write_text(HEAD + "\n".join(lines) + "\n", encoding="utf-8")

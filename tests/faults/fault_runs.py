@@ -1,4 +1,4 @@
-"""An enrollment and an identification under faults, and what can be said about each when it is over."""
+"""Enrollments and identifications under simulated faults, and checks of their outcomes."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,10 +23,10 @@ from rig.events.events import Accepted, Enrolled, Event, Identified
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from sim.bench import ShelfOperator, open_sim_bench
+from sim.devices import SimDevices
 from sim.faults import Fault, Faults
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
-from sim.parts import SimParts
 from sim.world import World
 from tests.faults.angle_code import Coded, coded_deg
 
@@ -36,29 +36,29 @@ SHORT = 12
 NAME = "toy-car"
 KNOWN = (NAME, "cereal-puzzle", "dice")
 NOISE = NoiseModel(full_well_e=0, read_noise_e=0)
-"""The bench's noise, but that of the pixels, which costs most of a run and bears on nothing here."""
+"""The bench's noise without that of the pixels, which takes most of the time and changes nothing here."""
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
-"""Frames of a quarter of the size, which cost a quarter."""
-STANDING_S = 1.0
-"""Longer than the servo's watchdog takes to stop the table."""
+"""Frames of a quarter of the size take a quarter of the time."""
+STILL_S = 1.0
+"""Longer than the servo's watchdog needs to stop the table."""
 
 
-def things() -> dict[str, Coded]:
+def objects() -> dict[str, Coded]:
     return {name: Coded(shelf()[name]) for name in KNOWN}
 
 
 @dataclass
 class Rig:
-    """A simulated bench that outlives its openings, with a catalog on a real disk."""
+    """Simulated devices that several benches open one after the other, and a catalog on a real disk."""
 
-    parts: SimParts
+    devices: SimDevices
     operator: ShelfOperator
     folder: Path
     settings: tuple[str, ...] = SMALL
 
     def bench(self, *faults: str) -> Bench:
         scheduled = [Fault.parse(text) for text in faults]
-        return open_sim_bench(load_config(None, self.settings), self.operator, faults=scheduled, parts=self.parts)
+        return open_sim_bench(load_config(None, self.settings), self.operator, faults=scheduled, devices=self.devices)
 
     @contextmanager
     def opened(self, *faults: str) -> Iterator[tuple[Bench, Catalog]]:
@@ -67,7 +67,7 @@ class Rig:
 
     @property
     def world(self) -> World:
-        return self.parts.world
+        return self.devices.world
 
     @property
     def faults(self) -> Faults:
@@ -76,8 +76,8 @@ class Rig:
 
     @property
     def torque(self) -> bool:
-        """Whether the servo holds the shaft, by its own register."""
-        return bool(self.parts.servo.memory["Torque Enable"])
+        """Whether the servo's torque is on, from its register."""
+        return bool(self.devices.servo.memory["Torque Enable"])
 
 
 @contextmanager
@@ -85,8 +85,8 @@ def new_rig(folder: Path, *settings: str, seed: int = 7) -> Iterator[Rig]:
     world = World(noise=NOISE, seed=seed)
     settings = (*SMALL, *settings)
     config = load_config(None, settings)
-    with SimParts.connected(config, world) as parts:
-        rig = Rig(parts, ShelfOperator(world, things()), folder, settings)
+    with SimDevices.connected(config, world) as devices:
+        rig = Rig(devices, ShelfOperator(world, objects()), folder, settings)
         try:
             yield rig
         finally:
@@ -96,7 +96,7 @@ def new_rig(folder: Path, *settings: str, seed: int = 7) -> Iterator[Rig]:
 
 @dataclass
 class Outcome:
-    """How a plan ended: with an answer or an error; ``found_s`` is from the first fault to the end, torque off."""
+    """Events and error of a plan; ``found_s`` is the time from the first fault to the end, when the torque is off."""
 
     events: list[Event] = field(default_factory=list)
     error: RigError | None = None
@@ -113,8 +113,8 @@ class Outcome:
 
 
 @contextmanager
-def _judged(rig: Rig) -> Iterator[Outcome]:
-    """Yield the outcome to be filled in, and take an error for what it is: one."""
+def _outcome(rig: Rig) -> Iterator[Outcome]:
+    """Yield an outcome for the caller to fill in; store an error in it."""
     outcome = Outcome()
     try:
         yield outcome
@@ -133,8 +133,8 @@ def enrollment(
     views: int = VIEWS,
     at_most: int | None = None,
 ) -> Outcome:
-    """Enroll; leave the plan after ``at_most`` views where that is given."""
-    with _judged(rig) as outcome, rig.opened(*faults) as (bench, catalog):
+    """Enroll, at most ``at_most`` views of the plan if it is given."""
+    with _outcome(rig) as outcome, rig.opened(*faults) as (bench, catalog):
         plan = enroll(bench, catalog, NAME, views=None if resume else views, resume=resume, replace=replace)
         for event in plan:
             outcome.events.append(event)
@@ -145,14 +145,14 @@ def enrollment(
 
 def identification(rig: Rig, *faults: str, yaw_deg: float = 77.0) -> Outcome:
     rig.operator.next_object, rig.operator.yaw_deg = NAME, yaw_deg
-    with _judged(rig) as outcome, rig.opened(*faults) as (bench, _):
+    with _outcome(rig) as outcome, rig.opened(*faults) as (bench, _):
         outcome.events.extend(identify(bench, known_views()))
     return outcome
 
 
 @cache
 def known_views() -> hbr.ViewIndex:
-    """Return the views of three objects, enrolled without any fault."""
+    """Return the views of three objects, enrolled without a fault."""
     with TemporaryDirectory() as folder, new_rig(Path(folder), seed=1) as rig, rig.opened() as (bench, catalog):
         for name in KNOWN:
             for _ in enroll(bench, catalog, name, views=24):
@@ -169,22 +169,22 @@ def check_stored(
     offset: bool = False,
     shown: bool = True,
 ) -> None:
-    """Check that exactly the expected views are stored, each whole, and each at the angle that its picture carries.
+    """Check that the expected views are stored and complete, each with the azimuth that its image shows.
 
-    With ``offset``, all of them may be off by the same angle; with ``shown`` false, pictures may show no angle.
+    With ``offset``, all azimuths may differ by one angle. Without ``shown``, images may show no angle.
     """
     with Catalog.open(rig.folder, clock=rig.world.clock) as catalog:
         stored = newest_views(catalog)
         assert {view.record.index for view in stored} == expected
-        zero_deg = 0.0
+        offset_deg = 0.0
         for view in stored:
             image = catalog.read_image(view)
             true_deg = coded_deg(image)
             assert true_deg is not None or not shown, f"view {view.record.index} shows no object"
-            off_deg = 0.0 if true_deg is None else float(wrap180(view.record.azimuth_deg + true_deg - zero_deg))
+            error_deg = 0.0 if true_deg is None else float(wrap180(view.record.azimuth_deg + true_deg - offset_deg))
             if offset and view is stored[0]:
-                zero_deg, off_deg = off_deg, 0.0
-            assert abs(off_deg) <= tolerance_deg, f"view {view.record.index} is {off_deg:+.2f}° off"
+                offset_deg, error_deg = error_deg, 0.0
+            assert abs(error_deg) <= tolerance_deg, f"view {view.record.index} is {error_deg:+.2f}° off"
             planned_deg = -view.record.index * 360.0 / planned
             assert abs(wrap180(view.record.azimuth_deg - planned_deg)) <= 1.0
             x, y, width, height = load_config(None, rig.settings).view.roi or (0, 0, 320, 240)
@@ -200,11 +200,11 @@ def newest_views(catalog: Catalog) -> list[StoredView]:
 
 
 def check_stands(rig: Rig) -> None:
-    """Check that the table comes to a stand, and stays there."""
-    rig.world.clock.sleep(STANDING_S)
+    """Check that the table stops and does not move again."""
+    rig.world.clock.sleep(STILL_S)
     before = rig.world.shaft()
     assert before[1] == 0
-    rig.world.clock.sleep(STANDING_S)
+    rig.world.clock.sleep(STILL_S)
     assert rig.world.shaft() == before
 
 

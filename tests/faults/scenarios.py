@@ -1,18 +1,18 @@
-"""What is expected of an enrollment and of an identification under each fault of the vocabulary.
+"""The expected outcome of an enrollment and of an identification under each simulated fault.
 
-``found`` and ``then`` are the columns of `docs/faults.md` that no program can write; the others are measured.
+``found`` and ``then`` are words of `docs/faults.md` that cannot be measured; its other columns are measured.
 """
 
 from dataclasses import dataclass
 from enum import Enum
 
 FOUND = "found"
-"""An identification that names the object that stands there."""
+"""The identification names the object on the table."""
 BOOT_S = 0.5
 
 
 class Step(Enum):
-    """What the operator must do before the table moves again."""
+    """The command that the operator must run before the table moves again."""
 
     ACKNOWLEDGE = "`rig acknowledge`"
     REBOOT = "`rig acknowledge --reboot`"
@@ -20,9 +20,9 @@ class Step(Enum):
 
 
 class After(Enum):
-    """How an enrollment that ended early goes on once the cause is gone."""
+    """How a stopped enrollment continues after the cause is removed."""
 
-    DONE = "by itself"
+    DONE = "automatic"
     RESUME = "`--resume`"
     REPLACE = "`--replace`"
 
@@ -32,30 +32,30 @@ ACK = Step.ACKNOWLEDGE
 
 @dataclass(frozen=True)
 class Scenario:
-    """One fault.
+    """A fault and its expected outcomes.
 
     Attributes
     ----------
     fault
-        As it happens to the enrollment.
+        The fault during the enrollment, in the short notation.
     code
-        Of the error that ends the enrollment; None where it is completed.
+        Code of the error that stops the enrollment; None if it completes.
     found
-        How it is found, in words.
+        How the rig detects the fault, in words.
     after
-        How the enrollment goes on.
+        How the enrollment continues.
     identify
-        As it happens to the identification; the same, in its first move, where not given.
+        The fault during the identification; default: the same fault during its first move.
     answer
-        The code that ends the identification, or `FOUND`, or None for an object called unknown.
+        Code of the error that stops the identification, or `FOUND`, or None for an unknown object.
     then
         What the operator does first, in words.
     step
-        Without which nothing moves afterwards.
+        The command without which the table does not move.
     shown
-        Whether the stored pictures show the object, and so its angle.
+        Whether the stored images show the object, and with it the angle.
     torque
-        Whether the servo must be left holding the shaft: it cannot be told anything.
+        Whether the servo's torque stays on because the servo cannot be reached.
     """
 
     fault: str
@@ -83,95 +83,101 @@ class Scenario:
 
 
 def stopped(fault: str, code: int, found: str, then: str, **more: object) -> Scenario:
-    """Return the scenario of a fault that ends both plans alike."""
+    """Return the scenario of a fault that stops both plans with the same code."""
     values: dict[str, object] = {"after": After.RESUME, "answer": code} | more
     return Scenario(fault, code, found, then=then, **values)  # type: ignore[arg-type]
 
 
 def survived(fault: str, found: str, **more: object) -> Scenario:
-    """Return the scenario of a fault that both plans outlive."""
+    """Return the scenario of a fault that stops neither plan."""
     return Scenario(fault, None, found, **more)  # type: ignore[arg-type]
 
 
-SILENT = "every transaction is repeated `servo.retries` times, then the servo counts as silent"
+SILENT = "no answer after `servo.retries` repetitions of a transaction"
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
         # -- the servo -------------------------------------------------------------------------------------------
-        stopped("servo.off@move3", 402, SILENT, "give the servo its supply", step=Step.HOME),
+        stopped("servo.off@move3", 402, SILENT, "connect the servo's supply", step=Step.HOME),
         stopped(
             "servo.stuck@move3", 509, "the encoder's angle does not change", "restart the servo", answer=502, step=ACK
         ),
-        stopped("servo.garbage@move3", 404, "readings that no servo can have", "restart the servo", step=ACK),
+        stopped("servo.garbage@move3", 404, "the readings are impossible", "restart the servo", step=ACK),
         stopped(
             "servo.wrong@move3",
             502,
             "encoder and gyro disagree",
-            "mount the magnet",
+            "fasten the magnet",
             after=After.REPLACE,
             answer=FOUND,
             step=ACK,
         ),
-        survived("servo.slow", "not at all: an answer within the timeout is as good as a fast one"),
-        stopped("servo.delayed", 502, "encoder and gyro disagree in the return to 0", "restart the servo", step=ACK),
-        survived("servo.intermittent", "timeouts; each transaction is repeated, and counted"),
+        survived("servo.slow", "not detected: answers within the timeout are valid"),
+        stopped(
+            "servo.delayed", 502, "encoder and gyro disagree on the way back to home", "restart the servo", step=ACK
+        ),
+        survived("servo.intermittent", "timeout; the transaction is repeated and counted"),
         # -- the gyro --------------------------------------------------------------------------------------------
-        stopped("imu.off@move3", 402, "no acknowledge, after three attempts", "plug the sensor in"),
-        stopped("imu.stuck@move3", 404, "equal samples: noise alone would change them", "restart the sensor", step=ACK),
+        stopped("imu.off@move3", 402, "no acknowledge in three attempts", "connect the sensor"),
+        stopped("imu.stuck@move3", 404, "samples are equal, without noise", "restart the sensor", step=ACK),
         stopped("imu.garbage@move3", 502, "encoder and gyro disagree", "restart the sensor", step=ACK),
-        stopped("imu.wrong@move3", 502, "encoder and gyro disagree", "change the sensor, or calibrate it", step=ACK),
+        stopped("imu.wrong@move3", 502, "encoder and gyro disagree", "replace or calibrate the sensor", step=ACK),
         stopped(
             "imu.slow@move3",
             404,
-            "samples are missing: the table never counts as at rest",
+            "samples are missing, so settling does not end",
             "restart the sensor",
             step=ACK,
         ),
         stopped(
             "imu.delayed@move3",
             404,
-            "the gyro tells of a turn while the encoder stands",
+            "the gyro reports rotation, the encoder does not",
             "restart the sensor",
             answer=502,
             step=ACK,
         ),
         stopped(
-            "imu.intermittent@move3", 404, "the sensor fell asleep and lost its settings", "mend its supply", step=ACK
+            "imu.intermittent@move3",
+            404,
+            "the sensor is in sleep mode without its settings",
+            "repair its supply",
+            step=ACK,
         ),
         # -- the camera ------------------------------------------------------------------------------------------
-        stopped("camera.off@move3", 402, "five frames in a row fail", "plug the camera in"),
-        stopped("camera.stuck@move3", 402, "no frame within the time-out", "open the camera anew"),
-        stopped("camera.garbage@move3", 600, "the picture is noise", "change the cable"),
-        stopped("camera.wrong@move3", 404, "a frame of another size than the camera's", "open the camera anew"),
-        survived("camera.slow", "not at all: a view takes as long as the next frame"),
-        survived("camera.delayed", "frames are chosen by their time stamp, late ones too"),
-        survived("camera.intermittent", "a frame that fails is fetched again, four times at most"),
-        # -- the servo's line, supply, load and gears ------------------------------------------------------------
-        survived("crc_flip", "CRC; the transaction is repeated, and counted"),
+        stopped("camera.off@move3", 402, "five consecutive frames fail", "connect the camera"),
+        stopped("camera.stuck@move3", 402, "no frame within the timeout", "reconnect the camera"),
+        stopped("camera.garbage@move3", 600, "the image is noise", "replace the cable"),
+        stopped("camera.wrong@move3", 404, "the frame has a wrong size", "reconnect the camera"),
+        survived("camera.slow", "not detected: each view waits for its frame"),
+        survived("camera.delayed", "not detected: frames are selected by time stamp"),
+        survived("camera.intermittent", "a failed frame is fetched again, at most four times"),
+        # -- the servo's bus, supply, load and gears -------------------------------------------------------------
+        survived("crc_flip", "CRC; the transaction is repeated and counted"),
         survived(
             "late_reply:rate=0.02",
-            "length and quiet line: after a timeout the line is drained before the next question",
+            "after a timeout the bus is drained before the next request",
         ),
-        survived("babble", "bytes that are no packet are skipped, within a deadline"),
-        survived("echo", "the adapter's echo is no status packet, and is skipped"),
+        survived("babble", "bytes that are not a packet are skipped until the timeout"),
+        survived("echo", "the echo is not a status packet and is skipped"),
         stopped(
             "unplug@move3",
             402,
-            "the port fails; the servo's own watchdog stops the table",
-            "plug the adapter in",
+            "the port fails; the servo's watchdog stops the table",
+            "connect the adapter",
             torque=True,
         ),
-        stopped("brownout@move3", 402, SILENT, "mend the supply", step=Step.HOME),
-        stopped("overload@move3", 404, "the alert bit of every answer", "let it cool down", step=Step.REBOOT),
-        stopped("overheat@move3", 404, "the alert bit of every answer", "let it cool down", step=Step.REBOOT),
-        stopped("watchdog_trip@move3", 510, "the servo's watchdog register", "find what kept the computer busy"),
-        stopped("duplicate_id@move3", 402, "answers spoil each other: no valid packet", "give each servo its own id"),
-        stopped("wrong_model", 401, "Model Number, when the bench is opened", "connect the right servo"),
+        stopped("brownout@move3", 402, SILENT, "repair the supply", step=Step.HOME),
+        stopped("overload@move3", 404, "the alert bit in the answers", "let the servo cool down", step=Step.REBOOT),
+        stopped("overheat@move3", 404, "the alert bit in the answers", "let the servo cool down", step=Step.REBOOT),
+        stopped("watchdog_trip@move3", 510, "the servo's watchdog register", "find out what blocked the computer"),
+        stopped("duplicate_id@move3", 402, "the answers collide and no packet is valid", "give each servo its own id"),
+        stopped("wrong_model", 401, "the model number, when the bench opens", "connect the configured servo"),
         stopped(
             "backlash@move3",
             502,
             "encoder and gyro disagree",
-            "mend the gears",
+            "repair the gears",
             after=After.REPLACE,
             answer=FOUND,
             step=ACK,
@@ -189,41 +195,37 @@ SCENARIOS: dict[str, Scenario] = {
             "jam@move3",
             509,
             "the encoder's angle does not change, or the load is high",
-            "free it",
+            "free the shaft",
             answer=505,
             step=ACK,
         ),
         # -- the gyro's bus and range ----------------------------------------------------------------------------
-        survived("i2c_nack", "errno; the transfer is repeated, and counted"),
-        stopped("i2c_stuck@move3", 402, "the kernel's timeout, three times", "power-cycle the sensor"),
+        survived("i2c_nack", "transfer error; the transfer is repeated and counted"),
+        stopped("i2c_stuck@move3", 402, "three timeouts of the kernel", "power-cycle the sensor"),
         stopped(
             "imu_saturated@move3",
             404,
-            "the gyro's rate stands at the end of its range",
+            "the gyro's rate is the maximum of its range",
             "restart the sensor",
             step=ACK,
         ),
-        # -- pictures --------------------------------------------------------------------------------------------
-        stopped("frozen_frame@move3", 600, "two equal frames", "open the camera anew", answer=FOUND),
-        stopped("black_frame@move3", 600, "mean level and share of black pixels", "take the cap off"),
-        stopped("blur@move3", 600, "variance of the Laplacian", "focus"),
-        stopped("exposure_jump@move3", 600, "the camera's locks, read back with every frame", "open the camera anew"),
-        survived(
-            "light_flicker", "not at all at this depth: CEDD hardly sees it; the mean level is kept with each view"
-        ),
-        # -- around ----------------------------------------------------------------------------------------------
+        # -- images ----------------------------------------------------------------------------------------------
+        stopped("frozen_frame@move3", 600, "two equal frames", "reconnect the camera", answer=FOUND),
+        stopped("black_frame@move3", 600, "mean level and share of black pixels", "remove the lens cap"),
+        stopped("blur@move3", 600, "variance of the Laplacian", "focus the camera"),
+        stopped("exposure_jump@move3", 600, "the exposure settings, read with every frame", "reconnect the camera"),
+        survived("light_flicker", "not detected at this depth: it hardly changes CEDD; views store their mean level"),
+        # -- object and computer ---------------------------------------------------------------------------------
         stopped(
             "object_falls@move3",
             601,
-            "the last view, taken at 0 again, does not look like the first",
+            "a last view at home differs from the first view",
             "put the object back",
             after=After.REPLACE,
             answer=FOUND,
             shown=False,
         ),
-        stopped("disk_full@move3", 700, "the write that is to be durable", "free some space", answer=FOUND),
-        survived(
-            "clock_jump@view3", "not at all: time is measured on the monotonic clock", identify="clock_jump@view0"
-        ),
+        stopped("disk_full@move3", 700, "a write fails", "free some disk space", answer=FOUND),
+        survived("clock_jump@view3", "not detected: durations use the monotonic clock", identify="clock_jump@view0"),
     )
 }

@@ -6,15 +6,15 @@ import pytest
 
 from rig.core.errors import FaultLatched, Unreferenced
 from rig.motion.turntable import Turntable
-from sim.faults import kinds
+from sim.faults import fault_kinds
 from tests.faults.document import (
     SLACK_S,
     documented,
-    goes_on,
     identification_cell,
     masked,
     message,
     planned_views,
+    recovery,
     sentence,
 )
 from tests.faults.fault_runs import (
@@ -41,11 +41,11 @@ LATE_MOVE = 20
 
 
 def test_every_fault_has_a_scenario_and_a_documented_row() -> None:
-    assert set(SCENARIOS) == set(kinds())
-    assert list(documented()) == list(kinds())
+    assert set(SCENARIOS) == set(fault_kinds())
+    assert list(documented()) == list(fault_kinds())
     for name, cells in documented().items():
-        assert cells[1:3] == (kinds()[name].what, sentence(SCENARIOS[name].found)), UPDATE
-        assert cells[5] == goes_on(SCENARIOS[name]), UPDATE
+        assert cells[1:3] == (fault_kinds()[name].what, sentence(SCENARIOS[name].found)), UPDATE
+        assert cells[5] == recovery(SCENARIOS[name]), UPDATE
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

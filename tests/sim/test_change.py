@@ -20,7 +20,7 @@ def _frame(bench: Bench) -> NDArray[np.uint8]:
 
 
 def _seen(change: Change, seed: int, name: str | None = "toy-house") -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Frames of one thing before and after a change."""
+    """Frames of one solid before and after a change."""
     world = World(noise=NoiseModel.none(), seed=seed)
     operator = ShelfOperator(world, shelf(), next_object=name, yaw_deg=0.0)
     with open_sim_bench(RigConfig(), operator) as bench:
@@ -29,7 +29,7 @@ def _seen(change: Change, seed: int, name: str | None = "toy-house") -> tuple[ND
             operator.clear() if name is None else operator.place(None)
             frames.append(_frame(bench))
             if not number:
-                operator.another_day(change)
+                operator.change_bench(change)
         return frames[0], frames[1]
 
 

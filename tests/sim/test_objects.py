@@ -20,9 +20,9 @@ from sim.objects.tube import Tube
 RED, BLUE = (30, 30, 220), (220, 30, 30)
 
 
-def render(thing: Visible, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> Image:
+def render(solid: Visible, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> Image:
     image = empty_platter()
-    thing.draw(image, azimuth_deg, offset_mm)
+    solid.draw(image, azimuth_deg, offset_mm)
     return image
 
 
@@ -62,8 +62,8 @@ def test_a_mark_on_a_turned_body_is_where_the_projection_says(azimuth_deg: float
 
 
 def test_counter_clockwise_from_above_moves_the_front_to_the_right() -> None:
-    for thing in (CYLINDER, DIE):
-        positions = [middle(render(thing, azimuth), RED)[0] for azimuth in (-40.0, -20.0, 0.0, 20.0, 40.0)]
+    for solid in (CYLINDER, DIE):
+        positions = [middle(render(solid, azimuth), RED)[0] for azimuth in (-40.0, -20.0, 0.0, 20.0, 40.0)]
         assert positions == sorted(positions)
 
 
@@ -129,44 +129,44 @@ def test_the_inside_of_a_vessel_is_seen_through_its_mouth() -> None:
 
 
 def test_the_shelf_has_what_a_bench_needs() -> None:
-    things = shelf()
-    assert len(things) >= 24
-    assert all(name == thing.name and isinstance(thing, Visible) for name, thing in things.items())
-    assert len([t for t in things.values() if t.symmetry_deg == 0]) >= 3
-    assert {t.symmetry_deg for t in things.values()} >= {0.0, 90.0, 180.0, 360.0}
-    assert all(a in things and b in things for a, b in CONFUSABLE)
+    objects = shelf()
+    assert len(objects) >= 24
+    assert all(name == solid.name and isinstance(solid, Visible) for name, solid in objects.items())
+    assert len([t for t in objects.values() if t.symmetry_deg == 0]) >= 3
+    assert {t.symmetry_deg for t in objects.values()} >= {0.0, 90.0, 180.0, 360.0}
+    assert all(a in objects and b in objects for a, b in CONFUSABLE)
 
 
 @pytest.mark.parametrize("name", shelf())
 def test_every_thing_fits_the_frame_and_turns_smoothly(name: str) -> None:
-    thing, empty = shelf()[name], empty_platter()
+    solid, empty = shelf()[name], empty_platter()
     for azimuth in (0.0, 77.0, 201.0):
-        image = render(thing, azimuth, (3.0, 2.0))
+        image = render(solid, azimuth, (3.0, 2.0))
         changed = (image != empty).any(axis=2)
         assert changed.mean() > 0.03
         assert not changed[:4].any()
         assert not changed[-4:].any()
         assert not changed[:, :4].any()
         assert not changed[:, -4:].any()
-        little = difference(image, render(thing, azimuth + 0.1, (3.0, 2.0)))
-        much = difference(image, render(thing, azimuth + 3.0, (3.0, 2.0)))
+        little = difference(image, render(solid, azimuth + 0.1, (3.0, 2.0)))
+        much = difference(image, render(solid, azimuth + 3.0, (3.0, 2.0)))
         assert little <= 0.35 * much + 0.02
 
 
 @pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg < 360])
 def test_symmetric_things_look_the_same_after_their_turn(name: str) -> None:
-    thing = shelf()[name]
-    turn = thing.symmetry_deg or 41.3
+    solid = shelf()[name]
+    turn = solid.symmetry_deg or 41.3
     for azimuth in (0.0, 17.0):
-        a, b = render(thing, azimuth), render(thing, azimuth + turn)
+        a, b = render(solid, azimuth), render(solid, azimuth + turn)
         assert difference(a, b) < 0.1
         assert tanimoto(describe(a), describe(b)).item() > 0.99
 
 
 @pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg == 360])
 def test_the_others_do_not(name: str) -> None:
-    thing = shelf()[name]
-    views = [render(thing, azimuth) for azimuth in range(0, 360, 30)]
+    solid = shelf()[name]
+    views = [render(solid, azimuth) for azimuth in range(0, 360, 30)]
     for turn in (2, 3, 4, 6):  # of 30°: 6-, 4-, 3- and 2-fold
         assert max(difference(views[i], views[(i + turn) % 12]) for i in range(12)) > 0.3
 
@@ -193,12 +193,12 @@ def test_textures_are_the_same_in_every_run() -> None:
 
 
 def test_profiles_keep_what_the_tracing_relies_on() -> None:
-    for thing in shelf().values():
-        for part in thing.parts:
+    for solid in shelf().values():
+        for part in solid.parts:
             if isinstance(part, Revolution):
-                assert (np.diff([h for _, h in part.profile]) <= 1e-9).all(), thing.name
-                assert (np.diff([h for _, h in part.inside]) <= 1e-9).all(), thing.name
-                assert not part.inside or part.inside[0] == part.profile[0], thing.name
+                assert (np.diff([h for _, h in part.profile]) <= 1e-9).all(), solid.name
+                assert (np.diff([h for _, h in part.inside]) <= 1e-9).all(), solid.name
+                assert not part.inside or part.inside[0] == part.profile[0], solid.name
 
 
 # -- curves and brushes -----------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Photographs of real things on the simulated platter."""
+"""Photographs of real objects on the simulated platter."""
 
 import os
 from pathlib import Path
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.errors import UsageError
-from sim.objects.photographs import Photographed, photographs
+from sim.objects.photographs import PhotographedObject, photographs
 from sim.objects.projection import Image, Visible
 
 
@@ -20,9 +20,9 @@ def save(path: Path, level: int, *, border: int = 0, size: tuple[int, int] = (60
     assert cv2.imwrite(str(path), image)
 
 
-def shown(thing: Visible, azimuth_deg: float) -> Image:
+def shown(solid: Visible, azimuth_deg: float) -> Image:
     image = np.full((480, 640, 3), 99, np.uint8)
-    thing.draw(image, azimuth_deg, (0.0, 0.0))
+    solid.draw(image, azimuth_deg, (0.0, 0.0))
     return image
 
 
@@ -37,16 +37,16 @@ def test_objects_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
         "obj3_0.png",
     ):
         save(tmp_path / name, 200) if not name.endswith("txt") else (tmp_path / name).write_text("obj")
-    things = photographs(tmp_path)
-    assert list(things) == ["obj1", "obj2", "obj10"]
-    assert things["obj1"].azimuth_deg.tolist() == [2.5, 355]
-    assert all(isinstance(thing, Visible) for thing in things.values())
+    objects = photographs(tmp_path)
+    assert list(objects) == ["obj1", "obj2", "obj10"]
+    assert objects["obj1"].azimuth_deg.tolist() == [2.5, 355]
+    assert all(isinstance(solid, Visible) for solid in objects.values())
 
 
 def test_the_nearest_photograph_is_shown_around_the_circle(tmp_path: Path) -> None:
     for angle, level in ((0, 50), (90, 100), (182.5, 150), (270, 200)):
         save(tmp_path / f"obj1__{angle:g}.png", level)
-    thing = photographs(tmp_path)["obj1"]
+    solid = photographs(tmp_path)["obj1"]
     for azimuth, level in (
         (0, 50),
         (359, 50),
@@ -57,14 +57,14 @@ def test_the_nearest_photograph_is_shown_around_the_circle(tmp_path: Path) -> No
         (720 + 44, 50),
         (-270, 100),
     ):
-        assert shown(thing, azimuth)[240, 320].tolist() == [level] * 3
+        assert shown(solid, azimuth)[240, 320].tolist() == [level] * 3
 
 
 @given(st.lists(st.floats(0, 359.9), min_size=1, max_size=20, unique=True), st.floats(-1000, 1000))
 def test_no_photograph_is_nearer_than_the_one_shown(angles: list[float], azimuth: float) -> None:
-    thing = Photographed("obj1", np.array(sorted(angles)), tuple(Path(str(a)) for a in sorted(angles)))
+    solid = PhotographedObject("obj1", np.array(sorted(angles)), tuple(Path(str(a)) for a in sorted(angles)))
     apart = [abs(np.angle(np.exp(1j * np.radians(a - azimuth)), deg=True)) for a in sorted(angles)]
-    assert apart[thing.nearest(azimuth)] == pytest.approx(min(apart), abs=1e-6)
+    assert apart[solid.nearest(azimuth)] == pytest.approx(min(apart), abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -97,27 +97,27 @@ def test_what_is_wrong_with_a_folder_is_said(tmp_path: Path) -> None:
 def test_a_damaged_photograph_is_named_when_it_is_seen(tmp_path: Path) -> None:
     save(tmp_path / "obj1__0.png", 200)
     (tmp_path / "obj1__90.png").write_bytes(b"not an image")
-    thing = photographs(tmp_path)["obj1"]
-    shown(thing, 10)
+    solid = photographs(tmp_path)["obj1"]
+    shown(solid, 10)
     with pytest.raises(UsageError, match=r"obj1__90\.png"):
-        shown(thing, 80)
+        shown(solid, 80)
 
 
 def test_a_drawn_frame_can_be_changed_without_harm(tmp_path: Path) -> None:
     save(tmp_path / "obj1__0.png", 200)
-    thing = photographs(tmp_path)["obj1"]
-    shown(thing, 0)[:] = 0
-    assert shown(thing, 0)[240, 320, 0] == 200
+    solid = photographs(tmp_path)["obj1"]
+    shown(solid, 0)[:] = 0
+    assert shown(solid, 0)[240, 320, 0] == 200
 
 
 def test_the_photographs_of_coil_100_are_found() -> None:
     folder = Path(os.environ.get("RIG_TEST_DATA", "../shared/data")) / "coil-100"
     if not folder.is_dir():
         pytest.skip(f"no photographs in {folder}")
-    things = photographs(folder)
-    assert list(things) == [f"obj{k}" for k in range(1, 101)]
-    assert sum(len(thing.files) for thing in things.values()) == 7178
-    image = shown(things["obj1"], 43.0)
+    objects = photographs(folder)
+    assert list(objects) == [f"obj{k}" for k in range(1, 101)]
+    assert sum(len(solid.files) for solid in objects.values()) == 7178
+    image = shown(objects["obj1"], 43.0)
     photo = cv2.imread(str(folder / "obj1__45.png"))
     assert photo is not None
     assert image[:, 80:560].mean() == pytest.approx(photo.mean(), abs=1)

@@ -136,9 +136,9 @@ def test_a_thing_is_put_down_by_the_platters_mark() -> None:
     world.put(Mug(), yaw_deg=100.0, offset_mm=(1.0, -2.0))
     assert world.scene.yaw_deg == 100.0  # wherever the table stands
     assert world.scene.offset_mm == (1.0, -2.0)
-    assert world.scene.thing is not None
+    assert world.scene.object is not None
     world.put(None)
-    assert world.scene.thing is None
+    assert world.scene.object is None
 
 
 def test_scenes_change_in_time_and_the_past_keeps_its_own() -> None:
@@ -154,7 +154,7 @@ def test_scenes_change_in_time_and_the_past_keeps_its_own() -> None:
     lights = [world.scene_at(t).light for t in (500_000_000, 1_500_000_000, 2_500_000_000, 3_500_000_000)]
     assert lights == [(1.0, 1.0, 1.0), (1.0, 1.0, 1.0), dark, (1.0, 1.0, 1.0)]
     assert world.scene_at(500_000_000) == Scene()
-    assert world.scene_at(2_500_000_000).thing is world.scene.thing
+    assert world.scene_at(2_500_000_000).solid is world.scene.object
 
 
 # -- randomness ----------------------------------------------------------------------------------------------------

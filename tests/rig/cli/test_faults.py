@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.cli.main import app
-from sim.faults import Fault, kinds
+from sim.faults import Fault, fault_kinds
 
 SMALL = ("--count", "2", "--set", "enroll.views=4", "--set", "identify.max_views=2")
 
@@ -17,7 +17,7 @@ def rig(*arguments: str):
 
 def test_faults_are_listed_with_parameters():
     text = rig("faults").stdout
-    for kind in kinds().values():
+    for kind in fault_kinds().values():
         assert f"{kind.name} " in text
         assert kind.what in text
         for name, parameter in kind.parameters.items():
@@ -27,7 +27,7 @@ def test_faults_are_listed_with_parameters():
 
 def test_faults_are_listed_as_json():
     listed = [json.loads(line) for line in rig("faults", "--json").stdout.splitlines()]
-    assert [entry["fault"] for entry in listed] == list(kinds())
+    assert [entry["fault"] for entry in listed] == list(fault_kinds())
     for entry in listed:
         given = "".join(f":{name}={value['default']}" for name, value in entry["parameters"].items())
         assert Fault.parse(entry["fault"] + given).kind.what == entry["what"]

@@ -48,7 +48,7 @@ def test_a_crc_error_on_the_wire_is_retried_and_counted():
         spoiled.append(frame)
         return replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 0x01]))
 
-    wires.bus.tampers.append(flip_once)
+    wires.bus.filters.append(flip_once)
     assert bus.ping(1) == 1060
     assert (bus.statistics.corrupt, bus.statistics.retries, bus.statistics.transactions) == (1, 1, 2)
     assert len(wires.instructions) == 2  # the question really went out again
@@ -57,7 +57,7 @@ def test_a_crc_error_on_the_wire_is_retried_and_counted():
 def test_a_line_that_always_spoils_ends_in_device_silent_with_the_sdks_reason():
     wires = servo_wires()
     bus = open_bus(wires, retries=2)
-    wires.bus.tampers.append(lambda frame: replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 0xFF])))
+    wires.bus.filters.append(lambda frame: replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 0xFF])))
     with pytest.raises(DeviceSilent) as caught:
         bus.read(1, TABLE["Present Position"])
     assert caught.value.evidence["reason"] == "Incorrect status packet!"
@@ -69,7 +69,7 @@ def test_a_lost_reply_is_asked_for_again():
     wires = servo_wires()
     bus = open_bus(wires)
     lost = iter([None])
-    wires.bus.tampers.append(lambda frame: next(lost, frame))
+    wires.bus.filters.append(lambda frame: next(lost, frame))
     assert bus.read(1, TABLE["Present Input Voltage"]) > 0
     assert bus.statistics.timeouts == 1
 
@@ -82,7 +82,7 @@ def test_a_reply_that_comes_too_late_is_never_taken_for_the_next_answer():
     def delay_once(frame: Frame) -> Frame:
         return replace(frame, start_ns=frame.start_ns + next(late, 0))
 
-    wires.bus.tampers.append(delay_once)
+    wires.bus.filters.append(delay_once)
     model, torque = bus.read(1, TABLE["Model Number"]), bus.read(1, TABLE["Torque Enable"])
     assert (model, torque) == (1060, 0)
     assert bus.statistics.retries >= 1
@@ -95,7 +95,7 @@ def test_a_babbling_line_ends_instead_of_hanging():
     def babble(frame: Frame) -> Frame:
         return replace(frame, data=b"\x00" * 60_000)
 
-    wires.bus.tampers.append(babble)
+    wires.bus.filters.append(babble)
     before_ns = wires.world.clock.now_ns()
     with pytest.raises(DeviceSilent):
         bus.ping(1)
@@ -145,7 +145,7 @@ def test_garbage_in_place_of_replies_never_becomes_a_value(noise):
     wires = servo_wires()
     bus = open_bus(wires, retries=len(noise))
     garbage = iter(noise)
-    wires.bus.tampers.append(lambda frame: replace(frame, data=next(garbage, frame.data)))
+    wires.bus.filters.append(lambda frame: replace(frame, data=next(garbage, frame.data)))
     assert bus.read(1, TABLE["Model Number"]) == 1060
     assert bus.statistics.retries == len(noise)
 
@@ -193,11 +193,11 @@ def test_the_answer_to_a_question_that_was_cut_short_is_never_taken_for_the_next
         raise KeyboardInterrupt
 
     def late_and_interrupted(frame: Frame) -> Frame:
-        wires.bus.tampers.clear()
+        wires.bus.filters.clear()
         wires.world.clock.call_at(wires.world.clock.now_ns(), interrupt)
         return replace(frame, start_ns=frame.start_ns + 1_000_000)
 
-    wires.bus.tampers.append(late_and_interrupted)
+    wires.bus.filters.append(late_and_interrupted)
     with pytest.raises(KeyboardInterrupt):
         bus.read(1, TABLE["Present Temperature"])
     assert bus.read(1, TABLE["Torque Enable"]) == 0

@@ -21,7 +21,7 @@ from rig.devices.head.protocol import BAUD, PROTOCOL_VERSION, HeadFault, HeadSta
 from sim.clock import VirtualClock
 from sim.head import build
 from sim.head.board import SimHead
-from sim.head.wire import HeadSerial
+from sim.head.serial_port import HeadSerial
 from sim.imu.mpu6050 import SimMpu6050
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
@@ -96,10 +96,10 @@ def test_nobody_at_the_port(opened):
 
 def test_a_board_that_starts_slowly_is_waited_for():
     with simulated_head(noise=NoiseModel.none()) as (head, world):
-        head.attach(0x68, SimMpu6050(head.world_then))
+        head.attach(0x68, SimMpu6050(head.world_at_board_time))
         wire = HeadSerial(head)
         starts_ns = world.clock.now_ns() + 1_700 * MS  # the boot loader of an Arduino whose port was opened
-        head.tampers.append(lambda _to_head, byte: byte if world.clock.now_ns() > starts_ns else None)
+        head.filters.append(lambda _to_head, byte: byte if world.clock.now_ns() > starts_ns else None)
         imu = RigHead(wire, world.clock, mpu6050())
         assert world.clock.now_ns() > starts_ns
         imu.close()
@@ -110,7 +110,7 @@ def test_no_sensor_and_another_sensor():
         with pytest.raises(DeviceSilent, match="does not answer") as caught:
             RigHead(HeadSerial(head), world.clock, mpu6050())
         assert caught.value.evidence["imu_status"] == "absent"
-        head.attach(0x68, SimMpu6050(head.world_then, who_am_i=0x70))
+        head.attach(0x68, SimMpu6050(head.world_at_board_time, who_am_i=0x70))
         with pytest.raises(DeviceMismatch, match=r"0x70, expected 0x68.*MPU-6500"):
             RigHead(HeadSerial(head), world.clock, mpu6050())
 
@@ -268,7 +268,7 @@ def test_corrupt_frames_are_counted_and_cost_samples_but_no_wrong_value(opened):
     opened.clock.sleep(0.5)
     opened.imu.read_samples()
     start_ns = opened.clock.now_ns()
-    opened.head.tampers.append(lambda _to_head, byte: byte ^ 0x20 if rng.random() < 0.002 else byte)
+    opened.head.filters.append(lambda _to_head, byte: byte ^ 0x20 if rng.random() < 0.002 else byte)
     rates, times, lost = [], [], 0
     for _ in range(50):
         opened.clock.sleep(0.1)
@@ -308,10 +308,10 @@ def test_an_answer_that_comes_too_late_answers_nothing_else():
         wire = HeadSerial(h.head)
         link = HeadLink(wire, h.clock, lambda _event: None, "head")
         link.start()
-        h.head.tampers.append(lambda to_head, byte: None if not to_head else byte)
+        h.head.filters.append(lambda to_head, byte: None if not to_head else byte)
         with pytest.raises(DeviceSilent):
             link.request(Trigger(500), Triggered, attempts=1)
-        h.head.tampers.clear()
+        h.head.filters.clear()
         h.clock.sleep(0.1)
         link.poll()
         assert link.request(Trigger(700), Triggered).width_us == 700
@@ -320,7 +320,7 @@ def test_an_answer_that_comes_too_late_answers_nothing_else():
 def test_a_request_whose_answer_was_lost_is_repeated_but_not_done_twice(opened):
     opened.imu._cancel()
     deaf_until_ns = opened.clock.now_ns() + 30 * MS
-    opened.head.tampers.append(lambda to_head, byte: byte if to_head or opened.clock.now_ns() > deaf_until_ns else None)
+    opened.head.filters.append(lambda to_head, byte: byte if to_head or opened.clock.now_ns() > deaf_until_ns else None)
     opened.imu._link.request(Trigger(500), Triggered)
     opened.clock.sleep(0.1)
     assert len(opened.head.pulses("trigger")) == 2  # up and down, once
@@ -363,7 +363,7 @@ def test_a_cable_that_is_put_in_again_is_taken_up_by_itself_with_everything_off(
 def test_another_head_in_its_place_is_not_taken_for_it():
     with opened_head(noise=NoiseModel.none(), reopen=lambda _head: HeadSerial(other)) as h:
         other = SimHead(h.world, serial=2)
-        other.attach(0x68, SimMpu6050(other.world_then))
+        other.attach(0x68, SimMpu6050(other.world_at_board_time))
         h.unplug()
         with pytest.raises(DeviceSilent):
             h.imu.read_samples()

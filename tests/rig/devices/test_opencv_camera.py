@@ -400,7 +400,7 @@ def test_a_fast_camera_is_not_slowed_down_by_other_things(world: World) -> None:
 
 def test_an_enrollment_with_a_slow_camera_loses_no_sample_of_the_gyro(simulated, tmp_path: Path) -> None:
     s = simulated()
-    s.operator.parts.camera.every = round(1.2 * FPS)  # 1.2 s a frame; the FIFO lasts for 0.85 s
+    s.operator.devices.camera.every = round(1.2 * FPS)  # 1.2 s a frame; the FIFO lasts for 0.85 s
     s.operator.next_object = "lamp"
     with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
         events = list(enroll(s.bench, catalog, "lamp", views=6))

@@ -40,7 +40,7 @@ tricky = st.lists(st.sampled_from([0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x55]), m
 
 def test_a_lost_reply_is_no_zero() -> None:
     wires = servo_wires()
-    wires.bus.tampers.append(lambda _: None)
+    wires.bus.filters.append(lambda _: None)
     port = ClockedPort(wires.serial, wires.world.clock)
     sdk_value, sdk_result, _ = Protocol2PacketHandler().read2ByteTxRx(port, 1, 144)
     assert (sdk_value, sdk_result == COMM_SUCCESS) == (0, False)  # the defect: 0 is a voltage, an angle, ...
@@ -69,7 +69,7 @@ def test_a_late_reply_answers_no_other_question(late_ms: float, pauses_ms: list[
             free_ns = start_ns + frame.end_ns - frame.start_ns
         return replace(frame, start_ns=start_ns)
 
-    wires.bus.tampers.append(delay)
+    wires.bus.filters.append(delay)
     for i, pause_ms in enumerate(pauses_ms):
         name = list(WORDS)[i % len(WORDS)]
         with suppress(DeviceSilent):  # a line that is held up for a second may count as silent

@@ -15,8 +15,8 @@ from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile
 from rig.motion.turntable import Turntable
+from sim.devices import SimDevices
 from sim.noise import NoiseModel
-from sim.parts import SimParts
 from sim.servo.ax12 import DEG_PER_COUNT
 from sim.servo.models import MODELS
 from sim.servo.motor import OVERLOAD_S
@@ -24,26 +24,26 @@ from sim.world import World
 from tests.rig.bench_parts import servo_wires
 
 
-def parts_of(*overrides: str, noise: NoiseModel | None = None) -> SimParts:
-    return SimParts.connected(load_config(None, overrides), World(noise=noise or NoiseModel.none()))
+def parts_of(*overrides: str, noise: NoiseModel | None = None) -> SimDevices:
+    return SimDevices.connected(load_config(None, overrides), World(noise=noise or NoiseModel.none()))
 
 
-def servo_of(parts: SimParts, *overrides: str, write: bool = True) -> RegisterServo:
+def servo_of(devices: SimDevices, *overrides: str, write: bool = True) -> RegisterServo:
     config = load_config(None, overrides)
-    servo = open_servo(parts.adapter, config.servo, parts.world.clock, config.table.mode)
+    servo = open_servo(devices.adapter, config.servo, devices.world.clock, config.table.mode)
     if write:
         prepare_servo(servo, write=True)
     return servo
 
 
-def go(parts: SimParts, servo: RegisterServo, angle_deg: float) -> float:
+def go(devices: SimDevices, servo: RegisterServo, angle_deg: float) -> float:
     """Move to ``angle_deg`` and return how far the table's shaft really turned."""
-    start_deg = parts.world.shaft()[0]
+    start_deg = devices.world.shaft()[0]
     servo.set_profile(MotionProfile(90.0, 500.0))
     servo.torque_on()
     servo.move_to(angle_deg)
-    parts.world.clock.sleep(8.0)
-    return parts.world.shaft()[0] - start_deg
+    devices.world.clock.sleep(8.0)
+    return devices.world.shaft()[0] - start_deg
 
 
 # -- the models --------------------------------------------------------------------------------------------------------
@@ -52,10 +52,10 @@ def go(parts: SimParts, servo: RegisterServo, angle_deg: float) -> float:
 @pytest.mark.parametrize("model", MODELS)
 def test_each_model_turns_beyond_a_revolution_and_reads_its_state(model: str) -> None:
     chosen = f"servo.model={model}"
-    parts = parts_of(chosen)
-    servo = servo_of(parts, chosen)
+    devices = parts_of(chosen)
+    servo = servo_of(devices, chosen)
     start = servo.read_state()
-    turned = go(parts, servo, start.position_deg + 500.0)
+    turned = go(devices, servo, start.position_deg + 500.0)
     state = servo.read_state()
     assert turned == pytest.approx(500.0, abs=servo.resolution_deg)
     assert state.position_deg - start.position_deg == pytest.approx(500.0, abs=servo.resolution_deg)
@@ -69,13 +69,13 @@ def test_each_model_turns_beyond_a_revolution_and_reads_its_state(model: str) ->
 @pytest.mark.parametrize("model", MODELS)
 def test_load_is_a_percentage_whatever_the_model_measures(model: str) -> None:
     chosen = f"servo.model={model}"
-    parts = parts_of(chosen)
-    servo = servo_of(parts, chosen)
+    devices = parts_of(chosen)
+    servo = servo_of(devices, chosen)
     servo.set_profile(MotionProfile(90.0, 500.0))
     servo.torque_on()
-    parts.servo.jam()
+    devices.servo.jam()
     servo.move_to(servo.read_state().position_deg - 90.0)
-    parts.world.clock.sleep(1.0)
+    devices.world.clock.sleep(1.0)
     assert -101 <= servo.read_state().load_percent < -60
 
 
@@ -99,11 +99,11 @@ def test_an_ax12_is_no_turntable_and_says_why() -> None:
 @settings(max_examples=20)
 @given(goal_deg=st.floats(0.0, 300.0))
 def test_an_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
-    parts = parts_of(*AX)
-    servo = servo_of(parts, *AX)
+    devices = parts_of(*AX)
+    servo = servo_of(devices, *AX)
     start_deg = servo.read_state().position_deg
     assert servo.reach_deg == pytest.approx((0.0, 300.0))
-    turned = go(parts, servo, goal_deg)
+    turned = go(devices, servo, goal_deg)
     state = servo.read_state()
     assert turned == pytest.approx(goal_deg - start_deg, abs=DEG_PER_COUNT)
     assert state.position_deg == pytest.approx(goal_deg, abs=DEG_PER_COUNT)
@@ -121,25 +121,25 @@ def test_what_an_ax12_lacks_is_told() -> None:
 
 
 def test_an_ax12_holds_where_it_is_when_its_torque_comes_on() -> None:
-    parts = parts_of(*AX)
-    servo = servo_of(parts, *AX)
-    parts.servo.turn_by_hand(40.0)
-    parts.world.clock.sleep(2.0)
+    devices = parts_of(*AX)
+    servo = servo_of(devices, *AX)
+    devices.servo.turn_by_hand(40.0)
+    devices.world.clock.sleep(2.0)
     servo.torque_on()
-    parts.world.clock.sleep(1.0)
-    assert parts.world.shaft()[0] == pytest.approx(40.0, abs=DEG_PER_COUNT)
+    devices.world.clock.sleep(1.0)
+    assert devices.world.shaft()[0] == pytest.approx(40.0, abs=DEG_PER_COUNT)
     assert servo.read_condition().torque
     servo.torque_off()
     assert not servo.read_condition().torque
 
 
 def test_an_overloaded_ax12_is_told_by_its_error_byte() -> None:
-    parts = parts_of(*AX)
-    servo = servo_of(parts, *AX)
+    devices = parts_of(*AX)
+    servo = servo_of(devices, *AX)
     servo.torque_on()
-    parts.servo.jam()
+    devices.servo.jam()
     servo.move_to(290.0)
-    parts.world.clock.sleep(OVERLOAD_S + 1.0)
+    devices.world.clock.sleep(OVERLOAD_S + 1.0)
     assert servo.read_state().hardware_errors == ("overload",)
     with pytest.raises(DeviceFault, match="overload"):
         servo.torque_on()
@@ -147,14 +147,14 @@ def test_an_overloaded_ax12_is_told_by_its_error_byte() -> None:
 
 def test_an_echoing_adapter_deceives_no_reader_of_protocol_1() -> None:
     """An echoed instruction that reads two bytes is a valid status packet: address and length for a value."""
-    parts = parts_of(*AX)
-    parts.servo_bus.echo = True
-    servo = servo_of(parts, *AX)
+    devices = parts_of(*AX)
+    devices.servo_bus.echo = True
+    servo = servo_of(devices, *AX)
     assert servo.identity.model == "ax_12a"
     assert servo.read_state().position_deg == pytest.approx(150.0, abs=0.3)
     assert servo._read("Max Torque") == 1023
     servo.torque_on()
-    assert parts.servo.memory["Torque Enable"] == 1
+    assert devices.servo.memory["Torque Enable"] == 1
 
 
 def test_an_ax12_bench_goes_to_angles_within_its_reach(simulated) -> None:
@@ -177,18 +177,18 @@ def test_limits_beyond_the_reach_are_refused_before_anything_moves(simulated) ->
 def test_behind_a_gear_angles_and_rates_are_the_tables(ratio: float, angle_deg: float, sign: int) -> None:
     angle_deg *= sign
     chosen = f"servo.gear_ratio={ratio}"
-    parts = parts_of(chosen)
-    servo = servo_of(parts, chosen)
+    devices = parts_of(chosen)
+    servo = servo_of(devices, chosen)
     start_deg = servo.read_state().position_deg
     profile = servo.set_profile(MotionProfile(20.0, 100.0))
     assert profile.velocity_dps == pytest.approx(20.0, rel=0.1)
     servo.torque_on()
     servo.move_to(start_deg + angle_deg)
-    parts.world.clock.sleep(0.6)
+    devices.world.clock.sleep(0.6)
     assert servo.read_state().velocity_dps == pytest.approx(sign * profile.velocity_dps, abs=1.4 / ratio)
-    assert parts.world.shaft()[1] == pytest.approx(sign * profile.velocity_dps, abs=1.4 / ratio)
-    parts.world.clock.sleep(20.0)
-    assert parts.world.shaft()[0] == pytest.approx(angle_deg, abs=servo.resolution_deg)
+    assert devices.world.shaft()[1] == pytest.approx(sign * profile.velocity_dps, abs=1.4 / ratio)
+    devices.world.clock.sleep(20.0)
+    assert devices.world.shaft()[0] == pytest.approx(angle_deg, abs=servo.resolution_deg)
     assert servo.read_state().position_deg - start_deg == pytest.approx(angle_deg, abs=1.01 * servo.resolution_deg)
 
 
@@ -203,19 +203,19 @@ def test_a_geared_bench_agrees_with_its_gyro(simulated) -> None:
 
 
 def test_a_wrong_gear_ratio_shows_against_the_gyro() -> None:
-    parts = parts_of("servo.gear_ratio=3.0")
-    servo = servo_of(parts, "servo.gear_ratio=2.0")
+    devices = parts_of("servo.gear_ratio=3.0")
+    servo = servo_of(devices, "servo.gear_ratio=2.0")
     start_deg = servo.read_state().position_deg
-    assert go(parts, servo, start_deg + 30.0) == pytest.approx(20.0, abs=0.2)
+    assert go(devices, servo, start_deg + 30.0) == pytest.approx(20.0, abs=0.2)
 
 
 def test_a_pan_servo_stays_within_one_revolution() -> None:
     chosen = ("table.mode=pan", "table.limits_deg=[-170, 170]")
-    parts = parts_of(*chosen)
-    servo = servo_of(parts, *chosen)
-    assert parts.servo.memory["Operating Mode"] == 3
+    devices = parts_of(*chosen)
+    servo = servo_of(devices, *chosen)
+    assert devices.servo.memory["Operating Mode"] == 3
     assert servo.reach_deg == pytest.approx((0.0, 359.9), abs=0.1)
-    assert go(parts, servo, 10.0) == pytest.approx(-170.0, abs=0.1)
+    assert go(devices, servo, 10.0) == pytest.approx(-170.0, abs=0.1)
     with pytest.raises(RequestRejected, match="data limit"):
         servo.move_to(400.0)
 
@@ -230,30 +230,30 @@ def test_orientation_follows_what_the_servo_carries(carries: str, sign: int) -> 
 
 @pytest.mark.parametrize("dps", [30.0, -60.0])
 def test_a_constant_speed_turns_the_table_and_leaves_the_servo_as_it_was(dps: float) -> None:
-    parts = parts_of()
-    servo = servo_of(parts)
+    devices = parts_of()
+    servo = servo_of(devices)
     assert isinstance(servo, DynamixelServo)
     speeds = [state.velocity_dps for state in servo.spin(dps, 5.0)]
     assert 80 < len(speeds) < 110
     assert speeds[20:] == pytest.approx([dps] * len(speeds[20:]), abs=0.7)
-    assert parts.world.shaft()[0] == pytest.approx(5.0 * dps, rel=0.05)
-    assert parts.servo.memory["Operating Mode"] == 4
-    assert parts.servo.memory["Torque Enable"] == 0
+    assert devices.world.shaft()[0] == pytest.approx(5.0 * dps, rel=0.05)
+    assert devices.servo.memory["Operating Mode"] == 4
+    assert devices.servo.memory["Torque Enable"] == 0
     assert servo.setting_differences() == []
 
 
 def test_a_spin_that_nobody_listens_to_ends_by_itself() -> None:
-    parts = parts_of()
-    servo = servo_of(parts)
+    devices = parts_of()
+    servo = servo_of(devices)
     assert isinstance(servo, DynamixelServo)
     spin = servo.spin(60.0, 60.0)
     next(spin)
-    parts.world.clock.sleep(3.0)  # the host does something else
-    assert parts.world.shaft()[1] == 0.0
+    devices.world.clock.sleep(3.0)  # the host does something else
+    assert devices.world.shaft()[1] == 0.0
     with closing(spin):
         pass
-    assert parts.servo.memory["Torque Enable"] == 0
-    assert parts.servo.memory["Operating Mode"] == 4
+    assert devices.servo.memory["Torque Enable"] == 0
+    assert devices.servo.memory["Operating Mode"] == 4
 
 
 def test_an_impossible_speed_is_refused_with_the_possible_ones() -> None:
@@ -278,60 +278,60 @@ WRONG = {
 
 
 def test_every_setting_in_the_way_is_found_told_with_its_reason_written_and_verified() -> None:
-    parts = parts_of()
-    servo = servo_of(parts, write=False)
+    devices = parts_of()
+    servo = servo_of(devices, write=False)
     for name, value in WRONG.items():
-        parts.servo.memory[name] = value
+        devices.servo.memory[name] = value
     differences = servo.setting_differences()
     assert {d.register: d.found for d in differences} == WRONG
     assert all(d.reason and str(d).startswith(f"{d.register}: {d.found} → {d.wanted} (") for d in differences)
-    before = {name: parts.servo.memory[name] for name in WRONG}
+    before = {name: devices.servo.memory[name] for name in WRONG}
     with pytest.raises(DeviceMismatch, match="7 EEPROM settings"):
         prepare_servo(servo, write=False)
-    assert {name: parts.servo.memory[name] for name in WRONG} == before  # nothing without a confirmation
+    assert {name: devices.servo.memory[name] for name in WRONG} == before  # nothing without a confirmation
     servo.write_settings(differences)
     assert servo.setting_differences() == []
-    assert parts.servo.memory["Shutdown"] == 52
+    assert devices.servo.memory["Shutdown"] == 52
 
 
 def test_settings_are_written_with_torque_off() -> None:
-    parts = parts_of()
-    servo = servo_of(parts, write=False)
+    devices = parts_of()
+    servo = servo_of(devices, write=False)
     servo.torque_on()
     prepare_servo(servo, write=True)
-    assert parts.servo.memory["Torque Enable"] == 0
+    assert devices.servo.memory["Torque Enable"] == 0
     assert servo.setting_differences() == []
 
 
 def test_a_servo_that_answers_no_writes_is_told_to_first() -> None:
-    parts = parts_of()
-    servo = servo_of(parts, write=False)
-    parts.servo.memory["Status Return Level"] = 1
+    devices = parts_of()
+    servo = servo_of(devices, write=False)
+    devices.servo.memory["Status Return Level"] = 1
     prepare_servo(servo, write=True)
-    assert parts.servo.memory["Status Return Level"] == 2
+    assert devices.servo.memory["Status Return Level"] == 2
     assert servo.setting_differences() == []
 
 
 def test_a_servo_that_answers_only_pings_is_told_so() -> None:
-    parts = parts_of()
-    parts.servo.memory["Status Return Level"] = 0
+    devices = parts_of()
+    devices.servo.memory["Status Return Level"] = 0
     with pytest.raises(DeviceSilent) as caught:
-        servo_of(parts, write=False)
+        servo_of(devices, write=False)
     assert "Status Return Level" in caught.value.__notes__[0]
 
 
 def test_a_setting_that_does_not_stay_is_an_error_that_names_it() -> None:
-    parts = parts_of()
-    servo = servo_of(parts, write=False)
-    parts.servo._on_write["Homing Offset"] = lambda: parts.servo.memory.__setitem__("Homing Offset", 5)
+    devices = parts_of()
+    servo = servo_of(devices, write=False)
+    devices.servo._on_write["Homing Offset"] = lambda: devices.servo.memory.__setitem__("Homing Offset", 5)
     with pytest.raises(RequestRejected, match="Homing Offset") as caught:
         servo.write_settings([SettingDifference("Homing Offset", 5, 0)])
     assert caught.value.evidence == {"register": "Homing Offset", "wrote": 0, "read_back": 5}
 
 
 def test_a_pan_servo_wants_the_position_mode() -> None:
-    parts = parts_of()
-    servo = servo_of(parts, write=False)
+    devices = parts_of()
+    servo = servo_of(devices, write=False)
     found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, ServoMode.PAN)}
     assert "Operating Mode" not in found  # the factory's
     found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, ServoMode.SPIN)}

@@ -15,8 +15,8 @@ from rig.doctor.examination import run_checks
 from rig.doctor.finding import Finding, Severity
 from sim.clock import VirtualClock
 from sim.computer import ComputerFiles, SimComputer
+from sim.devices import SimDevices
 from sim.noise import NoiseModel
-from sim.parts import SimParts
 from sim.servo import Frame, Source, XSeriesServo
 from sim.world import World
 
@@ -26,14 +26,14 @@ class Bench:
     """A bench that nobody has opened: its computer's files, its devices, and what went over the servo's line."""
 
     computer: ComputerFiles
-    parts: SimParts
+    devices: SimDevices
     context: DoctorContext
     sent: list[Frame] = field(default_factory=list)
 
     def add_servo(self, bus_id: int, baud: int, model: str = "xl430_w250") -> XSeriesServo:
         """Plug one more servo into the line."""
-        servo = XSeriesServo(World(clock=self.parts.world.clock), model, bus_id=bus_id, baudrate=baud)
-        self.parts.servo_bus.attach(servo)
+        servo = XSeriesServo(World(clock=self.devices.world.clock), model, bus_id=bus_id, baudrate=baud)
+        self.devices.servo_bus.attach(servo)
         return servo
 
     def findings(self, *topics: str) -> list[Finding]:
@@ -78,14 +78,14 @@ def unopened(
             there = config.servo.model_copy(update={"id": servo_at[0], "baud": servo_at[1]})
             built = config.model_copy(update={"servo": there})
         world = World(noise=noise, clock=VirtualClock(start_utc=datetime(2026, 5, 1, tzinfo=UTC)))
-        with SimParts.connected(built, world) as parts:
+        with SimDevices.connected(built, world) as devices:
             computer = ComputerFiles(Path(folder))
             if plugged:
                 computer.serial_port()
                 computer.i2c_bus()
                 computer.camera()
                 computer.keeps_time()
-            context = DoctorContext(SimComputer(Path(folder), parts, config, user), config, "sim", ("--bench", "sim"))
-            bench = Bench(computer, parts, context)
-            parts.servo_bus.taps.append(bench.sent.append)
+            context = DoctorContext(SimComputer(Path(folder), devices, config, user), config, "sim", ("--bench", "sim"))
+            bench = Bench(computer, devices, context)
+            devices.servo_bus.taps.append(bench.sent.append)
             yield bench

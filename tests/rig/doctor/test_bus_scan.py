@@ -17,7 +17,9 @@ PING, READ = 0x01, 0x02
 
 
 def heard(bench, *bauds: int, protocol: int = 2) -> list[BaudScan]:
-    return list(scan_servos(bench.parts.adapter, bench.context.computer.clock, bauds or BAUD_RATES, protocol=protocol))
+    return list(
+        scan_servos(bench.devices.adapter, bench.context.computer.clock, bauds or BAUD_RATES, protocol=protocol)
+    )
 
 
 places = st.tuples(
@@ -32,12 +34,12 @@ def test_every_servo_is_found_at_its_id_and_baud_rate(placed):
     with unopened(servo_at=first) as bench:
         for (bus_id, baud), model in others:
             bench.add_servo(bus_id, baud, model)
-        before = bench.parts.adapter.baudrate
+        before = bench.devices.adapter.baudrate
         all_heard = heard(bench)
         found = {(s.bus_id, s.baud): s.model for h in all_heard for s in h.servos}
         assert found == {**placed, first: "xl430_w250"}
         assert not any(h.duplicate_ids or h.noise for h in all_heard)
-        assert bench.parts.adapter.baudrate == before
+        assert bench.devices.adapter.baudrate == before
         assert bench.instructions <= {PING, READ}
 
 
@@ -62,7 +64,7 @@ def test_twins_are_found_beside_a_third_one():
 
 def test_a_line_that_babbles_is_noise_and_no_253_servos():
     with unopened() as bench:
-        faults = Faults(bench.parts)
+        faults = Faults(bench.devices)
         faults.schedule(*read_faults(["babble"]))
         (said,) = heard(bench, 57_600)
         faults.clear()
@@ -80,7 +82,7 @@ def test_a_servo_whose_answer_to_all_was_spoiled_is_asked_by_itself():
             spoiled.append(frame)
             return replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
 
-        bench.parts.servo_bus.tampers.append(spoil)
+        bench.devices.servo_bus.filters.append(spoil)
         (said,) = heard(bench, 57_600)
         assert [servo.bus_id for servo in said.servos] == [1]
         assert not said.duplicate_ids
@@ -88,7 +90,7 @@ def test_a_servo_whose_answer_to_all_was_spoiled_is_asked_by_itself():
 
 def test_an_adapter_that_hears_itself_changes_nothing():
     with unopened() as bench:
-        faults = Faults(bench.parts)
+        faults = Faults(bench.devices)
         faults.schedule(*read_faults(["echo"]))
         (said,) = heard(bench, 57_600)
         faults.clear()
@@ -107,7 +109,7 @@ def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
             return getattr(self.wire, name)
 
     with unopened() as bench:
-        said = list(scan_servos(Relay(bench.parts.adapter), bench.context.computer.clock))
+        said = list(scan_servos(Relay(bench.devices.adapter), bench.context.computer.clock))
         assert [len(each.servos) for each in said] == [1] * 8
         (once,) = without_echoes(said, 115_200)
         assert once.baud == 115_200
@@ -132,7 +134,7 @@ def test_rates_that_the_adapter_lacks_are_left_out():
             setattr(self.wire, name, value)
 
     with unopened() as bench:
-        rates = [said.baud for said in scan_servos(Slow(bench.parts.adapter), bench.context.computer.clock)]
+        rates = [said.baud for said in scan_servos(Slow(bench.devices.adapter), bench.context.computer.clock)]
         assert rates == [57_600, 1_000_000, 115_200, 9_600]
 
 
@@ -147,7 +149,7 @@ def test_an_ax_12a_is_found_by_its_own_protocol():
 
 def test_an_unknown_model_is_told_by_its_number():
     with unopened() as bench:
-        bench.parts.servo.memory["Model Number"] = 4711
+        bench.devices.servo.memory["Model Number"] = 4711
         assert 4711 not in model_numbers()
         ((servo,),) = (said.servos for said in heard(bench, 57_600))
         assert servo.model is None
@@ -182,9 +184,9 @@ class RegisterFile:
 def test_each_imu_is_known_by_its_own_register_at_each_of_its_addresses(chip):
     for address in chip.addresses:
         with unopened() as bench:
-            bench.parts.i2c.detach(0x68)
+            bench.devices.i2c.detach(0x68)
             device = RegisterFile({chip.register: chip.value})
-            bench.parts.i2c.attach(address, device)
+            bench.devices.i2c.attach(address, device)
             (found,) = scan_imus(bench.context.computer, 1)
             assert (found.name, found.driver, found.address) == (chip.name, chip.driver, address)
             assert all(len(data) == 1 for data in device.written)  # a register's number, never a value
@@ -192,10 +194,10 @@ def test_each_imu_is_known_by_its_own_register_at_each_of_its_addresses(chip):
 
 def test_an_unknown_chip_is_told_with_what_it_says_and_foreign_addresses_are_left_alone():
     with unopened() as bench:
-        bench.parts.i2c.detach(0x68)
+        bench.devices.i2c.detach(0x68)
         clock, memory = RegisterFile({0x00: 0x37}), RegisterFile({})
-        bench.parts.i2c.attach(0x68, clock)
-        bench.parts.i2c.attach(0x50, memory)
+        bench.devices.i2c.attach(0x68, clock)
+        bench.devices.i2c.attach(0x50, memory)
         (found,) = scan_imus(bench.context.computer, 1)
         assert found.driver is None
         assert "register 0x00 is 0x37" in str(found)
@@ -204,6 +206,6 @@ def test_an_unknown_chip_is_told_with_what_it_says_and_foreign_addresses_are_lef
 
 def test_a_bus_that_is_held_low_is_an_error_of_the_system():
     with unopened() as bench:
-        bench.parts.i2c.stuck = True
+        bench.devices.i2c.stuck = True
         with pytest.raises(TimeoutError):
             scan_imus(bench.context.computer, 1)

@@ -20,7 +20,7 @@ from rig.doctor.finding import Severity, fine
 from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
 from rig.safety.saved_state import BenchState as State
 from sim.clock import VirtualClock
-from sim.faults import Faults, kinds
+from sim.faults import Faults, fault_kinds
 from sim.faults.schedule import read_faults
 from tests.rig.catalog.catalog_samples import fill
 from tests.rig.doctor.doctor_parts import unopened
@@ -33,7 +33,7 @@ ADA = User("ada", 4242, frozenset({GID + 1}))
 def set_up(bench) -> None:
     """Give the servo the settings that the rig needs."""
     for name, value in {"Operating Mode": 4, "Return Delay Time": 0}.items():
-        bench.parts.servo.memory[name] = value
+        bench.devices.servo.memory[name] = value
 
 
 def one(problems: dict[str, str]) -> tuple[str, str]:
@@ -55,9 +55,9 @@ def test_a_bench_in_order_has_only_its_calibration_to_come():
 
 def test_an_empty_computer_is_told_device_by_device():
     with unopened(plugged=False) as bench:
-        bench.parts.adapter.unplug()
-        bench.parts.camera.unplug()
-        bench.parts.i2c.detach(0x68)
+        bench.devices.adapter.unplug()
+        bench.devices.camera.unplug()
+        bench.devices.i2c.detach(0x68)
         findings = bench.findings()
         bad = {f.topic for f in findings if f.level is Severity.BAD}
         assert bad == {"port", "servo", "imu", "camera"}
@@ -264,7 +264,7 @@ def test_several_servos_elsewhere_are_listed():
 
 def test_no_servo_at_all_asks_for_power():
     with unopened() as bench:
-        bench.parts.servo_bus.detach(bench.parts.servo)
+        bench.devices.servo_bus.detach(bench.devices.servo)
         text, fix = one(bench.problems("servo"))
         assert "nor any other at any baud rate" in text
         assert "12 V" in fix
@@ -284,14 +284,14 @@ def test_a_neighbour_is_mentioned_and_a_twin_is_an_obstacle():
 
 def test_another_model_can_be_made_the_configured_one():
     with unopened("servo.model=xm430_w350") as bench:
-        bench.parts.servo_bus.detach(bench.parts.servo)
+        bench.devices.servo_bus.detach(bench.devices.servo)
         bench.add_servo(1, 57_600, "xl430_w250")
         assert one(bench.problems("servo"))[1] == "rig config set servo.model xl430_w250"
 
 
 def test_an_ax_12a_says_what_it_lacks():
     with unopened("servo.model=ax_12a", "table.mode=pan", "servo.baud=1000000") as bench:
-        bench.parts.servo.memory["Return Delay Time"] = 0
+        bench.devices.servo.memory["Return Delay Time"] = 0
         texts = "\n".join(bench.problems("servo"))
         assert "no watchdog" in texts
         assert "EEPROM" not in texts
@@ -300,12 +300,12 @@ def test_an_ax_12a_says_what_it_lacks():
 def test_torque_left_on_and_a_tripped_watchdog_are_told_and_left():
     with unopened() as bench:
         set_up(bench)
-        bench.parts.servo.memory["Torque Enable"] = 1
-        bench.parts.servo.memory["Bus Watchdog"] = 0xFF
+        bench.devices.servo.memory["Torque Enable"] = 1
+        bench.devices.servo.memory["Bus Watchdog"] = 0xFF
         texts = "\n".join(bench.problems("servo"))
         assert "torque is on" in texts
         assert "watchdog tripped" in texts
-        assert bench.parts.servo.memory["Torque Enable"] == 1
+        assert bench.devices.servo.memory["Torque Enable"] == 1
 
 
 # -- faults of the whole vocabulary -----------------------------------------------------------------------------------
@@ -347,11 +347,11 @@ LOOKS = {"frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker"
 """Those that a camera may see; its frames are what takes time here."""
 
 
-@pytest.mark.parametrize("name", sorted(kinds()))
+@pytest.mark.parametrize("name", sorted(fault_kinds()))
 def test_under_every_fault_all_checks_come_to_an_end_and_those_that_show_are_found(name):
     with unopened() as bench:
         set_up(bench)
-        faults = Faults(bench.parts)
+        faults = Faults(bench.devices)
         faults.schedule(*read_faults([name]))
         seen = name.startswith("camera") or name in LOOKS
         findings = bench.findings("port", "servo", "imu", "clock", *(["camera"] if seen else []))
@@ -371,8 +371,8 @@ def test_under_every_fault_all_checks_come_to_an_end_and_those_that_show_are_fou
 
 def test_an_imu_at_its_other_address_and_on_its_side():
     with unopened("imu.address=0x69") as bench:
-        device = bench.parts.i2c.detach(0x69)
-        bench.parts.i2c.attach(0x68, device)
+        device = bench.devices.i2c.detach(0x69)
+        bench.devices.i2c.attach(0x68, device)
         assert one(bench.problems("imu"))[1] == "rig config set imu.address 0x68"
     with unopened("imu.model=bno055") as bench:
         bench.context.computer.clock.sleep(1.0)  # it is silent for a while after power-up
@@ -383,7 +383,7 @@ def test_an_imu_at_its_other_address_and_on_its_side():
 
 def test_a_clone_is_named():
     with unopened() as bench:
-        bench.parts.imu.who_am_i = 0x70
+        bench.devices.imu.who_am_i = 0x70
         text, _ = one(bench.problems("imu"))
         assert "MPU-6500" in text
 
@@ -394,7 +394,7 @@ def test_an_imu_on_a_rig_head_is_looked_at_there():
         bench.computer.serial_port("ttyUSB1", serial="HEAD")
         assert not bench.problems("port", "servo", "imu")
         assert any("rig head" in f.text for f in bench.findings("imu"))
-        bench.parts.head.unplugged = True
+        bench.devices.head.unplugged = True
         assert "no rig head" in one(bench.problems("imu"))[0]
 
 

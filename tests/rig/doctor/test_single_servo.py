@@ -23,7 +23,7 @@ WRITE = 0x03
 )
 def test_a_servo_found_anywhere_gets_another_id_and_rate(at, new_id, new_baud):
     with unopened(servo_at=at) as bench:
-        memory = bench.parts.servo.memory
+        memory = bench.devices.servo.memory
         memory["Torque Enable"] = 1
         with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == at
@@ -51,10 +51,10 @@ def test_a_second_servo_at_any_rate_forbids_it_and_nothing_is_written(place):
 def test_no_servo_an_unknown_one_and_a_bench_in_use(monkeypatch):
     monkeypatch.setattr("rig.doctor.single_servo.BAUD_RATES_1", (1_000_000,))
     with unopened() as bench:
-        bench.parts.servo.memory["Model Number"] = 4711
+        bench.devices.servo.memory["Model Number"] = 4711
         with pytest.raises(DeviceMismatch, match="4711"), single_servo(bench.context):
             pass
-        bench.parts.servo_bus.detach(bench.parts.servo)
+        bench.devices.servo_bus.detach(bench.devices.servo)
         with pytest.raises(DeviceNotFound, match="at any baud rate"), single_servo(bench.context):
             pass
         bench.sent.clear()
@@ -76,14 +76,14 @@ def test_what_a_servo_cannot_be_set_to_is_refused_before_anything_is_written():
 
 def test_a_servo_that_keeps_its_old_id_is_not_believed(monkeypatch):
     with unopened() as bench, single_servo(bench.context) as servo:
-        monkeypatch.setattr(type(bench.parts.servo), "bus_id", property(lambda _: 1))
+        monkeypatch.setattr(type(bench.devices.servo), "bus_id", property(lambda _: 1))
         with pytest.raises(RequestRejected, match="did not take the id 9"):
             servo.set_id(9)
 
 
 def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
     with unopened() as bench, single_servo(bench.context) as servo:
-        monkeypatch.setattr(type(bench.parts.servo), "baudrate", property(lambda _: 57_600))
+        monkeypatch.setattr(type(bench.devices.servo), "baudrate", property(lambda _: 57_600))
         with pytest.raises(RequestRejected, match="1000000 baud"):
             servo.set_baud(1_000_000)
         assert servo.read()["Baud Rate"] == 3  # what it was told; it answers at the rate that it has
@@ -91,10 +91,10 @@ def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
 
 def test_a_servo_that_answers_reads_alone_can_be_renamed():
     with unopened() as bench:
-        bench.parts.servo.memory["Status Return Level"] = 1
+        bench.devices.servo.memory["Status Return Level"] = 1
         with single_servo(bench.context) as servo:
             servo.set_id(5)
-        assert bench.parts.servo.memory["ID"] == 5
+        assert bench.devices.servo.memory["ID"] == 5
 
 
 def test_an_ax_12a_is_renamed_by_its_own_protocol(monkeypatch):

@@ -209,14 +209,14 @@ def test_ctrl_c_while_the_torque_goes_on_takes_it_off_again():
 
         def when_on(frame: Frame) -> Frame:
             if wires.device.memory["Torque Enable"]:
-                wires.bus.tampers.clear()
+                wires.bus.filters.clear()
                 wires.world.clock.call_at(wires.world.clock.now_ns(), interrupt)
             return frame
 
-        wires.bus.tampers.append(when_on)
+        wires.bus.filters.append(when_on)
         with pytest.raises(KeyboardInterrupt), Turntable(bench):
             pass
-        assert not wires.bus.tampers
+        assert not wires.bus.filters
         assert wires.device.memory["Torque Enable"] == 0
 
 

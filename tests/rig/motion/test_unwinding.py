@@ -70,7 +70,7 @@ def test_the_answer_is_given_although_the_cable_cannot_be_unwound(simulated, cat
         for event in identify(s.bench, hbr.ViewIndex(catalog.views().views)):
             events.append(event)
             if isinstance(event, Unwinding):
-                s.operator.parts.servo.jam()
+                s.operator.devices.servo.jam()
     assert isinstance(events[-1], Identified)
     assert events[-1].candidates[0].name == "toy-car"
     assert s.bench.safety.fault.code == Stalled.code

@@ -163,7 +163,7 @@ def servo_of(s):
 
 
 def i2c_of(s):
-    return s.operator.parts.i2c
+    return s.operator.devices.i2c
 
 
 @pytest.mark.parametrize("moving", [True, False])

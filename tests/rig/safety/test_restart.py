@@ -333,7 +333,7 @@ def test_a_stop_that_was_asked_for_ends_the_motion_with_torque_off(bench_of, tmp
 @pytest.mark.parametrize("when", ["in a motion", "between two"])
 def test_an_adapter_that_is_plugged_in_again_is_opened_anew_and_who_answers_is_looked_at(simulated, when):
     s = simulated()
-    adapter = s.operator.parts.adapter
+    adapter = s.operator.devices.adapter
     with pytest.raises(DeviceSilent) as caught, Turntable(s.bench) as table:
         if when == "in a motion":
             s.world.clock.call_at(s.world.clock.now_ns() + 1_200_000_000, adapter.unplug)
@@ -358,7 +358,7 @@ def test_an_adapter_that_is_plugged_in_again_is_opened_anew_and_who_answers_is_l
 
 def test_another_servo_behind_the_adapter_that_came_back_is_refused(simulated):
     s = simulated()
-    parts = s.operator.parts
+    parts = s.operator.devices
     with pytest.raises(DeviceSilent), Turntable(s.bench) as table:
         parts.adapter.unplug()
         table.goto(60.0)

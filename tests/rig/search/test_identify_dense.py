@@ -20,11 +20,11 @@ def shelf(tmp_path_factory):
     """Return the model of three objects that were enrolled without a picture of the empty table."""
     from rig.config import load_config
     from sim.bench import ShelfOperator, open_sim_bench
-    from sim.objects.shelf import shelf as things
+    from sim.objects.shelf import shelf as objects
     from sim.world import World
 
     with (
-        open_sim_bench(load_config(None, SMALL), ShelfOperator(World(seed=1), things())) as bench,
+        open_sim_bench(load_config(None, SMALL), ShelfOperator(World(seed=1), objects())) as bench,
         Catalog.open(tmp_path_factory.mktemp("dense"), clock=bench.clock) as catalog,
     ):
         for name in ("lamp", "dice", "teapot"):

@@ -50,7 +50,7 @@ def test_table_is_cleared_photographed_and_rotated_back(simulated: Open) -> None
     kept = empty_table_status(s.bench).table
     assert kept is not None
     assert np.array_equal(kept.image_bgr, taken.image_bgr)
-    assert s.world.scene.thing is None
+    assert s.world.scene.object is None
     assert taken.turning_share == 0
     assert abs(s.world.table_deg()) < 1
     assert empty_table_status(s.bench).problems == ()
@@ -108,7 +108,7 @@ def test_bench_that_rotates_its_camera_has_no_empty_table_image(simulated: Open)
 def test_age_and_settings_are_problems_and_another_size_is_not_usable(simulated: Open) -> None:
     s = simulated(*SMALL)
     photographed(s.bench)
-    s.operator.parts.camera.drift(kelvin=6000.0)
+    s.operator.devices.camera.drift(kelvin=6000.0)
     parameters = {"name": "white_balance_k", "before": 5000.0, "now": 6000.0}
     assert empty_table_status(s.bench).problems == (TableProblem(TableProblemCode.SETTING, parameters),)
     assert "white_balance_k was 5000, is 6000" in empty_table_status(s.bench).text
@@ -241,7 +241,7 @@ def test_enrolled_views_have_both_descriptors_evidence_and_the_image(simulated: 
 def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_path: Path) -> None:
     s = simulated(*SMALL, seed=2)
     photographed(s.bench)
-    s.operator.another_day(CHANGES["bench"])
+    s.operator.change_bench(CHANGES["bench"])
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         warned = [event for event in enroll(s.bench, catalog, "toy-car", views=6) if isinstance(event, Warned)]
         views = catalog.object("toy-car").views

@@ -80,7 +80,7 @@ def test_object_to_be_enrolled_is_there_already(simulated):
 
 def test_unplugged_camera_ends_the_waiting(simulated):
     s = simulated(*SMALL)
-    at(s, 5.0, s.operator.parts.camera.unplug)
+    at(s, 5.0, s.operator.devices.camera.unplug)
     with pytest.raises(DeviceSilent):
         TableWatcher(s.bench).place(None)
 

@@ -15,8 +15,8 @@ from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.safety.supervisor import TableState
 from sim.bench import ShelfOperator, open_sim_bench
+from sim.devices import SimDevices
 from sim.objects.shelf import shelf
-from sim.parts import SimParts
 from sim.world import World
 from tests.contract.heads import needs
 
@@ -54,17 +54,17 @@ def test_enrolled_and_found_with_the_binarys_gyro_as_the_only_source_of_orientat
 def test_the_bench_is_dark_and_unpowered_before_and_after(on_head):
     needs("memory")
     s = on_head()
-    assert s.operator.parts.head.relay_closed
+    assert s.operator.devices.head.relay_closed
     assert s.world.scene.light == pytest.approx((1.0,) * 3, abs=0.01)
     s.bench.close()
-    assert not s.operator.parts.head.relay_closed
+    assert not s.operator.devices.head.relay_closed
     assert s.world.scene.light == (0.0,) * 3
-    assert not s.operator.parts.servo.powered
+    assert not s.operator.devices.servo.powered
 
 
 def test_an_estop_in_mid_motion_stops_the_table_and_latches(on_head):
     s = on_head()
-    head = s.operator.parts.head
+    head = s.operator.devices.head
     with pytest.raises(EmergencyStop), Turntable(s.bench) as table:
         s.world.clock.call_at(s.world.clock.now_ns() + 1_500_000_000, lambda: setattr(head, "estop_open", True))
         table.goto(300.0)
@@ -90,7 +90,7 @@ def test_an_estop_while_the_table_rests_is_found_before_the_next_motion(on_head)
     s = on_head()
     with pytest.raises(EmergencyStop), Turntable(s.bench) as table:
         table.goto(20.0)
-        s.operator.parts.head.estop_open = True
+        s.operator.devices.head.estop_open = True
         s.world.clock.sleep(0.2)
         table.goto(40.0)
     assert s.bench.safety.state is TableState.FAULT
@@ -110,7 +110,7 @@ def test_a_light_that_goes_out_spoils_no_view(on_head, tmp_path):
 
 def test_a_pulled_cable_of_the_head_ends_the_plan_and_the_head_cuts_the_power(on_head, tmp_path):
     s = on_head()
-    head = s.operator.parts.head
+    head = s.operator.devices.head
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         events = enroll(s.bench, catalog, "lamp", views=8)
         with pytest.raises(DeviceSilent):
@@ -131,15 +131,15 @@ def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
     operator = ShelfOperator(world, shelf())
     config = load_config(None, WIRED)
     first = open_sim_bench(config, operator)
-    parts, wires = operator.parts, first.connections.pop_all()
+    devices, wires = operator.devices, first.connections.pop_all()
     first.head._cancel()  # kill -9
     world.clock.sleep(1.0)
-    assert not parts.head.relay_closed
-    with open_sim_bench(config, operator, parts=parts) as second:
+    assert not devices.head.relay_closed
+    with open_sim_bench(config, operator, devices=devices) as second:
         assert second.safety.state is TableState.FAULT
         with pytest.raises(FaultLatched, match="received nothing"), Turntable(second):
             pass
-        assert parts.head.relay_closed  # the servo can be asked how it is; it has no torque
+        assert devices.head.relay_closed  # the servo can be asked how it is; it has no torque
         second.safety.acknowledge()
         assert second.safety.fault is None
         assert second.head.fault is None
@@ -149,14 +149,14 @@ def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
 def test_the_servo_alone_is_fed_as_long_as_it_is_asked_unless_a_fault_is_latched():
     needs("memory")
     world, config = World(seed=4), load_config(None, WIRED)
-    with SimParts.connected(config, world) as parts:
-        with powered(config, parts.head_port, world.clock):
-            assert parts.servo.powered
-        assert not parts.servo.powered
-        parts.head.reset(Reset.BROWN_OUT)
-        with pytest.raises(HeadRestarted), powered(config, parts.head_port, world.clock):
+    with SimDevices.connected(config, world) as devices:
+        with powered(config, devices.head_port, world.clock):
+            assert devices.servo.powered
+        assert not devices.servo.powered
+        devices.head.reset(Reset.BROWN_OUT)
+        with pytest.raises(HeadRestarted), powered(config, devices.head_port, world.clock):
             pass
-        assert not parts.servo.powered
+        assert not devices.servo.powered
 
 
 def test_a_bench_whose_estop_is_pressed_says_what_to_do():
@@ -165,10 +165,10 @@ def test_a_bench_whose_estop_is_pressed_says_what_to_do():
     operator = ShelfOperator(world, shelf())
     config = load_config(None, WIRED)
     with open_sim_bench(config, operator) as bench:
-        parts, wires = operator.parts, bench.connections.pop_all()
-    parts.head.estop_open = True
+        devices, wires = operator.devices, bench.connections.pop_all()
+    devices.head.estop_open = True
     world.clock.sleep(0.1)
     with pytest.raises(EmergencyStop) as caught:
-        open_sim_bench(config, operator, parts=parts)
+        open_sim_bench(config, operator, devices=devices)
     assert "release" in caught.value.next_step
     wires.close()

@@ -25,7 +25,7 @@ from rig.devices.head.protocol import (
 )
 from sim.head.board import SimHead
 from sim.head.build import missing
-from sim.head.wire import HeadSerial
+from sim.head.serial_port import HeadSerial
 from sim.world import World
 
 MS = 1_000_000

@@ -8,7 +8,7 @@ from hypothesis import settings
 
 from rig.devices.head.head import RigHead
 from sim.head.board import SimHead
-from sim.head.wire import HeadSerial
+from sim.head.serial_port import HeadSerial
 from sim.noise import NoiseModel
 from sim.world import World
 from tests.contract.heads import mpu6050, needs

@@ -43,7 +43,7 @@ def eventful(kind: str) -> Trace:
             except RigError as error:
                 trace.errors.append(str(error))
 
-        h.head.tampers.append(tap)
+        h.head.filters.append(tap)
         h.imu.set_power(True)
         h.imu.set_light(0.3)
         h.world.drive(to_position(h.clock.now_ns() * 1e-9, 0.0, 0.0, 70.0, 90.0, 300.0))

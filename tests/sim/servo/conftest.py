@@ -1,6 +1,6 @@
 import pytest
 
-from tests.sim.servo.servo_line import Line
+from tests.sim.servo.servo_bench import Line
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from sim.servo.device import (
 from sim.servo.models import DEG_PER_COUNT, MODELS
 from sim.servo.motor import OVERLOAD_S, PWM_PER_COUNT
 from sim.servo.protocol2 import StatusError
-from tests.sim.servo.servo_line import ALERT, Line, extended
+from tests.sim.servo.servo_bench import ALERT, Line, extended
 
 FOLLOWING_ERROR = 0x08
 

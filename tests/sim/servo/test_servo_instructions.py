@@ -16,7 +16,7 @@ from sim.servo import Source
 from sim.servo.device import BOOT_S, OVERLOAD_ERROR
 from sim.servo.models import MODELS
 from sim.servo.protocol2 import StatusError, with_crc
-from tests.sim.servo.servo_line import ALERT, Line, extended
+from tests.sim.servo.servo_bench import ALERT, Line, extended
 
 
 def word(value: int) -> list[int]:

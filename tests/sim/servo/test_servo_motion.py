@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sim.noise import NoiseModel
 from sim.servo.models import DEG_PER_COUNT, DPS2_PER_UNIT, DPS_PER_UNIT, MODELS
 from sim.servo.motor import FRICTION_LOAD
-from tests.sim.servo.servo_line import Line, extended
+from tests.sim.servo.servo_bench import Line, extended
 
 XL430 = MODELS["xl430_w250"]
 IN_POSITION, ONGOING, FOLLOWING_ERROR = 0x01, 0x02, 0x08

@@ -7,7 +7,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from sim.servo.device import BOOT_S, OVERLOAD_ERROR
 from sim.servo.protocol2 import StatusError
-from tests.sim.servo.servo_line import ALERT, Line
+from tests.sim.servo.servo_bench import ALERT, Line
 
 EEPROM = {"Return Delay Time": 250, "Moving Threshold": 10, "Min Position Limit": 0, "Max Position Limit": 4095}
 RAM = {"LED": 0, "Profile Velocity": 0, "Profile Acceleration": 0, "Position P Gain": 640}

@@ -1,4 +1,4 @@
-"""The faults themselves: how they are written, when they happen, that they are over, and that the devices feel them."""
+"""Simulated faults: their notation, their times, their ends and their effects on the simulated devices."""
 
 from pathlib import Path
 
@@ -14,11 +14,11 @@ from rig.core.errors import DeviceMismatch, DeviceSilent, UsageError
 from rig.events.events import Accepted, Moved
 from rig.plans.enroll import enroll
 from sim.bench import SIM, ShelfOperator, SimOptions, open_sim_bench
-from sim.faults import Fault, Faults, kinds, load_faults
+from sim.devices import SimDevices
+from sim.faults import Fault, Faults, fault_kinds, load_faults
 from sim.faults.injector import DURING_S
 from sim.faults.schedule import Trigger
 from sim.objects.shelf import shelf
-from sim.parts import SimParts
 from sim.world import World
 from tests.faults.fault_runs import NOISE
 
@@ -33,21 +33,21 @@ VOCABULARY = {
 
 
 @pytest.fixture
-def parts():
-    with SimParts.connected(load_config(), World(noise=NOISE)) as parts:
-        yield parts
+def devices():
+    with SimDevices.connected(load_config(), World(noise=NOISE)) as devices:
+        yield devices
 
 
-def test_the_vocabulary_is_the_promised_one():
-    assert set(kinds()) == VOCABULARY
+def test_simulator_has_every_documented_fault():
+    assert set(fault_kinds()) == VOCABULARY
 
 
-# -- how they are written -----------------------------------------------------------------------------------------
+# -- notation -----------------------------------------------------------------------------------------------------
 
 
 @st.composite
 def faults(draw):
-    kind = draw(st.sampled_from(list(kinds().values())))
+    kind = draw(st.sampled_from(list(fault_kinds().values())))
     values = {}
     for name, parameter in kind.parameters.items():
         low, high = max(parameter.low, -1e6), min(parameter.high, 1e6)
@@ -60,20 +60,20 @@ def faults(draw):
 
 
 @given(faults())
-def test_what_is_written_is_read_as_it_was(fault):
+def test_fault_is_read_as_it_was_written(fault):
     assert Fault.parse(str(fault)) == fault
 
 
 @given(
     st.text(max_size=30) | st.from_regex(r"[a-z_.]{1,8}(:[a-z]{1,5}=[0-9.e-]{0,4})?(@[a-z0-9+.]{0,8})?", fullmatch=True)
 )
-def test_whatever_is_written_is_read_or_refused_with_a_next_step(text):
-    refusal = None
+def test_any_text_is_read_or_rejected_with_a_next_step(text):
+    rejection = None
     try:
         fault = Fault.parse(text)
-    except UsageError as refused:
-        refusal = refused
-    assert refusal.next_step if refusal else fault.kind.name in text
+    except UsageError as error:
+        rejection = error
+    assert rejection.next_step if rejection else fault.kind.name in text
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_whatever_is_written_is_read_or_refused_with_a_next_step(text):
         ("jam@move1.5", "Cannot read", "move3"),
         ("jam:tight", "Cannot read", "PARAMETER=VALUE"),
         ("jam:for_s=3", "Cannot read", "+2s"),
-        ("jam:tight=3", "no parameter 'tight'", "Leave it out"),
+        ("jam:tight=3", "no parameter 'tight'", "Remove"),
         ("slip:angel=3", "no parameter 'angel'", "angle, seconds"),
         ("slip:angle=far", "angle = 'far'", "number"),
         ("slip:angle=nan", "angle = 'nan'", "number"),
@@ -96,14 +96,14 @@ def test_whatever_is_written_is_read_or_refused_with_a_next_step(text):
         ("jam@3s+0s", "negative", "from 0"),
     ],
 )
-def test_mistakes_are_named_with_what_to_write_instead(text, what, next_step):
-    with pytest.raises(UsageError) as refused:
+def test_invalid_fault_is_rejected_with_a_correction(text, what, next_step):
+    with pytest.raises(UsageError) as rejected:
         Fault.parse(text)
-    assert what in refused.value.what
-    assert next_step in refused.value.next_step
+    assert what in rejected.value.what
+    assert next_step in rejected.value.next_step
 
 
-def test_a_file_holds_texts_and_tables(tmp_path: Path):
+def test_file_contains_texts_and_tables(tmp_path: Path):
     path = tmp_path / "faults.toml"
     path.write_text(
         '[[faults]]\nname = "slip"\nangle = 4\nduring_move = 3\n[[faults]]\nname = "unplug"\nat_s = 12\nfor_s = 3\n'
@@ -129,20 +129,20 @@ def test_a_file_holds_texts_and_tables(tmp_path: Path):
         ('[[faults]]\nname = "jam"\nat_s = true', "at_s = True"),
     ],
 )
-def test_mistakes_in_a_file_are_named_with_their_place(tmp_path, content, what):
+def test_invalid_file_is_rejected_with_the_place(tmp_path, content, what):
     path = tmp_path / "faults.toml"
     path.write_text(content)
-    with pytest.raises(UsageError, match=what) as refused:
+    with pytest.raises(UsageError, match=what) as rejected:
         load_faults(path)
-    assert refused.value.next_step
+    assert rejected.value.next_step
 
 
-def test_a_file_that_is_not_there_is_said(tmp_path):
+def test_missing_file_is_rejected(tmp_path):
     with pytest.raises(UsageError, match="Cannot read the faults"):
         load_faults(tmp_path / "none.toml")
 
 
-def test_a_configuration_with_a_mistaken_fault_is_refused():
+def test_configuration_with_an_invalid_fault_is_rejected():
     with pytest.raises(ValueError, match="Did you mean"):
         SimOptions(faults=["jamm"])
     config = load_config(overrides=['bench.sim.faults=["wrong_model"]'])
@@ -150,60 +150,65 @@ def test_a_configuration_with_a_mistaken_fault_is_refused():
         SIM.open(config, SimOptions(**config.bench["sim"]), 0)
 
 
-# -- when they happen -----------------------------------------------------------------------------------------------
+# -- times ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_fault_comes_and_goes_at_its_time(parts):
-    faults = Faults(parts)
-    heard = []
-    faults.listeners.append(lambda occurrence: heard.append((occurrence.began, occurrence.time_ns * 1e-9)))
+def test_fault_begins_and_ends_at_its_times(devices):
+    faults = Faults(devices)
+    reported = []
+    faults.listeners.append(lambda occurrence: reported.append((occurrence.began, occurrence.time_ns * 1e-9)))
     faults.schedule(Fault.parse("i2c_stuck@2s+3s"))
-    parts.world.clock.sleep(1.999)
-    assert not parts.i2c.stuck
-    parts.world.clock.sleep(0.001)
-    assert parts.i2c.stuck
+    devices.world.clock.sleep(1.999)
+    assert not devices.i2c.stuck
+    devices.world.clock.sleep(0.001)
+    assert devices.i2c.stuck
     assert [fault.kind.name for fault in faults.active] == ["i2c_stuck"]
-    parts.world.clock.sleep(3.0)
-    assert not parts.i2c.stuck
-    assert heard == [(True, 2.0), (False, 5.0)]
+    devices.world.clock.sleep(3.0)
+    assert not devices.i2c.stuck
+    assert reported == [(True, 2.0), (False, 5.0)]
 
 
-def test_what_is_cleared_is_over_and_does_not_come_any_more(parts):
-    faults = Faults(parts)
+def test_clear_ends_active_faults_and_cancels_scheduled_ones(devices):
+    faults = Faults(devices)
     faults.schedule(Fault.parse("i2c_stuck"), Fault.parse("unplug@2s"), Fault.parse("blur@view0"))
-    assert parts.i2c.stuck
+    assert devices.i2c.stuck
     faults.clear()
-    parts.world.clock.sleep(3.0)
-    assert not parts.i2c.stuck
-    assert parts.adapter.is_open
+    devices.world.clock.sleep(3.0)
+    assert not devices.i2c.stuck
+    assert devices.adapter.is_open
     assert not faults.active
 
 
 @pytest.mark.parametrize("name", sorted(VOCABULARY))
-def test_a_fault_that_is_over_leaves_no_hook_behind(parts, name):
-    before = _hooks(parts)
-    faults = Faults(parts)
+def test_ended_fault_leaves_no_hook(devices, name):
+    before = _hooks(devices)
+    faults = Faults(devices)
     faults.schedule(Fault.parse(name))
-    parts.world.clock.sleep(0.3)
+    devices.world.clock.sleep(0.3)
     faults.clear()
-    parts.world.clock.sleep(0.5)  # a servo boots
-    assert _hooks(parts) == before
-    assert parts.world.clock.next_event_ns() is None  # nothing goes on by itself
+    devices.world.clock.sleep(0.5)  # the servo boots
+    assert _hooks(devices) == before
+    assert devices.world.clock.next_event_ns() is None  # nothing is scheduled any more
 
 
-def _hooks(parts):
+def _hooks(devices):
     return [
-        *(len(hooks) for hooks in (parts.servo_bus.tampers, parts.servo.distortions, parts.imu.distortions)),
-        *(len(hooks) for hooks in (parts.i2c.refusals, parts.camera.tampers, parts.camera.falters)),
-        len(parts.servo_bus._devices),
-        *(parts.servo_bus.echo, parts.servo_bus.deaf, parts.i2c.stuck, parts.camera.hangs),
-        *(parts.camera.every, parts.camera.latency_ns, parts.camera.blur_px, parts.world.noise),
-        *(parts.servo.powered, parts.servo.memory["Model Number"], parts.world.scene.light, parts.world.scene.thing),
+        *(len(hooks) for hooks in (devices.servo_bus.filters, devices.servo.distortions, devices.imu.distortions)),
+        *(len(hooks) for hooks in (devices.i2c.nack_conditions, devices.camera.filters, devices.camera.grab_failures)),
+        len(devices.servo_bus._devices),
+        *(devices.servo_bus.echo, devices.servo_bus.deaf, devices.i2c.stuck, devices.camera.hangs),
+        *(devices.camera.every, devices.camera.latency_ns, devices.camera.blur_px, devices.world.noise),
+        *(
+            devices.servo.powered,
+            devices.servo.memory["Model Number"],
+            devices.world.scene.light,
+            devices.world.scene.object,
+        ),
     ]
 
 
-def test_moves_and_views_are_counted_as_the_plan_counts_them(tmp_path):
-    """Also where a move goes a way below first, and where a frame is taken again."""
+def test_moves_and_views_have_the_numbers_of_the_plan(tmp_path):
+    """Also if a move has two steps, and if a frame is repeated."""
     world = World(seed=5)
     operator = ShelfOperator(world, shelf())
     planned = [Fault.parse(text) for text in ("clock_jump@move0", "clock_jump@move2", "black_frame@view2+0.3s")]
@@ -226,22 +231,22 @@ def test_moves_and_views_are_counted_as_the_plan_counts_them(tmp_path):
     assert views[2] < begun[Trigger.VIEW, 2] < moves[3][1]
 
 
-# -- that the devices feel them ---------------------------------------------------------------------------------
+# -- effects on the devices -------------------------------------------------------------------------------------
 
 
-def test_the_same_seed_gives_the_same_fault():
+def test_same_seed_gives_the_same_fault():
     def noise(seed: int) -> bytes:
-        with SimParts.connected(load_config(), World(seed=seed)) as parts:
-            Faults(parts).schedule(Fault.parse("camera.garbage"))
-            parts.camera.grab()
-            return bytes(np.asarray(parts.camera.retrieve()[1])[:4])
+        with SimDevices.connected(load_config(), World(seed=seed)) as devices:
+            Faults(devices).schedule(Fault.parse("camera.garbage"))
+            devices.camera.grab()
+            return bytes(np.asarray(devices.camera.retrieve()[1])[:4])
 
     assert noise(1) == noise(1)
     assert noise(1) != noise(2)
 
 
-def test_a_full_disk_is_full_for_everybody_and_free_again(parts, tmp_path):
-    faults = Faults(parts)
+def test_full_disk_rejects_every_file_until_the_fault_ends(devices, tmp_path):
+    faults = Faults(devices)
     faults.schedule(Fault.parse("disk_full"))
     with pytest.raises(OSError, match="No space left"):
         files.write(tmp_path / "a", b"a")
@@ -250,32 +255,32 @@ def test_a_full_disk_is_full_for_everybody_and_free_again(parts, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_civil_time_jumps_and_the_monotonic_clock_does_not(parts):
-    before, before_ns = parts.world.clock.utc(), parts.world.clock.now_ns()
-    Faults(parts).schedule(Fault.parse("clock_jump:seconds=60"))
-    assert (parts.world.clock.utc() - before).total_seconds() == 60
-    assert parts.world.clock.now_ns() == before_ns
+def test_clock_jump_changes_civil_time_but_not_the_monotonic_clock(devices):
+    before, before_ns = devices.world.clock.utc(), devices.world.clock.now_ns()
+    Faults(devices).schedule(Fault.parse("clock_jump:seconds=60"))
+    assert (devices.world.clock.utc() - before).total_seconds() == 60
+    assert devices.world.clock.now_ns() == before_ns
 
 
-def test_a_fault_from_the_start_keeps_the_bench_from_opening():
+def test_fault_at_the_start_stops_the_bench_from_opening():
     with pytest.raises(DeviceMismatch, match="another model"):
         open_sim_bench(load_config(), ShelfOperator(World(), shelf()), faults=[Fault.parse("wrong_model")])
 
 
 @pytest.mark.parametrize("servo", ["xl430_w250", "xm430_w350", "xl330_m288", "mx_28", "ax_12a"])
 @pytest.mark.parametrize("imu", [("mpu6050", 0x68), ("bno055", 0x28)])
-def test_every_simulated_device_can_suffer_every_fault(servo, imu):
+def test_every_fault_works_on_every_simulated_device(servo, imu):
     settings = (f"servo.model={servo}", "servo.baud=1000000", f"imu.model={imu[0]}", f"imu.address={imu[1]}")
-    for name in kinds():
-        with SimParts.connected(load_config(None, settings), World(noise=NOISE)) as parts:
-            faults = Faults(parts)
+    for name in fault_kinds():
+        with SimDevices.connected(load_config(None, settings), World(noise=NOISE)) as devices:
+            faults = Faults(devices)
             faults.schedule(Fault.parse(name))
-            parts.world.clock.sleep(0.3)
+            devices.world.clock.sleep(0.3)
             faults.clear()
 
 
 @pytest.mark.sim(seed=2, faults=["camera.off@view1", "clock_jump@2s"])
-def test_the_fixtures_for_other_peoples_tests_take_faults(sim_bench, sim_catalog):
+def test_fixtures_of_the_pytest_plugin_take_faults(sim_bench, sim_catalog):
     with pytest.raises(DeviceSilent):
         list(enroll(sim_bench, sim_catalog, "dice", views=4))
     assert sim_catalog.resumable("dice").present == (0, 1)

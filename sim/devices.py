@@ -1,4 +1,4 @@
-"""The simulated side of a bench: what its drivers are connected to, and what a person there takes into the hand."""
+"""The simulated devices of a bench, to which its drivers are connected."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import READ_SLICE_S
 from sim.camera import SimCapture
 from sim.head.board import PinChange, SimHead
-from sim.head.wire import HeadSerial
+from sim.head.serial_port import HeadSerial
 from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
@@ -24,10 +24,10 @@ SimulatedImu = SimMpu6050 | SimBno055
 
 
 @dataclass
-class SimParts(AbstractContextManager["SimParts"]):
-    """The devices in one world and the wires to them; leaving a ``with`` block takes the wires away.
+class SimDevices(AbstractContextManager["SimDevices"]):
+    """The devices in one world and the connections to them, which the end of a ``with`` block closes.
 
-    They outlive a bench: a second one opened on the same parts finds them as the first one left them.
+    They outlive a bench: a second bench on the same devices finds them as the first one left them.
     """
 
     world: World
@@ -46,18 +46,18 @@ class SimParts(AbstractContextManager["SimParts"]):
 
     @classmethod
     def connected(cls, config: RigConfig, world: World) -> Self:
-        """Return the parts that ``config`` describes, as from the factory.
+        """Return the devices that ``config`` describes, with factory settings.
 
         Raises
         ------
         ConfigError
-            There is no simulated servo of that model, or it does not know the baud rate.
+            The simulator has no servo of that model, or the model does not support the baud rate.
         """
         servo = simulated_servo(world, config.servo)
         servo_bus = ServoBus(world.clock)
         servo_bus.attach(servo)
         head = _head(config, world, servo) if config.imu.connection == "head" else None
-        around = head.world_then if head else world
+        around = head.world_at_board_time if head else world
         imu: SimulatedImu
         if config.imu.model == "bno055":
             imu = SimBno055(around, adr=config.imu.address == 0x29)
@@ -71,27 +71,27 @@ class SimParts(AbstractContextManager["SimParts"]):
         return cls(world, servo_bus, servo, adapter, i2c, imu, camera, head)
 
     def head_port(self) -> HeadSerial:
-        """Open the head's line, as often as it is plugged in.
+        """Open the rig head's port.
 
         Raises
         ------
         DeviceNotFound
-            There is no head, or it is not plugged in.
+            The bench has no head, or it is unplugged.
         """
         if self.head is None or self.head.unplugged:
-            raise DeviceNotFound("There is no rig head at this port.", next_step="Plug its USB cable in.")
+            raise DeviceNotFound("No rig head is connected to this port.", next_step="Connect its USB cable.")
         return HeadSerial(self.head)
 
     def reopen_camera(self) -> SimCapture:
-        """Open the camera's stream anew, as after it was unplugged.
+        """Open the camera's stream again, for example after it was unplugged.
 
         Raises
         ------
         DeviceNotFound
-            It is not plugged in.
+            The camera is unplugged.
         """
         if not self.camera.reopen():
-            raise DeviceNotFound("There is no camera.", next_step="Plug the camera in.")
+            raise DeviceNotFound("No camera is connected.", next_step="Connect the camera.")
         return self.camera
 
     def reopen_adapter(self) -> SimSerial:
@@ -100,7 +100,7 @@ class SimParts(AbstractContextManager["SimParts"]):
         Raises
         ------
         DeviceNotFound
-            It is not plugged in.
+            The adapter is unplugged.
         """
         if not self.adapter.is_open:
             try:
@@ -108,30 +108,30 @@ class SimParts(AbstractContextManager["SimParts"]):
             except serial.SerialException as error:
                 raise DeviceNotFound(
                     f"Cannot open {self.adapter.port}.",
-                    next_step="Plug the adapter in.",
+                    next_step="Connect the adapter.",
                     evidence={"reason": str(error)},
                 ) from error
         return self.adapter
 
-    def open_wires(self) -> None:
-        """Open what a closed bench has let go of: the port, and the camera's stream if the camera is there.
+    def open_connections(self) -> None:
+        """Open what closing a bench has closed: the port, and the camera's stream if the camera is plugged in.
 
         Raises
         ------
         DeviceNotFound
-            The adapter is not plugged in.
+            The adapter is unplugged.
         """
         self.camera.reopen()
         self.reopen_adapter()
 
 
 def _head(config: RigConfig, world: World, servo: SimulatedServo) -> SimHead:
-    """Return a head whose outputs act on the world: its ring light is all the light, its relay feeds the servo.
+    """Return a rig head whose ring light is the only light and whose relay supplies the servo.
 
     Raises
     ------
     ConfigError
-        This machine cannot build the firmware.
+        The firmware cannot be built on this computer.
     """
     kind = str(config.bench.get("sim", {}).get("head", "memory"))
     error = world.noise.head_clock_error * float(world.rng("head").standard_normal())

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sim.servo import Frame, SimSerial, Source
 from sim.servo.bus import ABANDON_S, superpose
 from sim.servo.models import BAUD_RATES
-from tests.sim.servo.servo_line import Line
+from tests.sim.servo.servo_bench import Line
 
 PING = bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))
 
@@ -104,14 +104,14 @@ def flip(index: int) -> Callable[[Frame], Frame]:
 
 @pytest.mark.parametrize("index", [-1, -3, 9])
 def test_a_crc_error_on_the_wire_is_the_sdks_corrupt_packet(line: Line, index: int) -> None:
-    line.bus.tampers.append(flip(index))
+    line.bus.filters.append(flip(index))
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_CORRUPT
-    line.bus.tampers.clear()
+    line.bus.filters.clear()
     assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
 
 
 def test_a_lost_reply_is_the_sdks_timeout(line: Line) -> None:
-    line.bus.tampers.append(lambda _: None)
+    line.bus.filters.append(lambda _: None)
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
     assert line.sent(Source.DEVICE) == []
 
@@ -119,7 +119,7 @@ def test_a_lost_reply_is_the_sdks_timeout(line: Line) -> None:
 def test_a_late_reply_is_there_for_the_next_reader(line: Line) -> None:
     """The hazard that makes a driver drain the line: the answer to one read is taken for the answer to the next."""
     held_up = [0.05]
-    line.bus.tampers.append(
+    line.bus.filters.append(
         lambda frame: replace(frame, start_ns=frame.start_ns + round(held_up.pop() * 1e9)) if held_up else frame
     )
     assert line.sdk.read1ByteTxRx(line.port, 1, 9)[1] == COMM_RX_TIMEOUT  # Return Delay Time, 250
@@ -129,7 +129,7 @@ def test_a_late_reply_is_there_for_the_next_reader(line: Line) -> None:
 
 def test_a_held_up_reply_does_not_hold_up_the_next(line: Line) -> None:
     held_up = [0.2]
-    line.bus.tampers.append(
+    line.bus.filters.append(
         lambda frame: replace(frame, start_ns=frame.start_ns + round(held_up.pop() * 1e9)) if held_up else frame
     )
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
