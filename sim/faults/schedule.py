@@ -12,7 +12,7 @@ from rig.core.errors import UsageError
 from sim.faults.kind import FaultKind
 from sim.faults.lookup import find_fault
 
-NOTATION = "NAME[:PARAMETER=VALUE...][@TIME[+DURATION]], for example jam@12s, jam@move3 or blur@view10+2s"
+NOTATION = "NAME[:PARAMETER=VALUE...][@TIME[+2s]], where TIME is 12s, move3 or view10 and +2s is the duration"
 
 _SHORT = re.compile(r"(?P<name>[a-z0-9_.]+)(?P<values>(?::[^:@]*)*)(?:@(?P<when>.*))?")
 _WHEN = re.compile(r"(?:(?P<at>[\d.]+)s|move(?P<move>\d+)|view(?P<view>\d+))(?:\+(?P<length>[\d.]+)s)?")

@@ -93,7 +93,7 @@ def test_any_text_is_read_or_rejected_with_a_next_step(text):
         ("slip:angle=far", "angle = 'far'", "number"),
         ("slip:angle=nan", "angle = 'nan'", "number"),
         ("crc_flip:rate=2", "rate = 2 is out of range", "0 to 1"),
-        ("jam@3s+0s", "negative", "from 0"),
+        ("jam@3s+0s", "negative", "0 or later"),
     ],
 )
 def test_invalid_fault_is_rejected_with_a_correction(text, what, next_step):

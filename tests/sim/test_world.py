@@ -154,7 +154,7 @@ def test_scenes_change_in_time_and_the_past_keeps_its_own() -> None:
     lights = [world.scene_at(t).light for t in (500_000_000, 1_500_000_000, 2_500_000_000, 3_500_000_000)]
     assert lights == [(1.0, 1.0, 1.0), (1.0, 1.0, 1.0), dark, (1.0, 1.0, 1.0)]
     assert world.scene_at(500_000_000) == Scene()
-    assert world.scene_at(2_500_000_000).solid is world.scene.object
+    assert world.scene_at(2_500_000_000).object is world.scene.object
 
 
 # -- randomness ----------------------------------------------------------------------------------------------------
