@@ -1,4 +1,4 @@
-"""The example scripts run as they are documented."""
+"""The example scripts run as their README says."""
 
 import json
 import re
@@ -24,7 +24,7 @@ def commands() -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory):
-    """Return a folder that has the examples in it, and a catalog of the example tray."""
+    """Return a folder with the examples and a catalog of the example tray."""
     folder = tmp_path_factory.mktemp("workshop")
     (folder / "examples").symlink_to(EXAMPLES)
     tray, *_ = commands()
@@ -33,18 +33,18 @@ def workshop(tmp_path_factory):
     return folder, done.stdout
 
 
-def test_every_script_is_documented_with_a_command():
+def test_every_script_has_a_documented_command():
     assert sorted(f"examples/{path.name}" for path in EXAMPLES.glob("*.py")) == sorted(words[0] for words in commands())
 
 
-def test_the_tray_is_enrolled_and_skipped_the_next_time(workshop):
+def test_tray_is_enrolled_once_and_then_skipped(workshop):
     folder, first = workshop
     assert re.findall(r"\d/3 (\S+): (\w+)", first) == [("lamp", "enroll"), ("toy-car", "enroll"), ("dice", "enroll")]
     again = run(*commands()[0], cwd=folder)
     assert re.findall(r"\d/3 (\S+): (\w+)", again.stdout) == [("lamp", "skip"), ("toy-car", "skip"), ("dice", "skip")]
 
 
-def test_the_loop_writes_json_lines_and_ends_after_its_answers(workshop):
+def test_loop_writes_json_lines_and_ends_after_its_answers(workshop):
     folder, _ = workshop
     done = run(*commands()[1], cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -54,13 +54,13 @@ def test_the_loop_writes_json_lines_and_ends_after_its_answers(workshop):
     assert events[-1] == "identified"
 
 
-def test_the_loop_tells_an_error_as_its_last_line(tmp_path):
+def test_loop_writes_an_error_as_its_last_line(tmp_path):
     done = run(str(EXAMPLES / "unattended_loop.py"), "--catalog", "nowhere", cwd=tmp_path)
     assert done.returncode == 7
     assert json.loads(done.stdout.splitlines()[-1])["next_step"]
 
 
-def test_the_strategy_finds_the_objects_beside_the_others(tmp_path):
+def test_custom_strategies_find_the_same_objects_as_the_default(tmp_path):
     done = run(str(EXAMPLES / "custom_strategy.py"), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = re.findall(r"^([\w-]+) +(\S+) +found as (\S+) +(\d) views", done.stdout, re.M)

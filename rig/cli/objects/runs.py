@@ -38,13 +38,16 @@ def replay(
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
     from rig.events.events import event_dict
+    from rig.events.wording import counted
 
     if settings.json:
         for event in saved.events():
             settings.print_json(event_dict(event))
         return
     about = saved.about
-    print(f"Bench {about['bench']}, {about['started_utc']}, {len(saved.views.object_names)} objects enrolled")
+    started = str(about["started_utc"])[:16].replace("T", " ")
+    objects = counted(len(saved.views.object_names), "enrolled object")
+    print(f"Bench {about['bench']}, {started} UTC, {objects}")
     with IdentifyView(console(plain=True)) as view:
         for event in saved.events():
             view.show(event)

@@ -97,7 +97,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(EXIT_BY_SIGNAL + signal.SIGPIPE) from None
         except KeyboardInterrupt:
-            print("Interrupted. The servo's torque is off if the command used the table.", file=sys.stderr)
+            print("Interrupted. If the command has moved the table, its torque is off now.", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
     run.__signature__ = inspect.Signature([context, *own, *shared])  # type: ignore[attr-defined]
@@ -120,7 +120,7 @@ def show_error(error: RigError, settings: Settings) -> None:
     lines = [f"Error {error.code} ({error.title}): {error.what}"]
     for key, value in error.evidence.items():
         if isinstance(value, list | tuple):
-            lines += [f"  {key}:", *(f"    {item}" for item in value)]
+            lines += value and [f"  {key}:", *(f"    {item}" for item in value)]
         else:
             lines.append(f"  {key}: {value}")
     lines += [f"  {note}" for note in getattr(error, "__notes__", ())]

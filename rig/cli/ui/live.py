@@ -369,11 +369,11 @@ def _odds(one: Candidate) -> str:
 
 
 def _angle(angle_deg: float | None) -> str:
-    return "–" if angle_deg is None else f"{angle_deg:.2f}°"
+    return "–" if angle_deg is None else f"{angle_deg:.2f}°".replace("-", "−")
 
 
 def _with_sigma(row: _Row) -> str:
     if row.imu_deg is None:
         return "–"
     sigma = "" if row.sigma_deg is None else f" ± {row.sigma_deg:.2f}"
-    return f"{row.imu_deg:.2f}{sigma}°"
+    return f"{row.imu_deg:.2f}{sigma}°".replace("-", "−")

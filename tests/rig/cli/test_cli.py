@@ -1,4 +1,4 @@
-"""The command line as its users call it, in processes of its own where that matters."""
+"""The commands on a small catalog, and signals sent to real processes."""
 
 import json
 import os
@@ -14,14 +14,18 @@ from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.core.clock import SystemClock
 
+SMALL = (
+    'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
+    "[view]\nroi = [40, 0, 240, 240]\n"
+)
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 
 
 @pytest.fixture
 def rig(tmp_path, monkeypatch):
-    """Return a function that runs `rig ...` in an empty folder, with a small catalog of its own."""
+    """Return a function that runs `rig ...` in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(SMALL, encoding="utf-8")
 
     def run(*arguments: str):
         return CliRunner().invoke(app, list(arguments))
@@ -56,17 +60,17 @@ def test_enroll_list_show_identify(rig):
     assert {e["event"] for e in events} >= {"moved", "accepted", "ranked", "decided"}
 
 
-def test_views_are_dated_by_the_clock_of_their_bench(rig):
+def test_views_have_the_time_of_their_bench(rig):
     assert rig("enroll", "dice", "--views", "4").exit_code == 0
-    told = json.loads(rig("catalog", "show", "dice", "--json").stdout)
-    (enrollment,) = told["enrollments"]
-    captured = [view["captured_utc"] for view in told["views"]]
+    result = json.loads(rig("catalog", "show", "dice", "--json").stdout)
+    (enrollment,) = result["enrollments"]
+    captured = [view["captured_utc"] for view in result["views"]]
     assert enrollment["started_utc"] < captured[0]
     assert captured == sorted(captured)
     assert captured[-1] < enrollment["finished_utc"]
 
 
-def test_a_seed_determines_the_catalog_to_the_byte(rig):
+def test_catalog_depends_on_nothing_but_the_seed(rig):
     def enrolled(seed: str, folder: str) -> tuple[list[bytes], bytes]:
         assert rig("enroll", "dice", "--views", "4", "--seed", seed, "--set", f"catalog.path={folder}").exit_code == 0
         with Catalog.open(folder, clock=SystemClock(), read_only=True) as catalog:
@@ -74,65 +78,65 @@ def test_a_seed_determines_the_catalog_to_the_byte(rig):
         return [path.read_bytes() for path in sorted(Path(folder, "images").rglob("*.png"))], descriptors
 
     images, descriptors = enrolled("7", "first")
-    assert len(images) == 4 + 1  # and the empty table
+    assert len(images) == 4 + 1  # and the empty-table image
     assert enrolled("7", "again") == (images, descriptors)
     assert enrolled("8", "other")[0] != images
 
 
-def test_an_unknown_object_ends_with_exit_code_8(rig):
+def test_unknown_object_ends_with_exit_code_8(rig):
     rig("enroll", "mug-dots", "--views", "8")
     done = rig("identify", "--set", "bench.sim.object=clock", "--max-views", "3")
     assert done.exit_code == 8
     assert "Unknown object. The most similar enrolled object is mug-dots" in done.stdout
 
 
-def test_identify_without_a_catalog_says_what_to_do(rig):
+def test_identify_without_a_catalog_has_a_next_step(rig):
     done = rig("identify")
     assert done.exit_code == 7
     assert "Next step:" in done.stderr
 
 
-def test_a_second_enrollment_of_a_name_needs_a_decision(rig):
+def test_second_enrollment_of_a_name_needs_replace(rig):
     rig("enroll", "dice", "--views", "4")
     again = rig("enroll", "dice", "--views", "4")
     assert again.exit_code == 7
     assert "--replace" in again.stderr
-    assert "--resume" not in again.stderr  # this command has stored nothing
+    assert "--resume" not in again.stderr  # because this command has stored no views
     assert rig("enroll", "dice", "--views", "4", "--replace").exit_code == 0
 
 
-def test_an_object_that_is_not_on_the_shelf_is_told_with_those_that_are(rig):
+def test_object_that_is_not_on_the_shelf_is_rejected_with_a_list_of_the_shelf(rig):
     done = rig("enroll", "unicorn", "--views", "4")
     assert done.exit_code == 7
     assert "mug-white" in done.stderr
 
 
-def test_goto_turns_and_tells_encoder_and_gyro(rig):
-    told = json.loads(rig("goto", "-90", "--json").stdout)
-    assert told["encoder_deg"] == pytest.approx(-90, abs=0.3)
-    assert told["rotation_imu_deg"] == pytest.approx(-90, abs=4)
-    assert told["agrees"] is True
+def test_goto_rotates_the_table_and_reports_encoder_and_gyro(rig):
+    result = json.loads(rig("goto", "-90", "--json").stdout)
+    assert result["encoder_deg"] == pytest.approx(-90, abs=0.3)
+    assert result["rotation_imu_deg"] == pytest.approx(-90, abs=4)
+    assert result["agrees"] is True
 
 
-def test_goto_beyond_the_cable_is_a_motion_error(rig):
+def test_goto_beyond_the_cable_budget_is_a_motion_error(rig):
     done = rig("goto", "500")
     assert done.exit_code == 5
     assert "limits_deg" in done.stderr
 
 
-def test_status_tells_the_devices_and_moves_nothing(rig):
-    told = json.loads(rig("status", "--json").stdout)
-    assert told["servo"]["model"] == "xl430_w250"
-    assert told["imu"]["who_am_i"] == 0x68
-    assert told["camera"]["width"] == 640
-    assert told["camera"]["locks"]["auto_exposure"] is False
-    assert told["table_deg"] == pytest.approx(0, abs=0.3)
+def test_status_reports_the_devices(rig):
+    result = json.loads(rig("status", "--json").stdout)
+    assert result["servo"]["model"] == "xl430_w250"
+    assert result["imu"]["who_am_i"] == 0x68
+    assert result["camera"]["width"] == 320
+    assert result["camera"]["locks"]["auto_exposure"] is False
+    assert result["table_deg"] == pytest.approx(0, abs=0.3)
     text = rig("status").stdout
     assert "moving no" in text
     assert "gain –" in text
 
 
-def test_mistakes_in_the_configuration_come_all_at_once_and_in_json_too(rig):
+def test_all_mistakes_in_the_configuration_are_reported_at_once(rig):
     done = rig("status", "--set", "servo.baud=1", "--set", "view.roy=3", "--json")
     assert done.exit_code == 3
     error = json.loads(done.stdout)
@@ -141,7 +145,7 @@ def test_mistakes_in_the_configuration_come_all_at_once_and_in_json_too(rig):
     assert error["next_step"]
 
 
-def test_common_options_may_stand_before_or_after_the_command(rig):
+def test_common_options_can_precede_or_follow_the_command(rig):
     before = rig("--seed", "3", "--json", "goto", "30")
     after = rig("goto", "30", "--seed", "3", "--json")
     assert before.exit_code == after.exit_code == 0
@@ -149,15 +153,15 @@ def test_common_options_may_stand_before_or_after_the_command(rig):
     assert rig("goto", "30", "--seed", "4", "--json").stdout != after.stdout
 
 
-def test_an_unknown_bench_and_an_unknown_command(rig):
+def test_unknown_bench_and_unknown_command_are_rejected(rig):
     assert rig("status", "--bench", "mars").exit_code == 3
     assert rig("fly").exit_code == 2
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_signals_end_an_enrollment_with_their_code_and_it_resumes(tmp_path, number, code):
+def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(tmp_path, number, code):
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(SMALL, encoding="utf-8")
     process = subprocess.Popen(
         [*RIG, "enroll", "dice", "--views", "36", "--json"],
         cwd=tmp_path,

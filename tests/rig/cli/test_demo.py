@@ -11,7 +11,11 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 
-SMALL = ("--count", "3", "--set", "enroll.views=12", "--set", "identify.max_views=4")
+SETTINGS = (
+    *("enroll.views=12", "identify.max_views=4"),
+    *("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]"),
+)
+SMALL = ("--count", "3", *(word for setting in SETTINGS for word in ("--set", setting)))
 
 
 def demo(*arguments: str):

@@ -1,4 +1,4 @@
-"""Help: every command has its example, and none of it takes long."""
+"""The help of every command has an example and is fast."""
 
 import os
 import subprocess
@@ -29,7 +29,7 @@ def commands(group: object, words: tuple[str, ...] = ()) -> Iterator[tuple[str, 
 COMMANDS = sorted(commands(typer.main.get_command(app)))
 
 
-def test_there_are_the_commands_of_everybody():
+def test_all_commands_exist():
     assert {words[0] for words in COMMANDS} >= {
         "enroll", "identify", "replay", "report", "catalog", "import", "export", "log", "eval", "demo", "calibrate",
         "goto", "home", "status", "stop", "acknowledge", "doctor", "find", "setup", "config", "servo",
@@ -56,8 +56,8 @@ def test_every_error_has_an_exit_code_that_the_help_explains():
         assert f"{code:>3}  {meaning}" in shown
 
 
-def test_help_is_light_and_takes_little_time():
-    """The least of three runs: the others are slower by what the machine did beside."""
+def test_help_imports_no_heavy_module_and_is_fast():
+    """The fastest of three runs counts, because other processes can slow down a run."""
     code = (
         "import sys; sys.argv = ['rig', '--help']\n"
         "from rig.cli.main import main\n"
@@ -78,15 +78,15 @@ def test_help_is_light_and_takes_little_time():
 @pytest.mark.parametrize(
     "arguments", [("--help", "--no-color"), ("--no-color", "enroll", "--help"), ("fly", "--no-color")]
 )
-def test_no_color_holds_wherever_it_stands(arguments):
+def test_no_color_works_in_every_place(arguments):
     environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm-256color", "COLUMNS": "90"}
     environment.pop("NO_COLOR", None)
     done = subprocess.run([*RIG, *arguments], env=environment, capture_output=True, text=True)
     text = done.stdout + done.stderr
-    assert "\x1b[3" not in text  # no colour; bold and dim are none
+    assert "\x1b[3" not in text  # no color; bold and dim are allowed
 
 
-def test_a_terminal_that_lacks_signs_gets_question_marks_and_no_traceback(tmp_path):
+def test_terminal_without_unicode_shows_question_marks(tmp_path):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     done = subprocess.run(
         [*RIG, "goto", "20", "--bench", "sim"], env=environment, cwd=tmp_path, capture_output=True, text=True

@@ -1,4 +1,4 @@
-"""A servo in real time, and the real process that drives it: killed, stopped, terminated in the middle of a motion."""
+"""A program is killed, stopped and terminated during a motion of a servo that is simulated in real time."""
 
 import json
 import os
@@ -70,7 +70,7 @@ app()
 
 @pytest.fixture
 def servo(tmp_path):
-    """Return the settings that lead to a simulated servo in a process of its own, in real time."""
+    """Return the settings of a servo that another process simulates in real time."""
     start = "from rig.cli.main import main; main()"
     link = tmp_path / "servo"
     process = subprocess.Popen(
@@ -90,7 +90,7 @@ def servo(tmp_path):
 
 
 def moving(settings: list[str]) -> tuple[subprocess.Popen, str]:
-    """Start the program; return it when it has been moving for a while, and what it said about the servo it found."""
+    """Start the program; return it while the table moves, with its findings about the servo."""
     options = [word for setting in settings for word in ("--set", setting)]
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *options],
@@ -111,7 +111,7 @@ def ended(process: subprocess.Popen) -> tuple[int, str]:
 
 
 def look(settings: list[str]) -> tuple[bool, bool, bool]:
-    """Return whether the servo turns, whether its torque is on, and whether its watchdog has tripped."""
+    """Return whether the servo rotates, whether its torque is on, and whether its watchdog has tripped."""
     config = load_config(None, settings)
     wire = open_serial(config.servo.port, config.servo.baud)
     try:
@@ -130,7 +130,7 @@ def rig(settings: list[str], *words: str):
     return CliRunner().invoke(app, [*words, "--bench", "hardware", *options])
 
 
-def test_however_a_program_ends_in_the_middle_of_a_motion_the_table_stops(servo, tmp_path):
+def test_table_stops_however_the_program_ends(servo, tmp_path):
     process, findings = moving(servo)
     assert findings == "\n"
     process.send_signal(signal.SIGKILL)
@@ -140,10 +140,10 @@ def test_however_a_program_ends_in_the_middle_of_a_motion_the_table_stops(servo,
     path = json.loads(Path(tmp_path, "state", "hardware", "state.json").read_text())["table"]["path_deg"]
     assert path == pytest.approx([180.0, 530.0], abs=0.5)
 
-    process, findings = moving(servo)  # the next program says so, and goes on from where the table stands
-    for told in ("torque was on", "watchdog stopped it", "interrupted during a motion"):
-        assert told in findings
-    done = rig(servo, "stop", "--json")  # it opens the servo alone: the bench's camera and IMU need not be there
+    process, findings = moving(servo)  # the next program reports it and continues at the present angle
+    for finding in ("torque was on", "watchdog stopped it", "interrupted during a motion"):
+        assert finding in findings
+    done = rig(servo, "stop", "--json")  # needs only the servo, neither camera nor IMU
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout) == {"bench": "hardware", "pid": process.pid, "ended": True, "torque_was_on": False}
     code, errors = ended(process)
@@ -164,7 +164,7 @@ def test_however_a_program_ends_in_the_middle_of_a_motion_the_table_stops(servo,
     process, _ = moving(servo)
     process.send_signal(signal.SIGKILL)
     ended(process)
-    (tmp_path / "full").write_text("")  # nothing can be written, and the servo is stopped all the same
-    told = json.loads(rig([*servo, f"state_dir={str(tmp_path / 'full')!r}"], "stop", "--json").stdout)
-    assert (told["pid"], told["torque_was_on"]) == (None, True)
+    (tmp_path / "full").write_text("")  # the state cannot be written; the servo is stopped all the same
+    result = json.loads(rig([*servo, f"state_dir={str(tmp_path / 'full')!r}"], "stop", "--json").stdout)
+    assert (result["pid"], result["torque_was_on"]) == (None, True)
     assert look(servo) == (False, False, False)

@@ -1,4 +1,4 @@
-"""rig identify, replay and report as a technician uses them; dry runs, reports, completion and closed pipes."""
+"""The commands identify, replay and report; dry runs, completion, closed pipes, and benches with an operator."""
 
 import json
 import os
@@ -67,7 +67,7 @@ def rig(enrolled, monkeypatch):
     return run
 
 
-def test_enrollment_ends_with_what_the_object_may_be_taken_for_and_a_report(enrolled):
+def test_enrollment_ends_with_similar_objects_and_a_report(enrolled):
     folder, outputs = enrolled
     assert "looks like no other enrolled object" in outputs["lamp"].stdout
     told = [json.loads(line) for line in outputs["dice"].stdout.splitlines()]
@@ -77,19 +77,19 @@ def test_enrollment_ends_with_what_the_object_may_be_taken_for_and_a_report(enro
     assert "Contact sheet of lamp: 8 views" in page
     assert "Ring of 8 views by azimuth" in page
     assert "looks like" in page
-    assert not re.search(r'(src|href)="(?!data:|#)', page)  # needs nothing but itself
+    assert not re.search(r'(src|href)="(?!data:|#)', page)  # the page is self-contained
 
 
-def test_labels_may_be_repeated(rig):
+def test_label_option_is_repeatable(rig):
     listed = json.loads(rig("catalog", "list", "--json").stdout)
     assert next(o["label"] for o in listed["objects"] if o["name"] == "lamp") == "kitchen, brass"
 
 
-def test_a_saved_run_is_walked_through_checked_and_reported(rig, enrolled):
+def test_saved_run_is_replayed_checked_and_reported(rig, enrolled):
     folder, outputs = enrolled
-    walked = rig("replay", "runs/1")
-    assert walked.exit_code == 0
-    assert walked.stdout.splitlines()[1:] == outputs["run"].stdout.splitlines()
+    replayed = rig("replay", "runs/1")
+    assert replayed.exit_code == 0
+    assert replayed.stdout.splitlines()[1:] == outputs["run"].stdout.splitlines()
     events = [json.loads(line) for line in rig("replay", "runs/1", "--json").stdout.splitlines()]
     assert (events[0]["event"], events[-1]["event"]) == ("started", "identified")
     checked = rig("replay", "runs/1", "--check")
@@ -99,12 +99,12 @@ def test_a_saved_run_is_walked_through_checked_and_reported(rig, enrolled):
     assert rig("report", "runs/1").exit_code == 0
     page = (folder / "runs" / "1" / "report.html").read_text(encoding="utf-8")
     assert "dice" in page
-    assert "The camera’s way around the object" in page
+    assert "The camera’s path around the object" in page
     assert rig("report", "runs/1", "--out", "elsewhere.html", "--json").exit_code == 0
     assert Path("elsewhere.html").exists()
 
 
-def test_a_run_that_decides_otherwise_ends_with_code_6_and_says_where(rig, tmp_path):
+def test_replay_check_finds_a_changed_decision(rig, tmp_path):
     import shutil
 
     shutil.copytree("runs/1", tmp_path / "run")
@@ -120,7 +120,7 @@ def test_a_run_that_decides_otherwise_ends_with_code_6_and_says_where(rig, tmp_p
     assert "view 1, rotation_deg: saved -90.0, computed 90.0" in done.stderr
 
 
-def test_runs_that_are_not_there_or_would_be_overwritten(rig):
+def test_missing_runs_and_existing_folders_are_rejected(rig):
     assert rig("replay", "nowhere").exit_code == 2
     assert rig("report", "nowhere").exit_code == 2
     again = rig("identify", "--save-run", "runs/1")
@@ -128,18 +128,18 @@ def test_runs_that_are_not_there_or_would_be_overwritten(rig):
     assert "not empty" in again.stderr
 
 
-def test_an_identification_that_fails_is_kept_with_its_error(rig):
+def test_failed_identification_is_saved_with_its_error(rig):
     done = rig("identify", "--save-run", "runs/dark", "--set", "view.min_mean=250", "--set", "view.retakes=0")
     assert done.exit_code == 6
-    walked = rig("replay", "runs/dark")
-    assert walked.exit_code == 0
-    assert "Error 600 (view rejected)" in walked.stdout
+    replayed = rig("replay", "runs/dark")
+    assert replayed.exit_code == 0
+    assert "Error 600 (view rejected)" in replayed.stdout
     assert rig("report", "runs/dark").exit_code == 0
     assert rig("replay", "runs/dark", "--check").exit_code == 0
 
 
 @pytest.mark.parametrize("strategy", ["hbr", "ahbr", "sweep", "random"])
-def test_every_strategy_answers(rig, strategy):
+def test_every_strategy_finds_the_object(rig, strategy):
     done = rig(
         "identify", "--strategy", strategy, "--max-views", "3", "--top", "1", "--json", "--set", "bench.sim.object=lamp"
     )
@@ -150,7 +150,7 @@ def test_every_strategy_answers(rig, strategy):
     assert len([e for e in events if e["event"] == "accepted"]) == (3 if strategy == "hbr" else 2)
 
 
-def test_the_bench_searches_by_its_own_strategy_where_its_catalog_is_described_for_it(rig, enrolled):
+def test_dense_is_the_default_strategy(rig, enrolled):
     def searched(*words: str) -> tuple[list[dict], str]:
         done = rig("identify", "--json", "--set", "bench.sim.object=lamp", *words)
         return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
@@ -169,7 +169,7 @@ def test_the_bench_searches_by_its_own_strategy_where_its_catalog_is_described_f
     assert next(e for e in events if e["event"] == "started")["strategy"] == "ahbr"
 
 
-def test_rules_are_rehearsed_kept_and_used(rig, enrolled):
+def test_stopping_rule_is_calibrated_stored_and_used(rig, enrolled):
     told = rig("catalog", "calibrate", "--false-reject", "0.1")
     assert told.exit_code == 0, told.output
     assert re.search(r"^\d+ rehearsed searches of 4 views for 2 objects", told.stdout)
@@ -187,7 +187,7 @@ def test_rules_are_rehearsed_kept_and_used(rig, enrolled):
     kept.unlink()
 
 
-def test_a_catalog_of_before_is_searched_by_the_paper_and_says_what_to_do(enrolled, tmp_path, monkeypatch):
+def test_catalog_without_dense_descriptors_is_searched_by_ahbr_with_a_note(enrolled, tmp_path, monkeypatch):
     import shutil
     import sqlite3
     from contextlib import closing
@@ -203,21 +203,21 @@ def test_a_catalog_of_before_is_searched_by_the_paper_and_says_what_to_do(enroll
     assert "rig catalog redescribe --descriptor edges+colours adds it" in done.stdout
     assert "S_left" in done.stdout or "fixed" in done.stdout
     for words in (["identify", "--strategy", "dense"], ["catalog", "calibrate"]):
-        refused = run(app, words)
-        assert refused.exit_code == 7
-        assert "rig catalog redescribe --descriptor edges+colours" in refused.stderr
+        rejected = run(app, words)
+        assert rejected.exit_code == 7
+        assert "rig catalog redescribe --descriptor edges+colours" in rejected.stderr
     assert run(app, ["catalog", "redescribe", "--descriptor", "edges+colours"]).exit_code == 0
     again = run(app, ["identify", "--json", "--set", "bench.sim.object=lamp"])
     assert '"strategy": "dense"' in again.stdout
 
 
-def test_a_strategy_that_is_not_there_is_said_before_anything_moves(rig):
+def test_unknown_strategy_is_rejected(rig):
     done = rig("identify", "--strategy", "swep")
     assert done.exit_code == 2
     assert "Did you mean sweep?" in done.stderr
 
 
-def test_a_dry_run_says_all_and_does_nothing(rig):
+def test_dry_run_shows_the_plan_and_stores_nothing(rig):
     before = sorted(Path("catalog").rglob("*.png"))
     done = rig("enroll", "clock", "--step", "60", "--dry-run")
     assert done.exit_code == 0
@@ -243,17 +243,17 @@ def test_a_dry_run_says_all_and_does_nothing(rig):
         (("enroll", "clock", "--report", "catalog"), "The report cannot be written"),
     ],
 )
-def test_what_cannot_be_enrolled_is_said(rig, arguments, words):
+def test_enroll_rejects_wrong_options_with_a_next_step(rig, arguments, words):
     done = rig(*arguments)
     assert done.exit_code == 2
     assert words in done.stderr
     assert "Next step:" in done.stderr
 
 
-def test_a_resumed_enrollment_has_all_its_views_in_the_report(rig, enrolled):
+def test_report_of_a_resumed_enrollment_has_all_views(rig, enrolled):
     folder, _ = enrolled
-    rehearsed = ["enroll", "candle", "--json"]
-    process = subprocess.Popen([*RIG, *rehearsed], cwd=folder, stdout=subprocess.PIPE, text=True)
+    arguments = ["enroll", "candle", "--json"]
+    process = subprocess.Popen([*RIG, *arguments], cwd=folder, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     for line in process.stdout:
         if json.loads(line).get("index") == 4 and "accepted" in line:
@@ -265,18 +265,18 @@ def test_a_resumed_enrollment_has_all_its_views_in_the_report(rig, enrolled):
     assert "Contact sheet of candle: 8 views" in Path("candle.html").read_text(encoding="utf-8")
 
 
-def test_a_reader_that_has_seen_enough_ends_the_command_quietly(enrolled):
+def test_closed_pipe_ends_the_command_without_an_error(enrolled):
     folder, _ = enrolled
     command = (
         f"{sys.executable} -c 'from rig.cli.main import main; main()' identify | head -n 1; echo ${{PIPESTATUS[0]}}"
     )
     done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] in ("0", "8", "141")  # it may be ready before head is
+    assert done.stdout.splitlines()[-1] in ("0", "8", "141")  # it can end before head does
     assert "Traceback" not in done.stderr
     assert "Error" not in done.stderr
 
 
-def test_the_shell_completes_objects_benches_and_strategies(enrolled):
+def test_shell_completes_objects_benches_and_strategies(enrolled):
     folder, _ = enrolled
 
     def complete(*words: str) -> set[str]:
@@ -296,8 +296,8 @@ def test_the_shell_completes_objects_benches_and_strategies(enrolled):
 
 
 @pytest.fixture
-def without_hands(monkeypatch):
-    """Have the simulated bench opened as a real one is: nobody puts objects on the table; return its world."""
+def with_operator(monkeypatch):
+    """Open the simulated bench without the operator that places objects; return its world."""
     opened = []
     really = SimBenchKind.open
 
@@ -311,7 +311,7 @@ def without_hands(monkeypatch):
     return opened
 
 
-def test_on_a_bench_without_hands_a_person_is_asked_for_each_object(rig, without_hands, tmp_path):
+def test_operator_is_asked_for_each_object(rig, with_operator, tmp_path):
     Path("tray.csv").write_text("name,label\nlamp,\nradio,desk\nclock,\nbook-atlas,\n", encoding="utf-8")
     done = CliRunner().invoke(
         app, ["enroll", "--list", "tray.csv", "--views", "4", "--set", "view.min_sharpness=0"], input="\ns\nq\n"
@@ -328,12 +328,12 @@ def test_on_a_bench_without_hands_a_person_is_asked_for_each_object(rig, without
     assert not {"clock", "book-atlas"} & names
 
 
-def test_on_a_bench_without_hands_watching_goes_by_the_camera(rig, without_hands, monkeypatch):
+def test_watch_waits_until_the_camera_sees_an_object(rig, with_operator, monkeypatch):
     class Comes(TableWatcher):
-        """The world that changes while it is waited."""
+        """Puts an object on the table while the command waits."""
 
         def place(self, name):
-            (world,) = without_hands
+            (world,) = with_operator
             if self._empty is not None:
                 raise KeyboardInterrupt
             world.clock.call_at(world.clock.now_ns() + 3 * 10**9, lambda: world.put(shelf()["lamp"], 33.0))
@@ -350,8 +350,8 @@ def test_on_a_bench_without_hands_watching_goes_by_the_camera(rig, without_hands
     ]
 
 
-def test_what_is_enrolled_while_a_desk_watches_is_found_at_once(rig, enrolled):
-    """No retraining: the model is loaded anew when the catalog has changed, and only then."""
+def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
+    """The model is loaded again only if the catalog has changed."""
     folder, _ = enrolled
     with Catalog.open(folder / "catalog", clock=SystemClock(), read_only=True) as catalog:
         model = _Model(catalog)

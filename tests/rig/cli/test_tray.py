@@ -1,4 +1,4 @@
-"""A technician's day through the real command line: a tray of objects, interrupted twice, and all of them found."""
+"""A tray of objects, enrolled with two interruptions in real processes and then identified."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from sim.objects.shelf import CONFUSABLE, shelf
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 VIEWS = 9
-NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:25]
+NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:12]
 SMALL = f"""\
 default_bench = "sim"
 [catalog]
@@ -35,7 +35,7 @@ views = {VIEWS}
 
 
 class Process:
-    """A `rig` command in a process of its own, with its events as they come."""
+    """A `rig` command in its own process."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
         self._process = subprocess.Popen(
@@ -53,7 +53,7 @@ class Process:
             yield json.loads(line)
 
     def end(self, number: int | None = None) -> tuple[int, str]:
-        """Send a signal, if any, and return the exit code and what was said on stderr."""
+        """Send a signal, if any, and return the exit code and stderr."""
         if number is not None:
             self._process.send_signal(number)
         _, errors = self._process.communicate(timeout=60)
@@ -74,34 +74,34 @@ def folder(tmp_path):
 def enroll_until(folder: Path, views: int, number: int | None) -> tuple[list[dict[str, Any]], int, str]:
     """Enroll the tray and send a signal after so many views; return the events before it, the exit code and stderr."""
     process = Process(folder, "enroll", "--list", "tray.csv")
-    told = []
+    events = []
     for event in process.events():
-        told.append(event)
-        if number is not None and sum(e["event"] == "accepted" for e in told) == views:
+        events.append(event)
+        if number is not None and sum(e["event"] == "accepted" for e in events) == views:
             break
-    return told, *process.end(number)
+    return events, *process.end(number)
 
 
 def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
     return [event for event in events if event["event"] == kind]
 
 
-@pytest.mark.timeout(300)  # four processes one after the other, on a machine that may be busy
-def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identified(folder):
-    first, code, errors = enroll_until(folder, 7 * VIEWS + 3, signal.SIGINT)
+@pytest.mark.timeout(300)  # four processes in a row, on a busy machine
+def test_tray_is_enrolled_with_two_interruptions_and_identified(folder):
+    first, code, errors = enroll_until(folder, 3 * VIEWS + 3, signal.SIGINT)
     assert code == 130
     assert "rig enroll --list tray.csv" in errors
-    second, code, _ = enroll_until(folder, 8 * VIEWS + 2, signal.SIGKILL)
+    second, code, _ = enroll_until(folder, 4 * VIEWS + 2, signal.SIGKILL)
     assert code == -signal.SIGKILL
     third, code, errors = enroll_until(folder, 0, None)
     assert code == 0, errors
 
     done_at_first = [event["name"] for event in of_kind(first, "enrolled")]
-    assert done_at_first == NAMES[:7]
+    assert done_at_first == NAMES[:3]
     again = of_kind(second, "item")
-    assert [(e["name"], e["action"]) for e in again[:8]] == [
-        *((name, "skip") for name in NAMES[:7]),
-        (NAMES[7], "resume"),
+    assert [(e["name"], e["action"]) for e in again[:4]] == [
+        *((name, "skip") for name in NAMES[:3]),
+        (NAMES[3], "resume"),
     ]
     last = of_kind(third, "item")
     assert [e["name"] for e in last] == NAMES
@@ -109,19 +109,19 @@ def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identifi
     assert killed["action"] == "resume"
     assert killed["name"] == again[-1]["name"]
 
-    # No view was taken twice, and none is missing: a signal costs at most the view that was under way and is not told.
+    # No view was taken twice and none is missing; a signal loses at most the view that was being taken.
     taken = sum(len(of_kind(events, "accepted")) for events in (first, second, third))
     assert len(NAMES) * VIEWS - 4 <= taken <= len(NAMES) * VIEWS
     with Catalog.open(folder / "catalog", clock=SystemClock(), read_only=True) as catalog:
         assert {(s.name, s.label, s.views, s.unfinished_views) for s in catalog.objects()} == {
             (name, "tray 1", VIEWS, None) for name in NAMES
         }
-        for name in NAMES[7], killed["name"]:
+        for name in NAMES[3], killed["name"]:
             details = catalog.object(name)
             assert [view.record.index for view in details.views] == list(range(VIEWS))
             assert len({view.session.id for view in details.views}) == 2
             for view in details.views:
-                catalog.read_image(view)  # whole, and the one that was stored
+                catalog.read_image(view)  # raises if it is not the stored image
 
     things = f"bench.sim.object={json.dumps(NAMES)}"
     process = Process(folder, "identify", "--watch", "--save-run", "runs", "--seed", "3", "--set", things)
@@ -137,7 +137,7 @@ def test_a_tray_of_25_is_enrolled_through_two_interruptions_and_all_are_identifi
 
     runs = sorted((folder / "runs").iterdir())
     assert [path.name for path in runs[: len(NAMES)]] == [f"{number:04d}" for number in range(1, len(NAMES) + 1)]
-    for path in runs[: len(NAMES) : 12]:
+    for path in runs[: len(NAMES) : 6]:
         found = check(load_run(path))
         assert found.differences == []
-        assert found.decisions == found.views >= 1  # one after each view; the first may be enough
+        assert found.decisions == found.views >= 1  # one decision after each view; one view can be enough

@@ -1,4 +1,4 @@
-"""What is known before anything moves: angles within the cable's reach, and how long it takes."""
+"""Table angles within the cable budget, and the duration of an enrollment."""
 
 from itertools import pairwise
 
@@ -22,7 +22,7 @@ LIMITS = st.floats(-2000, 0).flatmap(
 
 
 @given(views=st.integers(4, 720), limits=LIMITS)
-def test_every_plan_fits_every_cable_that_holds_a_turn_and_climbs(views, limits):
+def test_table_angles_rise_within_every_cable_budget_of_a_revolution(views, limits):
     azimuths = even_azimuths(views, limits)
     angles = table_angles(azimuths, limits)
     assert len(angles) == len(set(azimuths)) == views
@@ -34,11 +34,11 @@ def test_every_plan_fits_every_cable_that_holds_a_turn_and_climbs(views, limits)
         assert wrap180(azimuth + angle) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_free_cable_begins_at_zero():
+def test_table_starts_at_zero_if_the_cable_allows_it():
     assert table_angles(even_azimuths(4, (-400, 400)), (-400, 400)) == (0.0, 90.0, 180.0, 270.0)
 
 
-def test_a_plan_of_another_bench_is_turned_by_whole_turns_or_refused_before_anything_moves():
+def test_plan_of_another_bench_is_shifted_by_revolutions_or_rejected():
     elsewhere = [float(wrap360(-angle)) for angle in range(-180, 180, 90)]
     assert table_angles(elsewhere, (-400, 400)) == (-180.0, -90.0, 0.0, 90.0)
     with pytest.raises(LimitExceeded) as caught:
@@ -46,7 +46,7 @@ def test_a_plan_of_another_bench_is_turned_by_whole_turns_or_refused_before_anyt
     assert "--replace" in caught.value.next_step
 
 
-def test_an_enrollment_on_a_short_cable_stays_within_it_and_sees_all_sides(simulated, tmp_path):
+def test_enrollment_with_a_short_cable_stays_within_it_and_sees_all_sides(simulated, tmp_path):
     s = simulated(*SMALL, "table.limits_deg=[-180, 185]")
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         moves = [e for e in enroll(s.bench, catalog, "dice", views=6) if isinstance(e, Moved)]
@@ -57,28 +57,28 @@ def test_an_enrollment_on_a_short_cable_stays_within_it_and_sees_all_sides(simul
 
 
 @pytest.mark.parametrize("views", [8, 36])
-def test_the_motion_model_tells_the_time_within_a_tenth(simulated, tmp_path, views):
+def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_path, views):
     s = simulated(*SMALL, seed=3)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         (before,) = dry_run(s.bench, catalog, ["dice"], views=views)
         left = TimeLeft(MotionModel(s.bench.config), before.angles_deg)
-        told = []
+        predicted = []
         for event in enroll(s.bench, catalog, "dice", views=views):
             left.add(event)
             if isinstance(event, Started):
                 assert event.angles_deg == before.angles_deg
                 start_ns = s.bench.clock.now_ns()
             if isinstance(event, Accepted):
-                told.append((s.bench.clock.now_ns(), left.seconds))
+                predicted.append((s.bench.clock.now_ns(), left.seconds))
     end_ns = s.bench.clock.now_ns()
-    took_s = (end_ns - start_ns) * 1e-9
+    duration_s = (end_ns - start_ns) * 1e-9
     assert isinstance(event, Enrolled)
-    assert before.seconds == pytest.approx(took_s, rel=0.1)
-    for now_ns, seconds in told:
+    assert before.seconds == pytest.approx(duration_s, rel=0.1)
+    for now_ns, seconds in predicted:
         assert seconds == pytest.approx((end_ns - now_ns) * 1e-9, rel=0.1, abs=1.5)
 
 
-def test_a_rehearsal_moves_and_stores_nothing_and_says_what_would_happen(simulated, tmp_path):
+def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_path):
     s = simulated(*SMALL)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         list(enroll(s.bench, catalog, "dice", views=4))
@@ -108,7 +108,7 @@ def test_a_rehearsal_moves_and_stores_nothing_and_says_what_would_happen(simulat
     assert dry_run(s.bench, None, ["new"], views=4)[0].action == "enroll"
 
 
-def test_the_model_knows_that_downward_moves_take_longer():
+def test_downward_moves_take_longer():
     model = MotionModel(load_config())
     assert model.move_s(-90) > model.move_s(90) > model.move_s(10)
     assert model.enrollment_s(0.0, ()) == 0.0

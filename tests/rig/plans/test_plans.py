@@ -1,4 +1,4 @@
-"""The plans end to end: real drivers, simulated wires, a catalog on disk."""
+"""The plans end to end: real drivers, simulated buses, a catalog on disk."""
 
 import json
 
@@ -27,6 +27,13 @@ from sim.objects.shelf import shelf
 from sim.world import World
 
 VIEWS = 18
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+
+
+@pytest.fixture
+def simulated(simulated):
+    """Return a function that opens a simulated bench with small images, which are computed faster."""
+    return lambda *settings, **options: simulated(*SMALL, *settings, **options)
 
 
 @pytest.fixture
@@ -37,7 +44,7 @@ def catalog(tmp_path, simulated):
 
 
 def torque(s) -> int:
-    """Return what the simulated servo's register says."""
+    """Return the torque register of the simulated servo."""
     return s.bench.servo._read("Torque Enable")
 
 
@@ -66,7 +73,7 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
     assert torque(s) == 0
 
 
-def test_a_view_is_durable_before_the_table_turns_on(simulated, catalog):
+def test_each_view_is_stored_before_the_table_rotates_on(simulated, catalog):
     s = simulated()
     stored = 0
     for event in enroll(s.bench, catalog, "dice", views=6):
@@ -77,7 +84,7 @@ def test_a_view_is_durable_before_the_table_turns_on(simulated, catalog):
             assert len(catalog.resumable("dice").present) == stored
 
 
-def test_an_interrupted_enrollment_keeps_its_views_and_resumes_with_the_others(simulated, catalog):
+def test_interrupted_enrollment_keeps_its_views_and_resume_takes_the_missing_ones(simulated, catalog):
     s = simulated()
     plan = enroll(s.bench, catalog, "lamp", views=6)
     for event in plan:
@@ -93,7 +100,7 @@ def test_an_interrupted_enrollment_keeps_its_views_and_resumes_with_the_others(s
     assert catalog.object("lamp").summary.views == 6
 
 
-def test_an_enrolled_object_is_replaced_only_on_request(simulated, catalog):
+def test_enrolled_object_is_replaced_only_on_request(simulated, catalog):
     s = simulated()
     list(enroll(s.bench, catalog, "dice", views=4))
     with pytest.raises(ObjectExists):
@@ -102,8 +109,8 @@ def test_an_enrolled_object_is_replaced_only_on_request(simulated, catalog):
     assert catalog.object("dice").summary.views == 5
 
 
-def test_what_a_view_was_taken_under_is_kept_with_it(simulated, catalog):
-    """Also on a bench without a noise model: the calibration in force, the camera's settings, what opening it found."""
+def test_conditions_of_a_view_are_stored_with_it(simulated, catalog):
+    """The conditions are the calibration in force, the camera settings, and the findings of opening the bench."""
     s = simulated("imu.scale=1.007")
     list(enroll(s.bench, catalog, "dice", views=4))
     provenance = catalog.object("dice").views[0].session.provenance
@@ -114,7 +121,7 @@ def test_what_a_view_was_taken_under_is_kept_with_it(simulated, catalog):
     assert provenance.devices["servo"]["model"] == "xl430_w250"
 
 
-def test_a_dark_moment_costs_retakes_and_darkness_ends_the_enrollment_without_losing_views(simulated, catalog):
+def test_darkness_causes_retakes_and_ends_the_enrollment_without_losing_views(simulated, catalog):
     s = simulated()
     events = []
     with pytest.raises(ViewRejected, match="too dark") as caught:
@@ -128,7 +135,7 @@ def test_a_dark_moment_costs_retakes_and_darkness_ends_the_enrollment_without_lo
     assert torque(s) == 0
 
 
-def test_a_slipping_platter_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
+def test_slipping_platter_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
     s = simulated()
     with pytest.raises(RotationDisagreement) as caught:
         for event in enroll(s.bench, catalog, "lamp", views=18):
@@ -138,7 +145,7 @@ def test_a_slipping_platter_ends_the_enrollment_before_a_wrong_angle_is_stored(s
     assert catalog.resumable("lamp").present == (0, 1, 2, 3)
 
 
-def test_a_pulled_servo_cable_ends_the_plan_with_everything_kept(simulated, catalog):
+def test_unplugged_servo_ends_the_plan_with_all_views_stored(simulated, catalog):
     s = simulated()
     with pytest.raises(DeviceSilent):
         for event in enroll(s.bench, catalog, "lamp", views=8):
@@ -146,10 +153,10 @@ def test_a_pulled_servo_cable_ends_the_plan_with_everything_kept(simulated, cata
                 s.bench.servo.bus.port.ser.unplug()
     assert catalog.resumable("lamp").present == (0, 1, 2)
     with pytest.raises(DeviceSilent):
-        s.bench.close()  # says that the torque could not be taken off, and lets go of the other devices
+        s.bench.close()  # reports that the torque is still on, and closes the other devices
 
 
-def test_torque_that_could_not_be_taken_off_is_noted_on_the_first_error(simulated):
+def test_torque_that_stays_on_is_noted_on_the_first_error(simulated):
     s = simulated()
     with pytest.raises(KeyboardInterrupt) as caught, s.bench:
         s.bench.servo.bus.port.ser.unplug()
@@ -158,7 +165,7 @@ def test_torque_that_could_not_be_taken_off_is_noted_on_the_first_error(simulate
 
 
 def servo_of(s):
-    """Return the simulated servo behind a bench."""
+    """Return the simulated servo of a bench."""
     return s.bench.servo.bus.port.ser._bus._devices[0]
 
 
@@ -168,23 +175,21 @@ def i2c_of(s):
 
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize(
-    ("trouble", "error"),
+    ("fail", "error"),
     [
         pytest.param(lambda s: i2c_of(s).detach(0x68), DeviceSilent, id="unplugged"),
         pytest.param(lambda s: i2c_of(s)._devices[0x68].power_cycle(), DeviceFault, id="power-cycled"),
         pytest.param(lambda s: setattr(i2c_of(s), "stuck", True), DeviceSilent, id="bus stuck"),
     ],
 )
-def test_a_gyro_that_fails_ends_the_plan_with_the_table_stopped_and_without_torque(
-    simulated, catalog, trouble, error, moving
-):
+def test_failing_gyro_ends_the_plan_with_the_table_stopped_and_torque_off(simulated, catalog, fail, error, moving):
     s = simulated()
     with pytest.raises(error):
         for event in enroll(s.bench, catalog, "lamp", views=8):
             if moving and isinstance(event, Accepted) and event.index == 2:
-                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: trouble(s))
+                s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: fail(s))
             if not moving and isinstance(event, Moved) and event.index == 3:
-                trouble(s)
+                fail(s)
     assert catalog.resumable("lamp").present == (0, 1, 2)
     assert torque(s) == 0
     s.world.clock.sleep(1.0)
@@ -192,7 +197,7 @@ def test_a_gyro_that_fails_ends_the_plan_with_the_table_stopped_and_without_torq
 
 
 @pytest.mark.parametrize("moving", [True, False])
-def test_a_dip_of_the_servos_supply_ends_the_plan_and_nothing_moves_afterwards(simulated, catalog, moving):
+def test_supply_dip_of_the_servo_ends_the_plan_and_nothing_moves_afterwards(simulated, catalog, moving):
     s = simulated()
     with pytest.raises(RigError) as caught:
         for event in enroll(s.bench, catalog, "lamp", views=8):
@@ -211,7 +216,7 @@ def test_a_dip_of_the_servos_supply_ends_the_plan_and_nothing_moves_afterwards(s
 
 @pytest.mark.parametrize("kind", [Started, Moved, Rejected, Accepted])
 @pytest.mark.parametrize("end", ["closed", "forgotten"])
-def test_a_plan_that_is_left_at_any_event_leaves_no_torque(simulated, catalog, kind, end):
+def test_plan_that_is_closed_at_any_event_switches_the_torque_off(simulated, catalog, kind, end):
     s = simulated()
     if kind is Rejected:
         s.world.change(light=(0.0, 0.0, 0.0))
@@ -223,7 +228,7 @@ def test_a_plan_that_is_left_at_any_event_leaves_no_torque(simulated, catalog, k
     assert torque(s) == 0
 
 
-def test_a_plan_that_outlives_its_bench_ends_quietly(simulated, catalog):
+def test_plan_can_be_closed_after_its_bench(simulated, catalog):
     s = simulated()
     plan = enroll(s.bench, catalog, "lamp", views=4)
     assert any(isinstance(event, Accepted) for event in plan)
@@ -232,7 +237,7 @@ def test_a_plan_that_outlives_its_bench_ends_quietly(simulated, catalog):
     plan.close()
 
 
-def test_a_blow_beyond_the_gyros_range_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
+def test_rotation_beyond_the_gyro_range_ends_the_enrollment_before_a_wrong_angle_is_stored(simulated, catalog):
     s = simulated()
     with pytest.raises(RotationDisagreement, match="not known"):
         for event in enroll(s.bench, catalog, "dice", views=6):
@@ -241,7 +246,7 @@ def test_a_blow_beyond_the_gyros_range_ends_the_enrollment_before_a_wrong_angle_
     assert catalog.resumable("dice").present == (0, 1, 2)
 
 
-def test_events_can_be_told_in_json_although_the_gyro_knows_nothing(simulated, catalog):
+def test_events_are_valid_json_without_gyro_values(simulated, catalog):
     s = simulated()
     rejected = []
     for event in enroll(s.bench, catalog, "dice", views=4):
@@ -257,7 +262,7 @@ def test_events_can_be_told_in_json_although_the_gyro_knows_nothing(simulated, c
 def three_enrolled(tmp_path_factory):
     operator = ShelfOperator(World(seed=9), shelf())
     with (
-        open_sim_bench(load_config(), operator) as bench,
+        open_sim_bench(load_config(None, SMALL), operator) as bench,
         Catalog.open(tmp_path_factory.mktemp("three"), clock=bench.clock) as catalog,
     ):
         for name in ("mug-dots", "lamp", "toy-car"):
@@ -270,9 +275,9 @@ def shelf_of_three(simulated, three_enrolled):
     return simulated(seed=10), three_enrolled
 
 
-def test_an_unknown_yaw_is_found_with_the_right_pose_by_physical_rotations(shelf_of_three):
+def test_object_in_any_orientation_is_found_with_the_right_pose(shelf_of_three):
     s, index = shelf_of_three
-    s.operator.next_object, s.operator.yaw_deg = "toy-car", 77.0  # the lamp looks alike all around
+    s.operator.next_object, s.operator.yaw_deg = "toy-car", 77.0  # the lamp looks the same from everywhere
     events = list(identify(s.bench, index))
     answer = events[-1]
     assert isinstance(answer, Identified)
@@ -283,14 +288,14 @@ def test_an_unknown_yaw_is_found_with_the_right_pose_by_physical_rotations(shelf
     assert len(moves) == answer.views == len(decisions) + 1
     for decided, move in zip(decisions, moves[1:], strict=True):
         assert move.commanded_deg == pytest.approx(decided.target_deg)
-        # The camera goes around the object as the table turns under it, backwards; whole turns are the cable's.
+        # The camera moves around the object against the table's rotation; whole revolutions unwind the cable.
         assert wrap180(move.rotation_encoder_deg + decided.rotation_deg) == pytest.approx(0, abs=0.5)
         assert move.rotation_imu_deg == pytest.approx(move.rotation_encoder_deg, abs=4 * move.imu_sigma_deg + 0.3)
     assert answer.travelled_deg == pytest.approx(sum(abs(m.rotation_encoder_deg) for m in moves))
     assert torque(s) == 0
 
 
-def test_every_ranking_follows_from_the_frames_that_were_seen(shelf_of_three):
+def test_each_ranking_follows_from_the_accepted_images(shelf_of_three):
     s, index = shelf_of_three
     s.operator.next_object = "lamp"
     x, y, width, height = s.bench.config.view.roi
@@ -306,7 +311,7 @@ def test_every_ranking_follows_from_the_frames_that_were_seen(shelf_of_three):
             assert event.margin == pytest.approx(hbr.score_margin(again, np.array(queries)) / len(queries), abs=1e-3)
 
 
-def test_what_was_never_enrolled_is_unknown_and_only_after_all_views(shelf_of_three):
+def test_object_that_is_not_enrolled_is_unknown_after_all_views(shelf_of_three):
     s, index = shelf_of_three
     s.operator.next_object = "radio"
     answer = list(identify(s.bench, index))[-1]
@@ -315,7 +320,7 @@ def test_what_was_never_enrolled_is_unknown_and_only_after_all_views(shelf_of_th
     assert answer.candidates
 
 
-def test_the_cable_is_unwound_when_a_decision_would_leave_the_limits(simulated, shelf_of_three):
+def test_cable_is_unwound_when_a_decision_would_leave_the_limits(simulated, shelf_of_three):
     _, index = shelf_of_three
     s = simulated("table.limits_deg=[-180, 185]", "identify.margin=1", "identify.max_views=6", seed=2)
     s.operator.next_object = "lamp"
@@ -325,7 +330,7 @@ def test_the_cable_is_unwound_when_a_decision_would_leave_the_limits(simulated, 
     assert -181 <= s.world.shaft()[0] <= 186
 
 
-def test_during_an_identification_the_gyro_is_believed_when_the_platter_slips_a_little(shelf_of_three):
+def test_identification_uses_the_gyro_when_the_platter_slips_a_little(shelf_of_three):
     s, index = shelf_of_three
     s.operator.next_object, s.operator.yaw_deg = "toy-car", 10.0
     moves = []
@@ -340,7 +345,7 @@ def test_during_an_identification_the_gyro_is_believed_when_the_platter_slips_a_
     assert off_deg == pytest.approx(0, abs=4 * moves[1].imu_sigma_deg)
 
 
-def test_a_loose_platter_ends_an_identification_in_the_middle_of_the_move(shelf_of_three):
+def test_loose_platter_ends_an_identification_during_the_move(shelf_of_three):
     s, index = shelf_of_three
     s.operator.next_object = "toy-car"
     with pytest.raises(RotationDisagreement, match="so far"):
@@ -351,24 +356,24 @@ def test_a_loose_platter_ends_an_identification_in_the_middle_of_the_move(shelf_
     assert torque(s) == 0
 
 
-def test_an_empty_catalog_is_said_before_anything_moves(simulated):
+def test_empty_catalog_is_reported_before_anything_moves(simulated):
     s = simulated()
     with pytest.raises(CatalogError, match="empty"):
         next(identify(s.bench, hbr.ViewIndex(hbr.Views.empty())))
 
 
-def test_equal_seeds_give_equal_events_and_other_seeds_do_not(simulated, tmp_path):
+def test_events_depend_on_nothing_but_the_seed(simulated, tmp_path):
     def run(seed: int, folder: str) -> list[dict]:
         s = simulated(seed=seed)
         with Catalog.open(tmp_path / folder, clock=s.bench.clock) as catalog:
-            told = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=6)]
-            return told + [event_dict(e) for e in identify(s.bench, hbr.ViewIndex(catalog.views().views))]
+            events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=6)]
+            return events + [event_dict(e) for e in identify(s.bench, hbr.ViewIndex(catalog.views().views))]
 
     assert run(5, "a") == run(5, "b")
     assert run(5, "c") != run(6, "d")
 
 
-def test_a_mistyped_name_leaves_nothing_in_the_catalog(simulated, catalog):
+def test_mistyped_name_leaves_nothing_in_the_catalog(simulated, catalog):
     s = simulated()
     plan = enroll(s.bench, catalog, "nonsense", views=6)
     with pytest.raises(ObjectNotFound):
@@ -380,13 +385,13 @@ def test_a_mistyped_name_leaves_nothing_in_the_catalog(simulated, catalog):
     assert [o.name for o in catalog.objects()] == ["dice"]
 
 
-def test_the_cable_is_left_unwound(simulated, catalog):
+def test_enrollment_ends_with_the_cable_unwound(simulated, catalog):
     s = simulated()
     list(enroll(s.bench, catalog, "dice", views=6))
     assert s.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
 
 
-def test_an_enrollment_killed_between_its_last_view_and_its_end_is_finished_by_resume(simulated, catalog):
+def test_resume_finishes_an_enrollment_that_has_all_its_views(simulated, catalog):
     s = simulated()
     plan = enroll(s.bench, catalog, "dice", views=4)
     for event in plan:
@@ -399,7 +404,7 @@ def test_an_enrollment_killed_between_its_last_view_and_its_end_is_finished_by_r
     assert catalog.object("dice").summary.views == 4
 
 
-def test_the_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, catalog):
+def test_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, catalog):
     s = simulated()
     list(enroll(s.bench, catalog, "dice", views=4))
     old_ids = set(catalog.views().view_ids.tolist())
@@ -410,7 +415,7 @@ def test_the_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, ca
             break
         assert set(catalog.views().view_ids.tolist()) == old_ids
         if isinstance(event, Accepted) and event.index == 3:
-            again.close()  # a pulled plug changes nothing about that
+            again.close()  # an interruption does not change that
     assert set(catalog.views().view_ids.tolist()) == old_ids
     list(enroll(s.bench, catalog, "dice", resume=True))
     new_ids = set(catalog.views().view_ids.tolist())

@@ -1,4 +1,4 @@
-"""A tray of objects: its list, and who is asked what."""
+"""The list of a tray, and the decisions of its operator."""
 
 import csv
 import io
@@ -31,7 +31,7 @@ def mistakes(tmp_path, text):
     return caught.value.evidence["mistakes"]
 
 
-def test_a_list_as_spreadsheets_write_it(tmp_path):
+def test_lists_of_spreadsheets_are_read(tmp_path):
     expected = (TrayItem(2, "mug", "kitchen", "white, chipped"), TrayItem(4, "lamp", "", "", 12))
     comma = 'name,label,note,views\nmug,kitchen,"white, chipped",\n\nlamp,,,12\n'
     assert read_tray(written(tmp_path, comma)) == expected
@@ -45,7 +45,7 @@ def test_a_list_as_spreadsheets_write_it(tmp_path):
     texts=st.lists(st.tuples(TEXT, TEXT), min_size=8, max_size=8),
     separator=st.sampled_from(",;"),
 )
-def test_whatever_a_csv_writer_wrote_is_read_back(tmp_path_factory, names, texts, separator):
+def test_list_of_a_csv_writer_is_read_back(tmp_path_factory, names, texts, separator):
     buffer = io.StringIO()
     writer = csv.writer(buffer, delimiter=separator)
     writer.writerow(["note", "name", "label"])
@@ -58,20 +58,20 @@ def test_whatever_a_csv_writer_wrote_is_read_back(tmp_path_factory, names, texts
 @given(
     st.binary(max_size=200) | st.text(string.printable, max_size=200).map(lambda text: f"name,note\n{text}".encode())
 )
-def test_garbage_is_refused_in_words_or_read(tmp_path_factory, content):
-    refused = None
+def test_random_content_is_read_or_rejected_with_a_message(tmp_path_factory, content):
+    rejected = None
     try:
         items = read_tray(written(tmp_path_factory.mktemp("tray"), content))
     except UsageError as error:
-        refused = error
-    if refused is None:
+        rejected = error
+    if rejected is None:
         assert items
         assert len({item.name for item in items}) == len(items)
     else:
-        assert refused.evidence["mistakes"]
+        assert rejected.evidence["mistakes"]
 
 
-def test_every_mistake_is_told_with_its_line(tmp_path):
+def test_every_mistake_is_reported_with_its_line(tmp_path):
     found = mistakes(tmp_path, "name,label,views\nmug,a\n,b\nlamp,c,three\nmug,d\nx,y,4,z\nbo\x07ok,e\n")
     assert [mistake.split(":")[0] for mistake in found] == ["line 3", "line 4", "line 6", "line 7", "line 2", "line 5"]
     assert "'three'" in found[1]
@@ -91,17 +91,17 @@ def test_every_mistake_is_told_with_its_line(tmp_path):
         ("name,views\nmug,3\n", "from 4 to 720"),
     ],
 )
-def test_a_list_that_cannot_be_used(tmp_path, text, words):
+def test_unusable_lists_are_rejected(tmp_path, text, words):
     assert words in " ".join(mistakes(tmp_path, text))
 
 
-def test_a_list_that_is_not_there(tmp_path):
+def test_missing_list_is_rejected(tmp_path):
     with pytest.raises(UsageError, match="cannot be read"):
         read_tray(tmp_path / "nothing.csv")
 
 
 class Scripted:
-    """An operator with answers ready."""
+    """An operator with prepared decisions."""
 
     def __init__(self, bring=(), trouble=()):
         self._bring, self._trouble = list(bring), list(trouble)
@@ -143,10 +143,10 @@ def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, ca
     s = simulated(*SMALL)
     list(enroll(s.bench, catalog, "dice", views=4))
     interrupted(s, catalog, "lamp")
-    person = Scripted()
-    events = list(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"), views=4, operator=person))
+    operator = Scripted()
+    events = list(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"), views=4, operator=operator))
     assert actions(events) == [("dice", "skip"), ("lamp", "resume"), ("clock", "enroll")]
-    assert person.brought == [("lamp", 2, 3, 2), ("clock", 3, 3, None)]
+    assert operator.brought == [("lamp", 2, 3, 2), ("clock", 3, 3, None)]
     assert [e.name for e in events if isinstance(e, Enrolled)] == ["lamp", "clock"]
     assert actions(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"))) == [
         ("dice", "skip"),
@@ -155,7 +155,7 @@ def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, ca
     ]
 
 
-def test_an_interrupted_object_that_was_moved_is_enrolled_anew(simulated, catalog):
+def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog):
     s = simulated(*SMALL)
     interrupted(s, catalog, "lamp")
     events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, operator=Scripted([TrayDecision.RESTART])))
@@ -164,15 +164,15 @@ def test_an_interrupted_object_that_was_moved_is_enrolled_anew(simulated, catalo
     assert len({view.session.id for view in catalog.object("lamp").views}) == 1
 
 
-def test_somebody_may_leave_objects_out_or_stop(simulated, catalog):
+def test_operator_can_skip_objects_or_stop(simulated, catalog):
     s = simulated(*SMALL)
-    person = Scripted([TrayDecision.SKIP, TrayDecision.PROCEED, TrayDecision.STOP])
-    events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, operator=person))
+    operator = Scripted([TrayDecision.SKIP, TrayDecision.PROCEED, TrayDecision.STOP])
+    events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, operator=operator))
     assert actions(events) == [("lamp", "skip"), ("dice", "enroll")]
     assert [o.name for o in catalog.objects()] == ["dice"]
 
 
-def test_an_object_in_the_dark_is_tried_again_with_the_views_it_has(simulated, catalog):
+def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, catalog):
     s = simulated(*SMALL)
     s.world.change(light=(0.0, 0.0, 0.0))
 
@@ -181,24 +181,24 @@ def test_an_object_in_the_dark_is_tried_again_with_the_views_it_has(simulated, c
             s.world.change(light=(1.0, 1.0, 1.0))
             return super().decide_after_error(item, error)
 
-    person = Lights(trouble=[TrayDecision.PROCEED])
-    events = list(enroll_tray(s.bench, catalog, items("dice"), views=4, operator=person))
-    assert person.troubles == [("dice", ViewRejected)]
+    operator = Lights(trouble=[TrayDecision.PROCEED])
+    events = list(enroll_tray(s.bench, catalog, items("dice"), views=4, operator=operator))
+    assert operator.troubles == [("dice", ViewRejected)]
     assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
     assert catalog.object("dice").summary.views == 4
 
 
-def test_an_object_that_fails_is_left_out_or_ends_the_tray(simulated, catalog):
+def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
     s = simulated(*SMALL)
-    person = Scripted(trouble=[TrayDecision.SKIP])
-    events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, operator=person))
+    operator = Scripted(trouble=[TrayDecision.SKIP])
+    events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, operator=operator))
     assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
     with pytest.raises(ObjectNotFound):
         list(enroll_tray(s.bench, catalog, items("nonsense"), views=4))
     assert {ViewRejected, RotationDisagreement, ObjectNotFound} == set(OBJECT_ERRORS)
 
 
-def test_the_lists_views_label_and_note_win(simulated, catalog):
+def test_views_label_and_note_of_the_list_are_used(simulated, catalog):
     s = simulated(*SMALL)
     tray = [TrayItem(2, "dice", "toys", "loaded", 5), TrayItem(3, "lamp")]
     list(enroll_tray(s.bench, catalog, tray, views=4))
