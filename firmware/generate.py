@@ -158,7 +158,7 @@ def module(table: Table) -> str:
         names = [camel(m["name"]) for m in table["message"] if m["from"] == direction]
         lines += ["", "", f"{title} = {' | '.join(names)}"][direction == "head" :]
     lines += ["", "MESSAGES: dict[int, type[Request] | type[Answer]] = {"]
-    lines += ["    kind.ID: kind for kind in (*get_args(Request), *get_args(Answer))", "}"]
+    lines += ["    message.ID: message for message in (*get_args(Request), *get_args(Answer))", "}"]
     lines += ["", "REPLIES: dict[type[Request], type[Answer]] = {"]
     lines += [f"    {camel(m['name'])}: {camel(m['reply'])}," for m in table["message"] if m["from"] == "host"]
     return "\n".join([*lines, "}", '"""The answer to a request that was not refused."""', ""])

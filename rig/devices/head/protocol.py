@@ -324,7 +324,9 @@ Request = Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger |
 
 Answer = Done | Identity | HeartbeatReply | Triggered | Counters | Sample | StatusChanged
 
-MESSAGES: dict[int, type[Request] | type[Answer]] = {kind.ID: kind for kind in (*get_args(Request), *get_args(Answer))}
+MESSAGES: dict[int, type[Request] | type[Answer]] = {
+    message.ID: message for message in (*get_args(Request), *get_args(Answer))
+}
 
 REPLIES: dict[type[Request], type[Answer]] = {
     Hello: Identity,
