@@ -1,1 +1,1 @@
-"""Speed, as ratios against named peers measured in the same run."""
+"""Benchmarks: times as ratios to a peer that is measured in the same run."""

@@ -1,7 +1,8 @@
-"""CEDD against OpenCV shrinking the same frame to 80 x 80, one thread.
+"""Time of CEDD, compared with OpenCV's resize of the same frame to 80 x 80, in one thread.
 
-Where the mean luminance of a quarter of a block is a whole number, its pixels are added up one by one, as rounding has
-it: in a grey frame of n pixels a quarter one of n, in a flat one and in noise in multiples of 48 all of them.
+If the mean luminance of a quarter of a block is an integer, CEDD adds its pixels one by one to reproduce the rounding.
+That happens for one of n quarters of n pixels in grey frames, and for all quarters of flat frames and of noise in
+multiples of 48.
 """
 
 import statistics
@@ -18,7 +19,7 @@ REPEATS = 300
 
 
 def frame(width: int, height: int) -> ImageArray:
-    """A textured, coloured scene with sensor noise on a plain background."""
+    """Return a textured, coloured scene with sensor noise on a plain background."""
     rng = np.random.default_rng(0)
     scene = cv2.resize(
         rng.integers(0, 256, (12, 16, 3), dtype=np.uint8), (width, height), interpolation=cv2.INTER_CUBIC
@@ -29,7 +30,7 @@ def frame(width: int, height: int) -> ImageArray:
 
 
 def microseconds(function: Callable[[], object]) -> tuple[float, float]:
-    """Minimum and median of a call."""
+    """Return minimum and median of the time of a call."""
     function()
     times = timeit.repeat(function, number=1, repeat=REPEATS)
     return min(times) * 1e6, statistics.median(times) * 1e6

@@ -1,7 +1,6 @@
-"""A step of the dense filter against one of AHBR, and every descriptor against plain CEDD, each in the same run.
+"""Time of a step of the dense filter, compared with AHBR, and of every descriptor, compared with plain CEDD.
 
-Times are the processor's, minimum and median; a ratio is of minima, for whatever else the machine does takes the caches
-from both.
+Times are processor times, minimum and median. Ratios are ratios of minima, because other programs disturb the caches.
 """
 
 import argparse
@@ -32,13 +31,13 @@ from hbr.dense.filter import Belief
 from hbr.descriptors import names
 from hbr.evaluation.scenes import plain_bench
 
-#: The views that a search has seen, as places on an object's ring of 72.
+#: The views of a search, as positions on an object's ring of 72.
 SEEN = (0, 18, 30, 45, 60, 66, 9, 51)
 REPEATS = 40
 
 
 def milliseconds(function: Callable[[int], object], repeats: int) -> list[float]:
-    """What each call takes."""
+    """Return the time of each call."""
     function(0)
     return [
         timeit.timeit(lambda i=i: function(i), timer=process_time, number=1) * 1e3  # type: ignore[misc]
@@ -52,7 +51,7 @@ def row(size: object, call: str, took_ms: list[float], peer_ms: list[float]) -> 
 
 
 def of_kind(views: Views, kind: str) -> Views:
-    """The same objects by another descriptor: levels that change slowly around each."""
+    """Return the same objects with another descriptor, whose levels change slowly around each object."""
     if kind == views.descriptor:
         return views
     rng = np.random.default_rng(5)
@@ -62,7 +61,7 @@ def of_kind(views: Views, kind: str) -> Views:
 
 
 def bench_step(objects: int) -> None:
-    """The 2nd and the 8th step of a search, lists and beliefs of the views before known."""
+    """Measure the 2nd and the 8th step of a search; lists and beliefs of the views before are known."""
     cedd = model(objects)
     chosen = np.random.default_rng(3).integers(objects, size=REPEATS)
     index = ViewIndex(cedd)
@@ -82,7 +81,7 @@ def bench_step(objects: int) -> None:
                 dense[kind].append(_step_ms(views, indices[kind], views.of(j)[list(SEEN[:n])]))
         row(len(cedd), f"AHBR, step {n} (= 1)", ahbr, ahbr)
         for kind, took in dense.items():
-            row(len(cedd), f"dense filter and next look by {kind}, step {n}", took, ahbr)
+            row(len(cedd), f"dense filter and next best view by {kind}, step {n}", took, ahbr)
 
 
 def _step_ms(views: Views, index: DenseIndex, rows: IndexArray) -> float:
@@ -97,16 +96,16 @@ def _step_ms(views: Views, index: DenseIndex, rows: IndexArray) -> float:
 
 
 def bench_describe(name: str, frame: ImageArray, empty: ImageArray | None) -> None:
-    """Finding the object, and each descriptor of it."""
+    """Measure the segmentation, and each descriptor of the object."""
     background = None if empty is None else Background(empty)
     plain = milliseconds(lambda _: descriptor("cedd").describe(frame), REPEATS)
     row(name, "cedd of the whole frame (= 1)", plain, plain)
     found = milliseconds(lambda _: segment(frame, empty_table=background), REPEATS)
-    row(name, "find the object and its light", found, plain)
+    row(name, "segmentation", found, plain)
     seen = segment(frame, empty_table=background)
 
     def describe(kind: str) -> object:
-        seen.__dict__.pop("alone", None)  # each has to make it anew
+        seen.__dict__.pop("alone", None)  # each call has to compute it again
         return descriptor(kind).describe(seen)
 
     for kind in names()[1:]:
@@ -122,14 +121,14 @@ def main() -> None:
         bench_step(objects)
     table = np.clip(plain_bench(np.random.default_rng(0)), 0, 255).astype(np.uint8)
     rng = np.random.default_rng(1)
-    thing = table.copy()
-    thing[60:190, 120:200] = cv2.resize(rng.integers(0, 256, (6, 4, 3), np.uint8), (80, 130))
+    scene = table.copy()
+    scene[60:190, 120:200] = cv2.resize(rng.integers(0, 256, (6, 4, 3), np.uint8), (80, 130))
     print(f"{'frame':>7} {'call':<58} {'min ms':>8} {'median ms':>10} {'ratio':>6}")
     for width in (320, 640):
         size = width, width * 3 // 4
-        bench_describe(f"{width}", *(cv2.resize(picture, size).astype(np.uint8) for picture in (thing, table)))
+        bench_describe(f"{width}", *(cv2.resize(image, size).astype(np.uint8) for image in (scene, table)))
     black = np.full((128, 128, 3), 20, np.uint8)
-    black[10:118, 30:98] = cv2.resize(thing[60:190, 120:200], (68, 108))
+    black[10:118, 30:98] = cv2.resize(scene[60:190, 120:200], (68, 108))
     bench_describe("128", black, None)
 
 

@@ -1,4 +1,4 @@
-"""How many frames a second the simulated camera draws, with noise, object by object, on one core.
+"""Frame rate of the simulated camera with noise, for each object, on one core.
 
 Run: OPENBLAS_NUM_THREADS=1 python benchmarks/bench_render.py
 """
@@ -16,7 +16,7 @@ REPEATS, FRAMES = 5, 8
 
 
 def best_ms(capture: SimCapture) -> float:
-    """Return the time of one frame in milliseconds: the fastest of several runs, others disturb one shared machine."""
+    """Return the time of one frame in milliseconds: the minimum, because other programs disturb the measurement."""
     return min(timeit.repeat(capture.read, number=FRAMES, repeat=REPEATS)) / FRAMES * 1e3
 
 
@@ -28,8 +28,8 @@ def main() -> None:
     capture.set(cv2.CAP_PROP_AUTO_WB, 0)
     print(f"{'empty platter':18s} {best_ms(capture):6.2f} ms")
     times = []
-    for name, thing in shelf().items():
-        world.put(thing, 33.0, (1.2, -0.7))
+    for name, item in shelf().items():
+        world.put(item, 33.0, (1.2, -0.7))
         first = timeit.timeit(capture.read, number=1) * 1e3
         times.append(best_ms(capture))
         print(f"{name:18s} {times[-1]:6.2f} ms {1000 / times[-1]:6.0f} frames/s, the first frame {first:.0f} ms")

@@ -1,4 +1,4 @@
-"""Exact Tanimoto search and a whole retrieval step, against one float32 product of a query in the same run."""
+"""Time of the exact Tanimoto search and of a retrieval step, compared with one float32 product of a query."""
 
 import argparse
 import statistics
@@ -18,7 +18,7 @@ K = 10
 
 
 def model(objects: int) -> Views:
-    """CEDD-like views: sparse, skewed levels that change slowly around each object."""
+    """Return views like those of CEDD: sparse, skewed levels that change slowly around each object."""
     rng = np.random.default_rng(0)
     shape = (objects, 1, 144)
     used = rng.random(shape) < 0.12
@@ -39,7 +39,7 @@ def model(objects: int) -> Views:
 
 
 def queries_of(views: Views, rows: IndexArray, seed: int) -> LevelArray:
-    """Views with some bins off by a level, as noise in the image makes them."""
+    """Return views with some bins changed by one level, like image noise does."""
     rng = np.random.default_rng(seed)
     shape = (len(rows), 144)
     off = (rng.random(shape) < 0.1) * rng.integers(-1, 2, shape)
@@ -47,13 +47,13 @@ def queries_of(views: Views, rows: IndexArray, seed: int) -> LevelArray:
 
 
 def milliseconds(function: Callable[[int], object], repeats: int) -> float:
-    """Median of a call, over different arguments."""
+    """Return the median time of a call, over different arguments."""
     function(0)
     return statistics.median(timeit.timeit(lambda i=i: function(i), number=1) for i in range(repeats)) * 1e3  # type: ignore[misc]
 
 
 def product_ms(views: Views, queries: LevelArray, repeats: int) -> tuple[float, float]:
-    """Time of one float32 product of a query with all views, alone and as a whole search for the best."""
+    """Return the time of one float32 product of a query with all views, alone and with the selection of the best."""
     as_float = views.descriptors.astype(np.float32)
     lengths = np.einsum("ij,ij->i", as_float, as_float)
     as_queries = queries.astype(np.float32)
@@ -69,7 +69,7 @@ def product_ms(views: Views, queries: LevelArray, repeats: int) -> tuple[float, 
 
 
 def bench_search(views: Views, methods: Sequence[Method], repeats: int) -> None:
-    """Search by every method: time, build, and the peak of memory beside the descriptors' own."""
+    """Measure search and construction with every method."""
     queries = queries_of(views, np.random.default_rng(1).integers(len(views), size=QUERIES), 2)
     alone, scanned = product_ms(views, queries, repeats)
     print(f"{len(views):>9} {'numpy float32 product alone':<44} {alone:9.3f} {alone / scanned:6.2f}")
@@ -90,7 +90,7 @@ def bench_search(views: Views, methods: Sequence[Method], repeats: int) -> None:
 
 
 def bench_memory(views: Views) -> None:
-    """Peak of numpy's allocations while the default index is built and searched, the descriptors included."""
+    """Measure the peak of NumPy's allocations while the default index is built and searched, with the descriptors."""
     own = views.descriptors.nbytes
     tracemalloc.start()
     index = ViewIndex(views)
@@ -101,7 +101,7 @@ def bench_memory(views: Views) -> None:
 
 
 def bench_adding(views: Views) -> None:
-    """One more object, against building the index anew."""
+    """Measure the addition of one object, compared with the construction of the index."""
     more = Views.of_object("new", views.descriptors[:72], views.azimuth_deg[:72])
     index = ViewIndex(views)
     build = milliseconds(lambda _: ViewIndex(views), 1)
@@ -110,7 +110,7 @@ def bench_adding(views: Views) -> None:
 
 
 def step_ms(views: Views, index: ViewIndex, repeats: int) -> tuple[float, float]:
-    """Median time of a step with 8 queries: after the 7 steps before it, and with no list known."""
+    """Return the median time of a step with 8 queries: after the 7 steps before it, and without known lists."""
     rng = np.random.default_rng(3)
     after, at_once = [], []
     for j in rng.integers(len(views.object_names), size=repeats).tolist():
@@ -129,7 +129,7 @@ def step_ms(views: Views, index: ViewIndex, repeats: int) -> tuple[float, float]
 
 
 def bench_step(views: Views, repeats: int) -> None:
-    """One step of an active search, against one product."""
+    """Measure one step of an active search, compared with one product."""
     alone, _ = product_ms(views, queries_of(views, np.arange(QUERIES), 2), repeats)
     steps = zip(("the 8th step", "8 queries at once"), step_ms(views, ViewIndex(views), repeats), strict=True)
     for name, took in steps:
@@ -137,12 +137,12 @@ def bench_step(views: Views, repeats: int) -> None:
 
 
 def growth(sizes: Sequence[int], times_ms: Sequence[float]) -> float:
-    """The exponent b of time = a * views**b, by least squares of the logarithms."""
+    """Return the exponent b of time = a * views**b, by least squares of the logarithms."""
     return float(np.polyfit(np.log(sizes), np.log(times_ms), 1)[0])
 
 
 def bench_growth(objects: Sequence[int]) -> None:
-    """Time against the number of views, and the order of growth over the larger half."""
+    """Measure the time against the number of views, and the order of growth over the larger half."""
     print(f"\n{'views':>9} {'search ms':>10} {'step ms':>10}")
     sizes, searches, steps = [], [], []
     for count in objects:
@@ -162,7 +162,9 @@ def bench_growth(objects: Sequence[int]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tree", action="store_true", help="the KD-tree at 1,000,000 views too (3 GB of memory)")
+    parser.add_argument(
+        "--tree", action="store_true", help="Also measure the KD-tree with 1,000,000 views (3 GB of memory)."
+    )
     tree = parser.parse_args().tree
     print(f"{'views':>9} {'call':<44} {'median ms':>9} {'ratio':>6}")
     every: tuple[Method, ...] = ("flat", "bound", "kdtree")

@@ -1,7 +1,7 @@
-"""A servo's status read through the rig's driver, as a ratio to the SDK's bare read of the same registers.
+"""Time of reading a servo's status by the rig's driver, compared with the SDK's read of the same registers.
 
-On the in-memory port, where a transaction costs computing and no waiting: with the simulated servo behind it, and
-played back to it from memory, which leaves nothing but driver and SDK. Run: python -m benchmarks.bench_servo
+The port is in memory, so that a transaction needs only processor time: with the simulated servo, and with an answer
+that is repeated from memory, which measures only driver and SDK. Run: python -m benchmarks.bench_servo
 """
 
 import time
@@ -26,8 +26,8 @@ TABLE = control_table("xl430_w250")
 FIRST, SIZE = TABLE["Moving"].address, TABLE["Present Temperature"].address + 1 - TABLE["Moving"].address
 
 
-class PlayedBack(SimSerial):
-    """A simulated port that after `record` gives the last answer again, whatever is asked."""
+class RepeatingSerial(SimSerial):
+    """A simulated port that repeats one answer after `record`."""
 
     def record(self, answer: bytes) -> None:
         self._answer, self._left = answer, b""
@@ -44,7 +44,7 @@ class PlayedBack(SimSerial):
 
 
 def best_us(calls: list[Callable[[], object]]) -> list[float]:
-    """Return the processor time of each call in µs: the best of many rounds in turn, so that all had the same luck."""
+    """Return the processor time of each call in µs: the minimum of many alternating rounds."""
     best = [float("inf")] * len(calls)
     for _ in range(ROUNDS):
         for i, call in enumerate(calls):
@@ -55,12 +55,12 @@ def best_us(calls: list[Callable[[], object]]) -> list[float]:
     return best
 
 
-def opened() -> tuple[RegisterServo, PlayedBack, list[Frame]]:
-    """Return a driver on a simulated servo, its port, and what goes over the line."""
+def opened() -> tuple[RegisterServo, RepeatingSerial, list[Frame]]:
+    """Return a driver of a simulated servo, its port, and the frames on the bus."""
     world = World(noise=NoiseModel.none())
     bus = ServoBus(world.clock)
     bus.attach(XSeriesServo(world, baudrate=BAUD))
-    wire = PlayedBack(bus, BAUD, READ_SLICE_S)
+    wire = RepeatingSerial(bus, BAUD, READ_SLICE_S)
     servo = open_servo(wire, ServoConfig(baud=BAUD), world.clock)
     prepare_servo(servo, write=True)
     frames: list[Frame] = []
@@ -81,19 +81,19 @@ def bare_read(servo: RegisterServo, wire: SimSerial) -> Callable[[], None]:
 
 
 def main() -> None:
-    for name, played in (("simulated servo", False), ("answer played back", True)):
+    for name, repeated in (("simulated servo", False), ("repeated answer", True)):
         servo, wire, frames = opened()
-        if played:
+        if repeated:
             wire.record(next(frame.data for frame in frames if frame.source is Source.DEVICE))
         driver_us, bare_us = best_us([servo.read_state, bare_read(servo, wire)])
         ratio = driver_us / bare_us
-        limit = "" if played else f" (at most {LIMIT})"
+        limit = "" if repeated else f" (at most {LIMIT})"
         print(
             f"status read of {SIZE} bytes, {name}: driver {driver_us:.0f} µs ({1e6 / driver_us:.0f} a second), "
             f"bare SDK {bare_us:.0f} µs ({1e6 / bare_us:.0f} a second): {ratio:.2f} ×{limit}; "
             f"at {LOOP_HZ} Hz {1e-4 * LOOP_HZ * driver_us:.2f} % of a processor, bare {1e-4 * LOOP_HZ * bare_us:.2f} %"
         )
-        assert played or ratio <= LIMIT, f"{ratio:.2f} × the bare SDK's read"
+        assert repeated or ratio <= LIMIT, f"{ratio:.2f} × the bare SDK's read"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""SIFT with ratio test and geometric check, the peer: hit-rate, time and bytes beside a small descriptor, one view."""
+"""Hit rate, time and bytes of SIFT with ratio test and geometric check, compared with a small descriptor; one view."""
 
 import argparse
 from pathlib import Path
@@ -17,36 +17,36 @@ from hbr.evaluation.protocol import views_enrolled
 from hbr.evaluation.statistics import wilson
 
 RATIO = 0.8
-LEAST_MATCHES = 4
+MIN_MATCHES = 4
 ERROR_PX = 4.0
 
 Features = tuple[FloatArray, FloatArray]
 
 
 def features(sift: cv2.SIFT, image: ImageArray) -> Features:
-    """Places and descriptors of the keypoints, in an image twice as large: at 128 pixels SIFT finds few."""
+    """Return positions and descriptors of keypoints in an image of twice the size: at 128 pixels SIFT finds few."""
     large = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     points, found = sift.detectAndCompute(large, None)
     return np.array([point.pt for point in points]).reshape(-1, 2), np.zeros((0, 128)) if found is None else found
 
 
 def inliers(matcher: cv2.BFMatcher, query: Features, enrolled: Features) -> int:
-    """Matches that pass the ratio test and agree on one similarity transform."""
-    if min(len(query[0]), len(enrolled[0])) < LEAST_MATCHES:
+    """Return the number of matches that pass the ratio test and agree with one similarity transform."""
+    if min(len(query[0]), len(enrolled[0])) < MIN_MATCHES:
         return 0
     pairs = matcher.knnMatch(query[1], enrolled[1], k=2)
     good = [first for first, second in pairs if first.distance < RATIO * second.distance]
-    if len(good) < LEAST_MATCHES:
+    if len(good) < MIN_MATCHES:
         return len(good)
     here, there = query[0][[m.queryIdx for m in good]], enrolled[0][[m.trainIdx for m in good]]
     _, kept = cv2.estimateAffinePartial2D(here, there, method=cv2.RANSAC, ransacReprojThreshold=ERROR_PX)
-    return LEAST_MATCHES + int(kept.sum()) if kept is not None else LEAST_MATCHES
+    return MIN_MATCHES + int(kept.sum()) if kept is not None else MIN_MATCHES
 
 
 def chosen(
     dataset: Dataset, views: int, queries: int, seed: int
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Object and photograph of every enrolled view, and of every query."""
+    """Return object and photograph of every enrolled view, and of every query."""
     enrolled, asked = [], []
     for j, item in enumerate(dataset.objects):
         kept = views_enrolled(item.azimuth_deg, views)
@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=2, help="of each object")
     given = parser.parse_args()
     if not given.folder.is_dir():
-        print(f"{given.folder} is not there: no photographs, no comparison with SIFT")
+        print(f"{given.folder} does not exist: the comparison with SIFT needs photographs")
         return
     cv2.setNumThreads(1)
     first, last = map(int, given.objects.split("-"))
@@ -82,21 +82,21 @@ def main() -> None:
     labels = np.array([j for j, _ in enrolled])
     stored = np.mean([places.shape[0] * (128 + 8) for places, _ in known])
     print(
-        f"{len(dataset.objects)} objects, {given.enrolled} views each, {len(asked)} queries; processor time of a query"
+        f"{len(dataset.objects)} objects, {given.enrolled} views each, {len(asked)} queries; processor time per query"
     )
-    print(f"{'noise':<6} {'method':<16} {'hit-rate, % [95 %]':>22} {'bytes a view':>13} {'ms a query':>11}")
+    print(f"{'noise':<6} {'method':<16} {'hit rate, % [95 %]':>22} {'bytes a view':>13} {'ms a query':>11}")
     for noise in ("none", "gn", "mb"):
         condition = Condition(noise=Noise.parse(noise))
         hits, times = np.zeros(2, int), np.zeros(2)
         for j, i in asked:
             image = condition.query(photograph(j, i), generator(0, dataset.objects[j].name, "photograph", i)).image
             cv2.setRNGSeed(0)
-            begun = process_time()
+            start_s = process_time()
             query = features(sift, image)
             counts = [inliers(matcher, query, one) for one in known]
             between = process_time()
             similar = compared.similarity(own.describe(image)[None])[0]
-            times += between - begun, process_time() - between
+            times += between - start_s, process_time() - between
             hits += labels[int(np.argmax(counts))] == j, labels[int(similar.argmax())] == j
         for name, hit, total, size_bytes in zip(
             ("SIFT", own.name), hits.tolist(), times.tolist(), (stored, own.size_bytes), strict=True

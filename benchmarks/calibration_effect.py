@@ -1,16 +1,16 @@
-"""What calibrating is worth: the same objects found on the same faulty benches, before and after.
+"""Effect of calibration: the same objects are identified on the same benches, with and without calibration.
 
 `python -m benchmarks.calibration_effect [--seeds 3] [--first-seed 0] [--level usual] [--orientation encoder]` enrolls
-objects on a simulated bench and finds them again on another one: the same after its camera was knocked, and its servo
-and IMU replaced. Both are as they are, or both were calibrated by `backlash`, `encoder`, `motion_model`, `gyro_scale`,
-`camera_model`, `table_axis` and `repeatability`; worlds, objects and angles are the same. The levels of error are those
-of a bench built with care, of a usual one, and of a poor one, each within the parts' datasheets; a view's angle is that
-of the encoder, or of the gyro alone.
+objects on a simulated bench and identifies them on another one: the same bench with a moved camera, another servo and
+another IMU. Either both are uncalibrated, or both were calibrated by `backlash`, `encoder`, `motion_model`,
+`gyro_scale`, `camera_model`, `table_axis` and `repeatability`. Worlds, objects and angles are the same. The levels of
+error are those of a carefully built bench, of a usual one and of a poor one, all within the datasheets of the parts.
+The angle of a view is that of the encoder, or only that of the gyro.
 
-Prints a table in Markdown: the rate of right answers, of "unknown" for objects that were not enrolled, and of "unknown"
-for those that were, with Wilson's 95 % intervals; how often the angle at which the object is said to stand is right
-within a step of the enrolled views (objects that look alike from several sides are not) and its error then; and how far
-the angles of the views are from the true ones.
+The output is a table in Markdown. It has the rates of correct answers, of "unknown" for unknown objects and of
+"unknown" for enrolled objects, with Wilson's 95 % intervals; the rate of poses that are correct within one step of the
+enrolled views (which fails for objects that look the same from several sides), with their error; and the error of the
+angles of the views.
 """
 
 import argparse
@@ -51,52 +51,63 @@ LEVELS = {
     ),
 }
 OBJECTS, UNKNOWN, TRIALS, VIEWS = 10, 5, 2, 24
+STATES = "uncalibrated", "calibrated"
 OTHER_BENCH = 1000
-"""The seed of the bench on which objects are found is so much above that of the one on which they were enrolled."""
+"""Difference between the seeds of the bench for identification and of the bench for enrollment."""
 
-Told = dict[str, list[float]]
+Figures = dict[str, list[float]]
 
 
-def calibrated_on(bench: Bench, store: CalibrationStore, told: Told, thing: str) -> None:
-    """Calibrate the bench and put in force what passes."""
+def calibrated_on(bench: Bench, store: CalibrationStore, figures: Figures, name: str) -> None:
+    """Calibrate the bench; the results that pass are in force."""
     found: dict[str, CalibrationResult] = {}
-    procedures = (Backlash(), Encoder(), MotionModel(), GyroScale(), CameraModel(), TableAxis(), Repeatability(thing))
+    procedures = (
+        Backlash(),
+        Encoder(),
+        MotionModel(),
+        GyroScale(),
+        CameraModel(),
+        TableAxis(),
+        Repeatability(name),
+    )
     for procedure in procedures:
-        *_, result = procedure.live(bench, *(found[name] for name in procedure.requires))
+        *_, result = procedure.live(bench, *(found[required] for required in procedure.requires))
         assert isinstance(result, CalibrationResult)
         found[result.name] = result
         store.add(result)
-        told[f"refused {result.name}"].append(not result.passed)
+        figures[f"rejected {result.name}"].append(not result.passed)
         calibrate(bench, store)
 
 
-def angles_off(events: Iterator[Any], operator: ShelfOperator, orientation: str) -> list[float]:
-    """Run an enrollment and return how far the angles of its rests are from the true ones, but for where zero is."""
-    off = []
+def angle_errors(events: Iterator[Any], operator: ShelfOperator, orientation: str) -> list[float]:
+    """Run an enrollment and return the errors of the angles of its views, without their mean."""
+    errors = []
     turned_deg = 0.0
     for event in events:
         if isinstance(event, Moved):
             turned_deg += event.rotation_imu_deg or 0.0
             read_deg = event.encoder_deg if orientation == "encoder" else turned_deg
-            off.append(read_deg - operator.world.table_deg())
-    return [float(value) for value in np.array(off) - np.mean(off)]
+            errors.append(read_deg - operator.world.table_deg())
+    return [float(value) for value in np.array(errors) - np.mean(errors)]
 
 
-def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder: Path) -> Told:
-    """Return the figures of one bench and the other: right, unknown and confirmed answers, errors in degrees, views."""
+def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder: Path) -> Figures:
+    """Return the figures of both benches: correct and unknown answers, errors in degrees, numbers of views."""
     objects = shelf()
     names = np.random.default_rng(seed).permutation(sorted(objects))[: OBJECTS + UNKNOWN].tolist()
     config = load_config(None, (f"table.orientation={orientation}",))
-    told: Told = defaultdict(list)
+    figures: Figures = defaultdict(list)
     for bench_seed in (seed, seed + OTHER_BENCH):
         operator = ShelfOperator(World(noise=noise, seed=bench_seed), objects)
         with open_sim_bench(config, operator) as bench:
             if calibrated:
-                calibrated_on(bench, CalibrationStore(folder / f"results {bench_seed}"), told, names[0])
+                calibrated_on(bench, CalibrationStore(folder / f"results {bench_seed}"), figures, names[0])
             with Catalog.open(folder / "catalog", clock=bench.clock, create=bench_seed == seed) as catalog:
                 if bench_seed == seed:
                     for name in names[:OBJECTS]:
-                        told["angle"] += angles_off(enroll(bench, catalog, name, views=VIEWS), operator, orientation)
+                        figures["angle"] += angle_errors(
+                            enroll(bench, catalog, name, views=VIEWS), operator, orientation
+                        )
                     continue
                 index = hbr.ViewIndex(catalog.views().views)
             rng = np.random.default_rng(seed)
@@ -104,24 +115,24 @@ def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder
                 operator.next_object, operator.yaw_deg = name, float(rng.uniform(0, 360))
                 try:
                     *_, answer = identify(bench, index, strategy="ahbr", seed=seed)
-                except RigError:  # e.g. encoder and gyro that do not agree
-                    told["broken off"].append(True)
-                    told["right" if name in names[:OBJECTS] else "unknown"].append(False)
+                except RigError:  # for example, encoder and gyro disagree
+                    figures["stopped"].append(True)
+                    figures["right" if name in names[:OBJECTS] else "unknown"].append(False)
                     continue
                 assert isinstance(answer, Identified)
-                told["views"].append(answer.views)
+                figures["views"].append(answer.views)
                 if name in names[:OBJECTS]:
-                    told["right"].append(answer.name == name)
-                    told["lost"].append(answer.name is None)
+                    figures["right"].append(answer.name == name)
+                    figures["lost"].append(answer.name is None)
                     if answer.name == name:
-                        told["yaw"].append(abs((answer.yaw_deg - operator.yaw_deg + 180) % 360 - 180))
+                        figures["yaw"].append(abs((answer.yaw_deg - operator.yaw_deg + 180) % 360 - 180))
                 else:
-                    told["unknown"].append(answer.name is None)
-    return told
+                    figures["unknown"].append(answer.name is None)
+    return figures
 
 
 def rate(values: list[float]) -> str:
-    """Return hits of trials with Wilson's interval."""
+    """Return the rate of hits with Wilson's interval."""
     hits = int(sum(values))
     low, high = wilson(hits, len(values))
     return f"{hits}/{len(values)} ({100 * low:.0f}–{100 * high:.0f} %)"
@@ -135,28 +146,30 @@ def main() -> None:
     arguments.add_argument("--orientation", choices=("encoder", "imu"), action="append")
     given = arguments.parse_args()
     print(
-        "| errors | angle by | bench | right | unknown recognized | known unknown | pose within 15° | RMSE "
-        "| table's angle, RMS | views |"
+        "| errors | angle by | bench | correct | unknown recognized | enrolled unknown | pose within 15° | RMSE "
+        "| table angle, RMS | views |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for level in given.level or LEVELS:
         for orientation in given.orientation or ("encoder", "imu"):
             for calibrated in (False, True):
-                told: Told = defaultdict(list)
+                figures: Figures = defaultdict(list)
                 for seed in range(given.first_seed, given.first_seed + given.seeds):
                     with TemporaryDirectory() as folder:
                         for key, values in run(seed, LEVELS[level], orientation, calibrated, Path(folder)).items():
-                            told[key] += values
-                near = [error <= 360 / VIEWS for error in told["yaw"]]
-                rms, off = (np.sqrt((np.array(v) ** 2).mean()) for v in (np.array(told["yaw"])[near], told["angle"]))
+                            figures[key] += values
+                near = [error <= 360 / VIEWS for error in figures["yaw"]]
+                rms, off = (
+                    np.sqrt((np.array(v) ** 2).mean()) for v in (np.array(figures["yaw"])[near], figures["angle"])
+                )
                 print(
-                    f"| {level} | {orientation} | {'calibrated' if calibrated else 'as it is'} | {rate(told['right'])} "
-                    f"| {rate(told['unknown'])} | {rate(told['lost'])} | {rate(near)} "
-                    f"| {rms:.1f} ° | {off:.2f} ° | {np.mean(told['views']):.2f} |",
+                    f"| {level} | {orientation} | {STATES[calibrated]} | {rate(figures['right'])} "
+                    f"| {rate(figures['unknown'])} | {rate(figures['lost'])} | {rate(near)} "
+                    f"| {rms:.1f} ° | {off:.2f} ° | {np.mean(figures['views']):.2f} |",
                     flush=True,
                 )
-                for key, values in told.items():
-                    if key.startswith(("refused ", "broken off")) and any(values):
+                for key, values in figures.items():
+                    if key.startswith(("rejected ", "stopped")) and any(values):
                         print(f"| {level} | {key} | {sum(values):.0f}/{len(values)} | | | | | | | |")
 
 

@@ -1,8 +1,8 @@
-"""Whether calibrations keep what they state: true values are drawn, and the estimates compared with them.
+"""Comparison of calibration results and their uncertainties with the true values of simulated benches.
 
 `python -m benchmarks.calibration_truth [--seeds 20] [--first-seed 0] [--only servo.backlash]` prints a table in
 Markdown: for each quantity the median error and uncertainty, the spread of error over uncertainty (1 is honest), and
-the share of 95 % intervals that hold the truth. Each seed's error over uncertainty goes to stderr.
+the share of 95 % intervals that contain the true value. Each seed's error over uncertainty goes to stderr.
 """
 
 import argparse
@@ -40,7 +40,7 @@ from sim.objects.shelf import shelf
 from sim.world import World
 
 Truth = Mapping[str, tuple[float, str]]
-"""The true value of each quantity of a result, and the unit it is printed in."""
+"""True value and unit of each quantity of a result."""
 
 
 @contextmanager
@@ -92,11 +92,11 @@ def backlash(seed: int) -> tuple[CalibrationResult, Truth]:
         return last(Backlash().live(bench)), {"backlash": (backlash_deg, "°")}
 
 
-def over_the_turn(seed: int) -> tuple[CalibrationResult, Truth]:
+def encoder(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed, NoiseModel(encoder_harmonic_deg=0.2)) as (bench, parts):
         result = last(Encoder().live(bench))
         (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
-        # The servo's own angle 0 is half a turn from the shaft's: odd harmonics change their sign.
+        # The angle 0 of the servo is 180° from that of the shaft: odd harmonics change their sign.
         return result, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
 
 
@@ -174,7 +174,7 @@ def axis(seed: int) -> tuple[CalibrationResult, Truth]:
 
 PROCEDURES: dict[str, Callable[[int], tuple[CalibrationResult, Truth]]] = {
     "servo.backlash": backlash,
-    "servo.encoder": over_the_turn,
+    "servo.encoder": encoder,
     "servo.motion": motion,
     "imu.scale": imu_scale,
     "imu.mounting": mounting,
@@ -201,10 +201,10 @@ def main() -> None:
         if given.only not in (None, name):
             continue
         errors: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        units, refused = {}, 0
+        units, rejected = {}, 0
         for seed in range(given.first_seed, given.first_seed + given.seeds):
             result, truth = procedure(seed)
-            refused += not result.passed
+            rejected += not result.passed
             print(f"{name}, seed {seed}: {' '.join(map(str, result.refusals)) or 'passed'}", file=sys.stderr)
             for key, (true, unit) in truth.items():
                 estimate = result.estimates[key]
@@ -219,8 +219,8 @@ def main() -> None:
                 f"| {np.sqrt((z**2).mean()):.2f} | {(np.abs(z) < 1.96).sum()}/{z.size} |",
                 flush=True,
             )
-        if refused:
-            print(f"| {name} | refused | {refused}/{given.seeds} | | | |")
+        if rejected:
+            print(f"| {name} | rejected | {rejected}/{given.seeds} | | | |")
 
 
 if __name__ == "__main__":

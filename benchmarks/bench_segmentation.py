@@ -1,9 +1,9 @@
-"""What an empty-table picture is worth to the front end: hit-rates with the right one, the enrollment's, and none.
+"""Hit rates with the empty-table image of the query bench, with that of the enrollment, and without an image.
 
-    python -m benchmarks.bench_front_end FOLDER --objects 1-50
+    python -m benchmarks.bench_segmentation FOLDER --objects 1-50
 
-Objects are enrolled on a plain bench with its picture, by 18 views, and looked for by the dense filter from four sides,
-90 degrees apart: on the same bench in another light, and on others where everything differs at once.
+Objects are enrolled on a plain bench with its empty-table image, by 18 views. The dense filter identifies them by four
+views 90° apart: on the same bench in another illumination, and on another bench with all perturbations.
 """
 
 import argparse
@@ -23,20 +23,20 @@ from hbr.evaluation.matrix import enrolled_few, hits
 from hbr.evaluation.perturb import Perturbations
 from hbr.evaluation.protocol import Protocol
 
-OTHER_LIGHT = "gain:2+white-balance:2+gradient:2+shift:2+scale:1+shadow:1"
+OTHER_ILLUMINATION = "gain:2+white-balance:2+gradient:2+shift:2+scale:1+shadow:1"
 EVERYTHING = (
     "shift:3+scale:3+elevation:2+occlusion:2+shadow:2+specular:2+gain:2+white-balance:3+gradient:2+gamma:2+defocus:2"
 )
 
 
 @dataclass(frozen=True)
-class Referenced(Condition):
-    """A condition whose queries come with one of three pictures of an empty table.
+class TableCondition(Condition):
+    """A condition with one of three empty-table images for the queries.
 
     Attributes
     ----------
     shown : {"own", "enrollment", "none"}
-        The query bench's own in the query's light, the enrollment bench's, or none.
+        The image of the query bench in the query's illumination, that of the enrollment bench, or none.
     """
 
     shown: str = "own"
@@ -48,19 +48,22 @@ class Referenced(Condition):
         return Shot(image, own if self.shown == "own" else self.enrolled(image_bgr).empty)
 
 
-def cases(descriptor: str) -> Iterator[tuple[str, Referenced]]:
-    """Benches and references by name."""
+def cases(descriptor: str) -> Iterator[tuple[str, TableCondition]]:
+    """Yield benches and empty-table images by name."""
     for bench, condition in (
-        ("other light", Referenced(background="bench", perturbations=Perturbations.parse(OTHER_LIGHT))),
-        ("another bench", Referenced(background="other-bench", perturbations=Perturbations.parse(EVERYTHING))),
+        (
+            "other illumination",
+            TableCondition(background="bench", perturbations=Perturbations.parse(OTHER_ILLUMINATION)),
+        ),
+        ("another bench", TableCondition(background="other-bench", perturbations=Perturbations.parse(EVERYTHING))),
     ):
-        for reference in ("own", "enrollment", "none"):
-            yield f"{bench}, {reference}", replace(condition, descriptor=descriptor, shown=reference)
+        for shown in ("own", "enrollment", "none"):
+            yield f"{bench}, {shown}", replace(condition, descriptor=descriptor, shown=shown)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="Photographs named as in COIL-100.")
+    parser.add_argument("folder", type=Path, help="Photographs, named like those of COIL-100.")
     parser.add_argument("--objects", default="1-50", metavar="FIRST-LAST")
     parser.add_argument("--trials", type=int, default=6)
     parser.add_argument("--descriptor", default="edges+colours")
@@ -73,12 +76,12 @@ def main() -> None:
     numbers = range(len(dataset.objects))
     plain = Condition(background="bench", descriptor=arguments.descriptor)
     index = DenseIndex(Views.concatenate([enrolled_few(dataset, j, plain, size, 18) for j in numbers]))
-    print(f"{'hit-rate, %, at N =':<28}     1     2     3     4  s CPU")
+    print(f"{'hit rate, %, at N =':<28}     1     2     3     4  s CPU")
     for name, condition in cases(arguments.descriptor):
-        began = process_time()
+        start_s = process_time()
         found = np.concatenate([hits(dataset, j, index, condition, size, protocol) for j in numbers])
         rates = " ".join(f"{rate:5.1f}" for rate in 100 * found.mean(axis=0))
-        print(f"{name:<28} {rates} {process_time() - began:6.0f}", flush=True)
+        print(f"{name:<28} {rates} {process_time() - start_s:6.0f}", flush=True)
 
 
 if __name__ == "__main__":
