@@ -37,7 +37,7 @@ lint: $(READY)
 # No network: the theme loads no fonts, and links to other sites are not followed.
 docs: $(READY)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --clean
-	@echo "Open site/index.html"
+	@echo "Open site/index.html. With search: python3 -m http.server --directory site"
 
 wheel: $(READY)
 	@sh .ci/wheel

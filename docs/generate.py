@@ -88,8 +88,8 @@ def _parameter_table(parameters: list[Any]) -> list[str]:
             name = ", ".join(f"`{option}`" for option in [*parameter.opts, *parameter.secondary_opts])
             if parameter.metavar and not parameter.is_flag:
                 name += f" `{parameter.metavar}`"
-        default = "" if parameter.default is None or callable(parameter.default) else parameter.default
-        default = "" if default in (False, (), []) else f"`{default}`"
+        given = isinstance(parameter.default, str | int | float | Path) and parameter.default not in (False, "")
+        default = f"`{parameter.default}`" if given else ""
         rows.append(f"| {name} | {_cell(getattr(parameter, 'help', '') or '')} | {default} |")
     return ["| name | meaning | default |", "|---|---|---|", *rows]
 
@@ -128,7 +128,7 @@ def _key_table(fields: dict[str, Any]) -> list[str]:
         for constraint in field.metadata:
             for attribute, sign in (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<")):
                 if (bound := getattr(constraint, attribute, None)) is not None:
-                    limits.append(f"{sign} {bound:g}")
+                    limits.append(f"{sign} {bound:.10g}")
         default = field.get_default(call_default_factory=True)
         shown = "–" if default is None else f"`{_toml(default)}`"
         cells = (f"`{name}`", _type_words(field.annotation), shown, ", ".join(limits), _cell(field.description or ""))

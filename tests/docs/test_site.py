@@ -1,0 +1,103 @@
+"""The documentation site: complete generated pages, a navigation that reaches every page, links that exist."""
+
+import re
+from typing import Any
+
+import pytest
+import yaml
+
+from docs import architecture, generate
+from rig.config import RigConfig
+from tests.docs.pages import DOCS
+
+ROOT = DOCS.parent
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    return generate.generated_pages()
+
+
+def test_command_page_has_every_command_and_option(pages):
+    text = pages["reference/cli.md"]
+    for command in ("rig enroll", "rig catalog show", "rig calibrate servo", "rig faults", "rig config set"):
+        assert f"\n## {command}\n" in text
+    for option in ("--bench", "--resume", "--save-run", "--print-board", "--udev"):
+        assert f"`{option}`" in text
+
+
+def test_configuration_page_has_every_key(pages):
+    sections = re.split(r"\n## ", pages["reference/configuration.md"])
+    for name, field in RigConfig.model_fields.items():
+        if section := generate._section(field):
+            (text,) = (s for s in sections if s.startswith(f"[{name}]"))
+            assert all(f"| `{key}` |" in text for key in section.model_fields), name
+        elif name != "bench":
+            assert f"| `{name}` |" in sections[1]
+
+
+def test_error_page_has_each_code_once(pages):
+    codes = re.findall(r"^\| (\d{3}) \|", pages["reference/errors.md"], re.MULTILINE)
+    assert len(codes) == len(set(codes)) > 40
+    assert codes == sorted(codes)
+
+
+def test_api_pages_have_every_module(pages):
+    shown = set(re.findall(r"^::: (\S+)$", "\n".join(pages.values()), re.MULTILINE))
+    assert {"hbr.dense.filter", "rig.core.errors", "sim.world", "calibration.backlash"} <= shown
+    assert all(module in generate.modules() for module in shown)
+
+
+def entries(nav: list[Any]) -> list[str]:
+    """Return the pages of the navigation."""
+    found = []
+    for entry in nav:
+        values = entry.values() if isinstance(entry, dict) else [entry]
+        for value in values:
+            found += entries(value) if isinstance(value, list) else [value]
+    return found
+
+
+def test_navigation_reaches_every_page_once(pages):
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    reached = entries(generate._expanded(yaml.safe_load(text)["nav"]))
+    stored = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
+    assert sorted(reached) == sorted(stored | pages.keys())
+
+
+def test_links_between_pages_exist():
+    for path in [*DOCS.rglob("*.md"), *(ROOT / page for page in generate.REPOSITORY_PAGES)]:
+        for target in re.findall(r"\]\((?!https?:|#)([^)#\s]+)", path.read_text(encoding="utf-8")):
+            generated = target.startswith("../images/architecture")
+            assert generated or (path.parent / target).exists(), f"{path.relative_to(ROOT)}: {target}"
+
+
+def test_links_out_of_docs_are_rewritten_for_the_site():
+    text, copied = generate.with_site_links(
+        "[a](../README.md#use) [b](../examples/tray.csv) [c](../tests)", "docs/style.md"
+    )
+    assert text == "[a](index.md#use) [b](files/examples/tray.csv) c"
+    assert copied == {"examples/tray.csv"}
+
+
+def test_decisions_have_consecutive_numbers_and_are_listed():
+    paths = sorted(DOCS.glob("decisions/0*.md"))
+    index = (DOCS / "decisions" / "README.md").read_text(encoding="utf-8")
+    for number, path in enumerate(paths, 1):
+        text = path.read_text(encoding="utf-8")
+        assert path.name.startswith(f"{number:04}-")
+        assert text.startswith(f"# {number:04} ")
+        assert f"({path.name})" in index
+        assert "**Status:**" in text
+        assert re.findall(r"^## (.*)$", text, re.MULTILINE) == ["Decision", "Reasons", "Consequences"]
+
+
+def test_architecture_picture_shows_every_room():
+    svg = architecture.picture()
+    for package in ("rig", "hbr"):
+        for room in (room for layer in architecture.layers(package) for room in layer):
+            assert f">{room.partition('.')[2]}</text>" in svg
+    assert ("rig.plans", "rig.search") in architecture.imports()
+    assert not any(
+        importing.startswith("hbr") and imported.startswith("rig") for importing, imported in architecture.imports()
+    )
