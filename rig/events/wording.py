@@ -180,9 +180,9 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
-def angle_words(angle_deg: float) -> str:
-    """Return an angle of the table to a tenth of a degree: "−12.5°"."""
-    return f"{angle_deg:.1f}°".replace("-", "−")
+def angle_words(angle_deg: float, decimals: int = 1) -> str:
+    """Return an angle of the table: "−12.5°"."""
+    return f"{round(angle_deg, decimals) + 0.0:.{decimals}f}°".replace("-", "−")  # + 0.0 removes the sign of a zero
 
 
 def joined(items: Sequence[str]) -> str:

@@ -1,5 +1,6 @@
-"""What a person watches while a plan runs: tables that grow on a terminal, a line for each view in a pipe."""
+"""The display of a running plan: a live table on a terminal, one line for each view in a pipe."""
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import TracebackType
@@ -28,6 +29,7 @@ from rig.events.events import (
     Started,
 )
 from rig.events.wording import (
+    angle_words,
     azimuth_words,
     counted,
     decision_words,
@@ -42,18 +44,18 @@ from rig.plans.estimate import TimeLeft
 from rig.views.capture import ViewEvidence, rejection_text
 
 ROWS: Final = 12
-"""Views that the table shows at once."""
+"""Largest number of rows in the live table."""
 WIDE, NARROW = 84, 60
-"""Columns that a terminal needs for all of a table, and for most of it."""
+"""Width of a terminal, in characters, that fits all columns of a table, and most of them."""
 
 
 class LiveView(AbstractContextManager["LiveView"]):
-    """Shows the events of a plan while it runs, and lets it pause; use it in a ``with`` block.
+    """Shows the events of a plan while it runs and lets the operator pause it; use it in a ``with`` block.
 
     Parameters
     ----------
     console
-        Where; what is no terminal gets plain lines.
+        The terminal or the pipe to print to; a pipe gets plain lines.
     """
 
     def __init__(self, console: Console) -> None:
@@ -72,21 +74,21 @@ class LiveView(AbstractContextManager["LiveView"]):
         self._pause.__exit__(kind, error, trace)
 
     def add(self, event: Event) -> None:
-        """Take the next event; returns when the plan may go on."""
+        """Show the next event; if the operator pauses the plan here, return when the operator resumes it."""
         if self.show(event):
             self._pause.point(self.note)
 
     def show(self, event: Event) -> bool:
-        """Show an event; whether the plan may rest after it."""
+        """Show an event and return whether the plan can pause after it."""
         raise NotImplementedError
 
     def note(self, text: str) -> None:
-        """Show a line that stays."""
+        """Print a line that stays on the screen, above the live table."""
         if text:
             self._console.print(text, markup=False, highlight=False, soft_wrap=not self._console.is_terminal)
 
     def render(self) -> RenderableType:
-        """Return what is on the screen now."""
+        """Return the present content of the live table."""
         raise NotImplementedError
 
     def _start(self) -> None:
@@ -97,42 +99,60 @@ class LiveView(AbstractContextManager["LiveView"]):
             self._live.start()
 
     def _stop(self) -> None:
-        """Leave the last picture on the screen; what is told from now on stands below it."""
+        """End the live table; it stays on the screen, and new lines appear below it."""
         if self._live is not None:
             self._live.stop()
             self._live = None
 
     @property
     def _hint(self) -> str:
-        stop = "Ctrl+C stops"
+        stop = "Ctrl+C: stop"
         return f"{HINT}, {stop}" if self._pause.listens else stop
 
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A frame as the table shows it."""
+    """An image of an enrollment, accepted or rejected."""
 
     number: int
-    asked_deg: float | None
-    encoder_deg: float | None
-    imu_deg: float | None
-    sigma_deg: float | None
+    move: Moved | None
     evidence: ViewEvidence
-    verdict: str
+    result: str
     accepted: bool
+
+    @property
+    def imu(self) -> str:
+        """The table angle by the gyro, with its uncertainty."""
+        if self.move is None or self.move.rotation_imu_deg is None:
+            return "–"
+        angle_deg = self.move.encoder_deg - self.move.rotation_encoder_deg + self.move.rotation_imu_deg
+        sigma = "" if self.move.imu_sigma_deg is None else f" ± {self.move.imu_sigma_deg:.2f}"
+        return f"{angle_words(angle_deg, 2).removesuffix('°')}{sigma}°"
+
+
+COLUMNS: Final[tuple[tuple[str, int, Callable[[_Row], str]], ...]] = (
+    ("view", 0, lambda row: str(row.number)),
+    ("asked", NARROW, lambda row: "–" if row.move is None else angle_words(row.move.commanded_deg, 2)),
+    ("encoder", 0, lambda row: "–" if row.move is None else angle_words(row.move.encoder_deg, 2)),
+    ("IMU", NARROW, lambda row: row.imu),
+    ("sharpness", NARROW, lambda row: f"{row.evidence.sharpness:.1f}"),
+    ("brightness", WIDE, lambda row: f"{row.evidence.mean_level:.0f}"),
+    ("saturated", WIDE, lambda row: f"{row.evidence.saturated_share * 100:.0f} %"),
+)
+"""Columns of an enrollment's table: heading, width that the terminal needs to show it, and cell."""
 
 
 class EnrollView(LiveView):
-    """The table of an enrollment: angle asked, encoder, IMU, sharpness, exposure, and whether the view was taken.
+    """The table of an enrollment, with a row for each image.
 
     Parameters
     ----------
     console
-        Where.
+        The terminal or the pipe to print to.
     config
-        Of the bench, for the time that is left.
+        Configuration of the bench, for the remaining time.
     heading
-        Before the object's name, such as "3 of 25".
+        Text before the object's name, such as "3 of 25".
     """
 
     def __init__(self, console: Console, config: RigConfig, heading: str = "") -> None:
@@ -164,7 +184,7 @@ class EnrollView(LiveView):
                     self.note(f"  {move_words(event)}")
             case Rejected():
                 texts = "; ".join(rejection_text(reason, event.evidence) for reason in event.reasons)
-                self._add(event.evidence, f"taken again: {texts}", accepted=False)
+                self._add(event.evidence, f"rejected: {texts}", accepted=False)
             case Accepted():
                 self._taken += 1
                 self._add(event.evidence, "accepted", accepted=True)
@@ -184,65 +204,25 @@ class EnrollView(LiveView):
     def _title(self) -> str:
         return f"{self._heading} {self._name}".strip()
 
-    def _add(self, evidence: ViewEvidence, verdict: str, *, accepted: bool) -> None:
-        move = self._move
-        imu_deg = None
-        if move is not None and move.rotation_imu_deg is not None:
-            imu_deg = move.encoder_deg - move.rotation_encoder_deg + move.rotation_imu_deg
-        row = _Row(
-            number=self._taken if accepted else self._taken + 1,
-            asked_deg=move.commanded_deg if move else None,
-            encoder_deg=move.encoder_deg if move else None,
-            imu_deg=imu_deg,
-            sigma_deg=move.imu_sigma_deg if move else None,
-            evidence=evidence,
-            verdict=verdict,
-            accepted=accepted,
-        )
+    def _add(self, evidence: ViewEvidence, result: str, *, accepted: bool) -> None:
+        row = _Row(self._taken if accepted else self._taken + 1, self._move, evidence, result, accepted)
         self._rows.append(row)
         del self._rows[:-ROWS]
         if not self._console.is_terminal:
-            self.note(self._plain(row))
-
-    def _plain(self, row: _Row) -> str:
-        evidence = row.evidence
-        left = f"  {duration_words(self._left.seconds)} left" if self._left and row.accepted else ""
-        return (
-            f"view {row.number} of {self._of}  asked {_angle(row.asked_deg)}  encoder {_angle(row.encoder_deg)}  "
-            f"IMU {_with_sigma(row)}  sharpness {evidence.sharpness:.1f}  level {evidence.mean_level:.0f}  "
-            f"saturated {evidence.saturated_share:.0%}  {row.verdict}{left}"
-        )
+            left = f"  {duration_words(self._left.seconds)} left" if self._left and accepted else ""
+            cells = "  ".join(f"{heading} {cell(row)}" for heading, _, cell in COLUMNS[1:])
+            self.note(f"view {row.number} of {self._of}  {cells}  {result}{left}")
 
     def render(self) -> RenderableType:
         width = self._console.width
-        table = Table(box=None, pad_edge=False, expand=False)
-        table.add_column("view", justify="right")
-        if width >= NARROW:
-            table.add_column("asked", justify="right")
-        table.add_column("encoder", justify="right")
-        if width >= NARROW:
-            table.add_column("IMU", justify="right", no_wrap=True)
-            table.add_column("sharpness", justify="right")
-        if width >= WIDE:
-            table.add_column("level", justify="right")
-            table.add_column("saturated", justify="right")
+        columns = [(heading, cell) for heading, needed, cell in COLUMNS if width >= needed]
+        table = Table(box=None, pad_edge=False)
+        for heading, _ in columns:
+            table.add_column(heading, justify="right", no_wrap=True)
         table.add_column("", overflow="fold")
-        rows = max(3, min(ROWS, self._console.height - 6))
-        for row in self._rows[-rows:]:
-            cells = [str(row.number)]
-            if width >= NARROW:
-                cells.append(_angle(row.asked_deg))
-            cells.append(_angle(row.encoder_deg))
-            if width >= NARROW:
-                cells += [
-                    _with_sigma(row) if width >= WIDE else _angle(row.imu_deg),
-                    f"{row.evidence.sharpness:.1f}",
-                ]
-            if width >= WIDE:
-                cells += [f"{row.evidence.mean_level:.0f}", f"{row.evidence.saturated_share:.0%}"]
-            verdict = Text(f"✓ {row.verdict}" if row.accepted else f"✗ {row.verdict}")
-            verdict.stylize("green" if row.accepted else "yellow")
-            table.add_row(*cells, verdict)
+        for row in self._rows[-max(3, min(ROWS, self._console.height - 6)) :]:
+            result = Text(f"{'✓' if row.accepted else '✗'} {row.result}", style="green" if row.accepted else "yellow")
+            table.add_row(*(cell(row) for _, cell in columns), result)
         if self._ended:
             return table
         bar = Table.grid(padding=(0, 1))
@@ -357,7 +337,7 @@ class IdentifyView(LiveView):
         if self._ended:
             return table if candidates else Group()
         where = f", azimuth {azimuth_words(self._azimuth_deg)}°" if self._taken else ""
-        lead = f", sure lead {signed(self._ranked.margin, 3)}" if self._ranked else ""
+        lead = f", margin {signed(self._ranked.margin, 3)}" if self._ranked else ""
         status = Text(f"view {self._taken} of {self._of} at most{where}{lead}", style="bold")
         status.append(f"   {self._hint}", style="dim")
         verdict = [Text(self._verdict)] if self._verdict else []
@@ -366,14 +346,3 @@ class IdentifyView(LiveView):
 
 def _odds(one: Candidate) -> str:
     return "" if one.probability is None else percent_words(one.probability)
-
-
-def _angle(angle_deg: float | None) -> str:
-    return "–" if angle_deg is None else f"{angle_deg:.2f}°".replace("-", "−")
-
-
-def _with_sigma(row: _Row) -> str:
-    if row.imu_deg is None:
-        return "–"
-    sigma = "" if row.sigma_deg is None else f" ± {row.sigma_deg:.2f}"
-    return f"{row.imu_deg:.2f}{sigma}°".replace("-", "−")

@@ -1,4 +1,4 @@
-"""How the events of a plan read on a terminal."""
+"""The text of events and dry runs on a terminal, and progress bars."""
 
 import sys
 from collections.abc import Sequence
@@ -50,24 +50,25 @@ SHOWN = 3
 
 class _Screen(Console):
     def on_broken_pipe(self) -> None:
-        raise BrokenPipeError  # for `rig.cli.ui.command`, which knows how to end
+        raise BrokenPipeError  # `rig.cli.ui.command` handles it
 
 
 def console(*, stderr: bool = False, plain: bool = False) -> Console:
-    """Return the screen, or the pipe: colours and width are as the terminal, NO_COLOR and COLUMNS have them.
+    """Return a console for stdout or stderr; colors and width follow the terminal, NO_COLOR and COLUMNS.
 
-    ``plain`` writes lines as into a pipe, on a terminal too.
+    ``plain`` prints lines as into a pipe, on a terminal too.
     """
     return _Screen(stderr=stderr, force_terminal=False if plain else None)
 
 
 def line(event: Event) -> str:
-    """Return what an event means to the person at the bench; empty where there is nothing to say."""
+    """Return the text of an event for the operator; empty if it has none."""
     match event:
         case Started():
             return "\n".join(f"Note: {note}." for note in event.notes)
         case Moved():
-            return f"  at {event.encoder_deg:.2f}° (asked {event.commanded_deg:.2f}°): {move_words(event)}"
+            encoder, asked = (angle_words(angle, 2) for angle in (event.encoder_deg, event.commanded_deg))
+            return f"  table at {encoder} (asked {asked}): {move_words(event)}"
         case Unwinding():
             return f"  {unwinding_words(event)}"
         case Rejected():
@@ -77,11 +78,11 @@ def line(event: Event) -> str:
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():
             leaders = ", ".join(_leader(c) for c in event.candidates[:SHOWN])
-            return f"  leading: {leaders} (sure lead {signed(event.margin, 3)})"
+            return f"  candidates: {leaders} (margin {signed(event.margin, 3)})"
         case Decided():
-            return f"  {decision_words(event)} The table goes to {event.target_deg:.1f}°."
+            return f"  {decision_words(event)} The table rotates to {angle_words(event.target_deg)}."
         case Enrolled():
-            retakes = f", {counted(event.retakes, 'frame')} taken again" if event.retakes else ""
+            retakes = f", {counted(event.retakes, 'rejected image')}" if event.retakes else ""
             took = duration_words(event.seconds)
             return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
         case Identified():
@@ -98,8 +99,8 @@ def line(event: Event) -> str:
         case SimilarObjects():
             return "\n".join(f"  {words}" for words in similar_objects_words(event))
         case EmptyTableImage():
-            turning = "" if event.turning_share is None else f", {event.turning_share:.1%} of it turns with the table"
-            return f"Picture of the empty table: {event.width} x {event.height} pixels{turning}"
+            share = "" if event.turning_share is None else f", {event.turning_share * 100:.1f} % rotates with the table"
+            return f"Empty-table image: {event.width} × {event.height} pixels{share}"
         case Warned():
             return f"Warning: {event.what}.\nNext step: {event.next_step}"
         case Waiting():
@@ -167,7 +168,7 @@ def _beginning(table_deg: float, first_deg: float) -> str:
 
 
 class Progress:
-    """A progress bar on stderr; where that is no terminal, notes alone."""
+    """A progress bar on stderr; only its notes if stderr is not a terminal."""
 
     def __init__(self, title: str) -> None:
         self._bar = RichProgress(
@@ -197,7 +198,7 @@ class Progress:
         self._bar.advance(self._task)
 
     def at(self, done: int) -> None:
-        """Show that so many are done."""
+        """Show that ``done`` items are done."""
         self._bar.update(self._task, completed=done)
 
     def note(self, text: str) -> None:

@@ -46,8 +46,8 @@ def test_it_is_taken_told_and_shown(rig: Callable[..., Any]) -> None:
 def test_an_enrollment_takes_it_once_a_day_and_says_what_came_of_it(rig: Callable[..., Any]) -> None:
     small = [word for setting in SMALL for word in ("--set", setting)]
     first, second = (rig("enroll", name, "--views", "4", *small) for name in ("dice", "lamp"))
-    assert "Picture of the empty table" in first.stderr
-    assert "Picture of the empty table" not in second.stderr
+    assert "Empty-table image:" in first.stderr
+    assert "Empty-table image:" not in second.stderr
     assert rig("empty-table", *small).exit_code == 0
     assert "photographed the empty table" in rig("log").stdout
     shown = rig("catalog", "show", "dice")

@@ -22,6 +22,7 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
 from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, SkipReason, Waiting
+from rig.events.wording import angle_words
 from rig.plans.tray import TrayDecision, TrayItem
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
@@ -69,8 +70,8 @@ def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
     views = [line for line in lines if line.startswith("view ")]
     assert len(views) == 9
     assert re.fullmatch(
-        r"view 4 of 8  asked 135.00°  encoder 135.04°  IMU 135.14 ± 0.10°  sharpness 2.0  level 90  saturated 0%  "
-        r"taken again: blurred \(sharpness 2.0 < 3\)",
+        r"view 4 of 8  asked 135.00°  encoder 135.04°  IMU 135.14 ± 0.10°  sharpness 2.0  brightness 90  saturated 0 "
+        r"%  rejected: blurred \(sharpness 2.0 < 3\)",
         views[3],
     )
     assert re.search(r"accepted  \d+ s left$", views[4])
@@ -98,8 +99,8 @@ def test_a_search_in_a_pipe_reads_as_lines():
     events = list(identifying())
     move = next(e for e in events if isinstance(e, Moved) and e.index == 1)
     text = shown(console, IdentifyView(console), events)
-    assert f"at {move.encoder_deg:.2f}°" in text
-    assert "leading: mug-white 0.910 at 60.0°" in text
+    assert f"at {angle_words(move.encoder_deg, 2)}" in text
+    assert "candidates: mug-white 0.910 at 60.0°" in text
     assert "turning 47.3°" in text
     assert max(map(len, text.splitlines())) > 100  # no line is broken for a terminal that is not there
 
@@ -121,7 +122,7 @@ def test_a_dense_search_in_a_pipe_reads_as_lines():
     console = screen(80, terminal=False)
     lines = shown(console, IdentifyView(console), list(searching_densely())).splitlines()
     assert lines[0] == "Note: rehearse them."
-    assert "  leading: mug-white 0.900 (60.0%) at 330.0°, mug-star 0.800 (40.0%) at 330.0°" in lines[3]
+    assert "  candidates: mug-white 0.900 (60.0%) at 330.0°, mug-star 0.800 (40.0%) at 330.0°" in lines[3]
     assert lines[4] == "  not sure yet: a probability of 60.0%, and 95.0% ends the search"
     assert lines[5].startswith("  left: to tell mug-white from mug-star")
 
