@@ -13,6 +13,7 @@ import re
 import sys
 import typing
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any
@@ -207,7 +208,8 @@ def public_names_page() -> str:
     return "\n".join(lines)
 
 
-def modules() -> list[str]:
+@cache
+def modules() -> tuple[str, ...]:
     """Return the dotted names of all modules that have an API page."""
     found = []
     for package in PACKAGES:
@@ -215,7 +217,7 @@ def modules() -> list[str]:
             parts = path.relative_to(ROOT).with_suffix("").parts
             if "migrations" not in parts and parts[-1] != "__main__":
                 found.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
-    return found
+    return tuple(found)
 
 
 def api_pages() -> Iterator[tuple[str, str]]:
