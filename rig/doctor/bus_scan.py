@@ -1,4 +1,4 @@
-"""Who answers on a servo bus and on an I2C bus, by questions that change nothing."""
+"""Scan servo buses and I2C buses for devices; the scan changes nothing."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -17,22 +17,22 @@ from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import model_numbers
 
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
-"""What servos of Protocol 2.0 are set to: the factory's first, then by how common they are."""
+"""Baud rates of Protocol 2.0: the factory setting first, then in order of frequency."""
 BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9_600)
 """The same for Protocol 1.0."""
 
 _ANSWER_1_S = 0.02
-"""How long a servo of Protocol 1.0 and its adapter take to answer; each id is asked by itself there."""
+"""Time for an answer of a servo of Protocol 1.0 and its adapter; each id is asked separately."""
 _PING_ANSWER = 14
 _LISTEN_S = 0.05
 _STATUS_READS = 8
 _STATUS = (120, 27)
-"""Realtime Tick to Present Temperature: two servos with one id do not agree on these for long."""
+"""Realtime Tick to Present Temperature: two servos with the same id soon differ in these."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundServo:
-    """A servo that answered; ``model`` is None where no control table is known for its number."""
+    """A servo that answered; ``model`` is None if there is no control table for its number."""
 
     bus_id: int
     baud: int
@@ -61,21 +61,21 @@ class BaudScan:
     noise: bool = False
 
     @property
-    def anything(self) -> bool:
+    def answered(self) -> bool:
         return bool(self.servos or self.duplicate_ids)
 
 
 def scan_servos(
     wire: SerialConnection, clock: Clock, bauds: Sequence[int] = BAUD_RATES, *, protocol: int = 2
 ) -> Iterator[BaudScan]:
-    """Ask at each baud rate who is there, and yield what was heard; at last the wire has the baud rate it had.
+    """Scan each baud rate and yield the answers; afterwards the port has its old baud rate again.
 
-    Takes about a second a baud rate, four at 9,600; with Protocol 1.0, where each id is asked, five.
+    Takes about one second per baud rate, four at 9,600 baud, and five with Protocol 1.0.
 
     Raises
     ------
     serial.SerialException, OSError
-        The adapter was pulled out.
+        The adapter was unplugged.
     """
     before = wire.baudrate
     try:
@@ -83,28 +83,28 @@ def scan_servos(
             port = ClockedPort(wire, clock)
             try:
                 port.setBaudRate(baud)
-            except (ValueError, NotImplementedError):  # this adapter has no such rate
+            except (ValueError, NotImplementedError):  # the adapter does not support this rate
                 continue
-            yield _heard_2(port, baud) if protocol == 2 else _heard_1(port, baud)
+            yield _scan_2(port, baud) if protocol == 2 else _scan_1(port, baud)
     finally:
         with suppress(serial.SerialException, OSError, ValueError):
             wire.baudrate = before
 
 
-def without_echoes(heard: Sequence[BaudScan], preferred: int) -> list[BaudScan]:
-    """Return what was heard at several rates; of a port that has no baud rate, what was heard at one, ``preferred``.
+def without_echoes(scans: Sequence[BaudScan], preferred: int) -> list[BaudScan]:
+    """Return the scans; for a port without a baud rate, only that at the ``preferred`` rate.
 
-    On a pseudo-terminal, a port in the network or a board that relays bytes the same servos answer whatever the rate.
+    On a pseudo-terminal, a network port or a board that relays bytes, the same servos answer at every rate.
     """
-    said = {frozenset((servo.bus_id, servo.model_number, servo.firmware) for servo in each.servos) for each in heard}
-    if len(heard) < 3 or len(said) > 1 or not heard[0].servos:
-        return list(heard)
-    return [next((each for each in heard if each.baud == preferred), heard[0])]
+    answers = {frozenset((servo.bus_id, servo.model_number, servo.firmware) for servo in each.servos) for each in scans}
+    if len(scans) < 3 or len(answers) > 1 or not scans[0].servos:
+        return list(scans)
+    return [next((each for each in scans if each.baud == preferred), scans[0])]
 
 
-def spoiled_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) -> int:
-    """Return how many of some reads of a servo's status came back spoiled; the bus must not retry by itself."""
-    spoiled = 0
+def corrupt_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) -> int:
+    """Return how many reads of a servo's status came back corrupt; the bus must not retry."""
+    corrupt = 0
     address, size = _STATUS if bus.protocol == 2 else (36, 8)
     for _ in range(reads):
         try:
@@ -112,38 +112,38 @@ def spoiled_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) ->
         except RequestRejected:
             continue
         except DeviceSilent:
-            spoiled += 1
-    return spoiled
+            corrupt += 1
+    return corrupt
 
 
-def _heard_2(port: ClockedPort, baud: int) -> BaudScan:
+def _scan_2(port: ClockedPort, baud: int) -> BaudScan:
     listening = _Recording(port)
     try:
         answers, _ = Protocol2PacketHandler().broadcastPing(listening)
     except BusBabble:
         return BaudScan(baud, 2, noise=True)
     port.drain()
-    if _unasked(port):
+    if _babbles(port):
         return BaudScan(baud, 2, noise=True)
     servos = [_servo(bus_id, baud, 2, number, firmware) for bus_id, (number, firmware) in sorted(answers.items())]
     bus = DynamixelBus(port, retries=0)
-    duplicate_ids = [servo.bus_id for servo in servos if spoiled_reads(bus, servo.bus_id) > _STATUS_READS // 2]
-    # The SDK leaves out what it cannot read, and calls that a success. The answers of servos with one id fall into each
-    # other: where more bytes came than belong to whole answers, each id is asked by itself.
+    duplicate_ids = [servo.bus_id for servo in servos if corrupt_reads(bus, servo.bus_id) > _STATUS_READS // 2]
+    # The SDK skips what it cannot read, and reports success. Answers of servos with the same id collide: if more bytes
+    # came than belong to complete answers, ask each id separately.
     rest = len(listening.answered) - _PING_ANSWER * len(answers)
     for bus_id in (bus_id for bus_id in range(253) if rest and bus_id not in answers):
         try:
             head = bus.read_block(bus_id, 0, 7)
         except (RequestRejected, DeviceSilent):
-            duplicate_ids += [bus_id] if _spoils(bus, bus_id) else []
-        else:  # its answer to all was spoiled, that to the question of its own is not
+            duplicate_ids += [bus_id] if _answers_corrupt(bus, bus_id) else []
+        else:  # its answer to the broadcast was corrupt, this one is not
             servos.append(_servo(bus_id, baud, 2, int.from_bytes(head[:2], "little"), head[6]))
     sound = tuple(servo for servo in servos if servo.bus_id not in duplicate_ids)
     return BaudScan(baud, 2, sound, tuple(sorted(duplicate_ids)), bool(rest) and not duplicate_ids and not sound)
 
 
 class _Recording(ClockedPort):
-    """A port that keeps what came, but for the instruction itself, which some adapters echo."""
+    """A port that records the received bytes, without the instruction that some adapters echo."""
 
     def __init__(self, port: ClockedPort) -> None:
         super().__init__(port.ser, port.clock)
@@ -164,12 +164,12 @@ class _Recording(ClockedPort):
         return data
 
 
-def _heard_1(port: ClockedPort, baud: int) -> BaudScan:
-    if _unasked(port):
+def _scan_1(port: ClockedPort, baud: int) -> BaudScan:
+    if _babbles(port):
         return BaudScan(baud, 1, noise=True)
     servos = []
     duplicate_ids = []
-    bus = DynamixelBus(_Hasty(port), retries=0, protocol=1)
+    bus = DynamixelBus(_ShortTimeout(port), retries=0, protocol=1)
     for bus_id in range(253):
         corrupt = bus.statistics.corrupt
         try:
@@ -177,15 +177,15 @@ def _heard_1(port: ClockedPort, baud: int) -> BaudScan:
         except RequestRejected:
             continue
         except DeviceSilent:
-            if bus.statistics.corrupt > corrupt and _spoils(bus, bus_id):
+            if bus.statistics.corrupt > corrupt and _answers_corrupt(bus, bus_id):
                 duplicate_ids.append(bus_id)
             continue
         servos.append(_servo(bus_id, baud, 1, int.from_bytes(head[:2], "little"), head[2]))
     return BaudScan(baud, 1, tuple(servos), tuple(duplicate_ids))
 
 
-def _unasked(port: ClockedPort) -> bool:
-    """Return whether bytes come although nobody was asked: with them every id would seem to answer."""
+def _babbles(port: ClockedPort) -> bool:
+    """Return whether bytes come without a request: they would make every id seem to answer."""
     end_ns = port.clock.now_ns() + round(_LISTEN_S * 1e9)
     while port.clock.now_ns() < end_ns:
         if port.ser.read(1):
@@ -193,8 +193,8 @@ def _unasked(port: ClockedPort) -> bool:
     return False
 
 
-class _Hasty(ClockedPort):
-    """A port that waits for an answer no longer than a servo and its adapter take."""
+class _ShortTimeout(ClockedPort):
+    """A port with the shortest sufficient timeout for an answer."""
 
     def __init__(self, port: ClockedPort) -> None:
         super().__init__(port.ser, port.clock)
@@ -207,8 +207,8 @@ def _servo(bus_id: int, baud: int, protocol: int, number: int, firmware: int) ->
     return FoundServo(bus_id, baud, protocol, model_numbers().get(number), number, firmware)
 
 
-def _spoils(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
-    """Return whether something answers an id every time, and never with a whole packet."""
+def _answers_corrupt(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
+    """Return whether every ping of an id gets a corrupt answer."""
     for _ in range(pings):
         corrupt = bus.statistics.corrupt
         try:
@@ -228,7 +228,7 @@ def _spoils(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Chip:
-    """A kind of sensor: where it may be, and the register that says which it is."""
+    """A sensor type: its possible addresses, and the register that identifies it."""
 
     name: str
     driver: str | None
@@ -250,28 +250,28 @@ CHIPS = (
 
 @dataclass(frozen=True, slots=True)
 class FoundImu:
-    """Somebody at an address where IMUs are; ``driver`` is None where the rig has none for it, or it is unknown.
+    """A device at an IMU address; ``driver`` is None if the rig has no driver for it, or if it is unknown.
 
-    ``trouble`` says what else was found there: an unknown chip, a kernel driver that holds the address.
+    ``note`` tells more about it: registers of an unknown chip, or a kernel driver that uses the address.
     """
 
     bus: str
     address: int
     name: str
     driver: str | None
-    trouble: str = ""
+    note: str = ""
 
     def __str__(self) -> str:
-        return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.trouble}" if self.trouble else "")
+        return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.note}" if self.note else "")
 
 
 def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
-    """Return who answers at the addresses that IMUs have; no other address is asked, and nothing is written.
+    """Return the devices that answer at IMU addresses; no other address is asked, and nothing is written.
 
     Raises
     ------
     OSError
-        The bus cannot be opened, or does not move.
+        The bus cannot be opened, or is stuck.
     """
     name = computer.i2c_name(bus)
     found = []
@@ -283,7 +283,7 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
                     said[register] = wire.read_byte_data(address, register)
             except OSError as error:
                 if error.errno == EBUSY:
-                    found.append(FoundImu(name, address, "something", None, "a driver of the kernel holds the address"))
+                    found.append(FoundImu(name, address, "unknown device", None, "a kernel driver uses the address"))
                 elif error.errno not in (ENXIO, EREMOTEIO):
                     raise
                 continue

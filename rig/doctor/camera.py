@@ -1,4 +1,4 @@
-"""The camera: its mode, its locks, and how old and how good its frames are."""
+"""Check the camera: its mode, its locks, and the age and quality of its frames."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -15,15 +15,15 @@ from rig.doctor.finding import Finding, bad, fine, of_error, warning
 from rig.views.capture import ImageQuality, rejection_text
 
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
-"""Frames taken one after the other, which tell the rate, and frames spread over a second, which tell of the light."""
+"""Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
-"""From the start of an exposure until the program has the frame; the table stands still for as long, each view."""
+"""Time from the start of an exposure until the program has the frame; the table waits that long at each view."""
 MAX_FLICKER = 0.05
 """Largest spread of the mean level of frames of one scene."""
 
 
 def camera(context: DoctorContext) -> Iterator[Finding]:
-    """Open the camera with its locks, and take some frames."""
+    """Open the camera, lock its settings, and take some frames."""
     if context.holder is not None:
         yield warning("camera", "not opened: the bench is in use", context.rig("stop"))
         return
@@ -51,7 +51,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     for refused in source.rejected_settings:
         yield warning(
             "camera",
-            f"{refused.setting}: asked for {refused.asked:g}, the camera reports {refused.reported:g}",
+            f"{refused.setting}: requested {refused.asked:g}, the camera reports {refused.reported:g}",
             "v4l2-ctl --list-ctrls-menus" + device,
         )
     automatic = [
@@ -63,7 +63,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         if value or (value is None and wanted is not None)
     ]
     if automatic:
-        text = f"{' and '.join(automatic)} not locked: views of one object may differ from each other"
+        text = f"{' and '.join(automatic)} not locked: views of one object may differ"
         yield warning("camera", text, "v4l2-ctl --list-ctrls-menus" + device)
     elif not source.rejected_settings:
         exposure = "?" if locks.exposure_us is None else f"{locks.exposure_us / 1e3:.3g} ms"
@@ -87,30 +87,30 @@ def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
     seen = [ImageQuality.of(frame, context.config.view) for frame in frames]
     levels = [each.mean_level for each in seen]
-    text = f"frames are {1e3 * max(ages):.0f} ms old when they come, {rate:.3g} a second"
+    text = f"frames arrive {1e3 * max(ages):.0f} ms after exposure, {rate:.3g} a second"
     evidence: dict[str, Any] = {"frame_age_s": max(ages), "frames_per_s": rate, "mean_levels": levels}
     if max(levels) < context.config.view.min_mean:
         fix = "Take the lens cap off and switch the light on, then: " + context.rig("doctor")
         yield bad("camera", f"black: mean level {max(levels):.1f} of 255", fix, **evidence)
         return
     if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
-        yield bad("camera", f"frozen: {len(frames)} frames are the same to the pixel", again, **evidence)
+        yield bad("camera", f"frozen: {len(frames)} frames are identical", again, **evidence)
         return
     if max(ages) > MAX_AGE_S:
-        yield warning("camera", f"{text}: old", "Try another USB port, or a smaller camera.width", **evidence)
+        yield warning("camera", f"{text}: too old", "Try another USB port, or reduce camera.width", **evidence)
     elif rate < 0.6 * source.identity.fps:
-        fix = "Try another USB port, a shorter camera.exposure_us, or a lower camera.fps"
+        fix = "Try another USB port, or reduce camera.exposure_us or camera.fps"
         yield warning("camera", f"{text}, not {source.identity.fps:.3g}", fix, **evidence)
     else:
         yield fine("camera", text, **evidence)
     spread = (max(levels) - min(levels)) / max(levels)
     if spread > MAX_FLICKER:
-        fix = "Use a lamp that does not flicker, keep daylight and shadows away, then: " + context.rig("doctor")
+        fix = "Use a lamp that does not flicker, and keep daylight and shadows away, then: " + context.rig("doctor")
         yield warning("camera", f"the light changes by {spread:.0%} within {SPACED * SPACING_S:.0f} s", fix, **evidence)
     words = f"mean level {levels[-1]:.0f}, sharpness {seen[-1].sharpness:.0f}, {seen[-1].saturated_share:.1%} saturated"
     if reasons := seen[-1].reasons(context.config.view):
         texts = "; ".join(rejection_text(reason, seen[-1]) for reason in reasons)
-        fix = "Look at light, exposure and focus; an empty table may look blurred: " + context.rig("config show view")
-        yield warning("camera", f"a frame as it is would be rejected: {texts}", fix)
+        fix = "Check light, exposure and focus (an empty table may look blurred): " + context.rig("config show view")
+        yield warning("camera", f"a view would be rejected now: {texts}", fix)
     else:
-        yield fine("camera", f"a frame as it is would be taken: {words}")
+        yield fine("camera", f"a view would be accepted now: {words}")

@@ -1,4 +1,4 @@
-"""All checks of a bench, in the order in which a person would look."""
+"""All checks of a bench, in their order."""
 
 from rig.doctor import computer, stored
 from rig.doctor.camera import camera
@@ -9,7 +9,7 @@ from rig.doctor.servo import servo
 CHECKS = (
     Check("bench", computer.bench_state),
     Check("port", computer.ports),
-    # One finding of it may be the answer of eight baud rates, at 9,600 of which a broadcast takes four seconds.
+    # Between two findings it may scan eight baud rates; a broadcast at 9,600 baud takes four seconds.
     Check("servo", servo, deadline_s=60.0),
     Check("imu", imu),
     Check("camera", camera, deadline_s=20.0),
@@ -18,4 +18,4 @@ CHECKS = (
     Check("catalog", stored.catalog, deadline_s=30.0),
     Check("calibration", stored.calibrations),
 )
-"""Those of the devices come before that of their calibrations, which hold for the devices that were met."""
+"""The devices are checked before their calibrations, which are bound to the devices found."""

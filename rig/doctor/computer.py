@@ -1,4 +1,4 @@
-"""The computer: who holds the bench, its ports and permissions, its disk and its clock."""
+"""Check the computer: the bench's state, ports and permissions, disk and clock."""
 
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -10,7 +10,7 @@ from rig.doctor.finding import Finding, bad, fine, warning
 from rig.safety.saved_state import FileStore
 
 LATENCY_MS = 1
-"""What an FTDI adapter's latency timer should be; 16 by default, and each reading waits for it."""
+"""Required latency timer of an FTDI adapter; the default is 16, and each reading waits for it."""
 _FTDI = "0403"
 
 VIEW_BYTES = 500_000
@@ -25,18 +25,18 @@ RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
 
 
 def bench_state(context: DoctorContext) -> Iterator[Finding]:
-    """Who works with the bench, and what it must not forget: a latched fault, a damaged file."""
+    """Check whether the bench is in use, whether a fault is latched, and whether the state file is damaged."""
     path = context.config.state_path(context.bench)
     if context.holder is not None:
         who = f"process {context.holder.pid} ({context.holder.command})" if context.holder.pid else "another process"
-        text = f"in use by {who}: servo, IMU and camera are left to it"
+        text = f"in use by {who}: servo, IMU and camera are not checked"
         yield warning("bench", text, context.rig("stop"), pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
         yield bad(
             "bench",
             state.damage,
-            "Look how far the cable is wound up, then: " + context.rig("home --turns N"),
+            "Check how far the cable is wound up, then: " + context.rig("home --turns N"),
             exit_code=5,
         )
     if state.fault is not None:
@@ -48,7 +48,7 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
 
 
 def ports(context: DoctorContext) -> Iterator[Finding]:
-    """The servo's serial port, the IMU's bus and the camera's device file: there, permitted, free, fast."""
+    """Check the servo's serial port, the IMU's bus and the camera's device file: present, permitted, free, fast."""
     head = context.config.imu.connection == "head"
     for key, wanted in (("servo.port", context.config.servo.port), ("head.port", context.config.head.port))[: 1 + head]:
         port = context.computer.serial_port(wanted)
@@ -73,7 +73,7 @@ def _i2c(context: DoctorContext) -> Iterator[Finding]:
         fix = context.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
         yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", fix)
     else:
-        yield bad("port", f"there is no I2C bus {bus}, nor any other", i2c_command(context))
+        yield bad("port", f"there is no I2C bus (configured: {bus})", i2c_command(context))
 
 
 def _video(context: DoctorContext) -> Iterator[Finding]:
@@ -93,12 +93,12 @@ def _video(context: DoctorContext) -> Iterator[Finding]:
         )
     else:
         yield bad(
-            "port", f"there is no camera {camera}, nor any other", "Connect the camera, then: " + context.rig("find")
+            "port", f"there is no camera (configured: {camera})", "Connect the camera, then: " + context.rig("find")
         )
 
 
 def disk(context: DoctorContext) -> Iterator[Finding]:
-    """Room for views, and a disk that is this computer's own."""
+    """Check the free space for views, and that the disk is local."""
     path = context.catalog_path
     there = context.computer.disk(path)
     views = there.free_bytes // VIEW_BYTES
@@ -118,11 +118,11 @@ def disk(context: DoctorContext) -> Iterator[Finding]:
         yield bad("disk", f"{context.computer.user.name} may not write to {path}", fix, exit_code=7)
     if there.network:
         fix = context.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
-        yield warning("disk", f"{path} is on a network file system, where locks may not hold", fix)
+        yield warning("disk", f"{path} is on a network file system, where locks may fail", fix)
 
 
 def clock(context: DoctorContext) -> Iterator[Finding]:
-    """Monotonic time that runs at the right pace, and a civil time that may be written into records."""
+    """Check the pace of the monotonic clock, and that the civil time is right."""
     time = context.computer.clock
     start_ns, start_utc = time.now_ns(), time.utc()
     time.sleep(_PAUSE_S)
@@ -130,29 +130,29 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
     civil_s = (time.utc() - start_utc).total_seconds()
     if not _PAUSE_S * 0.9 <= passed_s <= _PAUSE_S + _PAUSE_ERROR_S:
         text = (
-            f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.0f} ms: this computer is overloaded, or sleeps"
+            f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.0f} ms: this computer is overloaded, or suspends"
         )
-        yield warning("clock", text, "Close other programs, switch power saving off, then: " + context.rig("doctor"))
+        yield warning("clock", text, "Close other programs and switch power saving off, then: " + context.rig("doctor"))
     else:
         yield fine("clock", f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.1f} ms", pause_s=passed_s)
     now = time.utc()
     synchronised = context.computer.time_synchronised()
     fix = "sudo timedatectl set-ntp true"
     if abs(civil_s - passed_s) > _STEP_S:
-        yield warning("clock", f"the civil time jumped by {civil_s - passed_s:+.1f} s while it was watched", fix)
+        yield warning("clock", f"the civil time jumped by {civil_s - passed_s:+.1f} s during the check", fix)
     elif now < _OLDEST_UTC or now > _OLDEST_UTC + timedelta(days=365 * 50):
-        yield bad("clock", f"the date is wrong: {now:%Y-%m-%d %H:%M} UTC; what is stored would carry it", fix, 1)
+        yield bad("clock", f"the date is wrong: {now:%Y-%m-%d %H:%M} UTC: stored data would have a wrong date", fix, 1)
     elif synchronised is False:
         text = f"{now:%Y-%m-%d %H:%M} UTC, but no time server has been reached since this computer started"
         yield warning("clock", text, fix)
     elif synchronised is None:
-        yield warning("clock", f"{now:%Y-%m-%d %H:%M} UTC, kept by no time server that is known here", fix)
+        yield warning("clock", f"{now:%Y-%m-%d %H:%M} UTC, no time server that is known here", fix)
     else:
-        yield fine("clock", f"{now:%Y-%m-%d %H:%M} UTC, kept by a time server")
+        yield fine("clock", f"{now:%Y-%m-%d %H:%M} UTC, synchronized by a time server")
 
 
 def udev_rules(ports_found: list[SerialPort]) -> str:
-    """Return rules for udev: a short latency, a lasting name for the adapter, and access for who is logged in."""
+    """Return udev rules: a short latency, a permanent name for the adapter, and access for the logged-in user."""
     lines = [
         f"# {RULES_FILE}: made by `rig doctor --udev`",
         f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{LATENCY_MS}"',
@@ -173,7 +173,7 @@ def udev_rules(ports_found: list[SerialPort]) -> str:
 
 
 def udev_command(context: DoctorContext) -> str:
-    """Return the command that puts the rules in force."""
+    """Return the command that installs the rules."""
     return (
         f"{context.rig('doctor --udev')} | sudo tee {RULES_FILE} && "
         "sudo udevadm control --reload && sudo udevadm trigger --action=add"
@@ -181,7 +181,7 @@ def udev_command(context: DoctorContext) -> str:
 
 
 def i2c_command(context: DoctorContext) -> str:
-    """Return the command that makes a computer's I2C buses appear."""
+    """Return the command that enables the computer's I2C buses."""
     return "sudo raspi-config nonint do_i2c 0" if "Raspberry" in context.computer.model else "sudo modprobe i2c-dev"
 
 
@@ -189,32 +189,34 @@ def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPo
     usb = [port for port in found if port.usb]
     if not usb:
         fix = "Plug the adapter in, then: " + context.rig("find")
-        return bad("port", f"there is no serial port {wanted}, nor any other on USB", fix)
+        return bad("port", f"there is no serial port on USB (configured: {wanted})", fix)
     fix = context.set(key, usb[0].stable or usb[0].path) if len(usb) == 1 else context.rig("setup")
     return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", fix)
 
 
 def access(context: DoctorContext, topic: str, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
-    """Say whether a device file can be opened: nobody else has it open, and the user may."""
+    """Check that a device file can be opened: no other program uses it, and the user has permission."""
     if node.holders:
         who = " and ".join(map(str, node.holders))
         if not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
             modem = "ModemManager" in node.holders[0].command
             fix = "sudo systemctl disable --now ModemManager" if modem else f"kill {node.holders[0].pid}"
-            yield bad(topic, f"{node.path} is held by {who}", fix, holders=who)
+            yield bad(topic, f"{node.path} is in use by {who}", fix, holders=who)
             return
     if node.usable:
         yield fine(topic, f"{node.path}: {node.name}" + (f" ({node.stable})" if node.stable else ""))
         return
     group = node.group or usual_group
-    text = f"{context.computer.user.name} may not use {node.path} ({node.name})"
+    text = f"{context.computer.user.name} has no permission for {node.path} ({node.name})"
     if group == "root":
-        yield bad(topic, f"{text}: it belongs to root alone", udev_command(context))
+        yield bad(topic, f"{text}: only root has access", udev_command(context))
     elif context.computer.joined(group):
-        yield bad(topic, f"{text} yet: the group {group} counts from the next login on", f"newgrp {group}")
+        yield bad(
+            topic, f"{text} yet: the membership in group {group} takes effect at the next login", f"newgrp {group}"
+        )
     else:
         fix = f"sudo usermod -aG {group} {context.computer.user.name}"
-        yield bad(topic, f"{text}: the group {group} may; log in again after this", fix, group=group)
+        yield bad(topic, f"{text}: the group {group} has; log in again after this", fix, group=group)
 
 
 def _latency(context: DoctorContext, port: SerialPort) -> Finding:
@@ -223,7 +225,7 @@ def _latency(context: DoctorContext, port: SerialPort) -> Finding:
         return fine("port", text, latency_ms=port.latency_ms)
     return warning(
         "port",
-        f"{text}: each reading waits for it; {LATENCY_MS} ms is right (for good: {context.rig('doctor --udev')})",
+        f"{text}: each reading waits for it, set {LATENCY_MS} ms (permanently: {context.rig('doctor --udev')})",
         f"echo {LATENCY_MS} | sudo tee {port.latency_file}",
         latency_ms=port.latency_ms,
     )

@@ -1,4 +1,4 @@
-"""What is examined: a computer, and the bench that a configuration describes."""
+"""The subject of the checks: a computer, and the bench of a configuration."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,18 +16,18 @@ from rig.safety.saved_state import Holder, busy, holder
 
 @dataclass
 class DoctorContext:
-    """A bench that is not opened, and the computer where its devices are looked for.
+    """A bench that is not open, and the computer to which its devices are connected.
 
     Attributes
     ----------
     options
-        What `rig` must be given to mean the same bench: ``--bench sim``.
+        Options of `rig` that select this bench: ``--bench sim``.
     file_options
-        What `rig config set` must be given to mean the same file.
+        Options of `rig config set` that select this configuration file.
     holder
-        Who works with the bench now.
+        The program that uses the bench now.
     identities
-        The devices that were met, put here by the checks for those that come after them.
+        The devices that the checks found, for later checks.
     """
 
     computer: Computer
@@ -65,7 +65,7 @@ def open_context(
     options: tuple[str, ...] = (),
     file_options: tuple[str, ...] = (),
 ) -> Iterator[DoctorContext]:
-    """Yield a bench to be examined; for one that brings no computer of its own it is this one.
+    """Yield a bench to check; its computer is this one unless the bench provides another.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def open_context(
     chosen = validate(kind.options, config.bench.get(bench, {}), where="the configuration", prefix=f"bench.{bench}")
     try:
         who = holder(config.state_path(bench))
-    except OSError:  # the folder may not be read: the check of the bench's state tells
+    except OSError:  # the folder is not readable: the check of the bench's state reports it
         who = None
     if isinstance(kind, ComputerProvider):
         with kind.computer(config, chosen, seed) as computer:

@@ -1,4 +1,4 @@
-"""What is connected to the computer, and how it would be written into the configuration."""
+"""Find the devices that are connected to the computer, and their settings for the configuration."""
 
 import re
 from collections.abc import Generator, Iterator, Sequence
@@ -31,12 +31,12 @@ from rig.doctor.examination import Check
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
 _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
-"""I2C buses with memory, monitors and clock chips on them, which are not to be asked."""
+"""I2C buses of memory, monitors and clock chips, which must not be scanned."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundCamera:
-    """A camera that opened, and the mode it came up in."""
+    """A camera that opened, and its default mode."""
 
     node: DeviceFile
     width: int
@@ -46,33 +46,33 @@ class FoundCamera:
 
 @dataclass
 class DeviceScan:
-    """Looks at all ports, buses and cameras, and keeps what answered.
+    """A scan of all ports, buses and cameras, and the devices found.
 
     Parameters
     ----------
     both_protocols
-        Ask for servos of Protocol 1.0 even where some of Protocol 2.0 answered.
+        Also search for servos of Protocol 1.0 if some of Protocol 2.0 answered.
     """
 
     both_protocols: bool = False
     ports: tuple[str, ...] | None = None
-    """Serial ports to ask; all that may be asked where it is None."""
+    """Serial ports to scan; None: all on USB, and the configured one."""
     servos: list[tuple[SerialPort, FoundServo]] = field(default_factory=list)
     imus: list[FoundImu] = field(default_factory=list)
     cameras: list[FoundCamera] = field(default_factory=list)
     heads: list[SerialPort] = field(default_factory=list)
     duplicate_ids: bool = False
-    """Two servos with one id were heard."""
+    """Two servos with the same id were found."""
 
     @property
     def checks(self) -> tuple[Check, ...]:
         return (
-            Check("servo", self.look_for_servos, deadline_s=90.0),
-            Check("imu", self.look_for_imus),
-            Check("camera", self.look_for_cameras, deadline_s=20.0),
+            Check("servo", self.find_servos, deadline_s=90.0),
+            Check("imu", self.find_imus),
+            Check("camera", self.find_cameras, deadline_s=20.0),
         )
 
-    def look_for_servos(self, context: DoctorContext) -> Iterator[Finding | str]:
+    def find_servos(self, context: DoctorContext) -> Iterator[Finding | str]:
         known = context.computer.serial_ports()
         configured = context.computer.serial_port(context.config.servo.port)
         if configured is not None and not any(context.computer.same_file(port.path, configured.path) for port in known):
@@ -82,12 +82,12 @@ class DeviceScan:
         asked = [p for p in known if p.usb or context.computer.same_file(p.path, context.config.servo.port)]
         if not asked:
             text = f"no serial port on USB{'; there is ' + ', '.join(p.path for p in known) if known else ''}"
-            yield bad("servo", text, "Plug the U2D2 in, then: " + context.rig("find"))
+            yield bad("servo", text, "Connect the U2D2, then: " + context.rig("find"))
         for port in asked:
             yield from self._on_port(context, port)
 
     def _on_port(self, context: DoctorContext, port: SerialPort) -> Iterator[Finding | str]:
-        """Ask who is at a port, the quick questions first: AX-12A can only be asked one by one."""
+        """Scan a port, the fast scans first: the ids of AX-12A can only be asked one by one."""
         problems = [finding for finding in access(context, "servo", port, "dialout") if finding.fix]
         if problems:
             yield from problems
@@ -104,11 +104,11 @@ class DeviceScan:
             yield of_error("servo", error)
         except (serial.SerialException, OSError) as error:
             yield bad(
-                "servo", f"{port.path} failed: {error}", "Plug the adapter in again, then: " + context.rig("find")
+                "servo", f"{port.path} failed: {error}", "Connect the adapter again, then: " + context.rig("find")
             )
         else:
             if not (servos or head or self.duplicate_ids):
-                text = f"{port.path} ({port.name}): no servo answers at any baud rate, nor a rig head"
+                text = f"{port.path} ({port.name}): no servo and no rig head answer at any baud rate"
                 fix = "Check the servo's cable and switch on its supply, then: " + context.rig("find")
                 yield warning("servo", text, fix)
 
@@ -118,14 +118,14 @@ class DeviceScan:
         answered: list[BaudScan] = []
         with closing(context.computer.open_serial(port.path, rates[0])) as wire:
             for rate in rates:
-                yield f"{port.path}: asking at {rate} baud, protocol {protocol}.0 ..."
+                yield f"{port.path}: scanning at {rate} baud, protocol {protocol}.0 ..."
                 answered += scan_servos(wire, context.computer.clock, [rate], protocol=protocol)
-        for heard in without_echoes(answered, context.config.servo.baud):
-            yield from self._heard(context, port, heard)
-        return any(heard.anything for heard in answered)
+        for scan in without_echoes(answered, context.config.servo.baud):
+            yield from self._found(context, port, scan)
+        return any(scan.answered for scan in answered)
 
     def _head(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
-        yield f"{port.path}: asking for a rig head ..."
+        yield f"{port.path}: searching for a rig head ..."
         config = context.config.model_copy(update={"head": context.config.head.model_copy(update={"port": port.path})})
         try:
             with closing(
@@ -134,7 +134,7 @@ class DeviceScan:
                 who = head.identity
         except DeviceNotFound:
             return False
-        except RigError as error:  # a head, but not as it should be
+        except RigError as error:  # a rig head with an error
             yield of_error("imu", error)
             return True
         self.heads.append(port)
@@ -142,20 +142,20 @@ class DeviceScan:
         yield fine("imu", text, port=port.path)
         return True
 
-    def _heard(self, context: DoctorContext, port: SerialPort, heard: BaudScan) -> Iterator[Finding]:
-        for found in heard.servos:
+    def _found(self, context: DoctorContext, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
+        for found in scan.servos:
             self.servos.append((port, found))
             yield fine("servo", f"{port.path}: {found}", port=port.path, id=found.bus_id, baud=found.baud)
-        if heard.duplicate_ids:
+        if scan.duplicate_ids:
             self.duplicate_ids = True
-            ids = ", ".join(map(str, heard.duplicate_ids))
-            text = f"{port.path}: two servos answer at once to id {ids} at {heard.baud} baud"
+            ids = ", ".join(map(str, scan.duplicate_ids))
+            text = f"{port.path}: two servos answer at once to id {ids} at {scan.baud} baud"
             yield bad("servo", text, "Unplug one of the two, then: " + context.rig("servo set-id NEW"))
-        if heard.noise:
-            text = f"{port.path}: bytes at {heard.baud} baud that are no servo's"
-            yield warning("servo", text, "Take everything but servos off the bus, then: " + context.rig("find"))
+        if scan.noise:
+            text = f"{port.path}: bytes at {scan.baud} baud that do not belong to a servo"
+            yield warning("servo", text, "Remove everything but servos from the bus, then: " + context.rig("find"))
 
-    def look_for_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
+    def find_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
         configured = context.computer.i2c_name(context.config.imu.bus)
         asked = 0
         before = len(self.imus)
@@ -167,12 +167,12 @@ class DeviceScan:
             if problems:
                 yield from problems
                 continue
-            yield f"{node.path}: asking for IMUs ..."
+            yield f"{node.path}: searching for IMUs ..."
             try:
                 there = scan_imus(context.computer, node.path)
             except OSError as error:
-                fix = "Take the sensor's supply off and on; check SDA and SCL for a short"
-                yield bad("imu", f"{node.path} does not move: {error.strerror}", fix)
+                fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
+                yield bad("imu", f"{node.path} is stuck: {error.strerror}", fix)
                 continue
             for found in there:
                 if found.driver:
@@ -186,7 +186,7 @@ class DeviceScan:
             fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
             yield warning("imu", "no IMU answers on any I2C bus", fix)
 
-    def look_for_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
+    def find_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
         nodes = context.computer.cameras()
         if not nodes:
             yield warning("camera", "no camera", "Connect the camera, then: " + context.rig("find"))
@@ -209,7 +209,7 @@ class DeviceScan:
 
 
 def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:
-    """Return the keys of the configuration that mean this servo."""
+    """Return the settings of this servo, by key."""
     keys: dict[Key, Any] = {
         ("servo", "port"): port.stable or port.path,
         ("servo", "baud"): servo.baud,
@@ -219,7 +219,7 @@ def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:
 
 
 def imu_settings(found: FoundImu) -> dict[Key, Any]:
-    """Return the keys of the configuration that mean this IMU."""
+    """Return the settings of this IMU, by key."""
     number = found.bus.removeprefix("/dev/i2c-")
     bus = int(number) if number.isdigit() else found.bus
     where: dict[Key, Any] = {("imu", "model"): found.driver, ("imu", "bus"): bus, ("imu", "address"): found.address}
@@ -227,11 +227,11 @@ def imu_settings(found: FoundImu) -> dict[Key, Any]:
 
 
 def head_settings(port: SerialPort) -> dict[Key, Any]:
-    """Return the keys of the configuration that mean the IMU on a rig head."""
+    """Return the settings of the IMU on a rig head, by key."""
     return {("imu", "connection"): "head", ("head", "port"): port.stable or port.path}
 
 
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:
-    """Return the keys of the configuration that mean this camera; its number may be another one after a restart."""
+    """Return the settings of this camera, by key; its number may change after a restart."""
     number = Path(found.node.path).name.removeprefix("video")
     return {("camera", "source"): found.node.stable or (int(number) if number.isdigit() else found.node.path)}

@@ -1,4 +1,4 @@
-"""What an examination says: one finding a line, and one command that fixes it."""
+"""A finding of `rig doctor`: one line, and the fix for a problem."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from rig.core.errors import RigError
 
 
 class Severity(StrEnum):
-    """How bad it is: nothing to do, something to look at, something that stops the work."""
+    """The severity of a finding: no problem, a possible problem, or a problem that prevents work."""
 
     FINE = "fine"
     WARNING = "warning"
@@ -21,20 +21,20 @@ MARKS = {Severity.FINE: "✓", Severity.WARNING: "!", Severity.BAD: "✗"}
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One fact about the bench.
+    """One finding about the bench.
 
     Attributes
     ----------
     topic
-        What was looked at: ``servo``.
+        The checked part, for example ``servo``.
     level
-        How bad it is.
+        Its severity.
     text
-        What was found, with its numbers.
+        The finding, with its numbers.
     fix
-        The one command, or act of the hands, that fixes it; empty where there is nothing to fix.
+        The command or the action that fixes the problem; empty if there is none.
     exit_code
-        What `rig doctor` ends with because of it, 0 unless the finding is bad.
+        The exit code of `rig doctor` for this finding; 0 unless it is bad.
     evidence
         The numbers, units in the keys.
     """
@@ -69,7 +69,7 @@ def bad(topic: str, text: str, fix: str, exit_code: int = 4, **evidence: Any) ->
 
 
 def of_error(topic: str, error: RigError, fix: str = "") -> Finding:
-    """Return an error of the registry as a finding."""
+    """Return an error as a finding."""
     reason = error.evidence.get("reason")
     text = f"{error.what.rstrip('.')}: {reason}" if reason else error.what
     return Finding(topic, Severity.BAD, text, fix or error.next_step, error.exit_code, error.evidence)

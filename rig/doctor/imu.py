@@ -1,4 +1,4 @@
-"""The IMU: who answers, and what it reads while nothing moves."""
+"""Check the IMU: its identity, and its readings at rest."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -17,7 +17,7 @@ from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
 SECONDS, DRAIN_S = 1.5, 0.25
 NOISY = 4.0
-"""How many times the datasheet's noise is more than a quiet table shows."""
+"""Multiple of the datasheet's noise that a quiet table does not exceed."""
 NO_REST_DPS = 20.0
 MAX_BIAS_DPS = 20.0
 """Zero-rate output of the MPU-6050's datasheet; more is a rotation, or a broken sensor."""
@@ -26,9 +26,9 @@ UPRIGHT = 0.94
 
 
 def imu(context: DoctorContext) -> Iterator[Finding]:
-    """Identify the sensor, then look at its noise, its zero, and which way is up for it."""
+    """Identify the sensor, then check its noise, its zero, and its orientation."""
     if context.holder is not None:
-        yield warning("imu", "not asked: opening it would spoil the measurement that is running", context.rig("stop"))
+        yield warning("imu", "not checked: opening it would disturb the running measurement", context.rig("stop"))
         return
     config, clock = context.config, context.computer.clock
     if config.imu.connection == "head":
@@ -65,7 +65,7 @@ def _at_rest(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
 
 
 def _samples(context: DoctorContext, sensor: Imu) -> ImuSamples:
-    """Collect ``SECONDS`` of samples, what is old thrown away first."""
+    """Return ``SECONDS`` of samples, without older ones."""
     sensor.read_samples()
     taken = []
     for _ in range(round(SECONDS / DRAIN_S)):
@@ -83,7 +83,9 @@ def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Iterator[
     wanted = SECONDS * sensor.rate_hz
     if len(samples.time_ns) < 0.8 * wanted:
         text = f"{len(samples.time_ns)} samples in {SECONDS:g} s instead of {wanted:.0f}, {samples.lost} lost"
-        yield bad("imu", text, "Shorten the I2C cable, take other devices off the bus, then: " + context.rig("doctor"))
+        yield bad(
+            "imu", text, "Shorten the I2C cable and remove other devices from the bus, then: " + context.rig("doctor")
+        )
         return
     rates = samples.gyro_dps
     spread = rates.std(axis=0)
@@ -93,18 +95,18 @@ def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Iterator[
     evidence: dict[str, Any] = {"noise_dps": float(spread[axis]), "bias_dps": bias, "samples": len(rates)}
     if (np.abs(rates) >= sensor.range_dps * 0.999).any():
         fix = "Check the sensor's supply and cable, then: " + context.rig("doctor")
-        yield bad("imu", f"saturated at {sensor.range_dps:.0f} °/s although nothing moves", fix, **evidence)
+        yield bad("imu", f"saturated at {sensor.range_dps:.0f} °/s at rest", fix, **evidence)
     elif (rates == rates[0]).all():
         fix = "Switch the sensor's supply off and on, then: " + context.rig("doctor")
-        yield bad("imu", "frozen: every sample is the same, not even noise", fix, **evidence)
+        yield bad("imu", "frozen: all samples are identical, without noise", fix, **evidence)
     elif spread.max() > NO_REST_DPS:
         fix = "Check the sensor's supply, ground and cable, then: " + context.rig("doctor")
-        yield bad("imu", f"{text}: no table at rest shakes so, and no motor runs", fix, **evidence)
+        yield bad("imu", f"{text}: more than a table at rest shows", fix, **evidence)
     elif spread.max() > NOISY * expected:
-        fix = "Keep hands and vibration off the bench, then: " + context.rig("doctor")
-        yield warning("imu", f"{text}: restless, {expected:.3f} °/s is usual", fix, **evidence)
+        fix = "Keep hands and vibration away from the bench, then: " + context.rig("doctor")
+        yield warning("imu", f"{text}: noisy, {expected:.3f} °/s is usual", fix, **evidence)
     elif abs(bias) > MAX_BIAS_DPS:
-        yield bad("imu", f"{text}: no sensor of its kind is as far off", "Replace the sensor", **evidence)
+        yield bad("imu", f"{text}: outside the datasheet", "Replace the sensor", **evidence)
     else:
         yield fine("imu", text, **evidence)
 
@@ -130,19 +132,19 @@ def _gravity(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
 def _wrong(context: DoctorContext, config: ImuConfig, here: FoundImu | None, there: list[FoundImu]) -> Finding:
     bus = context.computer.i2c_name(config.bus)
     if here is not None:
-        fix = "Check its wiring; the rig drives MPU-6050 and BNO055"
+        fix = "Use an MPU-6050 or a BNO055, or check the wiring"
         return bad("imu", f"{here}: the rig has no driver for it", fix, address=here.address)
     usable = [found for found in there if found.driver]
-    text = f"nobody answers at {config.address:#04x} of {bus}"
+    text = f"no device answers at {config.address:#04x} of {bus}"
     if usable:
         return bad("imu", f"{text}; there is {usable[0]}", context.set("imu.address", f"{usable[0].address:#04x}"))
     fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
-    return bad("imu", f"{text}, nor at any other address of an IMU", fix)
+    return bad("imu", f"{text}, nor at any other IMU address", fix)
 
 
 def _bus_failed(context: DoctorContext, error: OSError) -> Finding:
     bus = context.computer.i2c_name(context.config.imu.bus)
     if isinstance(error, FileNotFoundError | PermissionError):
         return bad("imu", f"{bus} cannot be opened: {error.strerror}", context.rig("find"))
-    fix = "Take the sensor's supply off and on; check SDA and SCL for a short"
-    return bad("imu", f"{bus} does not move: {error.strerror}; a device holds the bus", fix, errno=error.errno)
+    fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
+    return bad("imu", f"{bus} is stuck: {error.strerror}; a device blocks the bus", fix, errno=error.errno)

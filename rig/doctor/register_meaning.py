@@ -1,4 +1,4 @@
-"""The registers of a servo in words and units, as the e-manual has them."""
+"""The meaning of a servo's registers, with the units of the e-manual."""
 
 from rig.devices.dynamixel.register_servo import hardware_errors
 from rig.devices.dynamixel.registers import ControlTable
@@ -6,7 +6,7 @@ from rig.devices.dynamixel.registers import ControlTable
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
 """Values of Baud Rate, Protocol 2.0."""
 AX_BAUD = 2_000_000
-"""Protocol 1.0: Baud Rate is this by the rate, less one."""
+"""Protocol 1.0: the value of Baud Rate is this divided by the rate, minus one."""
 
 _OPERATING_MODES = {
     0: "current",
@@ -56,7 +56,7 @@ _VELOCITIES = frozenset(
 )
 _CURRENTS = frozenset({"Current Limit", "Goal Current", "Present Current"})
 _MILLIAMPERES = {"xl330": 1.0, "xc330": 1.0, "xm430": 2.69, "xh430": 2.69, "xd430": 2.69, "xm540": 2.69, "xh540": 2.69}
-"""Unit of the currents by the first part of the model's name; of others the e-manual page is not known here."""
+"""Unit of the currents by the first part of the model's name; unknown for other models."""
 
 
 def baud_codes(table: ControlTable) -> dict[int, int]:
@@ -70,10 +70,10 @@ def baud_codes(table: ControlTable) -> dict[int, int]:
     return {rate: code for rate, code in BAUD_CODES.items() if rate <= fastest}
 
 
-def words(table: ControlTable, name: str, value: int) -> str:
-    """Return what a register's value means; empty where the number says it all."""
+def meaning(table: ControlTable, name: str, value: int) -> str:
+    """Return the meaning of a register's value; empty if the number needs none."""
     if table.ram_start != 64:
-        return _words_of_ax(name, value)
+        return _ax_meaning(name, value)
     match name:
         case "Baud Rate":
             return next((f"{rate} bit/s" for rate, code in BAUD_CODES.items() if code == value), "unknown rate")
@@ -124,7 +124,7 @@ def words(table: ControlTable, name: str, value: int) -> str:
     return ""
 
 
-def _words_of_ax(name: str, value: int) -> str:
+def _ax_meaning(name: str, value: int) -> str:
     match name:
         case "Baud Rate":
             return f"{AX_BAUD / (value + 1):.0f} bit/s"

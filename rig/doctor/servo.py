@@ -1,4 +1,4 @@
-"""The servo: who answers, as what, in what state; reads only."""
+"""Check the servo: its identity, settings and state; reads only."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -16,21 +16,21 @@ from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
 READS = 100
 REPEATED = 2
-"""How many of them a good line may spoil."""
+"""Number of repeated readings on a good bus."""
 SLOW = 1 / 3
-"""Share of the control loop's period that a reading may take; where it takes more it mostly is the latency timer."""
+"""Share of the control loop's period that a reading may take; the usual cause of more is the latency timer."""
 IMPOSSIBLE_C = 150
 POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then: "
 
 
 def servo(context: DoctorContext) -> Iterator[Finding | str]:
-    """Find the configured servo, whoever else is on its bus, and look at its settings, supply and temperature."""
+    """Find the configured servo and others on its bus, and check its settings, supply and temperature."""
     if context.holder is not None:
-        yield warning("servo", "not asked: the bench is in use", context.rig("stop"))
+        yield warning("servo", "not checked: the bench is in use", context.rig("stop"))
         return
     config = context.config.servo
     if context.config.imu.connection == "head" and context.config.head.power:
-        text = "not asked: its supply goes through the rig head's relay, which is closed only while a program works"
+        text = "not checked: the rig head's relay switches its supply on only while a program runs"
         yield warning("servo", text, context.rig("status"))
         return
     with ExitStack() as opened:
@@ -43,13 +43,13 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
         try:
             found = open_servo(wire, config, context.computer.clock, context.config.table.mode)
         except DeviceNotFound:
-            yield from _elsewhere(context, wire)
+            yield from _scan_rates(context, wire)
             return
         except DeviceMismatch as error:
             yield of_error("servo", error, context.set("servo.model", error.evidence["got"]))
             return
         except DeviceSilent as error:
-            yield from _alone(context, wire)
+            yield from _others_on_bus(context, wire)
             yield of_error("servo", error)
             return
         identity = found.identity
@@ -59,27 +59,27 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
             "servo", f"{name}, firmware {identity.firmware}, id {config.id} at {config.baud} baud, {config.port}"
         )
         for remark in found.remarks:
-            yield warning("servo", remark.removeprefix("servo: "), "Stay beside it, or use a servo of the X series")
-        yield from _alone(context, wire)
+            yield warning("servo", remark.removeprefix("servo: "), "Stay at the bench, or use a servo of the X series")
+        yield from _others_on_bus(context, wire)
         yield from _settings(context, found)
         yield from _condition(context, found)
-        yield from _line(context, found)
+        yield from _bus_quality(context, found)
 
 
-def _elsewhere(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding | str]:
-    """Nobody answers where the configuration says: look at the other baud rates, and say who is there instead."""
+def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding | str]:
+    """Scan the other baud rates, because the configured servo does not answer."""
     config = context.config.servo
     protocol = protocol_of(config.model)
     rates = BAUD_RATES if protocol == 2 else BAUD_RATES_1
     answered: list[BaudScan] = []
     for rate in [config.baud, *(rate for rate in rates if rate != config.baud)]:
-        yield f"{config.port}: nobody at id {config.id}; asking at {rate} baud ..."
-        for heard in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
-            if heard.duplicate_ids:
-                yield _duplicate(context, heard)
+        yield f"{config.port}: no servo at id {config.id}; scanning at {rate} baud ..."
+        for scan in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
+            if scan.duplicate_ids:
+                yield _duplicate(context, scan)
                 return
-            answered.append(heard)
-    there = [found for heard in without_echoes(answered, config.baud) for found in heard.servos]
+            answered.append(scan)
+    there = [found for scan in without_echoes(answered, config.baud) for found in scan.servos]
     wanted = f"no servo answers at id {config.id}, {config.baud} baud, {config.port}"
     if not there:
         yield bad("servo", f"{wanted}, nor any other at any baud rate", POWER + context.rig("doctor"))
@@ -88,11 +88,11 @@ def _elsewhere(context: DoctorContext, wire: SerialConnection) -> Iterator[Findi
         listed = "; ".join(map(str, there))
         yield bad("servo", f"{wanted}; {len(there)} others do: {listed}", context.rig("setup"))
         return
-    yield bad("servo", f"{wanted}; there is {there[0]}", _follow(context, config, there[0]))
+    yield bad("servo", f"{wanted}; there is {there[0]}", _change_config(context, config, there[0]))
 
 
-def _follow(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
-    """Return the command that makes the configuration say what there is."""
+def _change_config(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
+    """Return the command that changes the configuration to the servo found."""
     differing = {
         "servo.id": (config.id, there.bus_id),
         "servo.baud": (config.baud, there.baud),
@@ -102,45 +102,47 @@ def _follow(context: DoctorContext, config: ServoConfig, there: FoundServo) -> s
     return changes[0] if len(changes) == 1 else context.rig("setup")
 
 
-def _alone(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding]:
-    """Say who else answers at this baud rate, and whether two answer at once."""
+def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding]:
+    """Find other servos at this baud rate, and servos with the same id."""
     config = context.config.servo
     if protocol_of(config.model) == 1:
-        return  # has no broadcast ping: `rig find` asks each id
-    for heard in scan_servos(wire, context.computer.clock, [config.baud]):
-        others = [servo for servo in heard.servos if servo.bus_id != config.id]
-        if heard.duplicate_ids:
-            yield _duplicate(context, heard)
-        elif heard.noise:
-            text = "bytes arrive that are no servo's: another program or adapter on the line, or a loose contact"
-            yield warning("servo", text, "Take everything but the servo off the bus, then: " + context.rig("doctor"))
+        return  # Protocol 1.0 has no broadcast ping: `rig find` asks each id
+    for scan in scan_servos(wire, context.computer.clock, [config.baud]):
+        others = [servo for servo in scan.servos if servo.bus_id != config.id]
+        if scan.duplicate_ids:
+            yield _duplicate(context, scan)
+        elif scan.noise:
+            text = (
+                "bytes arrive that do not belong to a servo: another program or adapter on the bus, or a loose contact"
+            )
+            yield warning("servo", text, "Remove everything but the servo from the bus, then: " + context.rig("doctor"))
         elif others:
             listed = "; ".join(map(str, others))
-            yield fine("servo", f"also on the bus, left alone: {listed}")
+            yield fine("servo", f"also on the bus, not checked: {listed}")
         else:
-            yield fine("servo", "alone on its bus, no id twice")
+            yield fine("servo", "the only servo on its bus")
 
 
-def _duplicate(context: DoctorContext, heard: BaudScan) -> Finding:
-    ids = ", ".join(map(str, heard.duplicate_ids))
+def _duplicate(context: DoctorContext, scan: BaudScan) -> Finding:
+    ids = ", ".join(map(str, scan.duplicate_ids))
     return bad(
         "servo",
-        f"two servos answer at once to id {ids} at {heard.baud} baud (or the line is very bad)",
-        f"Unplug one of the two, then: {context.rig(f'servo set-id {_free_id(heard)}')}",
-        ids=list(heard.duplicate_ids),
-        baud=heard.baud,
+        f"two servos answer at once to id {ids} at {scan.baud} baud (or the connection is very bad)",
+        f"Unplug one of the two, then: {context.rig(f'servo set-id {_free_id(scan)}')}",
+        ids=list(scan.duplicate_ids),
+        baud=scan.baud,
     )
 
 
-def _free_id(heard: BaudScan) -> int:
-    taken = {servo.bus_id for servo in heard.servos} | set(heard.duplicate_ids)
+def _free_id(scan: BaudScan) -> int:
+    taken = {servo.bus_id for servo in scan.servos} | set(scan.duplicate_ids)
     return next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
 
 
 def _settings(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
     differences = found.setting_differences()
     if not differences:
-        yield fine("servo", "its permanent settings (EEPROM) are as the rig needs them")
+        yield fine("servo", "its permanent settings (EEPROM) are as required")
     for difference in differences:
         yield bad(
             "servo",
@@ -159,13 +161,13 @@ def _condition(context: DoctorContext, found: RegisterServo) -> Iterator[Finding
         text = f"reports a hardware error: {', '.join(condition.hardware_errors)}; torque stays off until it restarts"
         yield bad("servo", text, context.rig("acknowledge --reboot"), hardware_errors=list(condition.hardware_errors))
     if condition.watchdog_tripped:
-        yield warning("servo", "its watchdog tripped: a program died while the table moved", context.rig("status"))
+        yield warning("servo", "its watchdog tripped: a program ended during a rotation", context.rig("status"))
     if condition.torque:
-        yield warning("servo", "its torque is on although nobody works with it", context.rig("stop"))
+        yield warning("servo", "its torque is on although no program uses it", context.rig("stop"))
     low, high = limits.voltage_v
     if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
-        text = f"tells what cannot be: {state.voltage_v:.1f} V and {state.temperature_c:.0f} °C"
-        yield bad("servo", text, "Replace the servo, or its cable if another one tells the same")
+        text = f"reports impossible values: {state.voltage_v:.1f} V and {state.temperature_c:.0f} °C"
+        yield bad("servo", text, "Replace the servo, or its cable if another servo reports the same")
         return
     margin = safety.voltage_margin_v
     text = f"supply {state.voltage_v:.1f} V (the servo shuts down outside {low:.1f}..{high:.1f} V)"
@@ -177,13 +179,13 @@ def _condition(context: DoctorContext, found: RegisterServo) -> Iterator[Finding
         yield fine("servo", text, voltage_v=state.voltage_v)
     text = f"temperature {state.temperature_c:.0f} °C (the servo shuts down above {limits.temperature_c:.0f} °C)"
     if state.temperature_c >= limits.temperature_c - safety.temperature_margin_c:
-        fix = "Let it cool, and look for what makes the table hard to turn"
+        fix = "Let it cool, and find out why the table is hard to rotate"
         yield bad("servo", text, fix, temperature_c=state.temperature_c)
     else:
         yield fine("servo", text, temperature_c=state.temperature_c)
 
 
-def _line(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
+def _bus_quality(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
     clock = context.computer.clock
     before = found.bus_statistics
     ticks = _ticks(found)
@@ -193,7 +195,7 @@ def _line(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
     each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
     after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
-        text = f"frozen: its own clock stood at {ticks} ms during {READS} readings, so no reading of it can be believed"
+        text = f"frozen: its own clock stood at {ticks} ms during {READS} readings, so its readings are not valid"
         yield bad("servo", text, "Switch the servo's supply off and on, then: " + context.rig("doctor"), tick_ms=ticks)
         return
     again = after["retries"] - before["retries"]
@@ -217,7 +219,7 @@ def _line(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
 
 
 def _ticks(found: RegisterServo) -> int | None:
-    """Return the servo's own clock, in milliseconds; None for a model without."""
+    """Return the servo's own clock in milliseconds; None for a model without a clock."""
     table = control_table(found.identity.model, found.identity.firmware)
     if "Realtime Tick" not in table:
         return None

@@ -1,4 +1,4 @@
-"""A servo's id and baud rate: changed only while it is alone on its bus, its torque off, and verified afterwards."""
+"""Change a servo's id and baud rate: only if it is alone on its bus, with the torque off, and verified afterwards."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,32 +16,32 @@ from rig.doctor.register_meaning import baud_codes
 
 MAX_ID = 252
 _SETTLE_S = 0.05
-"""How long a servo may take to speak at a new rate."""
+"""Time that a servo needs before it answers at a new rate."""
 
 
 class SingleServo:
-    """The one servo on a bus, found at whatever id and baud rate it has.
+    """The only servo on a bus, found at any id and baud rate.
 
     Raises
     ------
     DeviceNotFound
         No servo answers at any baud rate.
     SeveralServos
-        More than one does, or two with one id.
+        Several servos answer, or two have the same id.
     DeviceMismatch
-        It is of a model that has no control table.
+        There is no control table for its model.
     """
 
     def __init__(
-        self, context: DoctorContext, wire: SerialConnection, say: Callable[[str], None] = lambda _: None
+        self, context: DoctorContext, wire: SerialConnection, progress: Callable[[str], None] = lambda _: None
     ) -> None:
         self._wire = wire
         self._clock = context.computer.clock
-        self.found = _the_only_one(context, wire, say)
+        self.found = _find_only_servo(context, wire, progress)
         if self.found.model is None:
             raise DeviceMismatch(
                 f"There is no control table for this servo: model number {self.found.model_number}.",
-                next_step="Use another servo, or set this one up with its maker's program.",
+                next_step="Use another servo, or set this one up with the manufacturer's program.",
                 evidence={"model_number": self.found.model_number},
             )
         wire.baudrate = self.found.baud
@@ -49,7 +49,7 @@ class SingleServo:
         self.table: ControlTable = control_table(self.found.model, self.found.firmware)
 
     def read(self) -> dict[str, int]:
-        """Return every register by name, in the order of their addresses; those of indirect addressing are left out."""
+        """Return every register by name, in the order of addresses, without indirect addressing."""
         registers = sorted(
             {r.address: r for r in self.table.values() if not r.name.startswith("Indirect")}.values(),
             key=lambda register: register.address,
@@ -57,14 +57,14 @@ class SingleServo:
         return {register.name: self.bus.read(self.found.bus_id, register) for register in registers}
 
     def set_id(self, new: int) -> None:
-        """Give the servo another id.
+        """Change the id of the servo.
 
         Raises
         ------
         UsageError
-            There is no such id.
+            The id is out of range.
         RequestRejected
-            It did not take the id; it answers to the old one.
+            The servo did not accept the id; it answers to the old one.
         """
         if not 0 <= new <= MAX_ID:
             raise UsageError(f"No servo has the id {new}.", next_step=f"Choose an id from 0 to {MAX_ID}.")
@@ -75,14 +75,14 @@ class SingleServo:
         self.found = replace(self.found, bus_id=new)
 
     def set_baud(self, rate: int) -> None:
-        """Give the servo another baud rate; the port follows.
+        """Change the baud rate of the servo and of the port.
 
         Raises
         ------
         UsageError
-            The model, or the adapter, has no such rate.
+            The model or the adapter does not support the rate.
         RequestRejected
-            It did not take the rate; it answers at the old one.
+            The servo did not accept the rate; it answers at the old one.
         """
         codes = baud_codes(self.table)
         if rate not in codes:
@@ -118,10 +118,10 @@ class SingleServo:
             )
 
     def _answered(self) -> bool:
-        """Return whether the servo answers a write; it may have been told to answer reads alone."""
+        """Return whether the servo answers a write; it may be set to answer reads only."""
         return self.bus.read(self.found.bus_id, self.table["Status Return Level"]) == 2
 
-    def _verify(self, bus_id: int, name: str, value: int, words: str) -> None:
+    def _verify(self, bus_id: int, name: str, value: int, what: str) -> None:
         self._clock.sleep(_SETTLE_S)
         try:
             kept = self.bus.read(bus_id, self.table[name]) == value
@@ -129,41 +129,41 @@ class SingleServo:
             kept = False
         if not kept:
             raise RequestRejected(
-                f"The servo did not take {words}.",
-                next_step="Switch its supply off and on, then look with `rig find`.",
+                f"The servo did not accept {what}.",
+                next_step="Switch its supply off and on, then run `rig find`.",
                 evidence={"register": name, "wrote": value, "id": bus_id},
             )
 
 
 @contextmanager
-def single_servo(context: DoctorContext, say: Callable[[str], None] = lambda _: None) -> Iterator[SingleServo]:
-    """Yield the one servo on the configured port, its port open for this program alone; see `SingleServo`."""
+def single_servo(context: DoctorContext, progress: Callable[[str], None] = lambda _: None) -> Iterator[SingleServo]:
+    """Yield the only servo on the configured port, opened exclusively; see `SingleServo`."""
     context.require_free()
     wire = context.computer.open_serial(context.config.servo.port, context.config.servo.baud)
     try:
-        yield SingleServo(context, wire, say)
+        yield SingleServo(context, wire, progress)
     finally:
         wire.close()
 
 
-def _the_only_one(context: DoctorContext, wire: SerialConnection, say: Callable[[str], None]) -> FoundServo:
-    """Look at all baud rates: a second servo at another one would answer as soon as their rates are the same."""
+def _find_only_servo(context: DoctorContext, wire: SerialConnection, progress: Callable[[str], None]) -> FoundServo:
+    """Scan all baud rates: a second servo at another rate would answer as soon as the rates are equal."""
     found: list[FoundServo] = []
     for protocol, rates in ((2, BAUD_RATES), (1, BAUD_RATES_1)):
         if protocol == 1 and found:
             break
-        there: list[BaudScan] = []
+        scans: list[BaudScan] = []
         for rate in rates:
-            say(f"{context.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
-            for heard in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
-                there.append(heard)
-                if heard.duplicate_ids:
+            progress(f"{context.config.servo.port}: asking at {rate} baud, protocol {protocol}.0 ...")
+            for scan in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
+                scans.append(scan)
+                if scan.duplicate_ids:
                     raise SeveralServos(
-                        f"Two servos answer at once to id {', '.join(map(str, heard.duplicate_ids))} at {rate} baud.",
-                        next_step="Unplug all servos but the one that is meant, then try again.",
-                        evidence={"ids": list(heard.duplicate_ids), "baud": rate},
+                        f"Two servos answer at once to id {', '.join(map(str, scan.duplicate_ids))} at {rate} baud.",
+                        next_step="Unplug all other servos, then try again.",
+                        evidence={"ids": list(scan.duplicate_ids), "baud": rate},
                     )
-        found = [servo for heard in without_echoes(there, context.config.servo.baud) for servo in heard.servos]
+        found = [servo for scan in without_echoes(scans, context.config.servo.baud) for servo in scan.servos]
     if not found:
         raise DeviceNotFound(
             f"No servo answers on {context.config.servo.port} at any baud rate.",
@@ -173,7 +173,7 @@ def _the_only_one(context: DoctorContext, wire: SerialConnection, say: Callable[
     if len(found) > 1:
         raise SeveralServos(
             f"There are {len(found)} servos on {context.config.servo.port}.",
-            next_step="Unplug all servos but the one that is meant, then try again.",
+            next_step="Unplug all other servos, then try again.",
             evidence={"servos": list(map(str, found))},
         )
     return found[0]

@@ -1,4 +1,4 @@
-"""What the bench keeps: its catalog and its calibrations."""
+"""Check the stored data of the bench: its catalog and its calibrations."""
 
 from collections.abc import Iterator
 
@@ -9,24 +9,24 @@ from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
 IMAGES = 24
-"""Images that are compared with what was stored; `rig catalog verify` looks at all of them."""
+"""Number of images that are verified; `rig catalog verify` verifies all."""
 
 WANTED = {"imu.scale": "the gyro's scale may be off by a percent"}
-"""Calibrations that every bench should have, and what is the matter without them."""
+"""Calibrations that every bench should have, and the consequence of a missing one."""
 
 
 def catalog(context: DoctorContext) -> Iterator[Finding]:
-    """The catalog can be opened, its database is whole, and so are some of its images."""
+    """Check that the catalog can be opened, and that its database and some of its images are undamaged."""
     path = context.catalog_path
     if not (path / "catalog.sqlite").exists():
-        yield fine("catalog", f"none yet in {path}; the first enrollment makes it")
+        yield fine("catalog", f"none yet in {path}; the first enrollment creates it")
         return
     with Catalog.open(path, clock=context.computer.clock, read_only=True) as opened:
         with opened.database.in_words(), opened.database.read() as connection:
-            said = connection.exec_driver_sql("PRAGMA quick_check(5)").scalars().all()
+            checked = connection.exec_driver_sql("PRAGMA quick_check(5)").scalars().all()
             orphans = len(connection.exec_driver_sql("PRAGMA foreign_key_check").all())
-        if said != ["ok"] or orphans:
-            text = f"{path}: the database is damaged: {'; '.join(map(str, said))}, {orphans} orphaned rows"
+        if checked != ["ok"] or orphans:
+            text = f"{path}: the database is damaged: {'; '.join(map(str, checked))}, {orphans} orphaned rows"
             yield bad("catalog", text, context.rig("catalog verify --repair"), exit_code=7)
         objects = opened.objects()
         ids = opened.views().view_ids.tolist()
@@ -38,19 +38,21 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
             except CatalogError as error:
                 broken.append(error)
         if broken:
-            text = f"{len(broken)} of {len(chosen)} images that were looked at: {broken[0].what}"
+            text = f"{len(broken)} of {len(chosen)} verified images are damaged: {broken[0].what}"
             yield bad("catalog", text, context.rig("catalog verify --repair"), exit_code=7, broken=len(broken))
         unfinished = [item.name for item in objects if item.unfinished_views is not None]
         if unfinished:
             fix = context.rig(f"enroll {unfinished[0]} --resume")
-            yield warning("catalog", f"enrollments that were broken off: {', '.join(unfinished)}", fix)
-        if said == ["ok"] and not orphans and not broken:
-            text = f"{path}: {len(objects)} objects, {len(ids)} views; database whole, {len(chosen)} images whole"
+            yield warning("catalog", f"unfinished enrollments: {', '.join(unfinished)}", fix)
+        if checked == ["ok"] and not orphans and not broken:
+            text = (
+                f"{path}: {len(objects)} objects, {len(ids)} views; database undamaged, {len(chosen)} images verified"
+            )
             yield fine("catalog", text, objects=len(objects), views=len(ids))
 
 
 def calibrations(context: DoctorContext) -> Iterator[Finding]:
-    """Calibrations are there, of this bench's devices, and not too old."""
+    """Check that calibrations of this bench's devices exist and have not expired."""
     store = CalibrationStore(context.config.calibration_path(context.bench))
     device = apparatus(context.bench, context.identities, context.config, {})
     standings = store.standings(device, context.computer.clock.utc())
@@ -68,6 +70,6 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
 
 
 def _configured(context: DoctorContext, key: str) -> bool:
-    """Return whether a person set the key in the configuration."""
+    """Return whether the configuration sets the key."""
     section, _, name = key.partition(".")
     return name in getattr(context.config, section).model_fields_set

@@ -40,7 +40,7 @@ def run(s, *, during=None) -> CalibrationResult:
     return event
 
 
-def test_the_truth_lies_within_the_stated_uncertainty():
+def test_true_values_lie_within_the_stated_uncertainty():
     rng = np.random.default_rng(1)
     backlashes = rng.uniform(0.0, 1.0, 200)
     found = [fit(drawn(rng, backlash)).estimates["backlash"] for backlash in backlashes]

@@ -43,7 +43,7 @@ def fit(steps: list[Step], direction: int = 1) -> Evaluation:
     )
 
 
-def test_the_truth_lies_within_the_stated_uncertainty():
+def test_true_values_lie_within_the_stated_uncertainty():
     rng = np.random.default_rng(1)
     z = []
     for _ in range(100):

@@ -36,7 +36,7 @@ def test_allan_deviation_matches_its_definition():
         assert found == pytest.approx(sqrt(np.mean(pairs) / 2))
 
 
-def test_the_truth_lies_within_the_stated_uncertainty():
+def test_true_values_lie_within_the_stated_uncertainty():
     truth = {"angle_random_walk": ARW, "rate_random_walk": WALK, "bias_slope": SLOPE}
     results = [fit(drawn(np.random.default_rng(seed))) for seed in range(24)]
     for name, true in truth.items():

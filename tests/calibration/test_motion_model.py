@@ -26,7 +26,7 @@ def fit(moves: list[TimedMove]) -> Evaluation:
     return evaluate(moves, MotionProfile(70.0, 220.0))
 
 
-def test_the_truth_lies_within_the_stated_uncertainty():
+def test_true_values_lie_within_the_stated_uncertainty():
     rng = np.random.default_rng(1)
     z = {"pace": [], "wind_up": [], "delay": []}
     for _ in range(60):

@@ -23,7 +23,7 @@ def px_per_mm(board: Board, picture) -> float:
     return float(np.linalg.norm(map_[0]))
 
 
-def test_the_png_says_how_large_it_is(tmp_path):
+def test_png_has_its_resolution(tmp_path):
     words = write_board(Board(), tmp_path / "board.png")
     assert "8 squares must be 120 mm" in words
     data = (tmp_path / "board.png").read_bytes()
@@ -32,7 +32,7 @@ def test_the_png_says_how_large_it_is(tmp_path):
     assert px_per_mm(Board(), cv2.imread(str(tmp_path / "board.png"))) == pytest.approx(12.0, rel=1e-3)
 
 
-def test_the_pdf_is_drawn_true_to_scale(tmp_path):
+def test_pdf_is_true_to_scale(tmp_path):
     """Painted from the page's own operators: PDF readers need not be installed."""
     board = Board(columns=6, rows=5, square_mm=20.0, marker_mm=20.0 * 11 / 15)
     write_board(board, tmp_path / "board.pdf")
@@ -49,14 +49,14 @@ def test_the_pdf_is_drawn_true_to_scale(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="pdftoppm (Debian: poppler-utils) is not installed")
-def test_a_pdf_reader_draws_it_too(tmp_path):
+def test_pdf_reader_draws_the_board(tmp_path):
     write_board(Board(), tmp_path / "board.pdf")
     subprocess.run(["pdftoppm", "-r", "150", "-png", tmp_path / "board.pdf", tmp_path / "page"], check=True)
     (page,) = tmp_path.glob("page*.png")
     assert px_per_mm(Board(), cv2.imread(str(page))) == pytest.approx(150 / 25.4, rel=1e-3)
 
 
-def test_what_cannot_be_printed_is_refused(tmp_path):
+def test_unprintable_boards_are_rejected(tmp_path):
     with pytest.raises(UsageError, match=r"neither .pdf nor .png"):
         write_board(Board(), tmp_path / "board.jpg")
     with pytest.raises(UsageError, match="does not fit"):

@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from rig.config.values import Values
     from rig.config.wording import KeyInfo
 
-app = typer.Typer(help="Look at the configuration, judge it, and change it.", no_args_is_help=True)
+app = typer.Typer(help="Show, check and change the configuration.", no_args_is_help=True)
 
 
 @app.command("check")
 @command
 def check(settings: Settings) -> None:
-    """Find every mistake in the configuration at once; exit code 3 if there is one.
+    """Check the whole configuration and list all mistakes. Exit code 3 if there is one.
 
     Example: rig config check --config rig.toml
     """
     from rig.config.wording import key_info
 
     values, config, _ = _checked(settings)
-    given = sum(values.origin(facts.key) != "default" for facts in key_info(type(config)))
+    given = sum(values.origin(info.key) != "default" for info in key_info(type(config)))
     where = str(values.path) if values.path else "No file: every key has its default"
     if settings.json:
         settings.print_json({"path": values.path, "valid": True, "keys_given": given})
@@ -44,11 +44,11 @@ def check(settings: Settings) -> None:
 def show(
     settings: Settings,
     wanted: Annotated[
-        list[str] | None, typer.Argument(metavar="[KEY]...", help="Keys or sections; all where none is given.")
+        list[str] | None, typer.Argument(metavar="[KEY]...", help="Keys or sections; default: all.")
     ] = None,
-    changed: Annotated[bool, typer.Option("--changed", help="Only what differs from the defaults.")] = False,
+    changed: Annotated[bool, typer.Option("--changed", help="Show only values that differ from the defaults.")] = False,
 ) -> None:
-    """Show every key as TOML: its value, where that comes from where it is no default, and what it is for.
+    """Show every key as TOML: its value, the origin of the value if it is not the default, and a description.
 
     Example: rig config show servo table.limits_deg
     """
@@ -56,43 +56,43 @@ def show(
 
     values, config, options = _checked(settings)
     rows = []
-    for facts, value in _keys(config, options):
-        named = not wanted or any(facts.name == name or facts.name.startswith(f"{name}.") for name in wanted)
-        if named and not (changed and value == facts.default):
-            rows.append((facts, value, values.origin(facts.key)))
+    for info, value in _keys(config, options):
+        named = not wanted or any(info.name == name or info.name.startswith(f"{name}.") for name in wanted)
+        if named and not (changed and value == info.default):
+            rows.append((info, value, values.origin(info.key)))
     if wanted and not rows and not changed:
-        raise _unknown(wanted[0], [facts.name for facts, _ in _keys(config, options)])
+        raise _unknown(wanted[0], [info.name for info, _ in _keys(config, options)])
     if settings.json:
         settings.print_json(
             {
                 "path": values.path,
                 "keys": {
-                    facts.name: {
+                    info.name: {
                         "value": value,
                         "origin": origin,
-                        "default": facts.default,
-                        "allowed": facts.allowed,
-                        "unit": facts.unit,
-                        "description": facts.description,
+                        "default": info.default,
+                        "allowed": info.allowed,
+                        "unit": info.unit,
+                        "description": info.description,
                     }
-                    for facts, value, origin in rows
+                    for info, value, origin in rows
                 },
             }
         )
         return
     print(f"# {values.path or 'no file: the defaults'}")
     section = None
-    for facts, value, origin in rows:
-        if facts.key[:-1] != section:
-            section = facts.key[:-1]
+    for info, value, origin in rows:
+        if info.key[:-1] != section:
+            section = info.key[:-1]
             print(f"\n[{'.'.join(section)}]" if section else "")
-        print(setting_line(facts, value, "" if origin == "default" else origin))
+        print(setting_line(info, value, "" if origin == "default" else origin))
 
 
 @app.command("path")
 @command
 def path(settings: Settings) -> None:
-    """Say which file is in force.
+    """Print the path of the configuration file in use.
 
     Example: rig config path
     """
@@ -104,13 +104,13 @@ def path(settings: Settings) -> None:
     elif found:
         print(found)
     else:
-        print(f"No file: the defaults are in force. Looked for: {', '.join(map(str, search_paths()))}")
+        print(f"No file: the defaults are used. Looked for: {', '.join(map(str, search_paths()))}")
 
 
 @app.command("init")
 @command
 def init(settings: Settings) -> None:
-    """Write a rig.toml with every key as a comment; an existing file is left alone.
+    """Write a rig.toml with every key as a comment. An existing file is not changed.
 
     Example: rig config init --config rig.toml
     """
@@ -122,8 +122,8 @@ def init(settings: Settings) -> None:
     target = settings.config or Path(FILE_NAME)
     if target.exists():
         raise ConfigError(
-            f"{target} exists already, and is left as it is.",
-            next_step="Change single values with `rig config set KEY VALUE`, or write another: --config FILE.",
+            f"{target} exists already.",
+            next_step="Change single values with `rig config set KEY VALUE`, or write another file with --config FILE.",
         )
     save(target, blank_file(RigConfig))
     if settings.json:
@@ -136,10 +136,10 @@ def init(settings: Settings) -> None:
 @command
 def set_(
     settings: Settings,
-    key: Annotated[str, typer.Argument(metavar="KEY", help="Key with its section, e.g. servo.port.")],
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value, as in TOML; quotes may be left out.")],
+    key: Annotated[str, typer.Argument(metavar="KEY", help="Key with its section, for example servo.port.")],
+    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value as in TOML; quotes are optional.")],
 ) -> None:
-    """Change one key in the file; comments and everything else in it stay.
+    """Change one key in the file. Comments and all other keys stay as they are.
 
     Example: rig config set servo.port /dev/ttyUSB1
     """
@@ -150,7 +150,9 @@ def set_(
     target = settings.config or default_path() or Path(FILE_NAME)
     old = read_text(target) if target.exists() else ""
     if "." not in key and key != "default_bench":
-        raise UsageError(f"{key!r} has no section.", next_step="Write SECTION.KEY, e.g. rig config set servo.id 2.")
+        raise UsageError(
+            f"{key!r} has no section.", next_step="Write SECTION.KEY, for example: rig config set servo.id 2."
+        )
     load_config(target if target.exists() else None, [*settings.overrides, f"{key}={value}"])
     new = with_values(old, {tuple(key.split(".")): parsed(value)})
     if new != old:
@@ -158,7 +160,11 @@ def set_(
     if settings.json:
         settings.print_json({"path": target, "key": key, "changed": changed_lines(old, new)})
         return
-    print("\n".join([f"{target}:", *changed_lines(old, new)]) if new != old else f"{target}: it is so already.")
+    print(
+        "\n".join([f"{target}:", *changed_lines(old, new)])
+        if new != old
+        else f"{target}: no change, the key has this value already."
+    )
 
 
 def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseModel]]":
@@ -170,15 +176,15 @@ def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseMode
 
 
 def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyInfo, Any]]":
-    """Yield the facts and the value in force of every key, those of the benches that have options last."""
+    """Yield description and value of every key; the options of benches come last."""
     from rig.config.wording import key_info
 
-    for facts in key_info(type(config)):
-        if facts.key != ("bench",):
-            yield facts, _value(config, facts.key)
+    for info in key_info(type(config)):
+        if info.key != ("bench",):
+            yield info, _value(config, info.key)
     for name, model in options.items():
-        for facts in key_info(type(model), ("bench", name)):
-            yield facts, _value(model, facts.key[2:])
+        for info in key_info(type(model), ("bench", name)):
+            yield info, _value(model, info.key[2:])
 
 
 def _value(model: Any, key: tuple[str, ...]) -> Any:
@@ -194,5 +200,5 @@ def _unknown(wanted: str, names: list[str]) -> ConfigError:
     near = get_close_matches(wanted, names, n=1)
     return ConfigError(
         f"There is no key {wanted!r}.",
-        next_step=f"Did you mean {near[0]}?" if near else "`rig config show` lists all keys.",
+        next_step=f"Did you mean {near[0]}?" if near else "Run `rig config show` for a list of all keys.",
     )

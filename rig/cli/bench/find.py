@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.bench.examination import doctor_context, print_finding, say
+from rig.cli.bench.findings import doctor_context, print_finding, show_progress
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 def find(
     settings: Settings,
     both_protocols: Annotated[
-        bool, typer.Option("--all", help="Ask for AX-12A (protocol 1.0) even where other servos answered; a minute.")
+        bool,
+        typer.Option("--all", help="Also search for AX-12A (protocol 1.0) if other servos answered. Takes a minute."),
     ] = False,
 ) -> None:
-    """List what is connected: servos at all baud rates, IMUs, cameras; and say what to write into rig.toml.
+    """List the connected servos (at all baud rates), IMUs and cameras, and their settings for rig.toml.
 
-    Asks only; nothing is written or moved.
+    Writes nothing and moves nothing. Exit code 4 if no device was found.
 
     Example: rig find --bench sim
     """
@@ -37,11 +38,11 @@ def find(
     scan = DeviceScan(both_protocols)
     with doctor_context(settings) as context:
         context.require_free()
-        for finding in run_checks(context, scan.checks, say):
+        for finding in run_checks(context, scan.checks, show_progress):
             findings.append(finding)
             if not settings.json:
                 print_finding(screen, finding)
-    wanted = proposal(scan)
+    wanted = proposed_settings(scan)
     if settings.json:
         settings.print_json(
             {
@@ -55,8 +56,8 @@ def find(
         raise typer.Exit(4)
 
 
-def proposal(scan: "DeviceScan") -> "dict[Key, Any]":
-    """Return the settings that leave no choice: of devices of which there is one."""
+def proposed_settings(scan: "DeviceScan") -> "dict[Key, Any]":
+    """Return the settings of the unambiguous devices: those of which exactly one was found."""
     from rig.doctor.device_scan import camera_settings, head_settings, imu_settings, servo_settings
 
     wanted: dict[Key, Any] = {}

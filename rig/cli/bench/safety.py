@@ -10,7 +10,7 @@ from rig.cli.ui.settings import Settings
 
 @command
 def stop(settings: Settings) -> None:
-    """Stop the table and take its torque off, also while another program drives it; its plan ends, and may be resumed.
+    """Stop the table and switch its torque off, even if another program moves it. Its plan ends and can be resumed.
 
     Example: rig stop --bench sim
     """
@@ -20,33 +20,35 @@ def stop(settings: Settings) -> None:
     done = stop_bench(settings.bench_name, settings.load(), SystemClock(), seed=settings.seed)
     who = done.holder
     if who is None:
-        words = f"No program held the bench; the torque was {'on, and is off now' if done.torque_was_on else 'off'}."
+        text = f"No program held the bench; the torque was {'on, and is off now' if done.torque_was_on else 'off'}."
     elif done.ended:
-        words = f"Process {who.pid} (`{who.command}`) has ended: the table is stopped, its torque off."
+        text = f"Process {who.pid} (`{who.command}`) has ended: the table is stopped, its torque off."
     else:
-        words = f"Process {who.pid} (`{who.command}`) has stopped the table and its torque; it still holds the bench."
+        text = f"Process {who.pid} (`{who.command}`) has stopped the table and its torque; it still holds the bench."
     report = {"bench": settings.bench_name, "pid": who.pid if who else None, "ended": done.ended}
-    settings.say(words, {**report, "torque_was_on": done.torque_was_on})
+    settings.say(text, {**report, "torque_was_on": done.torque_was_on})
 
 
 @command
 def acknowledge(
     settings: Settings,
     reboot: Annotated[
-        bool, typer.Option("--reboot", help="Restart the servo first: only that clears its own hardware errors.")
+        bool, typer.Option("--reboot", help="Restart the servo first. This clears its hardware errors.")
     ] = False,
 ) -> None:
-    """Acknowledge a latched fault: servo, supply, settings and angle are verified; while the cause is there it stays.
+    """Acknowledge a latched fault.
+
+    Servo, supply, settings and angle are checked first. A fault stays latched while its cause lasts.
 
     Example: rig acknowledge --reboot --bench sim
     """
     with settings.open_bench() as bench:
         fault = bench.safety.fault
         state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
-    words = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
+    text = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
     report = {
         "acknowledged": fault.model_dump() if fault else None,
         "state": str(state),
         "doubt": str(doubt) if doubt else None,
     }
-    settings.say(f"{words}\nThe table is {state}{f': {doubt}' if doubt else ''}.", report)
+    settings.say(f"{text}\nThe table is {state}{f': {doubt}' if doubt else ''}.", report)

@@ -12,23 +12,23 @@ if TYPE_CHECKING:
     from rig.doctor.context import DoctorContext
     from rig.doctor.single_servo import SingleServo
 
-app = typer.Typer(help="Look at the servo's registers, and set it up.", no_args_is_help=True)
+app = typer.Typer(help="Show the servo's registers, and change its settings, id and baud rate.", no_args_is_help=True)
 
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 
 
 @app.command("info")
 @command
 def info(settings: Settings) -> None:
-    """Show every register of the servo on the bus, in words and units; reads only.
+    """Show every register of the servo with its meaning and unit. Writes nothing.
 
     Example: rig servo info --bench sim
     """
-    from rig.cli.bench.examination import doctor_context, say
-    from rig.doctor.register_meaning import words
+    from rig.cli.bench.findings import doctor_context, show_progress
+    from rig.doctor.register_meaning import meaning
     from rig.doctor.single_servo import single_servo
 
-    with doctor_context(settings) as context, single_servo(context, say) as servo:
+    with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
         values = servo.read()
     if settings.json:
         settings.print_json(
@@ -38,7 +38,7 @@ def info(settings: Settings) -> None:
                     name: {
                         "address": servo.table[name].address,
                         "value": value,
-                        "meaning": words(servo.table, name, value),
+                        "meaning": meaning(servo.table, name, value),
                         "kept_without_supply": servo.table[name].address < servo.table.ram_start,
                     }
                     for name, value in values.items()
@@ -46,15 +46,15 @@ def info(settings: Settings) -> None:
             }
         )
         return
-    say("")
+    show_progress("")
     print(servo.found)
     kept = None
     for name, value in values.items():
         register = servo.table[name]
         if (now := register.address < servo.table.ram_start) is not kept:
             kept = now
-            print("\nkept without supply (EEPROM)" if kept else "\nlost without supply (RAM)")
-        print(f"  {register.address:3d}  {name:24s}{value:12d}  {words(servo.table, name, value)}".rstrip())
+            print("\nEEPROM: kept without supply" if kept else "\nRAM: lost without supply")
+        print(f"  {register.address:3d}  {name:24s}{value:12d}  {meaning(servo.table, name, value)}".rstrip())
 
 
 @app.command("settings")
@@ -62,25 +62,25 @@ def info(settings: Settings) -> None:
 def settings_(
     settings: Settings,
     write: Annotated[
-        bool, typer.Option("--write", help="Write what differs, with the torque off, and read it back.")
+        bool, typer.Option("--write", help="Write the differing settings with the torque off, and verify them.")
     ] = False,
     yes: YesOption = False,
 ) -> None:
-    """Compare the servo's permanent settings (EEPROM) with what the rig needs; exit code 4 where they differ.
+    """Compare the servo's permanent settings (EEPROM) with the required ones. Exit code 4 if they differ.
 
     Example: rig servo settings --write --bench sim
     """
-    from rig.cli.bench.examination import doctor_context, say
+    from rig.cli.bench.findings import doctor_context, show_progress
     from rig.devices.dynamixel.settings import ServoMode, compare
     from rig.devices.dynamixel.settings import write as write_settings
     from rig.doctor.single_servo import single_servo
 
-    with doctor_context(settings) as context, single_servo(context, say) as servo:
-        say("")
+    with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
+        show_progress("")
         differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(context.config.table.mode))
         if not settings.json:
             print(servo.found)
-            print("\n".join(f"  {difference}" for difference in differences) or "  as the rig needs it")
+            print("\n".join(f"  {difference}" for difference in differences) or "  all as required")
         written = bool(differences) and write and (yes or settings.json or ask_yes_no("Write these settings?"))
         if written:
             write_settings(servo.bus, servo.found.bus_id, servo.table, differences)
@@ -88,7 +88,7 @@ def settings_(
         rows = [{"register": d.register, "found": d.found, "wanted": d.wanted, "reason": d.reason} for d in differences]
         settings.print_json({**_identity(servo), "differences": rows, "written": written})
     elif written:
-        print("Written, and read back.")
+        print("Written and verified.")
     elif differences:
         print(f"To write them: {context.rig('servo settings --write')}")
     if differences and not written:
@@ -102,7 +102,7 @@ def set_id(
     new: Annotated[int, typer.Argument(metavar="ID", min=0, max=252, help="New id.")],
     yes: YesOption = False,
 ) -> None:
-    """Give the only servo on the bus another id, with its torque off, and verify it; rig.toml follows.
+    """Change the id of the only servo on the bus, with its torque off, and verify it. Updates rig.toml.
 
     Example: rig servo set-id 2 --bench sim --yes
     """
@@ -113,10 +113,10 @@ def set_id(
 @command
 def set_baud(
     settings: Settings,
-    rate: Annotated[int, typer.Argument(metavar="RATE", min=1, help="New baud rate, e.g. 1000000.")],
+    rate: Annotated[int, typer.Argument(metavar="RATE", min=1, help="New baud rate, for example 1000000.")],
     yes: YesOption = False,
 ) -> None:
-    """Give the only servo on the bus another baud rate, with its torque off, and verify it; rig.toml follows.
+    """Change the baud rate of the only servo on the bus, with its torque off, and verify it. Updates rig.toml.
 
     Example: rig servo set-baud 1000000 --bench sim --yes
     """
@@ -124,16 +124,16 @@ def set_baud(
 
 
 def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
-    from rig.cli.bench.examination import doctor_context, say
+    from rig.cli.bench.findings import doctor_context, show_progress
     from rig.doctor.single_servo import single_servo
 
-    with doctor_context(settings) as context, single_servo(context, say) as servo:
-        say("")
+    with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
+        show_progress("")
         old = servo.found.bus_id if what == "id" else servo.found.baud
         if not settings.json:
             print(servo.found)
         if old != new:
-            if not (yes or settings.json or ask_yes_no(f"Change its {what} from {old} to {new}, with its torque off?")):
+            if not (yes or settings.json or ask_yes_no(f"Change {what} from {old} to {new}, with the torque off?")):
                 print("Nothing was changed.")
                 return
             if what == "id":
@@ -144,15 +144,15 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
     if settings.json:
         settings.print_json({**_identity(servo), what: new, "was": old, "config_changed": followed or None})
         return
-    print(f"It has {what} {new} already." if old == new else f"Its {what} is {new} now, verified.")
+    print(f"The servo has {what} {new} already." if old == new else f"Changed {what} to {new}, and verified it.")
     if followed:
         print(f"{followed}: servo.{what} = {new}")
     elif getattr(context.config.servo, what) != new:
-        print(f"For the rig to find it: {context.set(f'servo.{what}', new)}")
+        print(f"To use it: {context.set(f'servo.{what}', new)}")
 
 
 def _follow(settings: Settings, context: "DoctorContext", what: str, old: int, new: int) -> str:
-    """Let the configuration file say what the servo says now, where it said what the servo said before."""
+    """Update the configuration file if it had the old value, and return its path; empty if it was not changed."""
     from rig.config.toml_file import read_text, save, with_values
     from rig.config.values import default_path
 

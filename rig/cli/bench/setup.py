@@ -1,4 +1,4 @@
-"""`rig setup`: from a box of parts to a rig.toml."""
+"""`rig setup`: find the devices and write a rig.toml."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SMALLEST_REACH_DEG, LARGEST_REACH_DEG = 180.0, 90_000.0
+MIN_BUDGET_DEG, MAX_BUDGET_DEG = 180.0, 90_000.0
 
 
 @command
 def setup(
     settings: Settings,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Ask nothing: take what leaves no choice, leave what does.")
+        bool,
+        typer.Option("--yes", "-y", help="Ask nothing: use the devices that are unambiguous, and change nothing else."),
     ] = False,
 ) -> None:
-    """Find servo, IMU and camera, ask what cannot be found out, and write a commented rig.toml; then see a doctor.
+    """Find servo, IMU and camera, ask for the rest, write a commented rig.toml, and run `rig doctor`.
 
-    An existing file keeps its comments and everything that was not asked about. Nothing moves; Ctrl+C leaves the file
-    untouched.
+    An existing file keeps its comments and all other settings. Nothing moves. Ctrl+C leaves the file unchanged.
 
     Example: rig setup --bench sim --yes
     """
-    from rig.cli.bench.doctor import examination
-    from rig.cli.bench.examination import doctor_context
+    from rig.cli.bench.doctor import print_findings
+    from rig.cli.bench.findings import doctor_context
     from rig.config import RigConfig
     from rig.config.toml_file import read_text, save, stated, with_values
     from rig.config.values import FILE_NAME, default_path
@@ -65,13 +65,13 @@ def setup(
             write = prompts.ask_yes_no(f"Write {path}?", default=True)
     if write:
         save(path, new)
-    done = f"Wrote {path}." if write else f"{path} is left as it is."
+    done = f"Wrote {path}." if write else f"{path} is unchanged."
     after = replace(settings, config=settings.config if path.exists() else None, _loaded={})
     if settings.json:
         settings.print_json({"path": path, "written": write, "settings": {".".join(k): v for k, v in changes.items()}})
     else:
         print(f"{done}\n")
-    code = examination(after)
+    code = print_findings(after)
     if not settings.json:
         print(_next(context, code))
     if code:
@@ -80,7 +80,7 @@ def setup(
 
 @dataclass
 class Dialogue:
-    """Finds the devices of a bench, asking the person where there is a choice."""
+    """The dialogue of `rig setup`: finds the devices of a bench, and asks if there is a choice."""
 
     context: "DoctorContext"
     ask_nothing: bool
@@ -88,7 +88,7 @@ class Dialogue:
     wanted: "dict[Key, Any]" = field(default_factory=dict)
 
     def run(self) -> "dict[Key, Any]":
-        """Return the keys of the configuration that were found out."""
+        """Return the settings that were found or entered, by key."""
         from rig.doctor.device_scan import DeviceScan, camera_settings, head_settings, imu_settings, servo_settings
 
         scan = DeviceScan()
@@ -101,7 +101,7 @@ class Dialogue:
         if servo is not None:
             self.wanted |= servo_settings(*servo)
             if computer.same_file(servo[0].path, self.context.config.servo.port) and self._configured("servo", "port"):
-                self.wanted[("servo", "port")] = self.context.config.servo.port  # a name that a person chose
+                self.wanted[("servo", "port")] = self.context.config.servo.port  # keep the configured name
             self._permanent_settings()
         elif not scan.servos:
             self._which_port()
@@ -116,34 +116,32 @@ class Dialogue:
         camera = self._pick("camera", scan.cameras, shown, lambda found: found.node)
         if camera is not None:
             self.wanted |= camera_settings(camera)
-        self._reach()
+        self._cable_budget()
         return self.wanted
 
     def _scan(self, scan: "DeviceScan") -> None:
         from rich.console import Console
 
-        from rig.cli.bench.examination import print_finding, say
+        from rig.cli.bench.findings import print_finding, show_progress
         from rig.doctor.examination import run_checks
 
         screen = Console(file=self.out)
-        for finding in run_checks(self.context, scan.checks, say):
+        for finding in run_checks(self.context, scan.checks, show_progress):
             print_finding(screen, finding)
 
     def _again(self, what: str) -> bool:
         if self.ask_nothing:
             return False
-        return prompts.ask_yes_no(f"{what} Look again, after you have checked cables and supply?", default=False)
+        return prompts.ask_yes_no(f"{what} Check cables and supply. Search again?", default=False)
 
     def _pick(
         self, what: str, found: Sequence[T], shown: Sequence[str], node: "Callable[[T], DeviceFile] | None" = None
     ) -> T | None:
-        """Return the one that there is, or the one that the person means; None where there is none or no saying."""
+        """Return the only device, or the one that the operator chooses; None without a choice."""
         if len(found) <= 1:
             return found[0] if found else None
         if self.ask_nothing:
-            print(
-                f"! {len(found)} devices could be the {what}; the configuration stays as it is for it.", file=self.out
-            )
+            print(f"! {len(found)} devices could be the {what}; its configuration is unchanged.", file=self.out)
             return None
         nodes = [node(each) for each in found] if node else []
         several = len({each.path for each in nodes}) > 1
@@ -152,11 +150,15 @@ class Dialogue:
         )
         if index is not None:
             return found[index]
-        pulled = self._pulled(what, lambda: [*self.context.computer.serial_ports(), *self.context.computer.cameras()])
-        return next((each for each, its in zip(found, nodes, strict=True) if pulled and its.path == pulled.path), None)
+        unplugged = self._unplugged(
+            what, lambda: [*self.context.computer.serial_ports(), *self.context.computer.cameras()]
+        )
+        return next(
+            (each for each, its in zip(found, nodes, strict=True) if unplugged and its.path == unplugged.path), None
+        )
 
-    def _pulled(self, what: str, there: "Callable[[], Sequence[DeviceFile]]") -> "DeviceFile | None":
-        """Find out which device file belongs to a device by having it unplugged and plugged in again."""
+    def _unplugged(self, what: str, there: "Callable[[], Sequence[DeviceFile]]") -> "DeviceFile | None":
+        """Find a device's file: the operator unplugs the device and plugs it in again."""
         before = there()
         while True:
             prompts.ask_line(f"Unplug the {what}'s USB cable, then press Enter.")
@@ -164,14 +166,14 @@ class Dialogue:
             gone = [node for node in before if node.path not in left]
             prompts.ask_line("Plug it in again, then press Enter.")
             if len(gone) == 1:
-                print(f"It is {gone[0].path} ({gone[0].name}).", file=self.out)
+                print(f"Found: {gone[0].path} ({gone[0].name}).", file=self.out)
                 return gone[0]
-            print(f"{len(gone) or 'No'} device{'s' if len(gone) != 1 else ''} went away.", file=self.out)
+            print(f"{len(gone) or 'No'} device{'s' if len(gone) != 1 else ''} disappeared.", file=self.out)
             if not prompts.ask_yes_no("Try again?", default=True):
                 return None
 
     def _which_port(self) -> None:
-        """Without a servo that answers: at least its adapter may be known."""
+        """Find the servo's adapter although no servo answers."""
         ports = [port for port in self.context.computer.serial_ports() if port.usb]
         port: DeviceFile | None = ports[0] if len(ports) == 1 else None
         if len(ports) > 1 and not self.ask_nothing:
@@ -180,12 +182,12 @@ class Dialogue:
                 [f"{each.path}: {each.name}" for each in ports],
                 other="find out by unplugging it",
             )
-            port = ports[index] if index is not None else self._pulled("adapter", self.context.computer.serial_ports)
+            port = ports[index] if index is not None else self._unplugged("adapter", self.context.computer.serial_ports)
         if port is not None and not self.context.computer.same_file(port.path, self.context.config.servo.port):
             self.wanted[("servo", "port")] = port.stable or port.path
 
     def _permanent_settings(self) -> None:
-        """Show what of the servo's EEPROM stands in the way, and write it if the person agrees."""
+        """Show the differing settings of the servo's EEPROM, and write them if the operator agrees."""
         from rig.config.toml_file import Key
         from rig.core.errors import SeveralServos
         from rig.devices.dynamixel.settings import ServoMode, compare, write
@@ -199,25 +201,25 @@ class Dialogue:
             differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(config.table.mode))
             if not differences:
                 return
-            print("The servo's permanent settings (EEPROM) are not as the rig needs them:", file=self.out)
+            print("Some permanent settings of the servo (EEPROM) differ from the required ones:", file=self.out)
             print("\n".join(f"  {difference}" for difference in differences), file=self.out)
             if self.ask_nothing:
-                print(f"  left as they are; to write them: {context.rig('servo settings --write')}", file=self.out)
+                print(f"  not changed; to write them: {context.rig('servo settings --write')}", file=self.out)
             elif prompts.ask_yes_no("Write them now, with the servo's torque off?", default=True):
                 write(servo.bus, servo.found.bus_id, servo.table, differences)
-                print("Written, and read back.", file=self.out)
+                print("Written and verified.", file=self.out)
 
-    def _reach(self) -> None:
-        """Ask for the cable's budget."""
+    def _cable_budget(self) -> None:
+        """Ask for the cable budget."""
         low, high = self.context.config.table.limits_deg
         if self.ask_nothing or self._configured("table", "limits_deg") or self.context.config.table.mode == "pan":
             return
-        reach = prompts.ask_value(
-            "How far may the table turn either way, in degrees, before the IMU's cable is taut?",
+        budget = prompts.ask_value(
+            "How far can the table rotate in each direction, in degrees, before the IMU's cable is taut?",
             min(-low, high),
             _degrees,
         )
-        self.wanted[("table", "limits_deg")] = [-reach, reach]
+        self.wanted[("table", "limits_deg")] = [-budget, budget]
 
     def _configured(self, section: str, key: str) -> bool:
         return key in getattr(self.context.config, section).model_fields_set
@@ -228,8 +230,8 @@ def _degrees(text: str) -> float:
         value = float(text.removesuffix("°"))
     except ValueError:
         raise ValueError(f"{text!r} is not a number.") from None
-    if not SMALLEST_REACH_DEG <= value <= LARGEST_REACH_DEG:
-        raise ValueError(f"Enter {SMALLEST_REACH_DEG:.0f}–{LARGEST_REACH_DEG:.0f} degrees: one revolution or more.")
+    if not MIN_BUDGET_DEG <= value <= MAX_BUDGET_DEG:
+        raise ValueError(f"Enter {MIN_BUDGET_DEG:.0f}–{MAX_BUDGET_DEG:.0f} degrees: one revolution or more.")
     return value
 
 
@@ -241,5 +243,5 @@ def _in_force(config: Any, key: "Key") -> Any:
 
 def _next(context: "DoctorContext", code: int) -> str:
     if code:
-        return f"\nNext: what is marked ✗ above, then {context.rig('doctor')}."
-    return f"\nNext: {context.rig('goto 90')} turns the table; then {context.rig('enroll NAME')}."
+        return f"\nNext: fix the findings marked ✗, then run {context.rig('doctor')}."
+    return f"\nNext: rotate the table with {context.rig('goto 90')}, then enroll with {context.rig('enroll NAME')}."

@@ -18,14 +18,14 @@ def goto(
     settings: Settings,
     angle_deg: Annotated[float, typer.Argument(metavar="ANGLE", help="Table angle in degrees, counter-clockwise.")],
 ) -> None:
-    """Turn the table to an angle and say where encoder and IMU think it is.
+    """Rotate the table to an angle, and print the rotation by encoder and IMU.
 
     Example: rig goto -90 --bench sim
     """
     from rig.motion.turntable import Turntable
 
     with settings.open_bench() as bench, Turntable(bench) as table:
-        _turn(settings, table, angle_deg)
+        _rotate(settings, table, angle_deg)
 
 
 @command
@@ -33,13 +33,11 @@ def home(
     settings: Settings,
     turns: Annotated[
         int | None,
-        typer.Option(metavar="N", help="I have looked: the cable is wound up by N whole turns; 0 if it hangs free."),
+        typer.Option(metavar="N", help="The cable is wound up by N revolutions, as you saw; 0 if it hangs free."),
     ] = None,
-    here: Annotated[
-        bool, typer.Option("--here", help="I have looked: zero is where the table stands now. Moves nothing.")
-    ] = False,
+    here: Annotated[bool, typer.Option("--here", help="Make the present angle home. Moves nothing.")] = False,
 ) -> None:
-    """Turn the table back to zero; where its turns are in doubt, say first how its cable lies.
+    """Rotate the table to home (0°). If its revolutions are in doubt, look at the cable and give --turns.
 
     Example: rig home --turns 0 --bench sim
     """
@@ -47,20 +45,20 @@ def home(
     from rig.motion.turntable import Turntable
 
     if here and turns is not None:
-        raise UsageError("--here and --turns exclude each other.", next_step="Give one of them.")
+        raise UsageError("--here and --turns cannot be combined.", next_step="Give one of them.")
     with settings.open_bench() as bench:
         if here:
             bench.safety.set_angle(0.0)
-            settings.say("Zero is where the table stands now.", {"table_deg": 0.0})
+            settings.say("The present angle is home now.", {"table_deg": 0.0})
             return
         if turns is not None:
             bench.safety.set_revolutions(turns)
         with Turntable(bench) as table:
-            _turn(settings, table, 0.0)
+            _rotate(settings, table, 0.0)
 
 
-def _turn(settings: Settings, table: "Turntable", angle_deg: float) -> None:
-    """Turn the table, and tell what is told of any move."""
+def _rotate(settings: Settings, table: "Turntable", angle_deg: float) -> None:
+    """Rotate the table, and report the events of the rotation."""
     from rig.cli.ui.present import line
     from rig.core.errors import RigError
     from rig.events.events import Event, event_dict
@@ -80,7 +78,7 @@ def _turn(settings: Settings, table: "Turntable", angle_deg: float) -> None:
 
 @command
 def status(settings: Settings) -> None:
-    """Say which devices answer and in what state they are; moves nothing.
+    """Show the state of the bench and its devices. Moves nothing.
 
     Example: rig status --bench sim --json
     """
@@ -107,25 +105,27 @@ def status(settings: Settings) -> None:
         settings.print_json(report)
         return
     print(f"bench    {report['bench']}")
-    print(f"state    {_state_words(safety)}")
-    print(f"table    {_table_words(table_deg, config.limits_deg)}")
+    print(f"state    {_state_text(safety)}")
+    print(f"table    {_table_text(table_deg, config.limits_deg)}")
     for device in ("servo", "imu", "head", "camera"):
         if device not in report:
             continue
-        facts = report[device]
-        assert isinstance(facts, dict)
-        print(f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in facts.items() if key != "time_ns"))
+        values = report[device]
+        assert isinstance(values, dict)
+        print(
+            f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in values.items() if key != "time_ns")
+        )
     for finding in bench.findings:
         print(f"note     {finding}")
 
 
-def _table_words(angle_deg: float | None, limits_deg: tuple[float, float]) -> str:
+def _table_text(angle_deg: float | None, limits_deg: tuple[float, float]) -> str:
     low, high = limits_deg
-    reach = f"the cable reaches from {low:g}° to {high:g}°, {low / 360:+.2f} to {high / 360:+.2f} turns"
-    return f"in doubt; {reach}" if angle_deg is None else f"{angle_deg:.2f}° ({angle_deg / 360:+.2f} turns); {reach}"
+    budget = f"cable budget {low:g}° to {high:g}° ({low / 360:+.2f} to {high / 360:+.2f} revolutions)"
+    return f"angle in doubt; {budget}" if angle_deg is None else f"{angle_deg:.2f}°; {budget}"
 
 
-def _state_words(safety: "Safety") -> str:
+def _state_text(safety: "Safety") -> str:
     if safety.fault is not None:
         fault = safety.fault
         return f"{safety.state} {fault.code} since {fault.utc}: {fault.what} {fault.next_step}"

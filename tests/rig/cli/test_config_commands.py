@@ -1,4 +1,4 @@
-"""`rig config ...` as its users call it."""
+"""`rig config ...` on the command line."""
 
 import json
 import tomllib
@@ -22,7 +22,7 @@ def rig(tmp_path, monkeypatch):
     return run
 
 
-def test_check_tells_all_mistakes_of_all_sections_at_once_each_with_its_line(rig, tmp_path):
+def test_check_lists_all_mistakes_with_their_lines(rig, tmp_path):
     (tmp_path / "rig.toml").write_text(
         "[bench.sim]\nobjekt = 1\n[bench.sin]\nx = 1\n[imu]\nbus = [1]\nrange_dps = 300\n"
         '[table]\nlimits_deg = ["a", 3]\n[camera]\nexposure_us = -1\nheigth = 3\n',
@@ -44,14 +44,14 @@ def test_check_tells_all_mistakes_of_all_sections_at_once_each_with_its_line(rig
     assert "8 mistakes in rig.toml" in done.stderr
 
 
-def test_a_slip_of_the_pen_is_shown_with_its_line(rig, tmp_path):
+def test_syntax_error_is_shown_with_its_line(rig, tmp_path):
     (tmp_path / "rig.toml").write_text('[servo]\nport = "x\n', encoding="utf-8")
     done = rig("config", "check")
     assert done.exit_code == 3
     assert 'line 2: port = "x' in done.stderr
 
 
-def test_a_new_file_changes_nothing_explains_everything_and_is_never_overwritten(rig, tmp_path):
+def test_init_writes_the_defaults_as_comments_and_never_overwrites(rig, tmp_path):
     assert rig("config", "init").exit_code == 0
     file = tmp_path / "rig.toml"
     assert load_config(file) == RigConfig()
@@ -94,7 +94,7 @@ def test_show_is_toml_and_says_where_each_value_comes_from(rig, tmp_path):
 
 
 def test_path_says_which_file_is_in_force(rig, tmp_path):
-    assert "defaults are in force" in rig("config", "path").stdout
+    assert "defaults are used" in rig("config", "path").stdout
     (tmp_path / "home" / "hbr-rig").mkdir(parents=True)
     (tmp_path / "home" / "hbr-rig" / "rig.toml").write_text("")
     assert rig("config", "path").stdout.strip() == str(tmp_path / "home" / "hbr-rig" / "rig.toml")

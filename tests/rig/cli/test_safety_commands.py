@@ -1,4 +1,4 @@
-"""`rig home`, `rig stop`, `rig acknowledge`, and what a killed program leaves to the next one, in real processes."""
+"""`rig home`, `rig stop`, `rig acknowledge`, and the state after a killed program, in real processes."""
 
 import json
 import os
@@ -67,7 +67,7 @@ def state() -> dict:
     return json.loads(Path("state/sim/state.json").read_text())
 
 
-def test_the_table_is_where_the_last_program_left_it(rig):
+def test_table_angle_survives_the_program(rig):
     assert rig("goto", "370").exit_code == 0
     told = json.loads(rig("status", "--json").stdout)
     assert told["state"] == "ready"
@@ -80,7 +80,7 @@ def test_the_table_is_where_the_last_program_left_it(rig):
     assert moved["encoder_deg"] == pytest.approx(0, abs=0.3)
 
 
-def test_a_move_beyond_the_budget_is_refused_with_from_to_and_limits(rig):
+def test_rotation_beyond_the_cable_budget_is_rejected(rig):
     rig("goto", "30")
     done = rig("goto", "401")
     assert done.exit_code == 5
@@ -88,7 +88,7 @@ def test_a_move_beyond_the_budget_is_refused_with_from_to_and_limits(rig):
     assert "-400° to 400° (-1.11 to +1.11 revolutions)" in done.stderr
 
 
-def test_doubt_is_told_and_resolved_by_a_person(rig):
+def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
     rig("goto", "90")
     kept = state()
     kept["table"]["path_deg"] = [200.0, 600.0]  # killed in a motion, and the supply was off since
@@ -106,7 +106,7 @@ def test_doubt_is_told_and_resolved_by_a_person(rig):
     assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
 
 
-def test_zero_may_be_declared_where_the_table_stands(rig):
+def test_home_here_sets_the_angle(rig):
     rig("goto", "90")
     assert rig("home", "--here").exit_code == 0
     assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(0, abs=0.1)
@@ -114,7 +114,7 @@ def test_zero_may_be_declared_where_the_table_stands(rig):
     assert moved["rotation_encoder_deg"] == pytest.approx(10, abs=0.3)
 
 
-def test_a_fault_is_told_by_every_command_until_it_is_acknowledged(rig):
+def test_every_command_reports_a_fault_until_it_is_acknowledged(rig):
     rig("goto", "5")
     store = FileStore(Path("state/sim"))
     stalled = Stalled(
@@ -141,13 +141,13 @@ def test_a_fault_is_told_by_every_command_until_it_is_acknowledged(rig):
     assert rig("goto", "0").exit_code == 0
 
 
-def test_a_servo_that_shut_down_is_rebooted_on_request(rig):
+def test_acknowledge_reboots_the_servo(rig):
     jammed = rig("goto", "300", "--set", 'bench.sim.faults=["overload@move0+0.2s"]')
     assert jammed.exit_code == 4
     assert json.loads(rig("acknowledge", "--reboot", "--json").stdout)["acknowledged"]["code"] == 404
 
 
-def test_a_running_plan_keeps_others_out_and_is_ended_by_rig_stop(rig, running):
+def test_running_plan_blocks_the_bench_and_stop_ends_it(rig, running):
     process = running()
     refused = rig("goto", "0")
     assert refused.exit_code == 9
@@ -169,7 +169,7 @@ def test_a_running_plan_keeps_others_out_and_is_ended_by_rig_stop(rig, running):
     assert "No program held the bench" in rig("stop").stdout
 
 
-def test_after_sigkill_the_bench_is_free_and_the_next_command_says_what_happened(rig, running):
+def test_killed_program_leaves_the_bench_free(rig, running):
     process = running()
     process.kill()
     process.wait()
@@ -183,7 +183,7 @@ def test_after_sigkill_the_bench_is_free_and_the_next_command_says_what_happened
 
 
 @pytest.mark.parametrize(("handler", "number"), [("", signal.SIGINT), ("unwinding", signal.SIGTERM)])
-def test_a_program_that_is_not_in_its_control_loop_gets_the_signal_that_unwinds_it(tmp_path, handler, number):
+def test_stop_signals_a_program_outside_its_control_loop(tmp_path, handler, number):
     code = f"""
 import signal, sys, time
 from pathlib import Path
@@ -210,7 +210,7 @@ finally:
     assert process.returncode == (143 if handler else -number)
 
 
-def test_a_program_that_does_not_react_is_told_how_to_end(tmp_path, monkeypatch):
+def test_stop_reports_how_to_end_a_program_that_does_not_react(tmp_path, monkeypatch):
     monkeypatch.setattr("rig.motion.stop_request.REACTION_S", 0.1)
     monkeypatch.setattr("rig.motion.stop_request.END_S", 0.3)
     code = f"""

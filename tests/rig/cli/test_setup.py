@@ -1,4 +1,4 @@
-"""`rig setup`, `rig doctor`, `rig find` and `rig servo` as a technician meets them, on simulated parts."""
+"""`rig setup`, `rig doctor`, `rig find` and `rig servo` on simulated parts."""
 
 import io
 import json
@@ -44,7 +44,7 @@ def parts(home, monkeypatch):
             options = NoOptions
 
             @contextmanager
-            def host(self, config, options, seed):
+            def computer(self, config, options, seed):
                 bench.context.computer._port = config.servo.port
                 yield bench.context.computer
 
@@ -55,7 +55,7 @@ def parts(home, monkeypatch):
 # -- set-up -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_box_of_parts_becomes_a_commented_file_that_the_bench_works_with(home):
+def test_setup_writes_a_commented_file_that_works(home):
     done = rig("setup", "--bench", "sim", answers="360\ny\n")
     assert done.exit_code == 0, done.output
     text = (home / "rig.toml").read_text(encoding="utf-8")
@@ -69,16 +69,16 @@ def test_a_box_of_parts_becomes_a_commented_file_that_the_bench_works_with(home)
     assert rig("goto", "10", "--json").exit_code == 0
 
 
-def test_a_second_run_changes_nothing_and_asks_nothing(home):
+def test_second_setup_changes_and_asks_nothing(home):
     assert rig("setup", "--bench", "sim", answers="\ny\n").exit_code == 0
     before = (home / "rig.toml").read_bytes()
     again = rig("setup")
     assert again.exit_code == 0, again.output
-    assert "left as it is" in again.stdout
+    assert "is unchanged" in again.stdout
     assert (home / "rig.toml").read_bytes() == before
 
 
-def test_a_persons_file_keeps_what_they_wrote(parts, home):
+def test_existing_file_keeps_comments_and_settings(parts, home):
     file = home / "rig.toml"
     file.write_text(
         '# bench 7\n[servo]\nport = "/dev/ttyUSB0" # red dot\nid = 9  # the old one\n[table]\n'
@@ -94,16 +94,16 @@ def test_a_persons_file_keeps_what_they_wrote(parts, home):
     assert "rig servo settings --write" in done.stdout
 
 
-def test_permanent_settings_are_written_only_with_consent(parts, home):
+def test_permanent_settings_are_written_only_after_confirmation(parts, home):
     memory = parts.parts.servo.memory
     rig("setup", answers="n\n\ny\n")
     assert memory["Operating Mode"] == 3
     done = rig("setup", answers="y\n")
     assert memory["Operating Mode"] == 4
-    assert "Written, and read back." in done.stdout
+    assert "Written and verified." in done.stdout
 
 
-def test_without_anybody_to_answer_it_says_what_to_do_and_changes_nothing(home):
+def test_setup_without_answers_is_a_usage_error(home):
     done = rig("setup", "--bench", "sim")
     assert done.exit_code == 2
     assert "--yes" in done.stderr
@@ -112,7 +112,7 @@ def test_without_anybody_to_answer_it_says_what_to_do_and_changes_nothing(home):
     assert not (home / "rig.toml").exists()
 
 
-def test_nonsense_is_asked_again(home):
+def test_invalid_answers_are_asked_again(home):
     done = rig("setup", "--bench", "sim", answers="far\n90\n720\nperhaps\ny\n")
     assert done.exit_code == 0
     assert load_config(home / "rig.toml").table.limits_deg == (-720, 720)
@@ -121,14 +121,14 @@ def test_nonsense_is_asked_again(home):
     assert "Answer y or n." in done.stderr
 
 
-def test_a_broken_file_is_refused_and_stays(home):
+def test_broken_file_is_rejected_and_unchanged(home):
     (home / "rig.toml").write_text("[servo\n", encoding="utf-8")
     done = rig("setup", "--bench", "sim", "--yes")
     assert done.exit_code == 3
     assert (home / "rig.toml").read_text(encoding="utf-8") == "[servo\n"
 
 
-def test_of_several_servos_the_one_that_is_meant_is_chosen(parts, home):
+def test_operator_chooses_one_of_several_servos(parts, home):
     parts.add_servo(7, 1_000_000, "xm430_w350")
     done = rig("setup", answers="3\n2\n\ny\n")
     config = load_config(home / "rig.toml")
@@ -139,8 +139,8 @@ def test_of_several_servos_the_one_that_is_meant_is_chosen(parts, home):
     assert "\nid =" not in (home / "rig.toml").read_text(encoding="utf-8")
 
 
-class Hands(io.StringIO):
-    """Answers, each with something that the person does before."""
+class Operator(io.StringIO):
+    """Answers, each with an action of the operator before."""
 
     def __init__(self, *lines) -> None:
         super().__init__()
@@ -152,13 +152,13 @@ class Hands(io.StringIO):
         return line
 
 
-def test_an_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
+def test_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
     monkeypatch.setattr("rig.doctor.device_scan.BAUD_RATES_1", (1_000_000,))
     parts.parts.servo_bus.detach(parts.parts.servo)  # nothing answers: the ports cannot be told apart
     parts.computer.serial_port("ttyUSB5", serial="OTHER")
     class_file = parts.computer.root / "sys/class/tty/ttyUSB5"
     aside = parts.computer.root / "aside"
-    hands = Hands(
+    operator = Operator(
         ("n\n", lambda: None),  # look for servos again?
         ("o\n", lambda: None),
         ("\n", lambda: shutil.move(class_file, aside)),
@@ -166,7 +166,7 @@ def test_an_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch
         ("\n", lambda: None),
         ("y\n", lambda: None),
     )
-    monkeypatch.setattr("rig.cli.ui.prompts.sys.stdin", hands)
+    monkeypatch.setattr("rig.cli.ui.prompts.sys.stdin", operator)
     with pytest.raises(typer.Exit) as ended:
         setup.__wrapped__(Settings(), yes=False)
     assert ended.value.exit_code == 4
@@ -187,7 +187,7 @@ def test_ctrl_c_leaves_the_old_file_untouched(home):
     assert (home / "rig.toml").read_text(encoding="utf-8") == 'default_bench = "sim" # mine\n'
 
 
-def test_json_is_lines_of_json(home):
+def test_setup_json_is_one_object_per_line(home):
     done = rig("setup", "--bench", "sim", "--json")
     written, examined = (json.loads(line) for line in done.stdout.splitlines())
     assert written["written"] is True
@@ -198,7 +198,7 @@ def test_json_is_lines_of_json(home):
 # -- doctor and find --------------------------------------------------------------------------------------------------
 
 
-def test_the_doctor_prints_a_line_a_finding_and_its_code_is_the_worst(parts, home):
+def test_doctor_prints_findings_with_fixes_and_exits_with_the_first_problem(parts, home):
     done = rig("doctor")
     assert done.exit_code == 4
     lines = done.stdout.splitlines()
@@ -209,7 +209,7 @@ def test_the_doctor_prints_a_line_a_finding_and_its_code_is_the_worst(parts, hom
     assert lines[-1].endswith("fine.")
 
 
-def test_the_doctor_in_json(parts, home):
+def test_doctor_json_has_a_fix_for_each_problem(parts, home):
     told = json.loads(rig("doctor", "--json").stdout)
     assert told["exit_code"] == 4
     bad = [finding for finding in told["findings"] if finding["level"] == "bad"]
@@ -219,7 +219,7 @@ def test_the_doctor_in_json(parts, home):
     assert voltage["evidence"]["voltage_v"] == pytest.approx(12, abs=0.5)
 
 
-def test_the_doctor_goes_on_with_the_defaults_when_the_configuration_is_broken(home):
+def test_doctor_uses_the_defaults_if_the_configuration_is_broken(home):
     (home / "rig.toml").write_text("[servo]\nbaud = 3\nprot = 1\n", encoding="utf-8")
     done = rig("doctor", "--bench", "sim")
     assert done.exit_code == 3
@@ -227,17 +227,17 @@ def test_the_doctor_goes_on_with_the_defaults_when_the_configuration_is_broken(h
     assert "XL430-W250" in done.stdout
 
 
-def test_the_doctor_on_a_bench_that_is_not_there(home):
+def test_doctor_rejects_an_unknown_bench(home):
     assert rig("doctor", "--bench", "mars").exit_code == 3
 
 
-def test_rules_for_udev_are_all_that_is_printed(home):
+def test_udev_prints_only_rules(home):
     done = rig("doctor", "--udev", "--bench", "sim")
     assert done.exit_code == 0
     assert all(line.startswith(("#", "ACTION", "SUBSYSTEM")) for line in done.stdout.splitlines())
 
 
-def test_find_says_what_to_write_and_it_is_right(parts, home):
+def test_find_prints_valid_settings(parts, home):
     done = rig("find")
     assert done.exit_code == 0
     (home / "rig.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
@@ -247,7 +247,7 @@ def test_find_says_what_to_write_and_it_is_right(parts, home):
     assert told["settings"]["camera.source"] == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
 
 
-def test_a_rig_head_is_found_on_its_port(home):
+def test_find_detects_a_rig_head(home):
     done = rig("find", "--bench", "sim", "--set", "imu.connection=head")
     assert done.exit_code == 0
     assert "a rig head" in done.stdout
@@ -268,7 +268,7 @@ def test_find_on_an_empty_computer(parts, home):
 # -- servo ------------------------------------------------------------------------------------------------------------
 
 
-def test_the_file_follows_the_servos_new_id_and_rate(parts, home):
+def test_servo_changes_update_the_file(parts, home):
     (home / "rig.toml").write_text("[servo]\nid = 1 # sticker\n", encoding="utf-8")
     assert "verified" in rig("servo", "set-id", "4", "--yes").stdout
     assert rig("servo", "set-baud", "1000000", answers="y\n").exit_code == 0
@@ -276,14 +276,14 @@ def test_the_file_follows_the_servos_new_id_and_rate(parts, home):
     assert "already" in rig("servo", "set-id", "4", "--yes").stdout
 
 
-def test_a_question_that_nobody_answers_or_that_is_denied_changes_nothing(parts, home):
+def test_missing_or_negative_answer_changes_nothing(parts, home):
     assert rig("servo", "set-id", "4").exit_code == 2
     assert "Nothing was changed." in rig("servo", "set-id", "4", answers="n\n").stdout
     assert parts.parts.servo.memory["ID"] == 1
     assert rig("servo", "set-id", "300", "--yes").exit_code == 2
 
 
-def test_with_two_servos_on_the_bus_nothing_is_shown_or_set(parts, home):
+def test_two_servos_on_the_bus_are_rejected(parts, home):
     parts.add_servo(2, 1_000_000)
     for command in (
         ["info"],
@@ -296,7 +296,7 @@ def test_with_two_servos_on_the_bus_nothing_is_shown_or_set(parts, home):
         assert "There are 2 servos" in done.stderr
 
 
-def test_info_shows_every_register_once(parts, home):
+def test_info_shows_every_register(parts, home):
     told = json.loads(rig("servo", "info", "--json").stdout)
     assert told["registers"]["Present Input Voltage"]["meaning"] == "12.0 V"
     assert told["registers"]["Operating Mode"]["kept_without_supply"] is True

@@ -30,7 +30,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return run
 
 
-def test_it_is_taken_told_and_shown(rig: Callable[..., Any]) -> None:
+def test_empty_table_image_is_taken_and_shown(rig: Callable[..., Any]) -> None:
     nothing = rig("empty-table", "--show", "empty.png")
     assert nothing.exit_code == 2
     assert "there is no empty-table image yet" in nothing.stderr
@@ -43,7 +43,7 @@ def test_it_is_taken_told_and_shown(rig: Callable[..., Any]) -> None:
     assert rig("empty-table", "--show", "empty.png", "--anyway").exit_code == 2
 
 
-def test_an_enrollment_takes_it_once_a_day_and_says_what_came_of_it(rig: Callable[..., Any]) -> None:
+def test_enrollment_takes_the_image_once_a_day(rig: Callable[..., Any]) -> None:
     small = [word for setting in SMALL for word in ("--set", setting)]
     first, second = (rig("enroll", name, "--views", "4", *small) for name in ("dice", "lamp"))
     assert "Empty-table image:" in first.stderr
@@ -94,7 +94,7 @@ def asked(
     return run
 
 
-def test_a_person_is_asked_again_when_the_object_was_forgotten(asked: Callable[..., tuple[Any, str]]) -> None:
+def test_operator_is_asked_again_if_an_object_is_on_the_table(asked: Callable[..., tuple[Any, str]]) -> None:
     table, said = asked(Answers("\n\n\n"))
     assert table is not None
     assert "There is no empty-table image yet. Take everything off the table." in said
@@ -103,7 +103,7 @@ def test_a_person_is_asked_again_when_the_object_was_forgotten(asked: Callable[.
     assert "Put toy-car on the table" in said
 
 
-def test_what_always_turns_with_the_table_is_kept_when_asked(asked: Callable[..., tuple[Any, str]]) -> None:
+def test_fixed_parts_on_the_table_are_accepted_on_request(asked: Callable[..., tuple[Any, str]]) -> None:
     table, said = asked(Answers("k\n\nk\n\n"), stays=True)
     assert table is not None
     assert table.evidence["turning_share"] > 0.004
@@ -112,7 +112,7 @@ def test_what_always_turns_with_the_table_is_kept_when_asked(asked: Callable[...
 
 
 @pytest.mark.parametrize("answer", ["s\n", "what?\ns\n", ""])
-def test_a_person_may_go_on_without_and_knows_what_that_means(
+def test_operator_can_continue_without_the_image(
     asked: Callable[..., tuple[Any, str]], answer: str
 ) -> None:
     table, said = asked(Answers(answer))
@@ -129,5 +129,5 @@ def test_automation_is_never_asked(asked: Callable[..., tuple[Any, str]], option
     assert "To take a new one: rig empty-table" in said
 
 
-def test_without_a_terminal_nobody_is_asked(asked: Callable[..., tuple[Any, str]]) -> None:
+def test_no_question_without_a_terminal(asked: Callable[..., tuple[Any, str]]) -> None:
     assert asked(io.StringIO("\n\n\n"))[0] is None

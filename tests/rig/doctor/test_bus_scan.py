@@ -1,4 +1,4 @@
-"""Who answers on the buses: found wherever they are, never disturbed, and two with one id told apart from one."""
+"""Scans of servo buses and I2C buses: devices are found, never disturbed, and duplicate ids are detected."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def test_every_servo_is_found_at_its_id_and_baud_rate(placed):
 
 @fuzz_settings(0.01)
 @given(st.integers(0, 252), st.sampled_from(BAUD_RATES))
-def test_two_servos_with_one_id_are_noticed_wherever_they_are(bus_id, baud):
+def test_duplicate_id_is_found_at_any_rate(bus_id, baud):
     with unopened(servo_at=(bus_id, baud)) as bench:
         bench.add_servo(bus_id, baud, "xm430_w350")
         (said,) = heard(bench, baud)
@@ -53,7 +53,7 @@ def test_two_servos_with_one_id_are_noticed_wherever_they_are(bus_id, baud):
         assert bus_id not in {servo.bus_id for servo in said.servos}
 
 
-def test_twins_are_found_beside_a_third_one():
+def test_duplicate_id_is_found_beside_another_servo():
     with unopened() as bench:
         bench.add_servo(1, 57_600)
         bench.add_servo(7, 57_600)
@@ -62,7 +62,7 @@ def test_twins_are_found_beside_a_third_one():
         assert [servo.bus_id for servo in said.servos] == [7]
 
 
-def test_a_line_that_babbles_is_noise_and_no_253_servos():
+def test_babbling_bus_is_noise():
     with unopened() as bench:
         faults = Faults(bench.devices)
         faults.schedule(*read_faults(["babble"]))
@@ -72,7 +72,7 @@ def test_a_line_that_babbles_is_noise_and_no_253_servos():
         assert not said.duplicate_ids
 
 
-def test_a_servo_whose_answer_to_all_was_spoiled_is_asked_by_itself():
+def test_servo_with_a_corrupt_answer_is_asked_again():
     with unopened() as bench:
         spoiled = []
 
@@ -88,7 +88,7 @@ def test_a_servo_whose_answer_to_all_was_spoiled_is_asked_by_itself():
         assert not said.duplicate_ids
 
 
-def test_an_adapter_that_hears_itself_changes_nothing():
+def test_echoing_adapter_changes_nothing():
     with unopened() as bench:
         faults = Faults(bench.devices)
         faults.schedule(*read_faults(["echo"]))
@@ -98,7 +98,7 @@ def test_an_adapter_that_hears_itself_changes_nothing():
         assert not said.duplicate_ids
 
 
-def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
+def test_port_without_a_baud_rate_has_one_servo():
     class Relay:
         """A pseudo-terminal: whatever rate it is told, the bytes arrive."""
 
@@ -118,7 +118,7 @@ def test_a_port_without_a_baud_rate_has_one_servo_and_not_eight():
         assert without_echoes(real, 57_600) == real  # two servos of one kind, at two rates
 
 
-def test_rates_that_the_adapter_lacks_are_left_out():
+def test_unsupported_rates_are_left_out():
     class Slow:
         """An adapter that stops at 1 MBd."""
 
@@ -138,16 +138,16 @@ def test_rates_that_the_adapter_lacks_are_left_out():
         assert rates == [57_600, 1_000_000, 115_200, 9_600]
 
 
-def test_an_ax_12a_is_found_by_its_own_protocol():
+def test_ax_12a_is_found_by_protocol_1():
     with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(9, 1_000_000)) as bench:
-        assert not any(said.anything for said in heard(bench, 1_000_000))
+        assert not any(said.answered for said in heard(bench, 1_000_000))
         (said,) = heard(bench, 1_000_000, protocol=1)
         (servo,) = said.servos
         assert (servo.bus_id, servo.model, servo.protocol) == (9, "ax_12a", 1)
         assert not said.duplicate_ids
 
 
-def test_an_unknown_model_is_told_by_its_number():
+def test_unknown_model_is_named_by_its_number():
     with unopened() as bench:
         bench.devices.servo.memory["Model Number"] = 4711
         assert 4711 not in model_numbers()
@@ -181,7 +181,7 @@ class RegisterFile:
 
 
 @pytest.mark.parametrize("chip", CHIPS, ids=lambda chip: chip.name)
-def test_each_imu_is_known_by_its_own_register_at_each_of_its_addresses(chip):
+def test_each_imu_is_identified_at_each_address(chip):
     for address in chip.addresses:
         with unopened() as bench:
             bench.devices.i2c.detach(0x68)
@@ -192,7 +192,7 @@ def test_each_imu_is_known_by_its_own_register_at_each_of_its_addresses(chip):
             assert all(len(data) == 1 for data in device.written)  # a register's number, never a value
 
 
-def test_an_unknown_chip_is_told_with_what_it_says_and_foreign_addresses_are_left_alone():
+def test_unknown_chip_is_reported_and_other_addresses_are_not_asked():
     with unopened() as bench:
         bench.devices.i2c.detach(0x68)
         clock, memory = RegisterFile({0x00: 0x37}), RegisterFile({})
@@ -204,7 +204,7 @@ def test_an_unknown_chip_is_told_with_what_it_says_and_foreign_addresses_are_lef
         assert not memory.written
 
 
-def test_a_bus_that_is_held_low_is_an_error_of_the_system():
+def test_stuck_bus_is_an_os_error():
     with unopened() as bench:
         bench.devices.i2c.stuck = True
         with pytest.raises(TimeoutError):

@@ -1,4 +1,4 @@
-"""Every finding of the doctor: what is wrong is found, says which command fixes it, and stops no other check."""
+"""Findings of `rig doctor`: each problem is found with its fix, and stops no other check."""
 
 import os
 import sqlite3
@@ -42,7 +42,7 @@ def one(problems: dict[str, str]) -> tuple[str, str]:
     return text, fix
 
 
-def test_a_bench_in_order_has_only_its_calibration_to_come():
+def test_sound_bench_lacks_only_its_calibration():
     with unopened() as bench:
         set_up(bench)
         findings = bench.findings()
@@ -53,7 +53,7 @@ def test_a_bench_in_order_has_only_its_calibration_to_come():
         assert bench.instructions <= {PING, READ}  # nothing is written, so nothing can move
 
 
-def test_an_empty_computer_is_told_device_by_device():
+def test_empty_computer_reports_each_missing_device():
     with unopened(plugged=False) as bench:
         bench.devices.adapter.unplug()
         bench.devices.camera.unplug()
@@ -68,7 +68,7 @@ def test_an_empty_computer_is_told_device_by_device():
 # -- the computer -----------------------------------------------------------------------------------------------------
 
 
-def test_the_latency_timer_is_mended_by_one_command():
+def test_latency_timer_is_fixed_by_one_command():
     with unopened(plugged=False) as bench:
         bench.computer.serial_port(latency_ms=16)
         bench.computer.i2c_bus()
@@ -79,18 +79,18 @@ def test_the_latency_timer_is_mended_by_one_command():
 
 
 @pytest.mark.parametrize(("members", "command"), [((), "sudo usermod -aG dialout ada"), (("ada",), "newgrp dialout")])
-def test_a_missing_permission_names_the_group_or_the_new_login(members, command):
+def test_missing_permission_names_the_group_or_the_new_login(members, command):
     with unopened(plugged=False, user=ADA) as bench:
         bench.computer.group("dialout", GID, *members)
         bench.computer.serial_port(mode=0o660)
         bench.computer.i2c_bus(mode=0o666)
         bench.computer.camera(mode=0o666)
         text, fix = one(bench.problems("port"))
-        assert "ada may not use /dev/ttyUSB0" in text
+        assert "ada has no permission for /dev/ttyUSB0" in text
         assert fix == command
 
 
-def test_a_port_of_root_alone_is_mended_by_rules_for_udev():
+def test_port_of_root_is_fixed_by_udev_rules():
     with unopened(plugged=False, user=ADA) as bench:
         bench.computer.group("root", GID)
         bench.computer.serial_port(mode=0o600, serial="FT3M9M97")
@@ -109,15 +109,15 @@ def test_a_port_of_root_alone_is_mended_by_rules_for_udev():
     ("command", "fix"),
     [("dynamixel_wizard", "kill 77"), ("/usr/sbin/ModemManager", "sudo systemctl disable --now ModemManager")],
 )
-def test_who_holds_the_port_is_named(command, fix):
+def test_port_in_use_names_the_process(command, fix):
     with unopened() as bench:
         bench.computer.process(77, command, "/dev/ttyUSB0")
         text, told = one(bench.problems("port"))
-        assert f"held by process 77 ({command})" in text
+        assert f"in use by process 77 ({command})" in text
         assert told == fix
 
 
-def test_another_port_than_the_configured_one_is_offered_by_its_lasting_name():
+def test_other_port_is_proposed_by_its_permanent_name():
     with unopened(plugged=False) as bench:
         bench.computer.serial_port("ttyUSB3", serial="FT7")
         bench.computer.i2c_bus(4)
@@ -130,7 +130,7 @@ def test_another_port_than_the_configured_one_is_offered_by_its_lasting_name():
         ]
 
 
-def test_two_other_ports_are_a_case_for_the_set_up():
+def test_two_other_ports_propose_setup():
     with unopened(plugged=False) as bench:
         bench.computer.serial_port("ttyUSB3", serial="A")
         bench.computer.serial_port("ttyUSB4", serial="B")
@@ -139,7 +139,7 @@ def test_two_other_ports_are_a_case_for_the_set_up():
         assert one(bench.problems("port"))[1] == "rig setup --bench sim"
 
 
-def test_a_bench_in_use_is_left_alone():
+def test_bench_in_use_is_not_touched():
     with unopened() as bench:
         path = bench.context.config.state_path("sim")
         lock = BenchLock(path, SystemClock())
@@ -153,7 +153,7 @@ def test_a_bench_in_use_is_left_alone():
         assert not bench.sent
 
 
-def test_a_latched_fault_and_a_damaged_state_are_told():
+def test_latched_fault_and_damaged_state_are_reported():
     with unopened() as bench:
         store = FileStore(bench.context.config.state_path("sim"))
         utc = "2026-05-01T10:00:00+00:00"
@@ -169,7 +169,7 @@ def test_a_latched_fault_and_a_damaged_state_are_told():
 
 
 @pytest.mark.parametrize(("free", "level"), [(50e9, Severity.FINE), (1e9, Severity.WARNING), (1e8, Severity.BAD)])
-def test_room_on_the_disk_is_told_in_objects(monkeypatch, free, level):
+def test_free_space_is_reported_in_objects(monkeypatch, free, level):
     with unopened() as bench:
         monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: Disk(int(free), network=False))
         (finding,) = bench.findings("disk")
@@ -177,7 +177,7 @@ def test_room_on_the_disk_is_told_in_objects(monkeypatch, free, level):
         assert f"about {int(free / 500_000) // 72} more objects" in finding.text
 
 
-def test_a_folder_that_may_not_be_written_to_is_told(monkeypatch):
+def test_read_only_folder_is_reported(monkeypatch):
     with unopened() as bench:
         monkeypatch.setattr(
             type(bench.context.computer), "disk", lambda *_: Disk(10**11, network=False, writable=False)
@@ -187,14 +187,14 @@ def test_a_folder_that_may_not_be_written_to_is_told(monkeypatch):
         assert fix == "rig config set catalog.path FOLDER"
 
 
-def test_a_catalog_on_another_computer_is_warned_of(monkeypatch):
+def test_catalog_on_a_network_disk_is_a_warning(monkeypatch):
     with unopened() as bench:
         monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: Disk(10**11, network=True))
         text, _ = one(bench.problems("disk"))
         assert "network file system" in text
 
 
-def test_a_clock_that_nobody_keeps_is_told_and_one_that_is_wrong_stops_the_work():
+def test_unsynchronized_clock_is_a_warning_and_wrong_date_is_bad():
     with unopened(plugged=False) as bench:
         assert "no time server that is known" in one(bench.problems("clock"))[0]
         bench.computer.keeps_time(synchronised=False)
@@ -208,7 +208,7 @@ def test_a_clock_that_nobody_keeps_is_told_and_one_that_is_wrong_stops_the_work(
         assert "1970-01-01" in wrong.text
 
 
-def test_a_civil_time_that_jumps_and_a_pause_that_drags_on_are_told():
+def test_time_jump_and_long_pause_are_reported():
     class Bad(VirtualClock):
         """Sleeps too long, and its civil time jumps meanwhile."""
 
@@ -231,7 +231,7 @@ def test_a_civil_time_that_jumps_and_a_pause_that_drags_on_are_told():
 # -- the servo --------------------------------------------------------------------------------------------------------
 
 
-def test_each_setting_of_the_factory_is_told_with_what_is_wanted_and_why():
+def test_factory_settings_are_reported_with_the_required_values():
     with unopened() as bench:
         problems = bench.problems("servo")
         assert set(problems.values()) == {"rig servo settings --write --bench sim"}
@@ -247,14 +247,14 @@ def test_each_setting_of_the_factory_is_told_with_what_is_wanted_and_why():
         ((3, 1_000_000), "rig setup --bench sim"),
     ],
 )
-def test_a_servo_elsewhere_is_found_and_the_configuration_can_follow(place, fix):
+def test_servo_at_another_id_or_rate_is_found(place, fix):
     with unopened(servo_at=place) as bench:
         text, told = one(bench.problems("servo"))
         assert f"id {place[0]} at {place[1]} baud" in text
         assert told == fix
 
 
-def test_several_servos_elsewhere_are_listed():
+def test_several_other_servos_are_listed():
     with unopened(servo_at=(3, 57_600)) as bench:
         bench.add_servo(4, 115_200)
         text, fix = one(bench.problems("servo"))
@@ -262,7 +262,7 @@ def test_several_servos_elsewhere_are_listed():
         assert fix == "rig setup --bench sim"
 
 
-def test_no_servo_at_all_asks_for_power():
+def test_missing_servo_asks_for_power():
     with unopened() as bench:
         bench.devices.servo_bus.detach(bench.devices.servo)
         text, fix = one(bench.problems("servo"))
@@ -270,7 +270,7 @@ def test_no_servo_at_all_asks_for_power():
         assert "12 V" in fix
 
 
-def test_a_neighbour_is_mentioned_and_a_twin_is_an_obstacle():
+def test_second_servo_is_reported_and_duplicate_id_is_bad():
     with unopened() as bench:
         set_up(bench)
         bench.add_servo(7, 57_600)
@@ -282,14 +282,14 @@ def test_a_neighbour_is_mentioned_and_a_twin_is_an_obstacle():
         assert "rig servo set-id 2 --bench sim" in fix
 
 
-def test_another_model_can_be_made_the_configured_one():
+def test_other_model_can_be_configured():
     with unopened("servo.model=xm430_w350") as bench:
         bench.devices.servo_bus.detach(bench.devices.servo)
         bench.add_servo(1, 57_600, "xl430_w250")
         assert one(bench.problems("servo"))[1] == "rig config set servo.model xl430_w250"
 
 
-def test_an_ax_12a_says_what_it_lacks():
+def test_ax_12a_reports_its_missing_functions():
     with unopened("servo.model=ax_12a", "table.mode=pan", "servo.baud=1000000") as bench:
         bench.devices.servo.memory["Return Delay Time"] = 0
         texts = "\n".join(bench.problems("servo"))
@@ -297,7 +297,7 @@ def test_an_ax_12a_says_what_it_lacks():
         assert "EEPROM" not in texts
 
 
-def test_torque_left_on_and_a_tripped_watchdog_are_told_and_left():
+def test_torque_and_tripped_watchdog_are_reported_and_not_changed():
     with unopened() as bench:
         set_up(bench)
         bench.devices.servo.memory["Torque Enable"] = 1
@@ -313,30 +313,30 @@ def test_torque_left_on_and_a_tripped_watchdog_are_told_and_left():
 FOUND = {
     "servo.off": ("servo", "no servo answers"),
     "servo.stuck": ("servo", "frozen"),
-    "servo.garbage": ("servo", "what cannot be"),
+    "servo.garbage": ("servo", "impossible values"),
     "servo.slow": ("servo", "slow"),
     "servo.intermittent": ("servo", "repeated"),
     "crc_flip": ("servo", "repeated"),
     "late_reply": ("servo", "repeated"),
-    "babble": ("servo", "no servo's"),
+    "babble": ("servo", "do not belong to a servo"),
     "unplug": ("servo", "Cannot open"),
     "duplicate_id": ("servo", "two servos"),
     "wrong_model": ("servo", "another model"),
     "brownout": ("servo", "no servo answers"),
     "overload": ("servo", "overload"),
     "overheat": ("servo", "overheating"),
-    "imu.off": ("imu", "nobody answers"),
+    "imu.off": ("imu", "no device answers"),
     "imu.stuck": ("imu", "frozen"),
-    "imu.garbage": ("imu", "no table at rest"),
+    "imu.garbage": ("imu", "more than a table at rest"),
     "imu.slow": ("imu", "samples in"),
     "imu_saturated": ("imu", "saturated"),
-    "i2c_stuck": ("imu", "does not move"),
+    "i2c_stuck": ("imu", "is stuck"),
     "camera.off": ("camera", "no camera"),
     "camera.stuck": ("camera", "no frame"),
     "camera.garbage": ("camera", "noise instead of an image"),
     "camera.wrong": ("camera", "320x240"),
     "camera.slow": ("camera", "2 a second"),
-    "camera.delayed": ("camera", "old"),
+    "camera.delayed": ("camera", "too old"),
     "frozen_frame": ("camera", "frozen"),
     "black_frame": ("camera", "black"),
     "light_flicker": ("camera", "light changes"),
@@ -348,7 +348,7 @@ LOOKS = {"frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker"
 
 
 @pytest.mark.parametrize("name", sorted(fault_kinds()))
-def test_under_every_fault_all_checks_come_to_an_end_and_those_that_show_are_found(name):
+def test_all_checks_end_under_every_fault_and_find_visible_ones(name):
     with unopened() as bench:
         set_up(bench)
         faults = Faults(bench.devices)
@@ -369,7 +369,7 @@ def test_under_every_fault_all_checks_come_to_an_end_and_those_that_show_are_fou
 # -- the IMU ----------------------------------------------------------------------------------------------------------
 
 
-def test_an_imu_at_its_other_address_and_on_its_side():
+def test_imu_at_another_address_and_axis_is_found():
     with unopened("imu.address=0x69") as bench:
         device = bench.devices.i2c.detach(0x69)
         bench.devices.i2c.attach(0x68, device)
@@ -381,14 +381,14 @@ def test_an_imu_at_its_other_address_and_on_its_side():
         assert one(bench.problems("imu"))[1] == "rig config set imu.axis z"
 
 
-def test_a_clone_is_named():
+def test_clone_is_named():
     with unopened() as bench:
         bench.devices.imu.who_am_i = 0x70
         text, _ = one(bench.problems("imu"))
         assert "MPU-6500" in text
 
 
-def test_an_imu_on_a_rig_head_is_looked_at_there():
+def test_imu_on_a_rig_head_is_checked():
     with unopened("imu.connection=head", "head.port=/dev/ttyUSB1") as bench:
         set_up(bench)
         bench.computer.serial_port("ttyUSB1", serial="HEAD")
@@ -398,7 +398,7 @@ def test_an_imu_on_a_rig_head_is_looked_at_there():
         assert "no rig head" in one(bench.problems("imu"))[0]
 
 
-def test_a_servo_fed_by_the_heads_relay_is_not_called_dead():
+def test_servo_behind_the_relay_is_not_reported_missing():
     with unopened("imu.connection=head", "head.port=/dev/ttyUSB1", "head.power=true") as bench:
         text, _ = one(bench.problems("servo"))
         assert "relay" in text
@@ -412,7 +412,7 @@ def enroll(path: Path, views: int) -> None:
         fill(catalog, "mug", views)
 
 
-def test_a_catalog_is_looked_into():
+def test_catalog_is_checked():
     with unopened() as bench:
         assert "none yet" in bench.findings("catalog")[0].text
         path = bench.context.catalog_path
@@ -423,7 +423,7 @@ def test_a_catalog_is_looked_into():
         image = next((path / "images").rglob("*.png"))
         image.write_bytes(b"no image")
         text, fix = one(bench.problems("catalog"))
-        assert "1 of 6 images" in text
+        assert "1 of 6 verified images" in text
         assert fix == "rig catalog verify --repair --bench sim"
         image.unlink()
         (path / "catalog.sqlite").write_bytes(b"SQLite format 3\0" + b"rubbish" * 999)
@@ -432,7 +432,7 @@ def test_a_catalog_is_looked_into():
         assert finding.exit_code == 7
 
 
-def test_a_catalog_with_rows_of_nobody_is_damaged():
+def test_catalog_with_orphaned_rows_is_damaged():
     with unopened() as bench:
         path = bench.context.catalog_path
         enroll(path, 4)
@@ -458,7 +458,7 @@ def result(bench, days_ago: float, valid_days: float | None = None, **device: ob
     )
 
 
-def test_calibrations_missing_expired_and_of_another_device():
+def test_missing_expired_and_other_device_calibrations_are_warnings():
     with unopened() as bench:
         set_up(bench)
         store = CalibrationStore(bench.context.config.calibration_path("sim"))
@@ -483,7 +483,7 @@ def test_calibrations_missing_expired_and_of_another_device():
 # -- the examination itself -------------------------------------------------------------------------------------------
 
 
-def test_a_check_that_hangs_fails_or_dies_stops_no_other_one():
+def test_hanging_or_failing_check_stops_no_other():
     released = threading.Event()
 
     def hangs(context):

@@ -1,4 +1,4 @@
-"""Id and baud rate are changed on a servo that is alone, with its torque off, and verified."""
+"""Change of id and baud rate: only on a single servo, with its torque off, and verified."""
 
 import pytest
 from hypothesis import given
@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, RequestRejected, SeveralServos, UsageError
 from rig.devices.dynamixel.registers import control_table, model_numbers
-from rig.doctor.register_meaning import baud_codes, words
+from rig.doctor.register_meaning import baud_codes, meaning
 from rig.doctor.single_servo import single_servo
 from rig.safety.saved_state import Holder
 from tests.fuzzing import fuzz_settings
@@ -21,7 +21,7 @@ WRITE = 0x03
     new_id=st.integers(0, 252),
     new_baud=st.sampled_from([9_600, 57_600, 115_200, 4_500_000]),
 )
-def test_a_servo_found_anywhere_gets_another_id_and_rate(at, new_id, new_baud):
+def test_servo_at_any_id_and_rate_can_be_changed(at, new_id, new_baud):
     with unopened(servo_at=at) as bench:
         memory = bench.devices.servo.memory
         memory["Torque Enable"] = 1
@@ -38,7 +38,7 @@ def test_a_servo_found_anywhere_gets_another_id_and_rate(at, new_id, new_baud):
 
 
 @pytest.mark.parametrize("place", [(2, 57_600), (2, 1_000_000), (1, 57_600), (1, 115_200)])
-def test_a_second_servo_at_any_rate_forbids_it_and_nothing_is_written(place):
+def test_second_servo_at_any_rate_prevents_changes(place):
     with unopened() as bench:
         bench.add_servo(*place)
         with pytest.raises(SeveralServos) as caught, single_servo(bench.context):
@@ -48,7 +48,7 @@ def test_a_second_servo_at_any_rate_forbids_it_and_nothing_is_written(place):
         assert WRITE not in bench.instructions
 
 
-def test_no_servo_an_unknown_one_and_a_bench_in_use(monkeypatch):
+def test_missing_servo_unknown_model_and_busy_bench_are_errors(monkeypatch):
     monkeypatch.setattr("rig.doctor.single_servo.BAUD_RATES_1", (1_000_000,))
     with unopened() as bench:
         bench.devices.servo.memory["Model Number"] = 4711
@@ -64,7 +64,7 @@ def test_no_servo_an_unknown_one_and_a_bench_in_use(monkeypatch):
         assert not bench.sent
 
 
-def test_what_a_servo_cannot_be_set_to_is_refused_before_anything_is_written():
+def test_invalid_id_and_rate_are_rejected_before_writing():
     with unopened() as bench, single_servo(bench.context) as servo:
         with pytest.raises(UsageError, match="No servo has the id 253"):
             servo.set_id(253)
@@ -74,14 +74,14 @@ def test_what_a_servo_cannot_be_set_to_is_refused_before_anything_is_written():
         assert WRITE not in bench.instructions
 
 
-def test_a_servo_that_keeps_its_old_id_is_not_believed(monkeypatch):
+def test_servo_that_keeps_its_id_is_an_error(monkeypatch):
     with unopened() as bench, single_servo(bench.context) as servo:
         monkeypatch.setattr(type(bench.devices.servo), "bus_id", property(lambda _: 1))
-        with pytest.raises(RequestRejected, match="did not take the id 9"):
+        with pytest.raises(RequestRejected, match="did not accept the id 9"):
             servo.set_id(9)
 
 
-def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
+def test_servo_that_keeps_its_rate_is_still_reached(monkeypatch):
     with unopened() as bench, single_servo(bench.context) as servo:
         monkeypatch.setattr(type(bench.devices.servo), "baudrate", property(lambda _: 57_600))
         with pytest.raises(RequestRejected, match="1000000 baud"):
@@ -89,7 +89,7 @@ def test_a_servo_that_keeps_its_old_rate_is_still_reached(monkeypatch):
         assert servo.read()["Baud Rate"] == 3  # what it was told; it answers at the rate that it has
 
 
-def test_a_servo_that_answers_reads_alone_can_be_renamed():
+def test_servo_that_answers_only_reads_can_be_changed():
     with unopened() as bench:
         bench.devices.servo.memory["Status Return Level"] = 1
         with single_servo(bench.context) as servo:
@@ -97,7 +97,7 @@ def test_a_servo_that_answers_reads_alone_can_be_renamed():
         assert bench.devices.servo.memory["ID"] == 5
 
 
-def test_an_ax_12a_is_renamed_by_its_own_protocol(monkeypatch):
+def test_ax_12a_is_changed_by_protocol_1(monkeypatch):
     monkeypatch.setattr("rig.doctor.single_servo.BAUD_RATES_1", (1_000_000, 115_200))  # each asks 253 ids
     with unopened("servo.model=ax_12a", "table.mode=pan", servo_at=(1, 1_000_000)) as bench:
         with single_servo(bench.context) as servo:
@@ -106,14 +106,14 @@ def test_an_ax_12a_is_renamed_by_its_own_protocol(monkeypatch):
             servo.set_baud(115_200)
         with single_servo(bench.context) as servo:
             assert (servo.found.bus_id, servo.found.baud) == (4, 115_200)
-            assert words(servo.table, "Baud Rate", servo.read()["Baud Rate"]).startswith("1176")  # 2 MBd by 17
+            assert meaning(servo.table, "Baud Rate", servo.read()["Baud Rate"]).startswith("1176")  # 2 MBd by 17
 
 
-# -- words ------------------------------------------------------------------------------------------------------------
+# -- meaning ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "expected"),
     [
         ("Baud Rate", 3, "1000000 bit/s"),
         ("Return Delay Time", 250, "500 µs"),
@@ -138,15 +138,15 @@ def test_an_ax_12a_is_renamed_by_its_own_protocol(monkeypatch):
         ("Position P Gain", 640, ""),
     ],
 )
-def test_registers_are_told_in_the_units_of_the_e_manual(name, value, said):
-    assert words(control_table("xm430_w350"), name, value) == said
+def test_registers_have_the_units_of_the_e_manual(name, value, expected):
+    assert meaning(control_table("xm430_w350"), name, value) == expected
 
 
-def test_every_register_of_every_model_has_words_for_every_value():
+def test_every_register_of_every_model_accepts_every_value():
     for model in model_numbers().values():
         table = control_table(model)
         assert baud_codes(table)
         for register in table.values():
             top = 256**register.size
             for value in (0, 1, 2, top // 2 - 1, -top // 2 if register.signed else top - 1):
-                assert isinstance(words(table, register.name, value), str)
+                assert isinstance(meaning(table, register.name, value), str)

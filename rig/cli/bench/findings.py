@@ -1,4 +1,4 @@
-"""What `rig doctor`, `rig find` and `rig setup` share: the bench under examination, its findings, the progress."""
+"""What `rig doctor`, `rig find` and `rig setup` share: the bench to check, its findings, the progress."""
 
 import sys
 from contextlib import contextmanager
@@ -21,7 +21,7 @@ _INDENT = 2 + _TOPIC_WIDTH
 
 @contextmanager
 def doctor_context(settings: Settings, *, default: bool = False) -> "Iterator[DoctorContext]":
-    """Yield the bench that the common options mean; with ``default`` as if there were no configuration."""
+    """Yield the bench of the common options; with ``default``, ignore the configuration file."""
     from rig.config import RigConfig
     from rig.doctor.context import open_context
 
@@ -35,7 +35,7 @@ def doctor_context(settings: Settings, *, default: bool = False) -> "Iterator[Do
 
 
 def print_finding(screen: "Console", finding: "Finding") -> None:
-    """Print a finding: its mark, its topic, what was found, and below it the command that fixes it."""
+    """Print a finding: its mark, its topic, its text, and below it the fix."""
     from rich.text import Text
 
     from rig.doctor.finding import MARKS, Severity
@@ -52,7 +52,7 @@ def print_finding(screen: "Console", finding: "Finding") -> None:
         screen.print(Text(f"{' ' * _INDENT}→ {finding.fix}", "bold"), soft_wrap=True)
 
 
-def say(text: str) -> None:
-    """Tell who waits at a terminal what is going on; it is gone with the next line."""
+def show_progress(text: str) -> None:
+    """Show progress at a terminal; the next line replaces it."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{text[:78]}\r", end="", file=sys.stderr, flush=True)
