@@ -95,7 +95,7 @@ def test_existing_file_keeps_comments_and_settings(parts, home):
 
 
 def test_permanent_settings_are_written_only_after_confirmation(parts, home):
-    memory = parts.parts.servo.memory
+    memory = parts.devices.servo.memory
     rig("setup", answers="n\n\ny\n")
     assert memory["Operating Mode"] == 3
     done = rig("setup", answers="y\n")
@@ -154,7 +154,7 @@ class Operator(io.StringIO):
 
 def test_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
     monkeypatch.setattr("rig.doctor.device_scan.BAUD_RATES_1", (1_000_000,))
-    parts.parts.servo_bus.detach(parts.parts.servo)  # nothing answers: the ports cannot be told apart
+    parts.devices.servo_bus.detach(parts.devices.servo)  # nothing answers: the ports cannot be told apart
     parts.computer.serial_port("ttyUSB5", serial="OTHER")
     class_file = parts.computer.root / "sys/class/tty/ttyUSB5"
     aside = parts.computer.root / "aside"
@@ -279,7 +279,7 @@ def test_servo_changes_update_the_file(parts, home):
 def test_missing_or_negative_answer_changes_nothing(parts, home):
     assert rig("servo", "set-id", "4").exit_code == 2
     assert "Nothing was changed." in rig("servo", "set-id", "4", answers="n\n").stdout
-    assert parts.parts.servo.memory["ID"] == 1
+    assert parts.devices.servo.memory["ID"] == 1
     assert rig("servo", "set-id", "300", "--yes").exit_code == 2
 
 

@@ -112,9 +112,7 @@ def test_fixed_parts_on_the_table_are_accepted_on_request(asked: Callable[..., t
 
 
 @pytest.mark.parametrize("answer", ["s\n", "what?\ns\n", ""])
-def test_operator_can_continue_without_the_image(
-    asked: Callable[..., tuple[Any, str]], answer: str
-) -> None:
+def test_operator_can_continue_without_the_image(asked: Callable[..., tuple[Any, str]], answer: str) -> None:
     table, said = asked(Answers(answer))
     assert table is None
     assert "s: continue without\n  (without it, objects are found only before a plain background" in said
