@@ -1,4 +1,4 @@
-"""A ChArUco board on the platter, seen through a true camera."""
+"""A ChArUco board on the platter, drawn through the lens of `sim.optics`, and a grey card."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -23,17 +23,17 @@ class BoardOnPlatter:
     Attributes
     ----------
     board
-        Its layout as printed.
+        The printed layout.
     optics
-        Of the camera that looks at it.
+        The camera that sees it.
     tilt_deg
-        How far its top leans away from the camera when the table stands at 0.
+        Lean of its top away from the camera when the table is at home.
     swing_deg, roll_deg
-        How far it is turned about the vertical, and in its own plane.
+        Rotation about the vertical and in its own plane.
     centre_mm
-        Where its middle is in the platter's frame: x to the right, y away, z up.
+        Its centre in the platter's frame: x to the right, y away from the camera, z up.
     loose_deg
-        How far it may swing about the vertical whenever the table has moved.
+        Largest rotation about the vertical after the table has moved, for a loose stand.
     """
 
     board: Board = field(default_factory=Board)
@@ -46,7 +46,7 @@ class BoardOnPlatter:
     name: str = "calibration-board"
 
     def put(self, *, tilt_deg: float, swing_deg: float = 0.0, roll_deg: float = 0.0) -> "BoardOnPlatter":
-        """Return the board put differently on its stand."""
+        """Return the board in another position on its stand."""
         return replace(self, tilt_deg=tilt_deg, swing_deg=swing_deg, roll_deg=roll_deg)
 
     def pose(self, table_deg: float) -> tuple[Floats, Floats]:
@@ -68,10 +68,10 @@ class BoardOnPlatter:
         return rotation @ on_platter, rotation @ corner + translation
 
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:  # noqa: ARG002
-        """Draw the board into ``image``; where it was put on the platter is its own, not ``offset_mm``."""
+        """Draw the board into ``image``; `centre_mm` is its position, not ``offset_mm``."""
         rotation, translation = self.pose(azimuth_deg)
         normal = rotation[:, 2]
-        if float(normal @ translation) <= 0:  # its back
+        if float(normal @ translation) <= 0:  # the camera sees its back
             return
         # A ray r meets the board's plane where the homography [r1 r2 t]⁻¹ takes it.
         to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation]))
@@ -90,7 +90,7 @@ class BoardOnPlatter:
 
     @cached_property
     def _texture(self) -> NDArray[np.uint8]:
-        """The print (grey, premultiplied) and what it covers, uint8 (rows, columns, 2)."""
+        """The print (grey, premultiplied) and its coverage, uint8 (rows, columns, 2)."""
         return _texture(self.board)
 
 
@@ -114,12 +114,12 @@ class GreyCard:
 
 
 def calibration_targets(optics: Optics, board: Board | None = None) -> dict[str, SimObject]:
-    """Return what the calibrations of the camera ask to be put up, by name: the grey card, and the board's stands."""
+    """Return the objects that camera calibrations need, by name: the grey card, and the board on each stand."""
     return {GreyCard().name: GreyCard(), **boards(optics, board)}
 
 
 def boards(optics: Optics, board: Board | None = None) -> dict[str, BoardOnPlatter]:
-    """Return the board as the calibrations ask for it to stand, by name."""
+    """Return the board in each position that calibrations need, by name."""
     layout = board or Board()
     return {
         "calibration-board upright": BoardOnPlatter(layout, optics, tilt_deg=4.0),

@@ -1,4 +1,4 @@
-"""The simulated camera: a UVC device at the seam of `cv2.VideoCapture`, looking at the world's platter."""
+"""The simulated camera: a UVC device with the interface of `cv2.VideoCapture` that sees the simulated platter."""
 
 from collections import deque
 from collections.abc import Callable
@@ -20,9 +20,9 @@ from sim.world import HISTORY_S, Activity, Scene, World
 
 FPS = 30
 NOMINAL_EXPOSURE = 100
-"""Exposure at which a scene's grey levels are the frame's, in V4L2's unit of 100 µs."""
+"""Exposure at which the frame has the scene's grey levels, in V4L2's unit of 100 µs."""
 READOUT_NS = 15_000_000
-"""From the end of the exposure until the computer has the frame."""
+"""Time from the end of the exposure until the computer has the frame."""
 SELECT_S = 10.0
 """How long OpenCV's V4L2 backend waits for a frame (OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT)."""
 V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY = 1, 3
@@ -34,9 +34,9 @@ _FOCUS_RANGE = (0, 255)
 _SHARP_AT = 120
 _BUFFERS_RANGE = (1, 10)
 
-_METER_FRAMES = 5  # how often the automatics act
+_METER_FRAMES = 5  # the automatic settings change every so many frames
 _METER_TARGET = 70.0
-_EDGE_PX_PER_DEG = radians(1.0) * 80 * PX_PER_MM  # how fast what stands 80 mm from the axis crosses the image
+_EDGE_PX_PER_DEG = radians(1.0) * 80 * PX_PER_MM  # motion in the image of a point 80 mm from the axis
 _STILL_PX = 0.25
 _MAX_SUBFRAMES = 16
 
@@ -62,32 +62,32 @@ class Controls:
 
 
 class SimCapture:
-    """What `cv2.VideoCapture` is to a driver, on the world's clock.
+    """A simulated `cv2.VideoCapture` on the world's clock.
 
-    Frame k is exposed from k / 30 s on and arrives `READOUT_NS` after its exposure. Up to four frames that nobody
-    fetches are kept, the oldest; then new ones are lost until there is room, as V4L2 does. A frame is drawn when it is
-    retrieved, from the world's past at its own exposure, so frames that are dropped cost nothing and change nothing.
-    There are two modes, 640x480 and 320x240, chosen by the width.
-    Properties follow OpenCV's V4L2 backend: its units, False from `set` and 0 from `get` for what the camera lacks.
+    The exposure of frame k starts at k / 30 s, and the frame arrives `READOUT_NS` after its exposure. As in V4L2, up to
+    four frames wait in buffers; while the buffers are full, new frames are lost. A frame is drawn when it is retrieved,
+    from the world's state at its exposure, so dropped frames take no time and change nothing. The width selects one of
+    two modes, 640x480 and 320x240. Properties have the units of OpenCV's V4L2 backend; for an unknown property `set`
+    returns False and `get` 0.
 
     Attributes
     ----------
     every
-        Of how many frames one is exposed: a camera that has become slow.
+        The camera exposes every so many frames: more than 1 for a slow camera.
     latency_ns
-        How much later than `READOUT_NS` a frame arrives.
+        Additional delay of each frame.
     grab_failures
-        Asked at each `grab` whether it fails.
+        Called at each `grab`; True makes it fail.
     hangs
-        Whether no frame arrives although the camera is there: `grab` gives up after `SELECT_S`.
+        Whether no frame arrives; `grab` fails after `SELECT_S`.
     orbits
-        Whether the table takes the camera around the object, instead of turning the object.
+        Whether the table moves the camera around the object instead of rotating the object.
     blur_px
-        Width of the blur of a lens that was knocked; the camera does not know.
+        Sigma of an additional blur.
     backdrop
-        What is behind and below the objects: wall, table and platter, uint8 (480, 640, 3).
+        Wall, table and platter without an object, uint8 (480, 640, 3).
     filters
-        Called with each frame that is fetched and its number, one after the other; returns the one that goes on.
+        Called in order with each fetched frame and its number; each returns a frame.
     """
 
     def __init__(self, world: World) -> None:
@@ -103,7 +103,7 @@ class SimCapture:
         self._binning = 1
         self._sensor = Sensor(world.noise, world.rng("camera"))
         self.backdrop = empty_platter()
-        # A camera that was mounted with care sees the objects as they are drawn; boards are drawn through its lens.
+        # A well-mounted camera sees the objects as they are drawn; calibration boards are drawn through its lens.
         self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
         self._open = self._plugged = True
         self._queue: deque[int] = deque()
@@ -112,21 +112,18 @@ class SimCapture:
         self._controls: list[tuple[int, Controls]] = [(self._clock.now_ns(), Controls())]
         self._metered = self._next
 
-    # -- the side of the world --------------------------------------------------------------------------------------
+    # -- for tests and faults ---------------------------------------------------------------------------------------
 
     def unplug(self) -> None:
-        """Pull the cable: from now on no frame arrives."""
+        """Unplug the camera: no frame arrives any more."""
         self._open, self._plugged = False, False
 
     def replug(self) -> None:
-        """Put the cable in again; the camera must be opened anew."""
+        """Plug the camera in; it must be opened again."""
         self._plugged = True
 
     def reopen(self) -> bool:
-        """Open the stream anew, as another `cv2.VideoCapture` does; return whether the camera is there.
-
-        The camera has kept its settings.
-        """
+        """Open the stream again with the same settings; return whether the camera is plugged in."""
         if self._plugged and not self._open:
             self._queue.clear()
             self._next = self._exposed_from(_frame_after(self._clock.now_ns()))
@@ -144,10 +141,10 @@ class SimCapture:
         return self._controls[-1][1].kelvin
 
     def drift(self, **values: Any) -> None:
-        """Change settings (fields of `Controls`) from inside, as a camera does that forgets its locks."""
+        """Change settings (fields of `Controls`) although they are locked, as a faulty camera does."""
         self._change(self._clock.now_ns(), replace(self._controls[-1][1], **values))
 
-    # -- the side of cv2.VideoCapture ---------------------------------------------------------------------------------
+    # -- interface of cv2.VideoCapture --------------------------------------------------------------------------------
 
     def isOpened(self) -> bool:  # noqa: N802
         return self._open
@@ -202,7 +199,7 @@ class SimCapture:
         return float(values.get(prop, 0.0))
 
     def set(self, prop: int, value: float) -> bool:
-        """Change a setting for the frames exposed from now on; what the camera controls itself is refused."""
+        """Change a setting for later frames; return False for settings that the camera controls automatically."""
         self._meter()
         now = self._controls[-1][1]
         match prop:
@@ -213,7 +210,7 @@ class SimCapture:
             case cv2.CAP_PROP_FRAME_WIDTH | cv2.CAP_PROP_FRAME_HEIGHT | cv2.CAP_PROP_FPS:
                 return value == self.get(prop)
             case cv2.CAP_PROP_BUFFERSIZE if _BUFFERS_RANGE[0] <= value <= _BUFFERS_RANGE[1]:
-                self._queue.clear()  # OpenCV gives its buffers back and starts the stream anew
+                self._queue.clear()  # OpenCV frees its buffers and starts the stream again
                 self._next = _frame_after(self._clock.now_ns())
                 now = replace(now, buffers=int(value))
             case cv2.CAP_PROP_AUTO_EXPOSURE if value in (V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY):
@@ -239,7 +236,7 @@ class SimCapture:
     # -- time ---------------------------------------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        """Queue what has arrived since the last look, as far as there is room; the rest is lost."""
+        """Queue the frames that have arrived while there is room; the others are lost."""
         self._meter()
         now_ns = self._clock.now_ns()
         room = self._controls[-1][1].buffers
@@ -254,7 +251,7 @@ class SimCapture:
                 self._next = self._exposed_from(self._next + 1)
 
     def _exposed_from(self, frame: int) -> int:
-        """Return the first frame from ``frame`` on that is exposed at all."""
+        """Return the number of the next exposed frame, ``frame`` or later."""
         return -(-frame // self.every) * self.every
 
     def _arrival_ns(self, frame: int) -> int:
@@ -297,37 +294,37 @@ class SimCapture:
         )
 
     def _subframes(self, start: int, exposure: int) -> NDArray[np.int64]:
-        """Return the moments whose pictures make up the exposure: one at rest, one a pixel of motion otherwise."""
+        """Return the times whose images are averaged for the exposure: one at rest, else one per pixel of motion."""
         probes = start + np.linspace(0, exposure, 9).astype(np.int64)
         path_px = np.abs(np.diff(self._world.table_motion(probes)[0])).sum() * _EDGE_PX_PER_DEG
         n = 1 if path_px < _STILL_PX else min(1 + ceil(path_px), _MAX_SUBFRAMES)
         return start + ((np.arange(n) + 0.5) / n * exposure).astype(np.int64)
 
     def _picture(self, scene: Scene, table_deg: float) -> Image:
-        """Return what the lens sees of a scene under nominal light."""
+        """Return the image of a scene under nominal light."""
         table_deg = -table_deg if self.orbits else table_deg
         image = self.backdrop.copy()
         if scene.object is None:
             return self._as_mounted(image)
         if not isinstance(scene.object, Visible):
-            raise TypeError(f"{scene.object!r} cannot be seen: put something with a method draw on the platter")
+            raise TypeError(f"{scene.object!r} is not visible: it has no method draw")
         x, y = scene.offset_mm
         c, s = cos(radians(table_deg)), sin(radians(table_deg))
         scene.object.draw(image, table_deg + scene.yaw_deg, (c * x - s * y, s * x + c * y))
         return image if isinstance(scene.object, BoardOnPlatter) else self._as_mounted(image)
 
     def _as_mounted(self, image: Image) -> Image:
-        """Return what is drawn as the camera sees it from where it stands."""
+        """Return the drawn image as the camera sees it from its mounting position."""
         if self._moved is None:
             return image
         seen = cv2.warpPerspective(image, self._moved, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(seen, dtype=np.uint8)
 
     def _meter(self) -> None:
-        """Let the automatics that are on act on the frames since the last look.
+        """Apply the automatic settings to the frames since the last call.
 
-        Automatic exposure pulls the mean brightness to a target; automatic white balance pulls red and blue together
-        (the grey world), whatever colour the object on the platter has.
+        Automatic exposure changes the mean brightness towards a target. Automatic white balance makes the means of red
+        and blue equal (the grey world), for objects of any colour.
         """
         now_ns = self._clock.now_ns()
         self._metered = max(self._metered, _frame_after(now_ns - round(HISTORY_S * 1e9)))

@@ -1,4 +1,4 @@
-"""Another day at the bench: what differs between enrollment and query, on purpose."""
+"""Changes of the bench between enrollment and identification, for tests of robustness."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -16,33 +16,33 @@ from sim.sensor import Gains
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """How strongly the bench changes; all by the world's seed, evenly distributed up to these strengths both ways.
+    """How strongly the bench changes.
 
-    The light is another for every object that is put on the table, as daylight is; the camera's settings and the
-    surroundings change once.
+    The world's seed gives each change, uniformly distributed between −strength and +strength. The light changes for each
+    object, like daylight. The camera's settings and the surroundings change once.
     """
 
     brightness: float = 0.0
     """Relative brightness of the light."""
     colour: float = 0.0
-    """Relative brightness of each of blue, green and red besides."""
+    """Additional relative brightness of blue, green and red, each on its own."""
     exposure: float = 0.0
     """Relative exposure time of the camera."""
     white_balance_k: float = 0.0
     """White balance of the camera, in kelvin."""
     placement_mm: float = 0.0
-    """Distance from the table's axis, along each axis of the platter."""
+    """Distance of objects from the table's axis, along each axis of the platter."""
     background: float = 0.0
-    """How far table and wall become those of another bench, with patterns: 1 altogether."""
+    """Weight of another bench's table and wall with patterns: 0 for none, 1 for only these."""
 
     @classmethod
     def named(cls, names: Iterable[str]) -> Self | None:
-        """Return the changes of these names together; None of no names.
+        """Return the combination of the named changes, or None if there are no names.
 
         Raises
         ------
         UsageError
-            One of them is unknown.
+            A name is unknown.
         """
         wanted = list(dict.fromkeys(names))
         for name in wanted:
@@ -61,12 +61,12 @@ class Change:
         return blue, green, red
 
     def offset_mm(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Draw how much farther off the axis the next object stands."""
+        """Draw the additional offset of the next object from the axis."""
         x, y = (self.placement_mm * rng.uniform(-1, 1, 2)).tolist()
         return x, y
 
     def apply_to(self, devices: SimDevices) -> None:
-        """Change the camera's settings and what stands around, from now on."""
+        """Change the camera's settings and the surroundings from now on."""
         rng, camera = devices.world.rng("another day"), devices.camera
         exposure, kelvin = rng.uniform(-1, 1, 2).tolist()
         camera.drift(
@@ -89,7 +89,7 @@ CHANGES: Mapping[str, Change] = MappingProxyType(
         ),
     }
 )
-"""By name: light, exposure and white balance; where objects stand; and all of it before another table and wall."""
+"""By name: light, exposure and white balance; placement; both together with another table and wall."""
 
 
 def another_bench(rng: np.random.Generator) -> Image:

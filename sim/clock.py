@@ -1,4 +1,4 @@
-"""Virtual time: integer nanoseconds that pass only when somebody waits for them."""
+"""Virtual time: integer nanoseconds that pass only while a program sleeps."""
 
 import heapq
 from collections.abc import Callable
@@ -6,11 +6,11 @@ from datetime import UTC, datetime, timedelta
 from itertools import count
 
 EPOCH = datetime(2020, 1, 1, tzinfo=UTC)
-"""Civil time at virtual time 0 where none is given: fixed, so that a run is reproducible to the byte."""
+"""Default civil time at virtual time 0; fixed, so that a run is reproducible to the byte."""
 
 
 class Timer:
-    """A callback that waits for its virtual time; `cancel` takes it back."""
+    """A callback that is scheduled for a virtual time; `cancel` removes it."""
 
     def __init__(self, at_ns: int, callback: Callable[[], None]) -> None:
         self.at_ns = at_ns
@@ -30,10 +30,10 @@ class Timer:
 
 
 class VirtualClock:
-    """A `rig.core.clock.Clock` whose time is moved by its sleepers.
+    """A `rig.core.clock.Clock` whose time advances when a program sleeps.
 
-    Emulators schedule what they do by themselves (a byte arrives, a watchdog expires) with `call_at`; whoever sleeps
-    runs these callbacks on the way, each at its own time, equal times in the order of their scheduling.
+    Emulators schedule their own activity (a byte arrives, a watchdog expires) with `call_at`. A sleep runs the
+    callbacks that fall due, each at its own time and those with equal times in the order of their scheduling.
     """
 
     def __init__(self, start_utc: datetime = EPOCH) -> None:
@@ -53,17 +53,17 @@ class VirtualClock:
             self.advance_to(self._now_ns + round(seconds * 1e9))
 
     def set_civil(self, seconds: float) -> None:
-        """Set the civil time forward or back, as a time server or a person does; `now_ns` goes on undisturbed."""
+        """Move the civil time by ``seconds``, as a time server does; `now_ns` does not change."""
         self._start_utc += timedelta(seconds=seconds)
 
     def call_at(self, at_ns: int, callback: Callable[[], None]) -> Timer:
-        """Schedule ``callback`` for ``at_ns``; a time that has passed means as soon as time moves on."""
+        """Schedule ``callback`` for ``at_ns``; a time in the past means the next time the clock advances."""
         timer = Timer(max(at_ns, self._now_ns), callback)
         heapq.heappush(self._timers, (timer.at_ns, next(self._order), timer))
         return timer
 
     def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
-        """Call ``action`` every ``seconds`` of virtual time, in the middle of whatever sleeps then."""
+        """Call ``action`` every ``seconds`` of virtual time, during sleeps; return the function that stops it."""
         timer: Timer | None = None
         over = False
 
@@ -92,7 +92,7 @@ class VirtualClock:
         return self._timers[0][0] if self._timers else None
 
     def advance_to(self, at_ns: int) -> None:
-        """Let time pass until ``at_ns``, running what falls due up to and including it."""
+        """Advance time to ``at_ns`` and run the callbacks that fall due, including those at ``at_ns``."""
         while (due_ns := self.next_event_ns()) is not None and due_ns <= at_ns:
             timer = heapq.heappop(self._timers)[2]
             self._now_ns = max(self._now_ns, due_ns)

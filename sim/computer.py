@@ -1,4 +1,4 @@
-"""The computer that a simulated bench hangs on: files as Linux lays them out, and the simulated wires behind them."""
+"""The simulated computer of a simulated bench: the files that Linux shows, and the simulated devices behind them."""
 
 import re
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from sim.i2c import SimI2cBus
 
 
 class ComputerFiles:
-    """Lays out, below a folder, what Linux shows of devices: device files, sysfs, /proc and /etc/group."""
+    """Writes the files in which Linux shows devices into a folder: device files, sysfs, /proc and /etc/group."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -58,7 +58,7 @@ class ComputerFiles:
         mode: int = 0o660,
         by_id: str | None = None,
     ) -> None:
-        """Plug in a U2D2 (an FTDI adapter); ``by_id`` is its stable name."""
+        """Connect a U2D2 (an FTDI adapter); ``by_id`` is its stable name."""
         self._usb += 1
         usb = f"sys/devices/usb1/1-{self._usb}"
         facts = {"idVendor": "0403", "idProduct": "6014", "manufacturer": "FTDI", "product": "USB <-> Serial Converter"}
@@ -78,21 +78,21 @@ class ComputerFiles:
         self.write(f"dev/i2c-{number}").chmod(mode)
 
     def camera(self, number: int = 0, name: str = "HD Webcam", *, index: int = 0, mode: int = 0o660) -> None:
-        """Plug in a camera's node; those with an index above 0 carry no images."""
+        """Add a node of a camera; nodes with an index above 0 deliver no images."""
         self.write(f"sys/class/video4linux/video{number}/name", f"{name}\n")
         self.write(f"sys/class/video4linux/video{number}/index", f"{index}\n")
         self.write(f"dev/video{number}").chmod(mode)
         self.link(f"dev/v4l/by-id/usb-{name.replace(' ', '_')}-video-index{index}", self.root / f"dev/video{number}")
 
     def keeps_time(self, synchronised: bool = True) -> None:
-        """Run a service that asks time servers."""
+        """Run a time synchronisation service."""
         (self.root / "run/systemd/timesync").mkdir(parents=True, exist_ok=True)
         if synchronised:
             self.write("run/systemd/timesync/synchronized")
 
 
 class SimComputer(LinuxComputer):
-    """A laid-out computer with the simulated devices at the places where ``config`` looks for them."""
+    """A simulated computer whose devices have the names in ``config``."""
 
     def __init__(self, root: Path, devices: SimDevices, config: RigConfig, user: User | None = None) -> None:
         super().__init__(root, devices.world.clock, user or User.current())
@@ -105,7 +105,7 @@ class SimComputer(LinuxComputer):
         if self.devices.head is not None and self.same_file(path, self._head_port):
             return self.devices.head_port()
         if not self.same_file(path, self._port):
-            raise DeviceNotFound(f"There is no port {path}.", next_step="Plug the adapter in.", evidence={"port": path})
+            raise DeviceNotFound(f"No port {path}.", next_step="Connect the adapter.", evidence={"port": path})
         adapter = self.devices.reopen_adapter()
         adapter.baudrate = baud
         return adapter
@@ -114,13 +114,13 @@ class SimComputer(LinuxComputer):
         wired = isinstance(self.devices.i2c, SimI2cBus) and self.i2c_name(bus) == self._bus
         return self.devices.i2c.path if wired else self.i2c_name(bus)
 
-    def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one
+    def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one camera
         return self.devices.reopen_camera()
 
 
 @contextmanager
 def simulated_computer(config: RigConfig, devices: SimDevices) -> Iterator[SimComputer]:
-    """Yield the computer of a simulated bench, its servo set up as the bench does when it is opened."""
+    """Yield the computer of a simulated bench. The servo is configured as by opening the bench."""
     with TemporaryDirectory(prefix="sim-host-") as folder:
         computer = ComputerFiles(Path(folder))
         name = Path(config.servo.port).name
@@ -141,7 +141,7 @@ def simulated_computer(config: RigConfig, devices: SimDevices) -> Iterator[SimCo
         number = re.search(r"(\d+)$", str(config.camera.source))
         computer.camera(int(number[1]) if number else 0)
         computer.keeps_time()
-        with suppress(RigError):  # no supply, a fault: the doctor tells
+        with suppress(RigError):  # no supply or a fault: the doctor reports it
             _set_up(devices, config.servo.id, config.servo.model)
         yield SimComputer(Path(folder), devices, config)
 

@@ -1,6 +1,6 @@
-"""A full disk, for this process: what is to be made durable finds no space.
+"""A simulated full disk for this process: `os.fsync` fails.
 
-The seam is `os.fsync`, which is where a file system that allocates late, or a quota, tells.
+A file system with delayed allocation or a quota reports a full disk there, too.
 """
 
 import errno
@@ -12,8 +12,8 @@ _os: Any = os
 
 
 def fill() -> Callable[[], None]:
-    """Fill the disk; return what frees it again."""
-    durable = os.fsync
+    """Fill the disk; return the function that frees it."""
+    fsync = os.fsync
 
     def full(_descriptor: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -21,6 +21,6 @@ def fill() -> Callable[[], None]:
     _os.fsync = full
 
     def free() -> None:
-        _os.fsync = durable
+        _os.fsync = fsync
 
     return free

@@ -1,7 +1,7 @@
-"""Trajectories of the servo's shaft and what the platter makes of them, in closed form.
+"""Trajectories of the servo's shaft and the resulting motion of the platter, in closed form.
 
-Everything is evaluated for arrays of times, past ones included, so that the gyro's FIFO and a frame's exposure see the
-angle of their own moment and nothing is integrated in steps.
+All functions take arrays of times, also past ones. So the gyro's FIFO and a frame's exposure get the angle at their own
+time, and nothing is integrated in steps.
 """
 
 from dataclasses import dataclass

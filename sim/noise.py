@@ -1,4 +1,4 @@
-"""Everything that is imperfect about the simulated bench, in one place."""
+"""All errors of the simulated bench."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -16,14 +16,14 @@ class NoiseModel:
     the given standard deviation; the others act on every reading.
     """
 
-    # Servo and table: XL430-W250 e-manual, measured play of its gears.
+    # Servo and table: XL430-W250 e-manual, measured backlash of its gears.
     backlash_deg: float = 0.25
-    """Free play between shaft and platter, full width."""
+    """Backlash between shaft and platter, full width."""
     encoder_noise_deg: float = 0.02
     """Standard deviation of one encoder reading before its quantisation to 0.088°."""
     encoder_harmonic_deg: float = 0.0
-    """Standard deviation, from part to part, of the encoder's error over a turn: cosine and sine of its first two
-    harmonics (the e-manual states none; a magnet off the axis gives some tenths of a degree)."""
+    """Standard deviation, from part to part, of the encoder's error over a revolution: cosine and sine of its first two
+    harmonics (the e-manual states no value; a magnet off the axis gives some tenths of a degree)."""
     structure_hz: float = 11.0
     """Natural frequency of platter and object on the shaft: they ring after each change of acceleration."""
     structure_damping: float = 0.15
@@ -41,7 +41,7 @@ class NoiseModel:
     gyro_bias_slope_dps_c: float = 0.02
     """Standard deviation of the zero rate's slope over temperature (specified: ±20 °/s between −40 and 85 °C)."""
     imu_warm_up_c: float = 5.0
-    """How much warmer than its surroundings the sensor gets after power-on."""
+    """Warming of the sensor above its surroundings after power-on."""
     gyro_scale_error: float = 0.01
     """Standard deviation of the relative scale error (specified within ±3 %)."""
     accel_noise_g_rthz: float = 0.0004
@@ -56,7 +56,7 @@ class NoiseModel:
 
     # Camera: a 1/3" USB sensor at gain 1 (EMVA 1288 terms).
     full_well_e: float = 10000.0
-    """Electrons of a saturated pixel: sets the shot noise; 0 switches it off."""
+    """Electrons of a saturated pixel, which determine the shot noise; 0: no shot noise."""
     read_noise_e: float = 12.0
     """Standard deviation of the dark noise in electrons."""
     vignetting: float = 0.12
@@ -65,9 +65,9 @@ class NoiseModel:
     """Standard deviation of the relative brightness from frame to frame."""
 
     camera_mount: float = 0.0
-    """How far the camera stands and looks from where it should: at 1 some millimetres and degrees (`sim.optics`)."""
+    """Error of the camera's position and direction: 1 means some millimetres and degrees (`sim.optics`)."""
 
-    # The hand that places the objects.
+    # The operator who places the objects.
     placement_mm: float = 1.0
     """Standard deviation of an object's distance from the axis, along each axis of the platter."""
 
@@ -85,7 +85,7 @@ class NoiseModel:
 
     @classmethod
     def none(cls) -> Self:
-        """Return the perfect bench: no noise, no play, no error (ringing is damped out at once)."""
+        """Return a model without noise, backlash, errors and ringing."""
         zeros = dict.fromkeys((f.name for f in fields(cls)), 0.0)
         return cls(**zeros)
 

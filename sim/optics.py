@@ -1,4 +1,4 @@
-"""A true camera: pinhole with distortion, before a table whose axis stands anywhere in its frame."""
+"""A pinhole camera with distortion in front of a table whose axis has any position and direction."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,13 +14,13 @@ from sim.world import World
 
 FOCAL_PX = 1000.0
 DISTANCE_MM = 500.0
-"""From the lens to the centre of the platter's top: together 2 px a mm, as `sim.objects.projection` has it."""
+"""From the lens to the centre of the platter's top; with the focal length 2 px/mm, as in `sim.objects.projection`."""
 SUPERSAMPLING = 2
 
 
 @dataclass(frozen=True)
 class Optics:
-    """What calibrations of the camera and of the table's axis should find.
+    """True values for the calibrations of the camera and of the table's axis.
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class Optics:
     rotation : tuple of 9
         Rows of the rotation from the room's frame (x right, y away, z up along the table's axis) into the camera's.
     translation_mm : tuple of 3
-        Where the camera's frame has the centre of the platter's top.
+        Centre of the platter's top in the camera's frame.
     wobble_deg
-        By how much the axis leans, to a side that goes round twice as fast as the table: a bearing out of true. (What
-        goes round with the table cannot be told from how the board stands.)
+        Lean of the axis in a direction that rotates twice as fast as the table, as with a bent bearing. (A lean that
+        rotates with the table cannot be separated from the board's own position.)
     """
 
     focal_px: tuple[float, float] = (FOCAL_PX, FOCAL_PX)
@@ -50,7 +50,7 @@ class Optics:
 
     @classmethod
     def of(cls, world: World) -> Self:
-        """Return the camera of a world: its lens drawn by the seed, mounted as its noise model says."""
+        """Return the camera of a world: the seed gives the lens, the noise model the mounting."""
         return cls.drawn(world.rng("optics"), mount=world.noise.camera_mount)
 
     @classmethod
@@ -69,12 +69,12 @@ class Optics:
         askew = cv2.Rodrigues(mount * np.radians([3.0, 1.0, 1.5]) * rng.standard_normal(3))[0]
         rotation = askew @ np.array(plain.rotation).reshape(3, 3)
         shift = mount * np.array([6.0, 6.0, 20.0]) * rng.standard_normal(3)
-        if mount == 0.0:  # whoever mounts a camera with care aims it by its picture
+        if mount == 0.0:  # a careful operator aims the camera with its image
             distance = DISTANCE_MM * fx / FOCAL_PX
             translation = distance * np.array([(CENTRE_PX[0] - cx) / fx, (CENTRE_PX[1] - cy) / fy, 1.0])
         else:
             translation = askew @ np.array(plain.translation_mm) + shift
-            # The platter stays in view however the camera looks.
+            # The platter stays in view for any rotation of the camera.
             translation[:2] = np.array(plain.translation_mm[:2]) + shift[:2]
         return cls(
             (fx, fy),
@@ -102,10 +102,10 @@ class Optics:
         return rotation @ _about_vertical(table_deg), np.array(self.translation_mm)
 
     def from_drawn(self) -> Floats:
-        """Return the homography (3, 3) by which this camera sees what `sim.objects.projection` draws.
+        """Return the homography (3, 3) from the drawings of `sim.objects.projection` to this camera's image.
 
-        It is exact for what stands in the plane through the axis that faces the drawing; the lens' distortion, some
-        pixels at the frame's edges, is left out.
+        It is exact for the plane through the axis that faces the camera. It ignores the distortion of the lens, some
+        pixels at the edges of the frame.
         """
         rotation = np.array(self.rotation).reshape(3, 3)
         seen = self.matrix @ np.column_stack([rotation[:, 0], rotation[:, 2], np.array(self.translation_mm)])
@@ -113,7 +113,7 @@ class Optics:
         return np.asarray(seen @ np.linalg.inv(drawn))
 
     def rays(self, factor: int = SUPERSAMPLING) -> NDArray[np.float32]:
-        """Return where the ray of each sub-pixel passes the plane one unit before the lens, float32 (n, 2)."""
+        """Return where the ray of each sub-pixel meets the plane one unit in front of the lens, float32 (n, 2)."""
         return _rays(self, factor)
 
 

@@ -1,7 +1,7 @@
-"""Image formation: from the light that a scene sends to the numbers that a camera's sensor makes of it.
+"""Image formation: from the light of a scene to the pixel values of a camera's sensor.
 
-The sensor is linear (gamma 1). The scene's 0..255 are its signal at nominal exposure, gain and light, so that a
-saturated pixel there holds `NoiseModel.full_well_e` electrons. Noise follows EMVA 1288: its variance in electrons is
+The sensor is linear (gamma 1). The scene's levels 0..255 are the signal at nominal exposure, gain and light, so a
+saturated pixel has `NoiseModel.full_well_e` electrons. Noise follows EMVA 1288: its variance in electrons is
 the number of electrons (shot noise) plus the square of the read noise.
 """
 
@@ -28,11 +28,11 @@ class Sensor:
     Parameters
     ----------
     noise
-        Its imperfections.
+        Its noise.
     rng
-        Draws the noise that all frames take their part of.
+        Draws the noise tile from which all frames take a part.
     binning
-        Of how many pixels, along each side, one is made.
+        Number of pixels along each side that are combined into one.
     """
 
     def __init__(self, noise: NoiseModel, rng: np.random.Generator, binning: int = 1) -> None:
@@ -64,7 +64,7 @@ class Sensor:
         Parameters
         ----------
         scene
-            What the camera looks at under nominal light, 0..255, (480, 640, 3).
+            The scene under nominal light, 0..255, (480, 640, 3).
         light
             The light relative to the nominal one.
         exposure
@@ -72,7 +72,7 @@ class Sensor:
         gains
             Amplification, white balance included.
         rng
-            This frame's own generator: the flicker of the light, and which part of the noise tile it takes.
+            Generator of this frame for the flicker of the light and for the part of the noise tile.
         """
         flicker = 1 + self._noise.light_flicker * rng.standard_normal()
         if light != self._light_key:

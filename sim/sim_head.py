@@ -1,4 +1,4 @@
-"""`rig sim-head`: a rig head for programs that want to open a serial port."""
+"""`rig sim-head`: a simulated rig head on a serial port."""
 
 import sys
 from contextlib import ExitStack
@@ -16,17 +16,21 @@ def sim_head(
     settings: Settings,
     kind: Annotated[
         Literal["memory", "avr"],
-        typer.Option(help="The firmware built for this computer, or the AVR binary in an emulated ATmega328P."),
+        typer.Option(
+            help="memory: the firmware built for this computer; avr: the AVR binary in an emulated ATmega328P."
+        ),
     ] = "memory",
-    spin: Annotated[float, typer.Option(metavar="DPS", help="Let the platter turn, in degrees a second.")] = 0.0,
+    spin: Annotated[
+        float, typer.Option(metavar="DPS", help="Rotate the platter at this speed, in degrees per second.")
+    ] = 0.0,
     link: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Also reach the port under this name, while it is there.")
+        Path | None, typer.Option(metavar="PATH", help="Create this link to the port while the program runs.")
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0, help="End by itself; else Ctrl+C does.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this time. Default: until Ctrl+C.")] = None,
 ) -> None:
     """Simulate a rig head with its IMU on a pseudo-terminal in real time, and print the port to connect to.
 
-    What its outputs do is told as it happens. Model and address of the IMU come from the section [imu].
+    Changes of its outputs are printed. Model and address of the IMU come from the section [imu].
 
     Example: rig sim-head --spin 30
     """
@@ -56,7 +60,7 @@ def sim_head(
                 link.symlink_to(terminal.port)
             except OSError as error:
                 raise UsageError(
-                    f"{link} cannot be made: {error.strerror}.", next_step="Give a name that is not in use."
+                    f"Cannot create {link}: {error.strerror}.", next_step="Give a name that is not in use."
                 ) from error
             ends.callback(link.unlink, missing_ok=True)
         if settings.json:
@@ -64,7 +68,7 @@ def sim_head(
         else:
             print(terminal.port, flush=True)
             where = f"--set imu.connection=head --set head.port={terminal.port}"
-            print(f"{config.imu.model} on a head; for a rig: {where}. Ctrl+C ends it.", file=sys.stderr)
+            print(f"{config.imu.model} on a rig head. Use it with {where}. Stop with Ctrl+C.", file=sys.stderr)
         clock = PacedClock(world.clock)
         while seconds is None or world.clock.now_ns() < seconds * 1e9:
             clock.sleep(0.01)

@@ -1,4 +1,4 @@
-"""`rig sim-servo`: a servo for programs that want to open a serial port."""
+"""`rig sim-servo`: simulated servos on a serial port."""
 
 import sys
 from contextlib import ExitStack
@@ -14,15 +14,17 @@ from rig.cli.ui.settings import Settings
 @command
 def sim_servo(
     settings: Settings,
-    ids: Annotated[list[int] | None, typer.Option("--id", min=0, max=252, help="Another id. Repeatable.")] = None,
-    link: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Also reach the port under this name, while it is there.")
+    ids: Annotated[
+        list[int] | None, typer.Option("--id", min=0, max=252, help="Id of a servo. Repeatable. Default: servo.id.")
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0, help="End by itself; else Ctrl+C does.")] = None,
+    link: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Create this link to the port while the program runs.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this time. Default: until Ctrl+C.")] = None,
 ) -> None:
     """Simulate servos on a pseudo-terminal in real time, and print the port to connect to.
 
-    Model, id and gear come from the section [servo]. The port takes any baud rate.
+    Model, id and gear ratio come from the section [servo]. The port accepts any baud rate.
 
     Example: rig sim-servo --set servo.model=xm430_w350 --id 1 --id 2
     """
@@ -49,7 +51,7 @@ def sim_servo(
                 link.symlink_to(port)
             except OSError as error:
                 raise UsageError(
-                    f"{link} cannot be made: {error.strerror}.", next_step="Give a name that is not in use."
+                    f"Cannot create {link}: {error.strerror}.", next_step="Give a name that is not in use."
                 ) from error
             ends.callback(link.unlink, missing_ok=True)
         if settings.json:
@@ -57,5 +59,5 @@ def sim_servo(
         else:
             print(port, flush=True)
             what = f"{config.servo.model}, id {', '.join(map(str, wanted))}"
-            print(f"{what}; for a rig: --set servo.port={port}. Ctrl+C ends it.", file=sys.stderr)
+            print(f"{what}. Use it with --set servo.port={port}. Stop with Ctrl+C.", file=sys.stderr)
         terminal.serve(seconds)

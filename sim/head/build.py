@@ -1,4 +1,4 @@
-"""Builds the firmware for simulation, once for each state of its sources, into the user's cache."""
+"""Builds the firmware for simulation into the user's cache, once for each version of its sources."""
 
 import os
 import shutil
@@ -21,7 +21,7 @@ COMPILE_S = 120
 
 
 def missing(kind: str) -> str:
-    """Return what this machine lacks for a ``memory`` or ``avr`` head, and how to get it; empty where it has all."""
+    """Return what is missing to build a ``memory`` or ``avr`` head, and how to install it; empty if nothing is."""
     if not (FIRMWARE / "Makefile").is_file():
         return "the firmware's sources are not installed: use a clone of the repository"
     if not (shutil.which("make") and compiler()):
@@ -40,12 +40,12 @@ def host_library(flags: str = "") -> Path:
 
 
 def pty_program() -> Path:
-    """Return the program that plays a head on a pseudo-terminal."""
+    """Return the program that simulates a head on a pseudo-terminal."""
     return _built("memory", "head-pty")
 
 
 def avr_image() -> bytes:
-    """Return the flash of an ATmega328P: the very bytes that `make flash` writes."""
+    """Return the flash of an ATmega328P: the bytes that `make flash` writes."""
     return _built("avr", "head.bin").read_bytes()
 
 
@@ -85,7 +85,7 @@ def _require(kind: str) -> None:
 
 
 def compiler() -> str:
-    """Return the C compiler of this machine; empty where it has none."""
+    """Return the C compiler of this computer; empty if it has none."""
     return os.environ.get("CC") or next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), "")
 
 
@@ -97,7 +97,7 @@ def _key(sources: list[Path], how: str) -> str:
 
 
 def _cached(key: str, product: str, command_for: Callable[[Path], list[str]]) -> Path:
-    """Return the product of a build that was made once; several programs may want it at the same time."""
+    """Return a product from the cache, built first if needed; several programs may do so at the same time."""
     root = Path(platformdirs.user_cache_dir(APP)) / "head"
     done = root / key / product
     if done.is_file():
@@ -109,12 +109,12 @@ def _cached(key: str, product: str, command_for: Callable[[Path], list[str]]) ->
         if run.returncode:
             raise ConfigError(
                 "The firmware does not compile.",
-                next_step="Mend the error below, or restore the sources.",
+                next_step="Correct the error below, or restore the sources.",
                 evidence={"compiler": (run.stderr or run.stdout)[-2000:]},
             )
         try:
             folder.rename(root / key)
-        except OSError:  # somebody else was faster
+        except OSError:  # another program was faster
             shutil.rmtree(folder)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

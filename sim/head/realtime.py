@@ -1,4 +1,4 @@
-"""A simulated rig head in real time on a pseudo-terminal, for pyserial and any other program."""
+"""A simulated rig head in real time on a pseudo-terminal, for any program that opens a serial port."""
 
 import fcntl
 import os
@@ -16,20 +16,20 @@ from sim.head.board import SimHead
 
 PUMP_S = 0.001
 LONGEST_STEP_NS = 20_000_000
-"""How far time goes on at once: after a halt (a debugger, a busy machine) host and head must both catch up."""
+"""Longest time step: after a pause (a debugger, a busy computer) host and head must both catch up."""
 
 
 class PacedClock:
-    """The clock of a program in real time: whenever it is looked at, a virtual clock catches up with the computer's.
+    """A real-time clock: each time it is read, a virtual clock catches up with the computer's clock.
 
-    What is simulated on ``virtual`` happens when somebody asks for the time here, or sleeps.
+    Simulated activity on ``virtual`` happens when a program reads this clock or sleeps.
 
     Parameters
     ----------
     virtual
-        The simulated world's.
+        The simulated world's clock.
     speed
-        How many of its seconds pass in one of the computer's.
+        Virtual seconds for each second of the computer.
     """
 
     def __init__(self, virtual: VirtualClock, speed: float = 1.0) -> None:
@@ -54,14 +54,14 @@ class PacedClock:
         return self._virtual.utc()
 
     def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
-        """Call ``action`` every ``seconds``, in the middle of whatever sleeps or asks for the time then."""
+        """Call ``action`` every ``seconds`` while a program sleeps or reads the time; return what stops it."""
         return self._virtual.every(seconds, action)
 
 
 class HeadPty:
     """A simulated head behind a pseudo-terminal.
 
-    ``port`` is what a program opens. The head's clock must be kept going, by a `PacedClock`.
+    A program opens ``port``. A `PacedClock` must advance the head's clock.
     """
 
     def __init__(self, head: SimHead) -> None:
@@ -75,7 +75,7 @@ class HeadPty:
         self._cancel = head.clock.every(PUMP_S, self.pump)
 
     def pump(self) -> None:
-        """Carry what has come in either direction."""
+        """Transfer the received bytes in both directions."""
         try:
             if data := os.read(self._master, 4096):
                 self._head.send(data)
@@ -83,11 +83,11 @@ class HeadPty:
             pass
         self._head.catch_up()
         if data := self._head.take(self._head.clock.now_ns()):
-            with suppress(BlockingIOError):  # nobody reads: the terminal is full, and what comes is lost
+            with suppress(BlockingIOError):  # the terminal is full because no program reads; the bytes are lost
                 self.sent += os.write(self._master, data)
 
     def waiting(self) -> int:
-        """Return how many bytes of the host have arrived and were not carried to the head yet."""
+        """Return the number of received bytes of the host that were not transferred to the head yet."""
         count = fcntl.ioctl(self._master, termios.FIONREAD, bytes(4))
         return int.from_bytes(count, sys.byteorder)
 

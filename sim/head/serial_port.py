@@ -1,4 +1,4 @@
-"""The host's end of a simulated rig head's line: pyserial's interface on the virtual clock."""
+"""The host's serial port of a simulated rig head: pyserial's interface on the virtual clock."""
 
 import errno
 
@@ -9,9 +9,10 @@ from sim.head.board import BYTE_NS, RECEIVER_BYTES, SimHead
 
 
 class HeadSerial:
-    """Looks like an open `serial.Serial`; who reads waits on the virtual clock.
+    """An open `serial.Serial` for a driver; reads wait on the virtual clock.
 
-    ``timeout`` is in seconds. It fails once the head is unplugged; one that is plugged in again is another port.
+    ``timeout`` is in seconds. After the head is unplugged, every call fails. When it is plugged in again, a new port must
+    be opened.
 
     Raises
     ------
@@ -28,13 +29,13 @@ class HeadSerial:
         self._plugged_out = False
         self._received = bytearray()
         head.catch_up()
-        head.take(head.clock.now_ns())  # what came while nobody had the port open
+        head.take(head.clock.now_ns())  # bytes that arrived while the port was closed
 
     def close(self) -> None:
         self.is_open = False
 
     def unplug(self) -> None:
-        """Pull the head's cable out of the computer."""
+        """Unplug the head from the computer."""
         self._head.unplugged = True
 
     @property
@@ -43,12 +44,12 @@ class HeadSerial:
         return len(self._received)
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to ``size`` bytes: all as soon as they are there, fewer at the timeout."""
+        """Return ``size`` bytes when they have arrived, or fewer at the timeout."""
         clock = self._head.clock
         deadline_ns = clock.now_ns() + round(self.timeout * 1e9)
         self._collect()
         while len(self._received) < size and clock.now_ns() < deadline_ns:
-            # A byte is known of when it begins to arrive: steps of a byte's length miss none.
+            # Steps of one byte's duration miss no byte.
             arrival_ns = self._head.arrival_ns(size - len(self._received)) or clock.now_ns() + BYTE_NS
             clock.advance_to(min(arrival_ns, deadline_ns))
             self._collect()
@@ -58,7 +59,7 @@ class HeadSerial:
 
     def write(self, data: bytes, /) -> int:
         self._require_open()
-        if self.baudrate == BAUD:  # at another rate the head reads something else, without end or sum
+        if self.baudrate == BAUD:  # at another rate the head receives no valid packet
             self._head.send(bytes(data))
         return len(data)
 

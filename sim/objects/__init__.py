@@ -1,1 +1,1 @@
-"""Things that can stand on the simulated platter: a built-in shelf, and photographs of real ones."""
+"""Objects for the simulated platter: built-in ones, and photographs of real ones."""

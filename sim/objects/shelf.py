@@ -17,10 +17,10 @@ CONFUSABLE: tuple[tuple[str, str], ...] = (
     ("cereal-plain", "cereal-puzzle"),
     ("toy-house", "toy-house-green"),
 )
-"""Pairs that differ in one sticker, face or marking only: from the other sides nobody can tell them apart."""
+"""Pairs that differ only in one sticker, face or marking. From the other sides they look the same."""
 
 
 @cache
 def shelf() -> Mapping[str, Solid]:
-    """Return the built-in objects by name. Their textures are painted when they are first seen."""
+    """Return the built-in objects by name. Their textures are painted when they are first drawn."""
     return MappingProxyType({solid.name: solid for solid in (*pottery(), *packs(), *toys())})

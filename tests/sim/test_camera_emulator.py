@@ -84,7 +84,7 @@ def test_frames_come_at_thirty_a_second_with_the_time_of_their_exposure() -> Non
         assert world.clock.now_ns() == stamp_ns(capture) + 10_000_000 + READOUT_NS
 
 
-def test_what_nobody_fetches_waits_in_four_buffers_and_the_rest_is_lost() -> None:
+def test_unfetched_frames_fill_four_buffers_and_later_ones_are_lost() -> None:
     world = World(noise=QUIET)
     capture = camera(world)
     capture.grab()
@@ -102,7 +102,7 @@ def test_what_nobody_fetches_waits_in_four_buffers_and_the_rest_is_lost() -> Non
 
 
 @pytest.mark.parametrize("buffers", [1, 2, 10])
-def test_the_number_of_buffers_can_be_chosen(buffers: int) -> None:
+def test_number_of_buffers_can_be_chosen(buffers: int) -> None:
     world = World(noise=QUIET)
     capture = camera(world, BUFFERSIZE=buffers)
     world.clock.sleep(1.0)
@@ -126,7 +126,7 @@ def test_stamps_rise_and_no_frame_comes_before_it_is_exposed(waits_ns: list[int]
         last = stamp_ns(capture)
 
 
-def test_an_old_frame_shows_the_world_as_it_was() -> None:
+def test_old_frame_shows_the_world_at_its_exposure() -> None:
     world = World(noise=QUIET)
     world.put(grey(50))
     capture = camera(world)
@@ -140,7 +140,7 @@ def test_an_old_frame_shows_the_world_as_it_was() -> None:
     assert (frame(capture) == 200).all()
 
 
-def test_an_unplugged_camera_delivers_nothing() -> None:
+def test_unplugged_camera_delivers_nothing() -> None:
     capture = camera(World(noise=QUIET))
     assert capture.read()[0]
     capture.unplug()
@@ -159,7 +159,7 @@ def centre(image: NDArray[np.float64]) -> tuple[float, float]:
     return mean, float(np.sqrt((light * (x - mean) ** 2).sum() / light.sum()))
 
 
-def test_the_thing_is_seen_at_table_angle_plus_yaw() -> None:
+def test_object_is_seen_at_table_angle_plus_yaw() -> None:
     world = World(noise=QUIET)
     capture = camera(world)
     world.put(Spot(), yaw_deg=20.0)
@@ -168,7 +168,7 @@ def test_the_thing_is_seen_at_table_angle_plus_yaw() -> None:
     assert centre(frame(capture))[0] == pytest.approx(320 + 160 * np.sin(np.radians(35)), abs=0.2)
 
 
-def test_the_offset_turns_with_the_table() -> None:
+def test_offset_rotates_with_the_table() -> None:
     world = World(noise=QUIET)
     capture = camera(world)
     world.put(Spot(), offset_mm=(0.0, 10.0))
@@ -230,7 +230,7 @@ def test_white_balance_scales_the_channels() -> None:
     assert blue > green > red
 
 
-def test_a_focus_beside_the_best_blurs() -> None:
+def test_wrong_focus_blurs() -> None:
     world = World(noise=QUIET)
     world.put(Spot())
     capture = camera(world)
@@ -270,7 +270,7 @@ def variance(noise: NoiseModel, level: int, **values: float) -> float:
     return float(np.var(frame(capture) - frame(capture)) / 2 - 1 / 12)
 
 
-def test_the_variance_grows_with_the_signal_as_shot_noise_does() -> None:
+def test_variance_grows_with_the_signal_as_shot_noise_does() -> None:
     noise = QUIET.with_values(full_well_e=4000, read_noise_e=20)
     volts = 255 / 4000
     for level in (20, 60, 120, 200):
@@ -297,7 +297,7 @@ def test_noise_is_new_in_every_frame() -> None:
     assert np.abs(correlation[~np.eye(6, dtype=bool)]).max() < 0.03
 
 
-def test_the_same_seed_gives_the_same_bytes_however_many_frames_were_looked_at() -> None:
+def test_same_seed_gives_the_same_bytes_for_any_number_of_frames() -> None:
     def last(seed: int, *, look_at_all: bool) -> Image:
         world = World(seed=seed)
         world.put(shelf()["mug-star"], 30.0)
@@ -317,7 +317,7 @@ def test_the_same_seed_gives_the_same_bytes_however_many_frames_were_looked_at()
 # -- settings ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_automatics_drift_with_the_scene_until_they_are_switched_off() -> None:
+def test_automatic_settings_drift_with_the_scene_until_they_are_off() -> None:
     world = World(noise=QUIET)
     capture = SimCapture(world)
     settled = []
@@ -335,7 +335,7 @@ def test_the_automatics_drift_with_the_scene_until_they_are_switched_off() -> No
     assert (capture.get(cv2.CAP_PROP_EXPOSURE), capture.get(cv2.CAP_PROP_WB_TEMPERATURE)) == settled[1]
 
 
-def test_automatic_exposure_does_not_depend_on_who_looks() -> None:
+def test_automatic_exposure_does_not_depend_on_reading_frames() -> None:
     def exposure(looks: int) -> float:
         world = World(noise=QUIET)
         world.put(shelf()["teapot"])
@@ -349,7 +349,7 @@ def test_automatic_exposure_does_not_depend_on_who_looks() -> None:
     assert exposure(1) == exposure(7) == exposure(60)
 
 
-def test_what_the_camera_controls_itself_is_refused() -> None:
+def test_automatic_settings_cannot_be_set() -> None:
     capture = SimCapture(World(noise=QUIET))
     assert not capture.set(cv2.CAP_PROP_EXPOSURE, 50)
     assert not capture.set(cv2.CAP_PROP_WB_TEMPERATURE, 4000)
@@ -359,7 +359,7 @@ def test_what_the_camera_controls_itself_is_refused() -> None:
     assert capture.get(cv2.CAP_PROP_EXPOSURE) == 50
 
 
-def test_values_are_brought_into_their_range_and_what_is_missing_is_said_so() -> None:
+def test_values_are_clipped_to_their_range_and_unknown_properties_rejected() -> None:
     capture = camera(World(noise=QUIET))
     capture.set(cv2.CAP_PROP_EXPOSURE, 5000)
     assert capture.get(cv2.CAP_PROP_EXPOSURE) == 333
@@ -371,7 +371,7 @@ def test_values_are_brought_into_their_range_and_what_is_missing_is_said_so() ->
     assert capture.get(cv2.CAP_PROP_FRAME_WIDTH) == 640
 
 
-def test_a_setting_acts_on_frames_exposed_after_it() -> None:
+def test_setting_acts_on_frames_exposed_after_it() -> None:
     world = World(noise=QUIET)
     world.put(grey(100))
     capture = camera(world)
@@ -381,7 +381,7 @@ def test_a_setting_acts_on_frames_exposed_after_it() -> None:
     assert frame(capture).mean() == 50
 
 
-def test_a_thing_that_cannot_be_seen_is_refused_in_words() -> None:
+def test_invisible_object_is_rejected_with_a_message() -> None:
     @dataclass(frozen=True)
     class Ghost:
         name: str = "ghost"

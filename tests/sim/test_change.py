@@ -33,7 +33,7 @@ def _seen(change: Change, seed: int, name: str | None = "toy-house") -> tuple[ND
         return frames[0], frames[1]
 
 
-def test_light_changes_exposure_and_colour_and_nothing_else() -> None:
+def test_light_change_affects_only_exposure_and_colour() -> None:
     before, after = _seen(CHANGES["light"], seed=1)
     lit = (before.min(axis=2) > 40) & (before.max(axis=2) < 150)
     gains = after[lit].astype(float) / before[lit]
@@ -42,25 +42,25 @@ def test_light_changes_exposure_and_colour_and_nothing_else() -> None:
     assert np.abs(middle - 1).max() > 0.05
 
 
-def test_placement_moves_the_thing_and_leaves_the_light() -> None:
+def test_placement_change_moves_the_object_but_not_the_light() -> None:
     before, after = _seen(CHANGES["placement"], seed=1)
     assert np.array_equal(before[:20], after[:20])
     assert not np.array_equal(before, after)
 
 
-def test_another_bench_has_another_wall() -> None:
+def test_bench_change_has_another_wall() -> None:
     before, after = _seen(CHANGES["bench"], seed=1, name=None)
     assert before[:100].std(axis=(0, 1)).max() < 2
     assert after[:100].std(axis=(0, 1)).max() > 8
 
 
-def test_the_seed_decides_how_it_changes() -> None:
+def test_change_depends_on_the_seed() -> None:
     one, again, other = (_seen(CHANGES["bench"], seed)[1] for seed in (1, 1, 2))
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)
 
 
-def test_changes_come_together_by_name() -> None:
+def test_changes_are_combined_by_name() -> None:
     assert Change.named([]) is None
     both = Change.named(["light", "placement"])
     assert both is not None

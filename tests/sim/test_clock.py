@@ -27,7 +27,7 @@ def test_timers_fire_at_their_time_in_the_order_of_scheduling(at: list[int], unt
 
 @quick
 @given(at=times, stops=st.lists(st.integers(0, 1_000), max_size=10))
-def test_it_does_not_matter_in_how_many_steps_time_passes(at: list[int], stops: list[int]) -> None:
+def test_number_of_time_steps_does_not_matter(at: list[int], stops: list[int]) -> None:
     def run(steps: list[int]) -> list[int]:
         clock = VirtualClock()
         fired: list[int] = []
@@ -42,7 +42,7 @@ def test_it_does_not_matter_in_how_many_steps_time_passes(at: list[int], stops: 
 
 @quick
 @given(at=times, cancelled=st.sets(st.integers(0, 29)))
-def test_a_cancelled_timer_does_not_fire(at: list[int], cancelled: set[int]) -> None:
+def test_cancelled_timer_does_not_fire(at: list[int], cancelled: set[int]) -> None:
     clock = VirtualClock()
     fired: list[int] = []
     timers = [clock.call_at(t, lambda k=k: fired.append(k)) for k, t in enumerate(at)]
@@ -53,7 +53,7 @@ def test_a_cancelled_timer_does_not_fire(at: list[int], cancelled: set[int]) -> 
     assert not any(timer.pending for timer in timers)
 
 
-def test_a_timer_may_set_timers_that_fall_due_on_the_same_way() -> None:
+def test_timer_can_schedule_timers_for_the_same_sleep() -> None:
     clock = VirtualClock()
     fired: list[int] = []
 
@@ -68,7 +68,7 @@ def test_a_timer_may_set_timers_that_fall_due_on_the_same_way() -> None:
     assert clock.next_event_ns() == 40
 
 
-def test_a_time_that_has_passed_means_now_and_time_never_runs_back() -> None:
+def test_passed_time_means_now_and_time_never_runs_back() -> None:
     clock = VirtualClock()
     clock.advance_to(100)
     fired: list[int] = []
@@ -82,20 +82,20 @@ def test_a_time_that_has_passed_means_now_and_time_never_runs_back() -> None:
 
 @quick
 @given(st.floats(-5.0, 5.0))
-def test_sleep_passes_its_seconds_and_nothing_for_less(seconds: float) -> None:
+def test_sleep_advances_time_by_positive_durations_only(seconds: float) -> None:
     clock = VirtualClock()
     clock.sleep(seconds)
     assert clock.now_ns() == max(round(seconds * 1e9), 0)
 
 
-def test_civil_time_starts_where_it_is_told_and_runs_along() -> None:
+def test_civil_time_starts_at_the_given_time_and_advances() -> None:
     assert VirtualClock().utc() == EPOCH
     clock = VirtualClock(start_utc=datetime(2024, 2, 29, 12, tzinfo=UTC))
     clock.sleep(86_400.0)
     assert clock.utc() - timedelta(days=1) == datetime(2024, 2, 29, 12, tzinfo=UTC)
 
 
-def test_an_error_in_a_timer_reaches_who_waits_and_costs_no_other_timer() -> None:
+def test_error_in_a_timer_reaches_the_sleeper_and_keeps_other_timers() -> None:
     clock = VirtualClock()
     fired: list[int] = []
 

@@ -84,7 +84,7 @@ registers = st.integers(0, 255)
 
 
 @given(register=registers, value=registers)
-def test_bytes_come_back(shared: Wires, register: int, value: int) -> None:
+def test_bytes_are_written_and_read(shared: Wires, register: int, value: int) -> None:
     shared.master.write_byte_data(AT, register, value)
     assert shared.memory.cells[register] == value
     assert shared.master.read_byte_data(AT, register) == value
@@ -100,7 +100,7 @@ def test_words_are_little_endian(shared: Wires, register: int, value: int) -> No
 
 
 @given(register=st.integers(0, 200), data=st.binary(min_size=1, max_size=32))
-def test_blocks_come_back_with_and_without_a_length_on_the_wire(shared: Wires, register: int, data: bytes) -> None:
+def test_blocks_are_read_with_and_without_a_length_on_the_wire(shared: Wires, register: int, data: bytes) -> None:
     shared.master.write_i2c_block_data(AT, register, list(data))
     assert bytes(shared.master.read_i2c_block_data(AT, register, len(data))) == data
     shared.master.write_block_data(AT, register, list(data))
@@ -109,7 +109,7 @@ def test_blocks_come_back_with_and_without_a_length_on_the_wire(shared: Wires, r
 
 
 @given(register=st.integers(0, 100), data=st.binary(min_size=1, max_size=150), count=st.integers(1, 150))
-def test_a_combined_transaction_has_one_stop(shared: Wires, register: int, data: bytes, count: int) -> None:
+def test_combined_transaction_has_one_stop(shared: Wires, register: int, data: bytes, count: int) -> None:
     shared.memory.seen.clear()
     answer = i2c_msg.read(AT, count)
     shared.master.i2c_rdwr(i2c_msg.write(AT, [register, *data]), i2c_msg.write(AT, [register]), answer)
@@ -126,7 +126,7 @@ def test_process_calls_answer_after_a_repeated_start(wires: Wires) -> None:
     assert wires.memory.cells[0x20:0x24] == b"\x03\x07\x08\x09"
 
 
-def test_quick_finds_who_is_there(wires: Wires) -> None:
+def test_quick_finds_attached_devices(wires: Wires) -> None:
     found = []
     for address in range(0x08, 0x78):
         with suppress(OSError):
@@ -135,12 +135,12 @@ def test_quick_finds_who_is_there(wires: Wires) -> None:
     assert found == [AT]
 
 
-def test_time_passes_by_the_byte(wires: Wires) -> None:
+def test_each_byte_takes_its_time(wires: Wires) -> None:
     wires.master.read_i2c_block_data(AT, 0, 14)  # address and register, address and 14 bytes
     assert wires.clock.now_ns() == round(17 * BYTE_S * 1e9)
 
 
-def test_the_wire_remembers_what_smbus2_sent(wires: Wires) -> None:
+def test_messages_of_smbus2_are_recorded(wires: Wires) -> None:
     wires.master.write_word_data(AT, 0x21, 0x4433)
     wires.master.read_byte_data(AT, 0x21)
     assert [(m.address, m.reading, m.data) for m in wires.bus.wire] == [
@@ -182,7 +182,7 @@ def test_faults_carry_the_kernels_numbers(wires: Wires) -> None:
     assert wires.clock.now_ns() - before_ns == 1_000_000_000
 
 
-def test_a_byte_that_the_device_refuses_is_a_remote_error(wires: Wires) -> None:
+def test_rejected_byte_is_a_remote_error(wires: Wires) -> None:
     wires.memory.accepts = 2
     with fails(EREMOTEIO):
         wires.master.write_i2c_block_data(AT, 5, [1, 2, 3])
@@ -191,13 +191,13 @@ def test_a_byte_that_the_device_refuses_is_a_remote_error(wires: Wires) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 33])
-def test_a_block_of_an_impossible_length_is_a_protocol_error(wires: Wires, length: int) -> None:
+def test_block_of_an_impossible_length_is_a_protocol_error(wires: Wires, length: int) -> None:
     wires.memory.cells[9] = length
     with fails(EPROTO):
         wires.master.read_block_data(AT, 9)
 
 
-def test_what_the_adapter_cannot_do_it_says(wires: Wires) -> None:
+def test_unsupported_functions_are_reported(wires: Wires) -> None:
     assert wires.master.funcs & smbus2.I2cFunc.I2C
     with pytest.raises(OSError, match="not a feature"):
         wires.master.enable_pec()
@@ -220,7 +220,7 @@ def test_addresses_are_checked_where_devices_are_attached(wires: Wires) -> None:
         wires.bus.attach(0x78, Memory())
 
 
-def test_buses_stand_side_by_side(wires: Wires) -> None:
+def test_several_buses_work_side_by_side(wires: Wires) -> None:
     with SimI2cBus(wires.clock) as other, SMBus(other.path) as master:
         memory = Memory()
         other.attach(AT, memory)
@@ -236,7 +236,7 @@ def test_other_files_still_reach_the_kernel(wires: Wires, tmp_path: Path) -> Non
         SMBus(str(plain))
 
 
-def test_the_seam_closes_behind_the_last_bus() -> None:
+def test_ioctl_is_restored_after_the_last_bus() -> None:
     script = """
 import fcntl, pathlib, smbus2
 from sim.clock import VirtualClock

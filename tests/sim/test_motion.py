@@ -41,9 +41,7 @@ def samples(path: Trajectory, n: int = 400, beyond_s: float = 1.0) -> np.ndarray
 
 @quick
 @given(starts, angles, speeds, angles, limits, ramps)
-def test_a_move_arrives_exactly_and_stays(
-    t: float, x: float, v: float, goal: float, v_max: float, a_max: float
-) -> None:
+def test_move_arrives_exactly_and_stays(t: float, x: float, v: float, goal: float, v_max: float, a_max: float) -> None:
     path = to_position(t, x, v, goal, v_max, a_max)
     for later in (0.0, 1e-9, 1.0, 1e4):
         position, velocity = path.at(path.end_s + later)
@@ -53,7 +51,7 @@ def test_a_move_arrives_exactly_and_stays(
 
 @quick
 @given(starts, angles, speeds, angles, limits, ramps)
-def test_a_move_keeps_to_its_limits(t: float, x: float, v: float, goal: float, v_max: float, a_max: float) -> None:
+def test_move_keeps_to_its_limits(t: float, x: float, v: float, goal: float, v_max: float, a_max: float) -> None:
     path = to_position(t, x, v, goal, v_max, a_max)
     times = samples(path)
     _, velocity = path.at(times)
@@ -66,16 +64,14 @@ def test_a_move_keeps_to_its_limits(t: float, x: float, v: float, goal: float, v
 
 @quick
 @given(starts, angles, speeds, angles, limits, ramps)
-def test_a_move_starts_where_the_shaft_is(
-    t: float, x: float, v: float, goal: float, v_max: float, a_max: float
-) -> None:
+def test_move_starts_where_the_shaft_is(t: float, x: float, v: float, goal: float, v_max: float, a_max: float) -> None:
     position, velocity = to_position(t, x, v, goal, v_max, a_max).at(t)
     assert (position, velocity) == pytest.approx((x, v), abs=1e-9)
 
 
 @quick
 @given(angles, angles, limits, ramps)
-def test_a_move_from_rest_takes_the_closed_forms_time(x: float, goal: float, v_max: float, a_max: float) -> None:
+def test_move_from_rest_takes_the_closed_forms_time(x: float, goal: float, v_max: float, a_max: float) -> None:
     path = to_position(0.0, x, 0.0, goal, v_max, a_max)
     distance = abs(goal - x)
     reaches_v_max = distance * a_max > v_max**2
@@ -96,7 +92,7 @@ def test_position_and_velocity_are_continuous(path: Trajectory) -> None:
     assert np.abs(after[1] - before[1]).max(initial=0) <= scale
 
 
-def test_a_goal_too_near_to_stop_at_is_overshot_without_a_jump() -> None:
+def test_goal_too_near_to_stop_at_is_overshot_without_a_jump() -> None:
     path = to_position(0.0, 0.0, 10.0, 4.0, 100.0, 10.0)  # standstill at 5, then back to 4
     assert path.at([0.5, 1.0])[0] == pytest.approx([3.75, 5.0])
     assert path.end_s == pytest.approx(1.0 + 2 * sqrt(1.0 / 10.0))
@@ -127,7 +123,7 @@ def test_pieces_are_monotone(path: Trajectory) -> None:
 
 @quick
 @given(starts, angles, speeds, speeds, ramps, st.floats(0, 10))
-def test_a_speed_is_reached_and_held(t: float, x: float, v: float, goal: float, a_max: float, after: float) -> None:
+def test_speed_is_reached_and_held(t: float, x: float, v: float, goal: float, a_max: float, after: float) -> None:
     path = to_velocity(t, x, v, goal, a_max)
     assert path.end_s - t == pytest.approx(abs(goal - v) / a_max, abs=1e-9)
     position, velocity = path.at(path.end_s + after)
@@ -137,7 +133,7 @@ def test_a_speed_is_reached_and_held(t: float, x: float, v: float, goal: float, 
 
 @quick
 @given(starts, angles, st.floats(-1e4, 1e4))
-def test_rest_rests(t: float, x: float, later: float) -> None:
+def test_rest_does_not_move(t: float, x: float, later: float) -> None:
     position, velocity = rest(t, x).at(t + later)
     assert (position, velocity) == (x, 0.0)
 
@@ -162,7 +158,7 @@ def play_operator(shaft: np.ndarray, start: float, half_play: float) -> np.ndarr
 
 @quick
 @given(trajectories(), st.floats(0, 3))
-def test_play_is_the_play_operator_and_stays_within_its_half(path: Trajectory, play_deg: float) -> None:
+def test_backlash_is_the_play_operator_and_stays_within_its_half(path: Trajectory, play_deg: float) -> None:
     follower = Platter(play_deg, 0.0, 0.0)
     follower.follow(path, None)
     times = samples(path, 2_000)
@@ -174,7 +170,7 @@ def test_play_is_the_play_operator_and_stays_within_its_half(path: Trajectory, p
 
 @quick
 @given(st.floats(0.01, 3), st.floats(5, 100), st.floats(5, 100))
-def test_play_is_a_hysteresis(play_deg: float, there: float, back: float) -> None:
+def test_backlash_is_a_hysteresis(play_deg: float, there: float, back: float) -> None:
     """Coming from below the platter lags by half the play, from above it leads by half."""
     follower = platter(play_deg)
     for k, goal in enumerate((there, there - back)):
@@ -190,7 +186,7 @@ def test_play_is_a_hysteresis(play_deg: float, there: float, back: float) -> Non
 
 @quick
 @given(trajectories(), st.floats(0, 2), st.sampled_from([0.0, 8.0, 30.0]), st.integers(0, 2**32 - 1))
-def test_the_rate_is_the_derivative_of_the_platters_angle(
+def test_rate_is_the_derivative_of_the_platters_angle(
     path: Trajectory, play_deg: float, structure_hz: float, seed: int
 ) -> None:
     follower = Platter(play_deg, structure_hz, 0.15)
@@ -208,7 +204,7 @@ def test_the_rate_is_the_derivative_of_the_platters_angle(
     assert slope[smooth] == pytest.approx(rate[smooth], abs=0.5)
 
 
-def test_a_stop_rings_at_the_structures_frequency_and_dies_out() -> None:
+def test_stop_rings_at_the_structures_frequency_and_decays() -> None:
     hz, damping, a_max = 11.0, 0.15, 400.0
     follower = platter(0.0, hz, damping)
     path = to_position(0.0, 0.0, 0.0, 90.0, 60.0, a_max)
@@ -229,7 +225,7 @@ def test_a_stop_rings_at_the_structures_frequency_and_dies_out() -> None:
 
 @quick
 @given(st.floats(0, 2), st.sampled_from([0.0, 11.0]), st.floats(0.05, 3.0), angles, angles)
-def test_a_move_interrupted_by_another_leaves_no_jump(
+def test_move_interrupted_by_another_leaves_no_jump(
     play_deg: float, structure_hz: float, when: float, goal: float, other: float
 ) -> None:
     first = Platter(play_deg, structure_hz, 0.15)

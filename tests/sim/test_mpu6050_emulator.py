@@ -77,7 +77,7 @@ def chip() -> Iterator[Chip]:
         yield c
 
 
-def test_it_sleeps_after_power_up_and_says_who_it_is(chip: Chip) -> None:
+def test_sensor_sleeps_after_power_up_and_reports_its_identity(chip: Chip) -> None:
     assert chip.get(WHO) == [0x68]
     assert chip.get(PWR) == [0x40]
     chip.turn(50)
@@ -89,7 +89,7 @@ def test_it_sleeps_after_power_up_and_says_who_it_is(chip: Chip) -> None:
     assert chip.get(INT_STATUS) == [0]
 
 
-def test_device_reset_brings_the_reset_values_back(chip: Chip) -> None:
+def test_device_reset_restores_the_reset_values(chip: Chip) -> None:
     chip.wake(fifo=0x70)
     chip.set(GYRO_CONFIG, 0x18, 0x18)
     chip.wait(0.1)
@@ -100,7 +100,7 @@ def test_device_reset_brings_the_reset_values_back(chip: Chip) -> None:
     assert chip.count() == 0
 
 
-def test_ad0_moves_the_address_not_the_identity() -> None:
+def test_ad0_changes_the_address_not_the_identity() -> None:
     sensor = SimMpu6050(World(), ad0=True)
     assert sensor.address == 0x69
     sensor.start(reading=False)
@@ -135,7 +135,7 @@ def test_only_the_writable_bits_of_writable_registers_change(register: int, valu
 
 
 @pytest.mark.parametrize(("setting", "lsb"), list(enumerate([131.0, 65.5, 32.8, 16.4])))
-def test_the_gyro_scales(chip: Chip, setting: int, lsb: float) -> None:
+def test_gyro_scales(chip: Chip, setting: int, lsb: float) -> None:
     chip.wake()
     chip.set(GYRO_CONFIG, setting << 3)
     chip.turn(200.0)
@@ -144,7 +144,7 @@ def test_the_gyro_scales(chip: Chip, setting: int, lsb: float) -> None:
 
 
 @pytest.mark.parametrize(("setting", "lsb"), list(enumerate([16384, 8192, 4096, 2048])))
-def test_the_accelerometer_scales(chip: Chip, setting: int, lsb: int) -> None:
+def test_accelerometer_scales(chip: Chip, setting: int, lsb: int) -> None:
     chip.wake()
     chip.set(ACCEL_CONFIG, setting << 3)
     chip.wait(0.1)
@@ -152,7 +152,7 @@ def test_the_accelerometer_scales(chip: Chip, setting: int, lsb: int) -> None:
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_rate_beyond_the_range_saturates(chip: Chip, sign: int) -> None:
+def test_rate_beyond_the_range_saturates(chip: Chip, sign: int) -> None:
     chip.wake()
     chip.turn(sign * 300.0)
     chip.wait(0.2)
@@ -173,9 +173,7 @@ def test_temperature_follows_the_datasheets_formula(chip: Chip) -> None:
     wait_ms=st.integers(1, 80),
 )
 @settings(max_examples=60)
-def test_the_fifo_fills_at_the_sample_rate_with_what_was_chosen(
-    divider: int, dlpf: int, fifo: int, wait_ms: int
-) -> None:
+def test_fifo_fills_at_the_sample_rate_with_what_was_chosen(divider: int, dlpf: int, fifo: int, wait_ms: int) -> None:
     words = 3 * bool(fifo & 0x08) + sum(bool(fifo & bit) for bit in (0x80, 0x40, 0x20, 0x10))
     with Chip() as chip:
         chip.wake(divider=divider, dlpf=dlpf, fifo=fifo)
@@ -193,7 +191,7 @@ def test_fifo_frames_follow_the_order_of_the_data_registers(chip: Chip) -> None:
     assert frames[-1].tolist() == chip.words() == [0, 0, 16384, round((25 - 36.53) * 340), 0, 0, 13100]
 
 
-def test_an_overflowing_fifo_drops_the_oldest_bytes_and_says_so(chip: Chip) -> None:
+def test_overflowing_fifo_drops_the_oldest_bytes_and_sets_its_flag(chip: Chip) -> None:
     chip.wake(divider=1, fifo=0x70)
     chip.wait(0.12)
     assert chip.get(INT_STATUS) == [0x01]
@@ -231,7 +229,7 @@ def test_fifo_is_read_in_place_and_an_empty_one_repeats_its_last_byte(chip: Chip
     assert chip.count() == 0
 
 
-def test_the_count_is_latched_by_its_high_byte(chip: Chip) -> None:
+def test_count_is_latched_by_its_high_byte(chip: Chip) -> None:
     chip.wake(fifo=0x70)
     chip.wait(0.3)
     high = chip.get(COUNT)[0]
@@ -241,7 +239,7 @@ def test_the_count_is_latched_by_its_high_byte(chip: Chip) -> None:
     assert chip.count() == pytest.approx(0.5 * 200 * 6, abs=12)
 
 
-def test_a_burst_belongs_to_one_sample() -> None:
+def test_burst_belongs_to_one_sample() -> None:
     with Chip(NoiseModel(), seed=3) as chip:
         chip.wake(divider=1, dlpf=1, fifo=0xF8)  # a sample falls due within every third burst of 14 bytes
         for _ in range(20):
@@ -260,7 +258,7 @@ def test_data_ready_comes_once_a_sample(chip: Chip) -> None:
     assert 9 <= ready <= 12
 
 
-def test_what_was_sampled_long_ago_is_the_rate_of_its_own_moment(chip: Chip) -> None:
+def test_old_samples_show_the_rate_of_their_own_time(chip: Chip) -> None:
     chip.wake(dlpf=1, fifo=0x10)
     for dps in (0.0, 40.0, -80.0):
         chip.turn(dps)
@@ -272,7 +270,7 @@ def test_what_was_sampled_long_ago_is_the_rate_of_its_own_moment(chip: Chip) -> 
 
 @given(slip_deg=st.floats(-0.8, 0.8), after_ms=st.integers(0, 20), look_first=st.booleans())
 @settings(max_examples=40)
-def test_a_knock_is_felt_however_short(slip_deg: float, after_ms: int, look_first: bool) -> None:
+def test_short_knock_is_measured(slip_deg: float, after_ms: int, look_first: bool) -> None:
     with Chip() as chip:
         chip.wake(divider=1, fifo=0x10)
         chip.wait((20 + after_ms) * 1e-3)
@@ -315,7 +313,7 @@ def test_bias_scale_and_tilt_are_drawn_with_the_models_spread() -> None:
     assert np.std(np.degrees(np.arcsin(ups[:, :2]))) == pytest.approx(noise.imu_tilt_deg, rel=0.1)
 
 
-def test_the_bias_walks_at_the_models_pace() -> None:
+def test_bias_walks_at_the_models_pace() -> None:
     pace = 0.1
     drifts = []
     for seed in range(100):
@@ -345,7 +343,7 @@ def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
 
 @given(looks_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))
 @settings(max_examples=40)
-def test_samples_do_not_depend_on_how_often_one_looks(looks_ms: list[int], seed: int) -> None:
+def test_samples_do_not_depend_on_the_reading_rate(looks_ms: list[int], seed: int) -> None:
     """The same seed gives the same bytes, in whatever portions they are fetched."""
 
     def fetch(looks: list[int]) -> bytes:
@@ -375,11 +373,11 @@ def test_samples_do_not_depend_on_how_often_one_looks(looks_ms: list[int], seed:
     assert whole[-len(at_once) :] == at_once if at_once else not whole
 
 
-def test_another_seed_is_another_part() -> None:
+def test_seeds_give_different_parts() -> None:
     biases = {SimMpu6050(World(seed=s)).inertial.gyro_bias_dps.tobytes() for s in range(5)}
     assert len(biases) == 5
 
 
-def test_a_clone_tells_its_own_name(chip: Chip) -> None:
+def test_clone_reports_its_own_identity(chip: Chip) -> None:
     chip.sensor.who_am_i = 0x70
     assert chip.get(WHO) == [0x70]

@@ -18,12 +18,12 @@ from sim.noise import NoiseModel
         ("vignetting", 1.1),
     ],
 )
-def test_what_no_bench_can_have_is_refused_by_name(name: str, value: float) -> None:
+def test_invalid_noise_values_are_rejected_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} = "):
         NoiseModel(**{name: value})
 
 
-def test_no_noise_is_none_at_all() -> None:
+def test_model_without_noise_has_no_noise() -> None:
     none = NoiseModel.none()
     assert {getattr(none, name) for name in NoiseModel.__slots__} == {0.0}
     assert none.with_values(backlash_deg=0.5) != none
@@ -37,7 +37,7 @@ def test_no_noise_is_none_at_all() -> None:
         ("bench.sim.noise.structure_damping=1.5", "below 1"),
     ],
 )
-def test_a_simulated_bench_that_cannot_be_is_a_configuration_error(setting: str, words: str) -> None:
+def test_invalid_simulated_bench_is_a_configuration_error(setting: str, words: str) -> None:
     with pytest.raises(ConfigError) as caught:
         open_bench("sim", load_config(None, [setting]))
     assert words in str(caught.value.evidence)

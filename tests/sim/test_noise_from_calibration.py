@@ -8,7 +8,7 @@ from calibration.procedures import Backlash, GyroNoise
 from sim.noise import NoiseModel, from_calibration
 
 
-def test_a_bench_is_found_again_in_the_noise_model_of_its_calibrations(simulated):
+def test_noise_model_from_calibrations_equals_the_benchs(simulated):
     true = NoiseModel(backlash_deg=0.7, gyro_noise_dps_rthz=0.012, gyro_bias_walk_dps_rts=0.0)
     bench = simulated(noise=true, seed=5).bench
     results = [[*Backlash().live(bench)][-1], [*GyroNoise(minutes=5).live(bench)][-1]]

@@ -54,7 +54,7 @@ DIE = solid(box((80, 80, 80), front=RED, right=BLUE, back=paint.GREEN, left=pain
 
 
 @pytest.mark.parametrize("azimuth_deg", [-60.0, -30.0, 0.0, 30.0, 60.0, 390.0])
-def test_a_mark_on_a_turned_body_is_where_the_projection_says(azimuth_deg: float) -> None:
+def test_mark_on_a_turned_body_is_where_the_projection_says(azimuth_deg: float) -> None:
     a = np.radians(azimuth_deg)
     x, y = middle(render(CYLINDER, azimuth_deg), RED)
     assert x == pytest.approx(CENTRE_PX[0] + 50 * np.sin(a) * PX_PER_MM, abs=1.5)
@@ -67,7 +67,7 @@ def test_counter_clockwise_from_above_moves_the_front_to_the_right() -> None:
         assert positions == sorted(positions)
 
 
-def test_the_side_of_a_box_that_faces_the_camera_is_the_one_named() -> None:
+def test_side_of_a_box_that_faces_the_camera_is_the_one_named() -> None:
     for azimuth, colour in ((0.0, RED), (-90.0, BLUE), (180.0, paint.GREEN), (90.0, paint.YELLOW)):
         x, _ = middle(render(DIE, azimuth), colour)
         assert x == pytest.approx(CENTRE_PX[0], abs=1.0)
@@ -87,14 +87,14 @@ def test_prints_are_not_mirrored(part: Part) -> None:
     assert middle(image, RED)[0] < CENTRE_PX[0] - 10 < CENTRE_PX[0] + 10 < middle(image, BLUE)[0]
 
 
-def test_the_offset_moves_a_thing_across_the_platter() -> None:
+def test_offset_moves_an_object_across_the_platter() -> None:
     x0, y0 = middle(render(DIE, 0.0), RED)
     for offset, move in (((10.3, 0.0), (20.6, 0.0)), ((0.0, 12.0), (0.0, -24 * SIN))):
         x, y = middle(render(DIE, 0.0, offset), RED)
         assert (x - x0, y - y0) == pytest.approx(move, abs=0.3)
 
 
-def test_a_turned_body_moves_by_fractions_of_a_pixel() -> None:
+def test_turned_body_moves_by_fractions_of_a_pixel() -> None:
     weight = np.arange(640)
 
     def position(offset: float) -> float:
@@ -107,7 +107,7 @@ def test_a_turned_body_moves_by_fractions_of_a_pixel() -> None:
         assert position(offset) - position(0.0) == pytest.approx(offset * PX_PER_MM, rel=0.25)
 
 
-def test_the_near_side_of_a_handle_covers_its_body_and_the_far_side_is_covered() -> None:
+def test_near_side_of_a_handle_covers_its_body_and_the_far_side_is_covered() -> None:
     mug = solid(CYLINDER.parts[0], Tube(((0, -50, 80, 4), (0, -70, 60, 4), (0, -50, 20, 4)), RED))
     facing, away = render(mug, 0.0), render(mug, 180.0)
     assert middle(facing, RED)[0] == pytest.approx(CENTRE_PX[0], abs=1.0)
@@ -116,7 +116,7 @@ def test_the_near_side_of_a_handle_covers_its_body_and_the_far_side_is_covered()
     np.testing.assert_array_equal(away[body], bare[body])
 
 
-def test_the_inside_of_a_vessel_is_seen_through_its_mouth() -> None:
+def test_inside_of_a_vessel_is_seen_through_its_mouth() -> None:
     outside, floor = ((45.0, 60.0), (48.0, 60.0), (48.0, 0.0)), ((45.0, 60.0), (45.0, 5.0), (0.0, 5.0))
     image = render(solid(Revolution(outside, painted(BLUE), inside=floor, lining=RED)), 0.0)
     _, y = middle(image, RED)
@@ -128,7 +128,7 @@ def test_the_inside_of_a_vessel_is_seen_through_its_mouth() -> None:
 # -- the shelf --------------------------------------------------------------------------------------------------------
 
 
-def test_the_shelf_has_what_a_bench_needs() -> None:
+def test_built_in_objects_include_symmetric_and_confusable_ones() -> None:
     objects = shelf()
     assert len(objects) >= 24
     assert all(name == solid.name and isinstance(solid, Visible) for name, solid in objects.items())
@@ -138,7 +138,7 @@ def test_the_shelf_has_what_a_bench_needs() -> None:
 
 
 @pytest.mark.parametrize("name", shelf())
-def test_every_thing_fits_the_frame_and_turns_smoothly(name: str) -> None:
+def test_every_object_fits_the_frame_and_rotates_smoothly(name: str) -> None:
     solid, empty = shelf()[name], empty_platter()
     for azimuth in (0.0, 77.0, 201.0):
         image = render(solid, azimuth, (3.0, 2.0))
@@ -154,7 +154,7 @@ def test_every_thing_fits_the_frame_and_turns_smoothly(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg < 360])
-def test_symmetric_things_look_the_same_after_their_turn(name: str) -> None:
+def test_symmetric_objects_look_the_same_after_their_rotation(name: str) -> None:
     solid = shelf()[name]
     turn = solid.symmetry_deg or 41.3
     for azimuth in (0.0, 17.0):
@@ -164,7 +164,7 @@ def test_symmetric_things_look_the_same_after_their_turn(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg == 360])
-def test_the_others_do_not(name: str) -> None:
+def test_objects_without_symmetry_look_different_after_a_rotation(name: str) -> None:
     solid = shelf()[name]
     views = [render(solid, azimuth) for azimuth in range(0, 360, 30)]
     for turn in (2, 3, 4, 6):  # of 30°: 6-, 4-, 3- and 2-fold
@@ -172,14 +172,14 @@ def test_the_others_do_not(name: str) -> None:
 
 
 @pytest.mark.parametrize(("one", "other"), CONFUSABLE)
-def test_confusable_things_differ_from_some_sides_only(one: str, other: str) -> None:
+def test_confusable_objects_differ_from_some_sides_only(one: str, other: str) -> None:
     a, b = shelf()[one], shelf()[other]
     apart = np.array([difference(render(a, o), render(b, o)) for o in np.arange(0.0, 360.0, 20.0)])
     assert 0.25 <= (apart < 0.02).mean() <= 0.9
     assert apart.max() > 0.3
 
 
-def test_things_that_are_not_confusable_differ() -> None:
+def test_other_objects_differ() -> None:
     names = list(shelf())
     descriptors = np.stack([describe(render(shelf()[name], 20.0)) for name in names])
     similarity = tanimoto(descriptors, descriptors)
@@ -192,7 +192,7 @@ def test_textures_are_the_same_in_every_run() -> None:
         np.testing.assert_array_equal(render(fresh, 33.0), render(shelf()[fresh.name], 33.0))
 
 
-def test_profiles_keep_what_the_tracing_relies_on() -> None:
+def test_profiles_meet_the_requirements_of_tracing() -> None:
     for solid in shelf().values():
         for part in solid.parts:
             if isinstance(part, Revolution):

@@ -43,7 +43,7 @@ def test_objects_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert all(isinstance(solid, Visible) for solid in objects.values())
 
 
-def test_the_nearest_photograph_is_shown_around_the_circle(tmp_path: Path) -> None:
+def test_nearest_photograph_is_shown_around_the_circle(tmp_path: Path) -> None:
     for angle, level in ((0, 50), (90, 100), (182.5, 150), (270, 200)):
         save(tmp_path / f"obj1__{angle:g}.png", level)
     solid = photographs(tmp_path)["obj1"]
@@ -70,7 +70,7 @@ def test_no_photograph_is_nearer_than_the_one_shown(angles: list[float], azimuth
 @pytest.mark.parametrize(
     ("size", "filled"), [((128, 128), (480, 480)), ((100, 200), (320, 640)), ((960, 640), (480, 320))]
 )
-def test_a_photograph_stands_in_the_middle_on_its_border_s_colour(
+def test_photograph_is_centred_on_the_colour_of_its_border(
     tmp_path: Path, size: tuple[int, int], filled: tuple[int, int]
 ) -> None:
     save(tmp_path / "obj1__0.png", 220, border=33, size=size)
@@ -83,7 +83,7 @@ def test_a_photograph_stands_in_the_middle_on_its_border_s_colour(
     assert (np.ptp(rows), np.ptp(columns)) == pytest.approx((filled[0] / 2, filled[1] / 2), abs=4)
 
 
-def test_what_is_wrong_with_a_folder_is_said(tmp_path: Path) -> None:
+def test_invalid_folder_is_rejected_with_a_message(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no folder"):
         photographs(tmp_path / "nowhere")
     with pytest.raises(UsageError, match="named like"):
@@ -94,7 +94,7 @@ def test_what_is_wrong_with_a_folder_is_said(tmp_path: Path) -> None:
         photographs(tmp_path)
 
 
-def test_a_damaged_photograph_is_named_when_it_is_seen(tmp_path: Path) -> None:
+def test_damaged_photograph_is_reported_with_its_path(tmp_path: Path) -> None:
     save(tmp_path / "obj1__0.png", 200)
     (tmp_path / "obj1__90.png").write_bytes(b"not an image")
     solid = photographs(tmp_path)["obj1"]
@@ -103,14 +103,14 @@ def test_a_damaged_photograph_is_named_when_it_is_seen(tmp_path: Path) -> None:
         shown(solid, 80)
 
 
-def test_a_drawn_frame_can_be_changed_without_harm(tmp_path: Path) -> None:
+def test_changing_a_drawn_frame_does_not_change_the_photograph(tmp_path: Path) -> None:
     save(tmp_path / "obj1__0.png", 200)
     solid = photographs(tmp_path)["obj1"]
     shown(solid, 0)[:] = 0
     assert shown(solid, 0)[240, 320, 0] == 200
 
 
-def test_the_photographs_of_coil_100_are_found() -> None:
+def test_photographs_of_coil_100_are_found() -> None:
     folder = Path(os.environ.get("RIG_TEST_DATA", "../shared/data")) / "coil-100"
     if not folder.is_dir():
         pytest.skip(f"no photographs in {folder}")

@@ -19,7 +19,7 @@ def run(folder: Path, *arguments: str, code: str) -> subprocess.CompletedProcess
     )
 
 
-def test_the_documented_tests_pass_elsewhere_and_the_marker_sets_seed_and_noise(tmp_path):
+def test_documented_tests_pass_in_another_project(tmp_path):
     (documented,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
     code = (
         f"{documented}\n"
@@ -37,7 +37,7 @@ def test_the_documented_tests_pass_elsewhere_and_the_marker_sets_seed_and_noise(
     assert "4 passed" in done.stdout
 
 
-def test_it_costs_nothing_where_nobody_asks(tmp_path):
+def test_plugin_imports_nothing_heavy_without_its_fixtures(tmp_path):
     code = (
         "import sys\n"
         "def test_light(request):\n"

@@ -34,7 +34,7 @@ def run(moves_made: list[tuple[float, float]], noise: NoiseModel, look: Callable
 
 @quick
 @given(moves)
-def test_the_past_is_what_it_was(moves_made: list[tuple[float, float]]) -> None:
+def test_past_does_not_change(moves_made: list[tuple[float, float]]) -> None:
     seen: list[tuple[int, float]] = []
     world = run(moves_made, NoiseModel(), lambda w: seen.append((w.clock.now_ns(), w.table_deg())))
     kept = [(t, angle) for t, angle in seen if t > world.clock.now_ns() - HISTORY_S * 1e9]
@@ -45,7 +45,7 @@ def test_the_past_is_what_it_was(moves_made: list[tuple[float, float]]) -> None:
 
 @quick
 @given(moves, st.integers(2, 200))
-def test_looking_in_between_changes_nothing(moves_made: list[tuple[float, float]], looks: int) -> None:
+def test_reading_the_world_changes_nothing(moves_made: list[tuple[float, float]], looks: int) -> None:
     def stare(world: World) -> None:
         for t in np.linspace(0, world.clock.now_ns(), looks).astype(np.int64):
             world.table_deg(int(t))
@@ -57,7 +57,7 @@ def test_looking_in_between_changes_nothing(moves_made: list[tuple[float, float]
 
 @quick
 @given(moves)
-def test_the_table_stays_within_the_play_and_the_ringing(moves_made: list[tuple[float, float]]) -> None:
+def test_table_stays_within_backlash_and_ringing(moves_made: list[tuple[float, float]]) -> None:
     world = run(moves_made, NoiseModel(structure_hz=0.0), lambda _: None)
     t = np.arange(0, world.clock.now_ns(), 1_000_000)
     table, _ = world.table_motion(t)
@@ -67,14 +67,14 @@ def test_the_table_stays_within_the_play_and_the_ringing(moves_made: list[tuple[
 
 @quick
 @given(moves)
-def test_without_play_and_ringing_the_table_is_the_shaft(moves_made: list[tuple[float, float]]) -> None:
+def test_table_follows_the_shaft_without_backlash_and_ringing(moves_made: list[tuple[float, float]]) -> None:
     world = run(moves_made, perfect, lambda _: None)
     for t in np.linspace(0, world.clock.now_ns(), 50).astype(np.int64):
         angle, rate = world.table_motion([t])
         assert (angle[0], rate[0]) == pytest.approx(world.shaft(int(t)), abs=1e-9)
 
 
-def test_motion_continues_where_the_one_before_is_interrupted() -> None:
+def test_interrupted_motion_continues_without_a_jump() -> None:
     world = World(noise=NoiseModel(backlash_deg=0.5, structure_hz=11.0))
     drive(world, 90.0)
     world.clock.sleep(0.7)
@@ -86,7 +86,7 @@ def test_motion_continues_where_the_one_before_is_interrupted() -> None:
     assert world.table_deg() == pytest.approx(-90.0 + 0.25, abs=1e-3)
 
 
-def test_a_slip_turns_the_platter_and_not_the_shaft() -> None:
+def test_slip_rotates_the_platter_and_not_the_shaft() -> None:
     world = World(noise=perfect)
     drive(world, 30.0)
     world.clock.sleep(2.0)
@@ -105,7 +105,7 @@ def test_a_slip_turns_the_platter_and_not_the_shaft() -> None:
     assert world.table_deg() == pytest.approx(57.0)
 
 
-def test_history_reaches_as_far_as_promised_and_is_then_forgotten() -> None:
+def test_history_has_the_documented_length() -> None:
     world = World(noise=perfect)
     for k in range(200):
         drive(world, 10.0 * (k % 2))
@@ -115,7 +115,7 @@ def test_history_reaches_as_far_as_promised_and_is_then_forgotten() -> None:
     assert len(world._motions) <= HISTORY_S + 2
 
 
-def test_turning_for_ever_needs_no_history() -> None:
+def test_endless_rotation_needs_no_history() -> None:
     world = World(noise=perfect)
     world.drive(to_velocity(0.0, 0.0, 0.0, 36.0, 1000.0))
     world.clock.sleep(3600.0)
@@ -130,7 +130,7 @@ class Mug:
     name = "mug"
 
 
-def test_a_thing_is_put_down_by_the_platters_mark() -> None:
+def test_object_is_put_on_the_platters_mark() -> None:
     world = World(noise=perfect)
     world.drive(rest(0.0, 40.0))
     world.put(Mug(), yaw_deg=100.0, offset_mm=(1.0, -2.0))
@@ -141,7 +141,7 @@ def test_a_thing_is_put_down_by_the_platters_mark() -> None:
     assert world.scene.object is None
 
 
-def test_scenes_change_in_time_and_the_past_keeps_its_own() -> None:
+def test_past_scenes_do_not_change() -> None:
     world = World(noise=perfect)
     dark = (0.1, 0.1, 0.1)
     world.clock.sleep(1.0)
@@ -160,7 +160,7 @@ def test_scenes_change_in_time_and_the_past_keeps_its_own() -> None:
 # -- randomness ----------------------------------------------------------------------------------------------------
 
 
-def test_streams_are_the_seeds_and_the_names() -> None:
+def test_random_streams_depend_on_seed_and_name() -> None:
     def draws(seed: int, name: str) -> list[float]:
         return World(seed=seed).rng(name).standard_normal(4).tolist()
 

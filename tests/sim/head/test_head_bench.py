@@ -34,7 +34,7 @@ def on_head(simulated):
     return open_one
 
 
-def test_enrolled_and_found_with_the_binarys_gyro_as_the_only_source_of_orientation(on_head, tmp_path):
+def test_object_is_enrolled_and_found_with_the_binarys_gyro_alone(on_head, tmp_path):
     s = on_head("avr", "identify.first_step_deg=60")
     truth_deg = []
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
@@ -51,7 +51,7 @@ def test_enrolled_and_found_with_the_binarys_gyro_as_the_only_source_of_orientat
     assert (health["lost"], health["crc_errors"], health["missed"]) == (0, 0, 0)
 
 
-def test_the_bench_is_dark_and_unpowered_before_and_after(on_head):
+def test_bench_is_dark_and_unpowered_before_and_after(on_head):
     needs("memory")
     s = on_head()
     assert s.operator.devices.head.relay_closed
@@ -62,7 +62,7 @@ def test_the_bench_is_dark_and_unpowered_before_and_after(on_head):
     assert not s.operator.devices.servo.powered
 
 
-def test_an_estop_in_mid_motion_stops_the_table_and_latches(on_head):
+def test_estop_in_mid_motion_stops_the_table_and_latches(on_head):
     s = on_head()
     head = s.operator.devices.head
     with pytest.raises(EmergencyStop), Turntable(s.bench) as table:
@@ -86,7 +86,7 @@ def test_an_estop_in_mid_motion_stops_the_table_and_latches(on_head):
     assert s.bench.safety.state in (TableState.READY, TableState.UNREFERENCED)
 
 
-def test_an_estop_while_the_table_rests_is_found_before_the_next_motion(on_head):
+def test_estop_while_the_table_rests_is_found_before_the_next_motion(on_head):
     s = on_head()
     with pytest.raises(EmergencyStop), Turntable(s.bench) as table:
         table.goto(20.0)
@@ -97,7 +97,7 @@ def test_an_estop_while_the_table_rests_is_found_before_the_next_motion(on_head)
     assert s.world.table_deg() == pytest.approx(20.0, abs=1.0)
 
 
-def test_a_light_that_goes_out_spoils_no_view(on_head, tmp_path):
+def test_failed_light_damages_no_view(on_head, tmp_path):
     s = on_head("memory", "view.retakes=1")
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         events = enroll(s.bench, catalog, "lamp", views=8)
@@ -108,7 +108,7 @@ def test_a_light_that_goes_out_spoils_no_view(on_head, tmp_path):
         assert len(catalog.views().views.azimuth_deg) in (0, 3)
 
 
-def test_a_pulled_cable_of_the_head_ends_the_plan_and_the_head_cuts_the_power(on_head, tmp_path):
+def test_unplugged_head_ends_the_plan_and_switches_the_servo_off(on_head, tmp_path):
     s = on_head()
     head = s.operator.devices.head
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
@@ -125,7 +125,7 @@ def test_a_pulled_cable_of_the_head_ends_the_plan_and_the_head_cuts_the_power(on
         s.bench.close()
 
 
-def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
+def test_next_program_reports_a_killed_program_before_any_motion():
     needs("memory")
     world = World(seed=4)
     operator = ShelfOperator(world, shelf())
@@ -146,7 +146,7 @@ def test_after_a_program_that_died_the_next_one_says_so_before_anything_moves():
     wires.close()
 
 
-def test_the_servo_alone_is_fed_as_long_as_it_is_asked_unless_a_fault_is_latched():
+def test_head_supplies_the_servo_unless_a_fault_is_latched():
     needs("memory")
     world, config = World(seed=4), load_config(None, WIRED)
     with SimDevices.connected(config, world) as devices:
@@ -159,7 +159,7 @@ def test_the_servo_alone_is_fed_as_long_as_it_is_asked_unless_a_fault_is_latched
         assert not devices.servo.powered
 
 
-def test_a_bench_whose_estop_is_pressed_says_what_to_do():
+def test_pressed_estop_is_reported_with_a_next_step():
     needs("memory")
     world = World(seed=4)
     operator = ShelfOperator(world, shelf())

@@ -114,7 +114,7 @@ def test_ten_minutes_at_200_hz_without_loss_and_dated_within_100_us():
 
 
 @pytest.mark.timeout(600)
-def test_the_binary_dates_its_samples_within_100_us():
+def test_binary_dates_its_samples_within_100_us():
     nightly = settings.get_current_profile_name() == "nightly"
     _, lost, error_ns = stream("avr", MINUTES * 60 if nightly else 15)
     assert lost == 0

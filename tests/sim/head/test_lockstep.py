@@ -82,7 +82,7 @@ def test_two_runs_are_identical_to_the_cycle(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_how_often_it_is_run_changes_nothing(kind, monkeypatch):
+def test_result_does_not_depend_on_how_often_the_board_runs(kind, monkeypatch):
     seen = []
     for quantum_s in (0.0005, 0.001, 0.005):
         monkeypatch.setattr(board, "QUANTUM_S", quantum_s)
@@ -106,7 +106,7 @@ def undisturbed(kind: str) -> list[tuple[int, int]]:
         return coming + [(c.time_ns, round(c.value)) for c in h.head.changes]
 
 
-def test_the_host_build_and_the_binary_measure_the_same():
+def test_host_build_and_the_binary_measure_the_same():
     """What differs is when a byte leaves, not what was measured."""
     angles = {}
     for kind in KINDS:

@@ -28,7 +28,7 @@ def answering(connect, clock):
 
 
 @pytest.mark.parametrize("kind", ["memory", "avr"])
-def test_a_program_with_pyserial_finds_a_head(kind, tmp_path):
+def test_program_with_pyserial_finds_a_head(kind, tmp_path):
     needs(kind)
     arguments = ["sim-head", "--json", "--kind", kind, "--spin", "30", "--seconds", "30", "--link", "head"]
     command = [sys.executable, "-c", "from rig.cli.main import main; main()", *arguments]

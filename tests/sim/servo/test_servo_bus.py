@@ -19,7 +19,7 @@ PING = bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))
 
 
 @pytest.mark.parametrize(("baudrate", "delay"), [(57_600, 250), (57_600, 0), (1_000_000, 10), (9_600, 254)])
-def test_a_ping_takes_its_bytes_and_the_return_delay(baudrate: int, delay: int) -> None:
+def test_ping_takes_its_bytes_and_the_return_delay(baudrate: int, delay: int) -> None:
     line = Line(baudrate)
     line.add()
     line.put(Return_Delay_Time=delay)
@@ -35,13 +35,13 @@ def test_a_ping_takes_its_bytes_and_the_return_delay(baudrate: int, delay: int) 
 
 @settings(max_examples=60, deadline=None)
 @given(baudrate=st.sampled_from(BAUD_RATES), start_ns=st.integers(0, 10**15), now=st.integers(-10, 10**8))
-def test_a_byte_has_arrived_when_its_time_is_up(baudrate: int, start_ns: int, now: int) -> None:
+def test_byte_arrives_at_the_end_of_its_stop_bit(baudrate: int, start_ns: int, now: int) -> None:
     frame = Frame(Source.DEVICE, start_ns, baudrate, bytes(50))
     arrived = frame.arrived(start_ns + now)
     assert arrived == sum(frame.arrival_ns(n) <= start_ns + now for n in range(1, 51))
 
 
-def test_bytes_trickle_in(line: Line) -> None:
+def test_bytes_arrive_one_after_the_other(line: Line) -> None:
     line.serial.baudrate = 1_000_000
     line.serial.write(PING)
     line.clock.advance_to(100_000 + 500_000)  # the request and the return delay
@@ -52,7 +52,7 @@ def test_bytes_trickle_in(line: Line) -> None:
     assert counts == list(range(15))
 
 
-def test_writes_follow_one_another_on_the_line(line: Line) -> None:
+def test_writes_follow_one_another_on_the_bus(line: Line) -> None:
     for part in (PING[:3], PING[3:8], PING[8:]):
         line.serial.write(part)
     assert line.serial.read(14)[:5] == PING[:5]
@@ -60,13 +60,13 @@ def test_writes_follow_one_another_on_the_line(line: Line) -> None:
     assert [frame.start_ns for frame in requests] == [0, 30_000, 80_000]
 
 
-def test_flush_waits_until_the_bytes_are_out(line: Line) -> None:
+def test_flush_waits_until_the_bytes_are_sent(line: Line) -> None:
     line.serial.write(PING)
     line.serial.flush()
     assert line.clock.now_ns() == 100_000
 
 
-def test_read_returns_early_what_it_wants_and_late_what_there_is(line: Line) -> None:
+def test_read_returns_when_complete_or_at_the_timeout(line: Line) -> None:
     line.serial.timeout = 0.01
     line.serial.write(PING)
     assert len(line.serial.read(5)) == 5
@@ -75,7 +75,7 @@ def test_read_returns_early_what_it_wants_and_late_what_there_is(line: Line) -> 
     assert line.clock.now_ns() == 650_000 + 10_000_000
 
 
-def test_a_read_without_timeout_waits_for_its_bytes_and_never_in_vain(line: Line) -> None:
+def test_read_without_timeout_waits_only_for_bytes_that_come(line: Line) -> None:
     line.serial.timeout = None
     line.serial.write(PING)
     assert len(line.serial.read(14)) == 14
@@ -83,7 +83,7 @@ def test_a_read_without_timeout_waits_for_its_bytes_and_never_in_vain(line: Line
         line.serial.read(1)
 
 
-def test_a_read_with_timeout_zero_takes_no_time(line: Line) -> None:
+def test_read_with_timeout_zero_takes_no_time(line: Line) -> None:
     line.serial.timeout = 0
     line.serial.write(PING)
     assert line.serial.read(14) == b""
@@ -103,20 +103,20 @@ def flip(index: int) -> Callable[[Frame], Frame]:
 
 
 @pytest.mark.parametrize("index", [-1, -3, 9])
-def test_a_crc_error_on_the_wire_is_the_sdks_corrupt_packet(line: Line, index: int) -> None:
+def test_crc_error_on_the_wire_is_a_corrupt_packet_for_the_sdk(line: Line, index: int) -> None:
     line.bus.filters.append(flip(index))
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_CORRUPT
     line.bus.filters.clear()
     assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
 
 
-def test_a_lost_reply_is_the_sdks_timeout(line: Line) -> None:
+def test_lost_reply_is_a_timeout_for_the_sdk(line: Line) -> None:
     line.bus.filters.append(lambda _: None)
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
     assert line.sent(Source.DEVICE) == []
 
 
-def test_a_late_reply_is_there_for_the_next_reader(line: Line) -> None:
+def test_late_reply_is_received_by_the_next_read(line: Line) -> None:
     """The hazard that makes a driver drain the line: the answer to one read is taken for the answer to the next."""
     held_up = [0.05]
     line.bus.filters.append(
@@ -127,7 +127,7 @@ def test_a_late_reply_is_there_for_the_next_reader(line: Line) -> None:
     assert line.sdk.read1ByteTxRx(line.port, 1, 65) == (250, COMM_SUCCESS, 0)  # asked for the LED
 
 
-def test_a_held_up_reply_does_not_hold_up_the_next(line: Line) -> None:
+def test_delayed_reply_does_not_delay_the_next(line: Line) -> None:
     held_up = [0.2]
     line.bus.filters.append(
         lambda frame: replace(frame, start_ns=frame.start_ns + round(held_up.pop() * 1e9)) if held_up else frame
@@ -136,20 +136,20 @@ def test_a_held_up_reply_does_not_hold_up_the_next(line: Line) -> None:
     assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
 
 
-def test_two_baud_rates_do_not_understand_each_other(line: Line) -> None:
+def test_different_baud_rates_do_not_understand_each_other(line: Line) -> None:
     line.serial.baudrate = 57_600
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
     line.serial.baudrate = 1_000_000
     assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
 
 
-def test_a_packet_that_breaks_off_is_given_up(line: Line) -> None:
+def test_incomplete_packet_is_dropped(line: Line) -> None:
     line.serial.write(PING[:7])
     line.sleep(ABANDON_S + 0.001)
     assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
 
 
-def test_a_packet_that_breaks_off_costs_no_more_than_itself(line: Line) -> None:
+def test_incomplete_packet_does_not_damage_the_next(line: Line) -> None:
     line.serial.write(PING[:7])
     results = [line.sdk.ping(line.port, 1)[1] for _ in range(2)]
     assert results[-1] == COMM_SUCCESS
@@ -157,7 +157,7 @@ def test_a_packet_that_breaks_off_costs_no_more_than_itself(line: Line) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.binary(min_size=1, max_size=12), st.binary(min_size=1, max_size=12))
-def test_two_senders_at_once_can_only_pull_the_line_low(one: bytes, other: bytes) -> None:
+def test_two_simultaneous_senders_can_only_pull_the_bus_low(one: bytes, other: bytes) -> None:
     frames = [Frame(Source.DEVICE, 0, 1_000_000, one), Frame(Source.DEVICE, 0, 1_000_000, other)]
     (mixed,) = superpose(frames)
     assert len(mixed.data) <= len(one) + len(other) + 1
@@ -165,7 +165,7 @@ def test_two_senders_at_once_can_only_pull_the_line_low(one: bytes, other: bytes
     assert all(mixed.data[0] & ~one[0] & 1 << bit == 0 for bit in range(8))
 
 
-def test_a_detached_servo_is_silent(line: Line) -> None:
+def test_detached_servo_is_silent(line: Line) -> None:
     line.bus.detach(line.servos[1])
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
 
@@ -173,7 +173,7 @@ def test_a_detached_servo_is_silent(line: Line) -> None:
 # -- the port as pyserial's ----------------------------------------------------------------------------------------
 
 
-def test_an_unplugged_port_fails_as_pyserials_does(line: Line) -> None:
+def test_unplugged_port_fails_like_pyserial(line: Line) -> None:
     line.serial.write(PING)
     line.serial.unplug()
     with pytest.raises(serial.SerialException):
@@ -190,7 +190,7 @@ def test_an_unplugged_port_fails_as_pyserials_does(line: Line) -> None:
     assert len(again.read(14)) == 14
 
 
-def test_a_cable_pulled_while_the_host_waits_ends_the_wait(line: Line) -> None:
+def test_unplugging_ends_a_waiting_read(line: Line) -> None:
     line.serial.timeout = 5.0
     line.clock.call_at(1_000_000_000, line.serial.unplug)
     with pytest.raises(serial.SerialException):
@@ -198,7 +198,7 @@ def test_a_cable_pulled_while_the_host_waits_ends_the_wait(line: Line) -> None:
     assert line.clock.now_ns() == 1_000_000_000
 
 
-def test_a_bus_has_one_host(line: Line) -> None:
+def test_bus_accepts_one_host(line: Line) -> None:
     with pytest.raises(serial.SerialException) as caught:
         SimSerial(line.bus)
     assert caught.value.errno == errno.EBUSY
@@ -208,7 +208,7 @@ def test_a_bus_has_one_host(line: Line) -> None:
         line.serial.open()
 
 
-def test_a_closed_port_says_so(line: Line) -> None:
+def test_closed_port_raises_an_error(line: Line) -> None:
     line.serial.close()
     line.serial.close()
     for use in (lambda: line.serial.read(1), lambda: line.serial.write(b"x"), line.serial.reset_input_buffer):
@@ -221,7 +221,7 @@ def test_a_closed_port_says_so(line: Line) -> None:
     assert len(line.serial.read(14)) == 14
 
 
-def test_reset_input_buffer_drops_what_has_arrived_and_nothing_else(line: Line) -> None:
+def test_reset_input_buffer_drops_only_received_bytes(line: Line) -> None:
     line.serial.write(PING)
     line.clock.advance_to(600_000 + 50_000)
     line.serial.reset_input_buffer()

@@ -27,7 +27,7 @@ FOLLOWING_ERROR = 0x08
 
 @given(units=st.integers(1, 127), last_read_s=st.floats(0.0, 1.0))
 @settings(max_examples=20, deadline=None)
-def test_the_watchdog_trips_its_time_after_the_last_instruction(units: int, last_read_s: float) -> None:
+def test_watchdog_trips_after_its_time_without_instructions(units: int, last_read_s: float) -> None:
     line = Line()
     servo = line.add()
     line.put(Operating_Mode=1, Torque_Enable=1, Goal_Velocity=50, Bus_Watchdog=units)
@@ -44,7 +44,7 @@ def test_the_watchdog_trips_its_time_after_the_last_instruction(units: int, last
     assert line.worlds[1].shaft()[1] == 0.0
 
 
-def test_a_tripped_watchdog_refuses_goals_until_it_is_cleared(line: Line) -> None:
+def test_tripped_watchdog_rejects_goals_until_it_is_cleared(line: Line) -> None:
     extended(line)
     line.put(Bus_Watchdog=5, Goal_Position=9000)
     line.sleep(0.5)
@@ -64,7 +64,7 @@ def test_a_tripped_watchdog_refuses_goals_until_it_is_cleared(line: Line) -> Non
     assert line.shaft() == pytest.approx(0.0)
 
 
-def test_a_fed_watchdog_does_not_trip(line: Line) -> None:
+def test_watchdog_does_not_trip_while_instructions_arrive(line: Line) -> None:
     extended(line)
     line.put(Bus_Watchdog=5, Goal_Position=9000)
     for _ in range(60):
@@ -73,7 +73,7 @@ def test_a_fed_watchdog_does_not_trip(line: Line) -> None:
     assert line.read("Bus Watchdog") == 5
 
 
-def test_instructions_to_others_do_not_feed_the_watchdog(line: Line) -> None:
+def test_instructions_to_other_servos_do_not_reset_the_watchdog(line: Line) -> None:
     line.add(2)
     extended(line)
     line.put(Bus_Watchdog=5)
@@ -83,7 +83,7 @@ def test_instructions_to_others_do_not_feed_the_watchdog(line: Line) -> None:
     assert line.read("Bus Watchdog") == 0xFF
 
 
-def test_the_watchdog_sleeps_while_torque_is_off(line: Line) -> None:
+def test_watchdog_is_inactive_while_torque_is_off(line: Line) -> None:
     line.put(Bus_Watchdog=1)
     line.sleep(5.0)
     assert line.read("Bus Watchdog") == 1
@@ -96,7 +96,7 @@ def test_the_watchdog_sleeps_while_torque_is_off(line: Line) -> None:
 
 
 @pytest.mark.parametrize("error", [OVERLOAD_ERROR, OVERHEATING_ERROR, ELECTRICAL_ERROR])
-def test_an_error_of_the_shutdown_mask_takes_torque_away_until_reboot(line: Line, error: int) -> None:
+def test_error_in_the_shutdown_mask_disables_torque_until_reboot(line: Line, error: int) -> None:
     line.put(Torque_Enable=1)
     line.servos[1].fail(error)
     assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, ALERT)
@@ -110,7 +110,7 @@ def test_an_error_of_the_shutdown_mask_takes_torque_away_until_reboot(line: Line
     assert line.read("Torque Enable") == 1
 
 
-def test_an_error_outside_the_mask_only_raises_the_alert(line: Line) -> None:
+def test_error_outside_the_mask_only_raises_the_alert(line: Line) -> None:
     line.put(Torque_Enable=1)
     line.servos[1].fail(ENCODER_ERROR)
     assert line.sdk.ping(line.port, 1)[2] == ALERT
@@ -118,7 +118,7 @@ def test_an_error_outside_the_mask_only_raises_the_alert(line: Line) -> None:
 
 
 @pytest.mark.parametrize(("supply_v", "alert"), [(5.9, True), (6.0, False), (14.0, False), (14.1, True)])
-def test_the_supply_is_judged_by_its_limits(line: Line, supply_v: float, alert: bool) -> None:
+def test_supply_is_compared_with_its_limits(line: Line, supply_v: float, alert: bool) -> None:
     line.put(Torque_Enable=1)
     line.servos[1].set_voltage(supply_v)
     assert (line.sdk.ping(line.port, 1)[2] == ALERT) is alert
@@ -129,7 +129,7 @@ def test_the_supply_is_judged_by_its_limits(line: Line, supply_v: float, alert: 
     assert (line.sdk.ping(line.port, 1)[2] == ALERT) is alert  # once raised, it stays
 
 
-def test_the_xl330_shuts_down_on_its_supply() -> None:
+def test_xl330_shuts_down_on_its_supply() -> None:
     line = Line()
     servo = line.add(1, "xl330_m288")
     line.put(Torque_Enable=1)
@@ -137,7 +137,7 @@ def test_the_xl330_shuts_down_on_its_supply() -> None:
     assert line.read("Torque Enable") == 0
 
 
-def test_overheating_is_judged_by_its_limit(line: Line) -> None:
+def test_temperature_is_compared_with_its_limit(line: Line) -> None:
     line.put(Torque_Enable=1)
     line.servos[1].set_temperature(72.0)
     assert line.read("Hardware Error Status") == 0
@@ -146,12 +146,12 @@ def test_overheating_is_judged_by_its_limit(line: Line) -> None:
     assert line.read("Present Temperature") == 72
 
 
-def test_a_lowered_limit_is_judged_at_once(line: Line) -> None:
+def test_lowered_limit_applies_at_once(line: Line) -> None:
     assert line.write("Temperature Limit", 30) == ALERT
     assert line.read("Hardware Error Status") == OVERHEATING_ERROR
 
 
-def test_the_case_cools_down_without_load(line: Line) -> None:
+def test_case_cools_down_without_load(line: Line) -> None:
     line.servos[1].set_temperature(70.0)
     readings = []
     for _ in range(5):
@@ -164,7 +164,7 @@ def test_the_case_cools_down_without_load(line: Line) -> None:
 # -- a jammed table -------------------------------------------------------------------------------------------------
 
 
-def test_a_jam_shows_as_following_error_then_load_then_overload(line: Line) -> None:
+def test_jam_shows_as_following_error_then_load_then_overload(line: Line) -> None:
     extended(line)
     line.put(Goal_Position=9000)
     line.sleep(1.0)
@@ -192,7 +192,7 @@ def test_a_jam_shows_as_following_error_then_load_then_overload(line: Line) -> N
     assert line.shaft() == stuck
 
 
-def test_a_jam_that_is_freed_in_time_is_made_up_for(line: Line) -> None:
+def test_servo_catches_up_after_a_short_jam(line: Line) -> None:
     extended(line)
     line.put(Goal_Position=4000)
     line.sleep(0.5)
@@ -204,7 +204,7 @@ def test_a_jam_that_is_freed_in_time_is_made_up_for(line: Line) -> None:
     assert line.read("Hardware Error Status") == 0
 
 
-def test_a_jammed_wheel_goes_on_when_freed(line: Line) -> None:
+def test_jammed_wheel_continues_when_freed(line: Line) -> None:
     line.put(Operating_Mode=1, Torque_Enable=1, Goal_Velocity=50)
     line.servos[1].jam()
     line.sleep(0.2)
@@ -214,7 +214,7 @@ def test_a_jammed_wheel_goes_on_when_freed(line: Line) -> None:
     assert line.read("Present Velocity") == 50
 
 
-def test_a_jam_without_torque_strains_nothing(line: Line) -> None:
+def test_jam_without_torque_causes_no_overload(line: Line) -> None:
     line.servos[1].jam()
     line.sleep(10.0)
     assert line.read("Hardware Error Status") == 0
@@ -237,7 +237,7 @@ def test_stalling_heats_the_case(line: Line) -> None:
 # -- power ----------------------------------------------------------------------------------------------------------
 
 
-def test_without_power_there_is_silence_and_no_torque(line: Line) -> None:
+def test_servo_without_power_is_silent_and_has_no_torque(line: Line) -> None:
     extended(line, velocity=100)
     line.put(Goal_Position=20_000)
     line.sleep(1.0)
@@ -254,7 +254,7 @@ def test_without_power_there_is_silence_and_no_torque(line: Line) -> None:
     assert line.read("Present Position") == round((stopped + 30) / DEG_PER_COUNT + 2048) % 4096
 
 
-def test_power_that_comes_and_goes_boots_once(line: Line) -> None:
+def test_short_power_cuts_cause_one_boot(line: Line) -> None:
     for _ in range(3):
         line.servos[1].power_cycle()
         line.sleep(BOOT_S / 2)
@@ -265,12 +265,12 @@ def test_power_that_comes_and_goes_boots_once(line: Line) -> None:
 
 
 @pytest.mark.parametrize(("option", "value"), [("bus_id", 253), ("baudrate", 56_000)])
-def test_servos_that_cannot_be_are_refused(option: str, value: int) -> None:
+def test_invalid_servos_are_rejected(option: str, value: int) -> None:
     with pytest.raises(ValueError, match=str(value)):
         Line().add(**{option: value})
 
 
-def test_an_unknown_model_is_refused_by_name() -> None:
+def test_unknown_model_is_rejected_by_name() -> None:
     with pytest.raises(ValueError, match=r"xl999.*xl430_w250"):
         Line().add(1, "xl999")
     assert set(MODELS) == {"xl430_w250", "xm430_w350", "xl330_m288", "mx_28"}

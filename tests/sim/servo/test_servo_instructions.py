@@ -37,7 +37,7 @@ def three(line: Line) -> Line:
 # -- ping, read, write ---------------------------------------------------------------------------------------------
 
 
-def test_ping_is_the_emanuals_to_the_byte(line: Line) -> None:
+def test_ping_answer_equals_the_emanuals(line: Line) -> None:
     assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, 0)
     assert line.sent(Source.HOST) == [bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))]
 
@@ -57,14 +57,14 @@ def test_every_model_answers_with_its_number_and_initial_values(model: str, numb
     assert line.read("Hardware Error Status") == 0
 
 
-def test_broadcast_ping_finds_all_in_the_order_of_their_ids(three: Line) -> None:
+def test_broadcast_ping_finds_all_servos_in_order_of_id(three: Line) -> None:
     found, result = three.sdk.broadcastPing(three.port)
     assert result == COMM_SUCCESS
     assert found == {1: [1060, 46], 4: [1200, 52], 7: [1020, 46]}
     assert [data[4] for data in three.sent(Source.DEVICE)] == [1, 4, 7]
 
 
-def test_two_servos_with_one_id_are_not_taken_for_one(line: Line) -> None:
+def test_two_servos_with_one_id_collide(line: Line) -> None:
     line.sdk.ping(line.port, 1)
     alone = line.sent(Source.DEVICE)[-1]
     line.add(1)
@@ -73,14 +73,14 @@ def test_two_servos_with_one_id_are_not_taken_for_one(line: Line) -> None:
     assert line.sent(Source.DEVICE)[-1] != alone
 
 
-def test_registers_of_every_size_go_there_and_back(line: Line) -> None:
+def test_registers_of_every_size_are_written_and_read(line: Line) -> None:
     line.put(LED=1, Position_P_Gain=1234, Profile_Velocity=23_456)
     assert [line.read(n) for n in ("LED", "Position P Gain", "Profile Velocity")] == [1, 1234, 23_456]
     line.put(Homing_Offset=-1_044_479)
     assert line.read("Homing Offset") == -1_044_479
 
 
-def test_the_bytes_on_the_wire_are_the_sdks(line: Line) -> None:
+def test_bytes_on_the_wire_equal_the_sdks(line: Line) -> None:
     recorded = []
     write = line.port.writePort
     line.port.writePort = lambda packet: recorded.append(bytes(packet)) or write(packet)
@@ -107,13 +107,13 @@ def test_the_bytes_on_the_wire_are_the_sdks(line: Line) -> None:
         (100, word(886), StatusError.DATA_LIMIT),  # PWM Limit
     ],
 )
-def test_writes_are_refused_with_the_emanuals_error(line: Line, address: int, data: list[int], error: int) -> None:
+def test_invalid_writes_return_the_emanuals_error(line: Line, address: int, data: list[int], error: int) -> None:
     before = bytes(line.servos[1].memory.read(0, 662))
     assert line.sdk.writeTxRx(line.port, 1, address, len(data), data) == (COMM_SUCCESS, error)
     assert line.servos[1].memory.read(0, 662) == before
 
 
-def test_a_block_is_written_as_a_whole_or_not_at_all(line: Line) -> None:
+def test_block_is_written_completely_or_not_at_all(line: Line) -> None:
     block = double(7) + double(8) + double(4096)  # profile acceleration, profile velocity, goal beyond its limit
     assert line.sdk.writeTxRx(line.port, 1, 108, 12, block) == (COMM_SUCCESS, StatusError.DATA_LIMIT)
     assert (line.read("Profile Acceleration"), line.read("Profile Velocity")) == (0, 0)
@@ -121,18 +121,18 @@ def test_a_block_is_written_as_a_whole_or_not_at_all(line: Line) -> None:
     assert [line.read(f"{n}") for n in ("Profile Acceleration", "Profile Velocity", "Goal Position")] == [7, 8, 100]
 
 
-def test_reads_beyond_the_table_are_refused(line: Line) -> None:
+def test_reads_beyond_the_table_are_rejected(line: Line) -> None:
     _, result, error = line.sdk.readTxRx(line.port, 1, 650, 20)
     assert (result, error) == (COMM_SUCCESS, StatusError.ACCESS)
 
 
-def test_an_unknown_instruction_is_answered_so(line: Line) -> None:
+def test_unknown_instruction_is_answered_with_an_error(line: Line) -> None:
     line.serial.write(with_crc(bytes.fromhex("FFFFFD0001030077")))
     line.sleep(0.01)
     assert line.serial.read(11)[8] == StatusError.INSTRUCTION
 
 
-def test_a_damaged_instruction_is_answered_with_a_crc_error_and_not_done(line: Line) -> None:
+def test_damaged_instruction_is_answered_with_a_crc_error_and_not_executed(line: Line) -> None:
     frame = bytearray(with_crc(bytes.fromhex("FFFFFD000106000341 0001".replace(" ", ""))))  # LED = 1
     frame[-1] ^= 0x40
     line.serial.write(frame)
@@ -152,7 +152,7 @@ def test_reg_write_waits_for_action(line: Line) -> None:
     assert (line.read("LED"), line.read("Registered Instruction")) == (1, 0)
 
 
-def test_reg_write_is_judged_when_it_is_registered(line: Line) -> None:
+def test_reg_write_is_checked_when_it_is_registered(line: Line) -> None:
     assert line.sdk.regWriteTxRx(line.port, 1, 132, 4, [0] * 4) == (COMM_SUCCESS, StatusError.ACCESS)
     assert line.read("Registered Instruction") == 0
 
@@ -164,7 +164,7 @@ def test_action_without_reg_write_is_an_instruction_error(line: Line) -> None:
 
 
 @pytest.mark.parametrize("fast", [False, True])
-def test_sync_read_answers_in_the_order_asked(three: Line, fast: bool) -> None:
+def test_sync_read_answers_in_the_requested_order(three: Line, fast: bool) -> None:
     for bus_id, position in ((1, 10.0), (7, 20.0), (4, 30.0)):
         three.servos[bus_id].turn_by_hand(position)
     three.sleep(2.0)
@@ -181,7 +181,7 @@ def test_sync_read_answers_in_the_order_asked(three: Line, fast: bool) -> None:
 
 
 @pytest.mark.parametrize("fast", [False, True])
-def test_bulk_read_asks_each_for_its_own(three: Line, fast: bool) -> None:
+def test_bulk_read_reads_other_registers_of_each_servo(three: Line, fast: bool) -> None:
     three.servos[7].set_temperature(41.0)
     group = GroupBulkRead(three.port, three.sdk)
     group.addParam(7, 146, 1)
@@ -190,7 +190,7 @@ def test_bulk_read_asks_each_for_its_own(three: Line, fast: bool) -> None:
     assert (group.getData(7, 146, 1), group.getData(1, 144, 2)) == (41, 120)
 
 
-def test_a_chain_ends_at_the_first_silent_servo(three: Line) -> None:
+def test_chain_ends_at_the_first_silent_servo(three: Line) -> None:
     three.servos[7].power_off()
     group = GroupSyncRead(three.port, three.sdk, 132, 4)
     for bus_id in (1, 7, 4):
@@ -199,7 +199,7 @@ def test_a_chain_ends_at_the_first_silent_servo(three: Line) -> None:
     assert [data[4] for data in three.sent(Source.DEVICE)] == [1]
 
 
-def test_sync_write_and_bulk_write_reach_each_servo_unanswered(three: Line) -> None:
+def test_sync_write_and_bulk_write_reach_each_servo_without_an_answer(three: Line) -> None:
     sync = GroupSyncWrite(three.port, three.sdk, 65, 1)
     sync.addParam(1, [1])
     sync.addParam(4, [1])
@@ -216,7 +216,7 @@ def test_sync_write_and_bulk_write_reach_each_servo_unanswered(three: Line) -> N
     assert len(three.sent(Source.DEVICE)) == answers_to_reads
 
 
-def test_the_group_of_a_secondary_id_obeys_in_silence(three: Line) -> None:
+def test_servos_obey_a_secondary_id_without_an_answer(three: Line) -> None:
     for bus_id in (1, 7, 4):
         three.put(bus_id, Secondary_ID=100)
     result, _ = three.sdk.write1ByteTxRx(three.port, 100, 65, 1)
@@ -230,7 +230,7 @@ def test_the_group_of_a_secondary_id_obeys_in_silence(three: Line) -> None:
 
 
 @pytest.mark.parametrize(("level", "read", "write"), [(0, False, False), (1, True, False), (2, True, True)])
-def test_status_return_level_decides_who_is_answered(line: Line, level: int, read: bool, write: bool) -> None:
+def test_status_return_level_selects_the_answered_instructions(line: Line, level: int, read: bool, write: bool) -> None:
     line.put(Status_Return_Level=level)
     assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
     assert (line.sdk.read1ByteTxRx(line.port, 1, 65)[1] == COMM_SUCCESS) is read
@@ -238,13 +238,13 @@ def test_status_return_level_decides_who_is_answered(line: Line, level: int, rea
     assert line.servos[1].memory["LED"] == 1
 
 
-def test_a_new_id_holds_from_the_next_instruction_on(line: Line) -> None:
+def test_new_id_is_used_from_the_next_instruction(line: Line) -> None:
     assert line.write("ID", 9) == 0  # answered under the old id, else the SDK would find no answer
     assert line.sdk.ping(line.port, 9) == (1060, COMM_SUCCESS, 0)
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
 
 
-def test_a_new_baud_rate_holds_from_the_next_instruction_on(line: Line) -> None:
+def test_new_baud_rate_is_used_from_the_next_instruction(line: Line) -> None:
     assert line.write("Baud Rate", 2) == 0
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
     line.serial.baudrate = 115_200
@@ -258,7 +258,7 @@ def test_eeprom_is_locked_while_torque_is_on(line: Line) -> None:
     assert line.read("Return Delay Time") == 0
 
 
-def test_indirect_data_stands_for_the_bytes_it_points_to(line: Line) -> None:
+def test_indirect_data_reads_and_writes_the_bytes_it_points_to(line: Line) -> None:
     for i, target in enumerate((132, 133, 134, 135, 65)):
         assert line.sdk.write2ByteTxRx(line.port, 1, 168 + 2 * i, target) == (COMM_SUCCESS, 0)
     line.servos[1].turn_by_hand(90.0)
@@ -271,7 +271,7 @@ def test_indirect_data_stands_for_the_bytes_it_points_to(line: Line) -> None:
     assert line.sdk.write2ByteTxRx(line.port, 1, 168, 7) == (COMM_SUCCESS, StatusError.DATA_RANGE)  # not of EEPROM
 
 
-def test_indirect_data_that_points_nowhere_is_a_byte_of_its_own(line: Line) -> None:
+def test_indirect_data_without_a_target_is_its_own_byte(line: Line) -> None:
     assert line.sdk.write1ByteTxRx(line.port, 1, 224, 42) == (COMM_SUCCESS, 0)
     assert line.sdk.read1ByteTxRx(line.port, 1, 224) == (42, COMM_SUCCESS, 0)
 
@@ -279,7 +279,7 @@ def test_indirect_data_that_points_nowhere_is_a_byte_of_its_own(line: Line) -> N
 # -- reboot, factory reset, clear ----------------------------------------------------------------------------------
 
 
-def test_reboot_is_answered_then_silent_then_as_new_but_for_the_eeprom(line: Line) -> None:
+def test_reboot_is_answered_and_resets_all_but_the_eeprom(line: Line) -> None:
     extended(line)
     line.put(LED=1)
     assert line.sdk.reboot(line.port, 1) == (COMM_SUCCESS, 0)
@@ -290,7 +290,7 @@ def test_reboot_is_answered_then_silent_then_as_new_but_for_the_eeprom(line: Lin
     assert line.read("Realtime Tick") < 10
 
 
-def test_reboot_forgets_the_turns(line: Line) -> None:
+def test_reboot_loses_the_revolutions(line: Line) -> None:
     extended(line, velocity=200)
     line.put(Goal_Position=2048 + 3 * 4096 + 100)
     line.sleep(8.0)
@@ -323,14 +323,14 @@ def test_factory_reset_keeps_what_the_option_says(option: int, bus_id: int, baud
     assert line.sdk.read1ByteTxRx(line.port, bus_id, 11)[0] == 3
 
 
-def test_factory_reset_of_everything_is_no_broadcast(line: Line) -> None:
+def test_factory_reset_of_everything_ignores_broadcasts(line: Line) -> None:
     line.put(Return_Delay_Time=7)
     line.sdk.factoryReset(line.port, 0xFE, 0xFF)
     line.sleep(0.5)
     assert line.read("Return Delay Time") == 7
 
 
-def test_clear_forgets_the_turns_of_a_standing_servo_only(line: Line) -> None:
+def test_clear_resets_the_revolutions_only_while_the_servo_stands_still(line: Line) -> None:
     extended(line, velocity=100)
     line.put(Goal_Position=2048 + 2 * 4096)
     line.sleep(0.5)

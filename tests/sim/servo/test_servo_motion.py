@@ -33,7 +33,7 @@ def arrival_s(line: Line) -> float:
     acceleration=st.integers(1, 139),
 )
 @settings(max_examples=25, deadline=None)
-def test_a_move_takes_the_profiles_time_and_ends_on_the_count(goal: int, velocity: int, acceleration: int) -> None:
+def test_move_takes_the_profiles_time_and_ends_on_the_count(goal: int, velocity: int, acceleration: int) -> None:
     line = Line()
     line.add()
     extended(line, velocity, acceleration)
@@ -49,7 +49,7 @@ def test_a_move_takes_the_profiles_time_and_ends_on_the_count(goal: int, velocit
     assert line.read("Moving Status") & 0x0F == IN_POSITION
 
 
-def test_no_profile_velocity_means_as_fast_as_the_motor_can(line: Line) -> None:
+def test_profile_velocity_0_means_maximum_speed(line: Line) -> None:
     line.put(Operating_Mode=4, Profile_Acceleration=1, Torque_Enable=1, Goal_Position=2048 + 4096)
     v = min(XL430.no_load_dps, 265 * DPS_PER_UNIT)
     assert arrival_s(line) == pytest.approx(duration(360, v, XL430.acceleration_dps2), rel=1e-6)
@@ -70,7 +70,7 @@ def test_moving_status_names_the_profile(
     assert line.read("Moving") == 1
 
 
-def test_a_time_based_profile_takes_the_time_it_is_given(line: Line) -> None:
+def test_time_based_profile_takes_the_time_it_is_given(line: Line) -> None:
     line.put(Drive_Mode=4, Operating_Mode=4, Profile_Velocity=2000, Profile_Acceleration=500, Torque_Enable=1)
     line.put(Goal_Position=2048 + 1024)
     assert arrival_s(line) == pytest.approx(2.0, abs=1e-6)
@@ -88,7 +88,7 @@ def test_velocity_limit_and_supply_bound_the_speed(line: Line) -> None:
     assert line.read("Present Velocity") == round(-XL430.no_load_dps / 2 / DPS_PER_UNIT)
 
 
-def test_velocity_mode_ramps_and_turns_on(line: Line) -> None:
+def test_velocity_mode_ramps_and_keeps_rotating(line: Line) -> None:
     line.put(Operating_Mode=1, Profile_Acceleration=10, Torque_Enable=1, Goal_Velocity=-100)
     line.sleep(0.2)
     at_200_ms = line.read("Present Velocity")
@@ -104,7 +104,7 @@ def test_velocity_mode_ramps_and_turns_on(line: Line) -> None:
     assert line.servos[1].motor.busy is False
 
 
-def test_a_goal_rewritten_on_the_way_changes_nothing(line: Line) -> None:
+def test_goal_written_again_during_a_move_changes_nothing(line: Line) -> None:
     """A driver that repeats a write whose answer was lost must not disturb the motion."""
     extended(line)
     line.put(Goal_Position=6000)
@@ -115,7 +115,7 @@ def test_a_goal_rewritten_on_the_way_changes_nothing(line: Line) -> None:
     assert line.servos[1].motor.commanded.end_s == pytest.approx(end_s, abs=1e-6)
 
 
-def test_torque_switched_on_again_disturbs_no_motion(line: Line) -> None:
+def test_torque_enabled_again_does_not_change_the_motion(line: Line) -> None:
     extended(line)
     line.put(Goal_Position=6000)
     line.sleep(0.5)
@@ -124,7 +124,7 @@ def test_torque_switched_on_again_disturbs_no_motion(line: Line) -> None:
     assert line.read("Present Position") == line.read("Goal Position") == 6000
 
 
-def test_a_new_goal_on_the_way_is_met_without_a_jerk(line: Line) -> None:
+def test_new_goal_during_a_move_is_reached_without_a_jerk(line: Line) -> None:
     extended(line)
     line.put(Goal_Position=6000)
     line.sleep(1.0)
@@ -172,7 +172,7 @@ def test_position_mode_stays_within_its_limits(line: Line) -> None:
     assert [line.write("Goal Position", g) for g in (999, 3001, 1000, 3000)] == [6, 6, 0, 0]
 
 
-def test_extended_position_counts_turns_with_torque_off_too(line: Line) -> None:
+def test_extended_position_counts_revolutions_also_with_torque_off(line: Line) -> None:
     line.put(Operating_Mode=4)
     seconds = line.servos[1].turn_by_hand(-800.0)
     line.sleep(seconds)
@@ -181,7 +181,7 @@ def test_extended_position_counts_turns_with_torque_off_too(line: Line) -> None:
     assert line.read("Goal Position") == line.read("Present Position") == round(2048 - 800 / DEG_PER_COUNT)
 
 
-def test_position_mode_forgets_the_turns_when_torque_comes_on(line: Line) -> None:
+def test_position_mode_loses_the_revolutions_when_torque_comes_on(line: Line) -> None:
     seconds = line.servos[1].turn_by_hand(720.0 + 90.0)
     line.sleep(seconds)
     assert line.read("Present Position") == 2048 + 2 * 4096 + 1024
@@ -202,7 +202,7 @@ def test_power_up_reads_within_one_revolution(turns_deg: float, center: int) -> 
     assert line.read("Present Position") == round(center + turns_deg / DEG_PER_COUNT) % 4096
 
 
-def test_reverse_mode_turns_everything_round(line: Line) -> None:
+def test_reverse_mode_inverts_every_sign(line: Line) -> None:
     line.put(Drive_Mode=1, Operating_Mode=4, Profile_Velocity=44, Profile_Acceleration=10, Torque_Enable=1)
     start = line.read("Present Position")
     line.put(Goal_Position=start + 1024)
@@ -227,7 +227,7 @@ def test_homing_offset_shifts_the_position(line: Line, mode: int, offset: int, p
         assert line.shaft() == pytest.approx(45)
 
 
-def test_encoder_noise_is_the_worlds_and_the_seeds() -> None:
+def test_encoder_noise_depends_on_noise_model_and_seed() -> None:
     def readings(sigma: float) -> list[int]:
         line = Line(noise=NoiseModel.none().with_values(encoder_noise_deg=sigma))
         line.add()
@@ -243,7 +243,7 @@ def test_encoder_noise_is_the_worlds_and_the_seeds() -> None:
 # -- torque and modes -----------------------------------------------------------------------------------------------
 
 
-def test_a_goal_written_while_torque_is_off_is_not_pursued(line: Line) -> None:
+def test_goal_written_while_torque_is_off_is_ignored(line: Line) -> None:
     line.put(Goal_Position=3000)
     assert line.read("Goal Position") == 3000
     line.sleep(1.0)
@@ -253,14 +253,14 @@ def test_a_goal_written_while_torque_is_off_is_not_pursued(line: Line) -> None:
     assert line.read("Goal Position") == 2048
 
 
-def test_a_goal_switches_torque_on_where_the_drive_mode_says_so(line: Line) -> None:
+def test_goal_enables_torque_if_the_drive_mode_says_so(line: Line) -> None:
     line.put(Drive_Mode=8, Goal_Position=3000)
     assert line.read("Torque Enable") == 1
     line.sleep(2.0)
     assert line.read("Present Position") == 3000
 
 
-def test_torque_off_lets_the_shaft_go(line: Line) -> None:
+def test_torque_off_releases_the_shaft(line: Line) -> None:
     extended(line, velocity=100)
     line.put(Goal_Position=20_000)
     line.sleep(1.0)
@@ -273,13 +273,13 @@ def test_torque_off_lets_the_shaft_go(line: Line) -> None:
     assert line.read("Moving Status") == 0
 
 
-def test_nobody_turns_a_held_shaft(line: Line) -> None:
+def test_held_shaft_cannot_be_rotated_by_hand(line: Line) -> None:
     line.put(Torque_Enable=1)
     with pytest.raises(ValueError, match="torque"):
         line.servos[1].turn_by_hand(10.0)
 
 
-def test_a_change_of_mode_resets_profile_and_gains(line: Line) -> None:
+def test_change_of_mode_resets_profile_and_gains(line: Line) -> None:
     line.put(Profile_Velocity=5, Profile_Acceleration=6, Position_P_Gain=77, Operating_Mode=1)
     assert [line.read(n) for n in ("Profile Velocity", "Profile Acceleration", "Position P Gain")] == [0, 0, 640]
 

@@ -66,7 +66,7 @@ def test_emanual_instruction_packets_are_understood(frame: str, packet: Instruct
     assert PacketParser1().feed(bytes.fromhex(frame)) == [packet]
 
 
-def test_status_packets_are_the_emanuals() -> None:
+def test_status_packets_equal_the_emanuals() -> None:
     assert status_packet1(1, Status(0, b"\x20")) == bytes.fromhex("FF FF 01 03 00 20 DB")
     assert status_packet1(1, Status(0)) == bytes.fromhex("FF FF 01 02 00 FC")
 
@@ -90,7 +90,7 @@ def test_packets_are_found_in_any_pieces(sent: list[tuple[int, int, bytes]], cut
 
 @quick
 @given(parameters=st.binary(max_size=20), data=st.data())
-def test_a_flipped_bit_is_never_accepted(parameters: bytes, data: st.DataObject) -> None:
+def test_flipped_bit_is_never_accepted(parameters: bytes, data: st.DataObject) -> None:
     body = bytes((1, len(parameters) + 2, 3)) + parameters
     frame = bytearray(b"\xff\xff" + body + bytes((checksum(body),)))
     bit = data.draw(st.integers(0, 8 * len(frame) - 1))
@@ -103,21 +103,21 @@ def test_a_flipped_bit_is_never_accepted(parameters: bytes, data: st.DataObject)
 # -- the servo ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_drivers_table_is_the_servos() -> None:
+def test_control_tables_of_driver_and_servo_are_equal() -> None:
     """Two tables, written down apart from each other."""
     assert {n: (r.address, r.size) for n, r in control_table("ax_12a").items()} == {
         n: (e.address, e.size) for n, e in ENTRIES.items()
     }
 
 
-def test_it_says_who_it_is(line: Line1) -> None:
+def test_ax12_reports_its_model_number(line: Line1) -> None:
     assert line.sdk.ping(line.port, 1) == (12, COMM_SUCCESS, 0)
     assert line.read(0) == 12
     assert line.sdk.ping(line.port, 2)[1] == COMM_RX_TIMEOUT
 
 
 @pytest.mark.parametrize("goal", [0, 200, 512, 1023])
-def test_a_goal_switches_torque_on_and_is_reached_within_300_degrees(line: Line1, goal: int) -> None:
+def test_goal_enables_torque_and_is_reached_within_300_degrees(line: Line1, goal: int) -> None:
     assert line.read(POSITION) == 512
     assert line.write(GOAL, goal) == 0
     assert line.read(24, 1) == 1
@@ -139,7 +139,7 @@ def test_speed_limits_the_motion_and_carries_its_direction(line: Line1) -> None:
     assert line.read(38) == 100 | 0x400
 
 
-def test_goals_outside_the_angle_limits_are_refused(line: Line1) -> None:
+def test_goals_outside_the_angle_limits_are_rejected(line: Line1) -> None:
     assert line.write(6, 300) == 0
     assert line.write(GOAL, 299) == Error.ANGLE_LIMIT
     assert line.write(GOAL, 1024) == Error.RANGE
@@ -147,7 +147,7 @@ def test_goals_outside_the_angle_limits_are_refused(line: Line1) -> None:
     assert line.read(24, 1) == 0
 
 
-def test_both_limits_zero_make_a_wheel(line: Line1) -> None:
+def test_wheel_mode_needs_both_limits_zero(line: Line1) -> None:
     line.write(8, 0)
     line.write(24, 1, 1)
     line.write(SPEED, 512)
@@ -163,13 +163,13 @@ def test_both_limits_zero_make_a_wheel(line: Line1) -> None:
     assert line.world.shaft()[1] == 0.0
 
 
-def test_a_supply_out_of_range_shows_in_every_answer(line: Line1) -> None:
+def test_supply_out_of_range_shows_in_every_answer(line: Line1) -> None:
     line.servo.set_voltage(5.0)
     data, result, error = line.sdk.readTxRx(line.port, 1, VOLTAGE, 1)
     assert (result, error, data) == (COMM_SUCCESS, Error.VOLTAGE, [50])
 
 
-def test_a_jam_ends_in_overload_and_a_torque_limit_of_zero(line: Line1) -> None:
+def test_jam_ends_in_overload_and_a_torque_limit_of_zero(line: Line1) -> None:
     line.write(GOAL, 700)
     line.servo.jam()
     line.write(GOAL, 1000)
@@ -195,7 +195,7 @@ def test_reg_write_waits_for_action(line: Line1) -> None:
     assert line.read(POSITION) == 768
 
 
-def test_sync_write_reaches_each_its_own(line: Line1) -> None:
+def test_sync_write_writes_other_values_to_each_servo(line: Line1) -> None:
     other = World(noise=NoiseModel.none(), clock=line.world.clock)
     line.bus.attach(Ax12Servo(other, bus_id=7))
     group = GroupSyncWrite(line.port, line.sdk, GOAL, 2)
@@ -207,7 +207,7 @@ def test_sync_write_reaches_each_its_own(line: Line1) -> None:
     assert other.shaft()[0] == pytest.approx(0.0)
 
 
-def test_without_power_it_is_silent_and_forgets_its_ram(line: Line1) -> None:
+def test_servo_without_power_is_silent_and_loses_its_ram(line: Line1) -> None:
     line.write(SPEED, 100)
     line.servo.power_off()
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
@@ -217,7 +217,7 @@ def test_without_power_it_is_silent_and_forgets_its_ram(line: Line1) -> None:
     assert line.read(34) == 1023
 
 
-def test_each_protocol_is_deaf_to_the_other(line: Line1) -> None:
+def test_protocols_do_not_answer_each_other(line: Line1) -> None:
     x = XSeriesServo(World(clock=line.world.clock), bus_id=1, baudrate=1_000_000)
     line.bus.attach(x)
     assert line.sdk.ping(line.port, 1) == (12, COMM_SUCCESS, 0)
@@ -225,11 +225,11 @@ def test_each_protocol_is_deaf_to_the_other(line: Line1) -> None:
 
 
 @pytest.mark.parametrize(("option", "value"), [("bus_id", 254), ("baudrate", 4_500_000)])
-def test_servos_that_cannot_be_are_refused(option: str, value: int) -> None:
+def test_invalid_servos_are_rejected(option: str, value: int) -> None:
     with pytest.raises(ValueError, match=str(value)):
         Ax12Servo(World(), **{option: value})
 
 
 @pytest.mark.parametrize("baud", sorted(BAUD_RATES.values()))
-def test_it_speaks_at_the_rate_it_is_set_to(baud: int) -> None:
+def test_servo_uses_the_baud_rate_in_its_register(baud: int) -> None:
     assert Ax12Servo(World(), baudrate=baud).baudrate == baud

@@ -40,7 +40,7 @@ packets = st.builds(InstructionPacket, ids, st.integers(1, 0x9A), payloads)
 
 @quick
 @given(st.binary(max_size=200))
-def test_crc_is_the_sdks(data: bytes) -> None:
+def test_crc_equals_the_sdks(data: bytes) -> None:
     assert crc16(data) == SDK.updateCRC(0, data, len(data))
 
 
@@ -71,11 +71,11 @@ def test_emanual_instruction_packets_are_understood(frame: str, packet: Instruct
         (2, Status(0, b"\x24"), "FF FF FD 00 02 05 00 55 00 24 8B A9"),
     ],
 )
-def test_status_packets_are_the_emanuals(bus_id: int, status: Status, frame: str) -> None:
+def test_status_packets_equal_the_emanuals(bus_id: int, status: Status, frame: str) -> None:
     assert status_packet(bus_id, status) == bytes.fromhex(frame)
 
 
-def test_fast_sync_read_status_is_the_emanuals() -> None:
+def test_fast_sync_read_status_equals_the_emanuals() -> None:
     answers = [
         (3, Status(0, (166).to_bytes(4, "little"))),
         (7, Status(0, (2079).to_bytes(4, "little"))),
@@ -108,7 +108,7 @@ def as_the_sdk_unstuffs(frame: bytes) -> bytes:
 @quick
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
 @example(bus_id=1, error=0, data=b"\xff\xff\xfd\xff\xfd\xfd")
-def test_what_the_servo_stuffs_holds_no_header_and_comes_back_whole(bus_id: int, error: int, data: bytes) -> None:
+def test_byte_stuffing_removes_headers_and_can_be_undone(bus_id: int, error: int, data: bytes) -> None:
     frame = status_packet(bus_id, Status(error, data))
     assert b"\xff\xff\xfd\x00" not in frame[4:-2]
     assert SDK.updateCRC(0, frame, len(frame) - 2) == frame[-2] | frame[-1] << 8
@@ -118,14 +118,14 @@ def test_what_the_servo_stuffs_holds_no_header_and_comes_back_whole(bus_id: int,
 
 @quick
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
-def test_the_sdk_unstuffs_what_the_servo_stuffs(bus_id: int, error: int, data: bytes) -> None:
+def test_sdk_unstuffs_what_the_servo_stuffs(bus_id: int, error: int, data: bytes) -> None:
     body = bytes((0x55, error)) + data
     # After one stuffed byte it takes FF FD FD for another: see the next test.
     assume(b"\xff\xfd\xfd" not in body.partition(b"\xff\xff\xfd")[2])
     assert as_the_sdk_unstuffs(status_packet(bus_id, Status(error, data))) == body
 
 
-def test_the_sdk_eats_a_byte_after_a_stuffed_one() -> None:
+def test_sdk_loses_the_byte_after_a_stuffed_byte() -> None:
     """`removeStuffing` works in place and looks back into what it has moved; rig.devices.dynamixel has its own."""
     frame = status_packet(1, Status(0, b"\xff\xff\xfd\xff\xfd\xfd"))
     assert as_the_sdk_unstuffs(frame) == b"\x55\x00\xff\xff\xfd\xff\xfd"
@@ -133,9 +133,7 @@ def test_the_sdk_eats_a_byte_after_a_stuffed_one() -> None:
 
 @quick
 @given(sent=st.lists(st.tuples(payloads, packets), max_size=6), cuts=st.lists(st.integers(0, 400), max_size=8))
-def test_packets_are_found_among_noise_and_in_any_pieces(
-    sent: list[tuple[bytes, InstructionPacket]], cuts: list[int]
-) -> None:
+def test_packets_are_found_in_noise_and_in_pieces(sent: list[tuple[bytes, InstructionPacket]], cuts: list[int]) -> None:
     stream = b"".join(noise + instruction_frame(p.bus_id, p.instruction, p.parameters) for noise, p in sent)
     stream += bytes(1100)  # completes whatever the noise may have announced
     parser = PacketParser()
@@ -149,7 +147,7 @@ def test_packets_are_found_among_noise_and_in_any_pieces(
 
 @quick
 @given(packet=packets, data=st.data())
-def test_a_flipped_bit_is_never_accepted(packet: InstructionPacket, data: st.DataObject) -> None:
+def test_flipped_bit_is_never_accepted(packet: InstructionPacket, data: st.DataObject) -> None:
     frame = bytearray(instruction_frame(packet.bus_id, packet.instruction, packet.parameters))
     bit = data.draw(st.integers(0, 8 * len(frame) - 1))
     frame[bit // 8] ^= 1 << bit % 8
@@ -164,7 +162,7 @@ def test_only_a_reserved_byte_of_zero_makes_a_header(reserved: int) -> None:
 
 @quick
 @given(noise=st.binary(max_size=300))
-def test_noise_leaves_no_more_than_one_packet_waiting(noise: bytes) -> None:
+def test_noise_delays_at_most_one_packet(noise: bytes) -> None:
     parser = PacketParser()
     parser.feed(noise)
     parser.reset()

@@ -72,9 +72,7 @@ def test_rustypot_drives_an_ax12(sim_servo: Callable[..., dict[str, Any]]) -> No
     servo.close()
 
 
-def test_the_sdks_own_port_and_the_rigs_driver_find_it(
-    sim_servo: Callable[..., dict[str, Any]], tmp_path: Path
-) -> None:
+def test_sdk_and_rig_driver_find_the_servo(sim_servo: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     """One after the other, through a link of a fixed name; in real time the driver moves it, and sees it move."""
     sim_servo("--link", str(tmp_path / "servo"))
     port = PortHandler(str(tmp_path / "servo"))
@@ -101,9 +99,7 @@ def test_the_sdks_own_port_and_the_rigs_driver_find_it(
     servo.close()
 
 
-def test_when_it_is_stopped_its_link_goes_and_readers_learn(
-    sim_servo: Callable[..., dict[str, Any]], tmp_path: Path
-) -> None:
+def test_stop_removes_the_link_and_ends_reads(sim_servo: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     told = sim_servo("--link", str(tmp_path / "servo"))
     told["process"].send_signal(signal.SIGTERM)
     assert told["process"].wait(10) == 143
