@@ -18,8 +18,8 @@ from sim.sensor import Gains
 class Change:
     """How strongly the bench changes.
 
-    The world's seed gives each change, uniformly distributed between −strength and +strength. The light changes for each
-    object, like daylight. The camera's settings and the surroundings change once.
+    The world's seed gives each change, uniformly distributed between −strength and +strength. The light changes for
+    each object, like daylight. The camera's settings and the surroundings change once.
     """
 
     brightness: float = 0.0

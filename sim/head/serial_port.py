@@ -11,8 +11,8 @@ from sim.head.board import BYTE_NS, RECEIVER_BYTES, SimHead
 class HeadSerial:
     """An open `serial.Serial` for a driver; reads wait on the virtual clock.
 
-    ``timeout`` is in seconds. After the head is unplugged, every call fails. When it is plugged in again, a new port must
-    be opened.
+    ``timeout`` is in seconds. After the head is unplugged, every call fails. When it is plugged in again, a new port
+    must be opened.
 
     Raises
     ------
