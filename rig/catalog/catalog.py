@@ -304,7 +304,7 @@ class Catalog:
         CatalogError
             The file is missing, is not the stored one, or the system denies access.
         """
-        with self.database.in_words():
+        with self.database.catalog_errors():
             return images.read(self.image_path(view), view.image_sha256)
 
     def _start_session(

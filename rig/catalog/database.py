@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, event, insert
 
-from rig.catalog.failures import DATABASE_NAME, absent, in_words
+from rig.catalog.failures import DATABASE_NAME, absent, catalog_errors
 from rig.catalog.schema import APPLICATION_ID, METADATA, SCHEMA_VERSION
 from rig.core.errors import CatalogError, CatalogOutdated
 from rig.core.files import make_folder, sync_folder
@@ -50,7 +50,7 @@ class Database:
         event.listen(self._engine, "begin", _begin)
         self._writing = self._engine.execution_options(begin="BEGIN IMMEDIATE")
         try:
-            with self.in_words():
+            with self.catalog_errors():
                 self._open(create=create and not read_only)
         except BaseException:
             self.close()
@@ -62,7 +62,7 @@ class Database:
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Yield a transaction that sees the catalog as it is at its first query."""
-        with self.in_words(), self._engine.begin() as connection:
+        with self.catalog_errors(), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
@@ -70,15 +70,15 @@ class Database:
         """Yield a transaction that only one process can have at a time. An exception rolls it back."""
         if self._read_only:
             raise CatalogError(f"the catalog {self.root} is open for reading only", next_step="open it for writing")
-        with self.in_words(), self._writing.begin() as connection:
+        with self.catalog_errors(), self._writing.begin() as connection:
             yield connection
 
-    def in_words(self) -> AbstractContextManager[None]:
+    def catalog_errors(self) -> AbstractContextManager[None]:
         """Raise errors of SQLite and of the file system as errors of the catalog."""
-        return in_words(self.root, self._busy_timeout_s)
+        return catalog_errors(self.root, self._busy_timeout_s)
 
     def _open(self, *, create: bool) -> None:
-        if not is_there(self.root):
+        if not database_exists(self.root):
             if not create:
                 raise absent(self.root)
             make_folder(self.root, within=next(parent for parent in self.root.parents if parent.exists()))
@@ -137,7 +137,7 @@ class Database:
                 made.replace(self._file)
 
 
-def is_there(root: Path) -> bool:
+def database_exists(root: Path) -> bool:
     """Return whether a folder has a database. A program that was killed may have left an empty file."""
     if root.exists() and not root.is_dir():
         raise absent(root)

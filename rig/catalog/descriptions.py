@@ -64,7 +64,7 @@ def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.ui
         The file is missing, is not the stored one, or the system denies access.
     """
     path, sha256 = empty_table
-    with catalog.database.in_words():
+    with catalog.database.catalog_errors():
         return images.read(catalog.path / path, sha256)
 
 

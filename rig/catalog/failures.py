@@ -15,7 +15,7 @@ DATABASE_NAME: Final = "catalog.sqlite"
 
 
 @contextmanager
-def in_words(root: Path, busy_timeout_s: float) -> Iterator[None]:
+def catalog_errors(root: Path, busy_timeout_s: float) -> Iterator[None]:
     """Raise errors of SQLite and of the file system as errors of the catalog in the folder ``root``."""
     try:
         yield

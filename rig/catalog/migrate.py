@@ -10,8 +10,8 @@ from pathlib import Path
 from sqlalchemy import Connection, NullPool, create_engine
 
 from rig.catalog import audit, migrations
-from rig.catalog.database import is_there, version_of
-from rig.catalog.failures import DATABASE_NAME, absent, in_words
+from rig.catalog.database import database_exists, version_of
+from rig.catalog.failures import DATABASE_NAME, absent, catalog_errors
 from rig.catalog.schema import SCHEMA_VERSION
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged
@@ -42,8 +42,8 @@ def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 
         Another process locks the catalog for longer than the timeout.
     """
     root = Path(path).expanduser().absolute()
-    with in_words(root, busy_timeout_s):
-        if not is_there(root):
+    with catalog_errors(root, busy_timeout_s):
+        if not database_exists(root):
             raise absent(root)
         file = root / DATABASE_NAME
         engine = create_engine(

@@ -175,7 +175,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
             size += path.stat().st_size
     collected = GarbageReport(deleted, len(ids), view_count, len(paths), size)
     if not dry_run:
-        with catalog.database.in_words():
+        with catalog.database.catalog_errors():
             _remove(catalog.path, paths)
         if ids or deleted or paths:
             catalog.note(

@@ -149,7 +149,7 @@ def verify(
     """
     state = _State(catalog, repair)
     # The files are listed before the rows: an image whose row is committed in the meantime is not an orphan.
-    with catalog.database.in_words():
+    with catalog.database.catalog_errors():
         files = _files(catalog.path)
     _check_rows(state)
     items, object_count = _items(catalog)

@@ -22,7 +22,7 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
         yield fine("catalog", f"none yet in {path}; the first enrollment creates it")
         return
     with Catalog.open(path, clock=context.computer.clock, read_only=True) as opened:
-        with opened.database.in_words(), opened.database.read() as connection:
+        with opened.database.catalog_errors(), opened.database.read() as connection:
             checked = connection.exec_driver_sql("PRAGMA quick_check(5)").scalars().all()
             orphans = len(connection.exec_driver_sql("PRAGMA foreign_key_check").all())
         if checked != ["ok"] or orphans:

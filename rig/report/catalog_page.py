@@ -10,7 +10,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rig.catalog.exchange.batch import Enrollment, ExportedObject, Object, Session, region_of_view
-from rig.catalog.exchange.bundle import checked
+from rig.catalog.exchange.bundle import read_stored
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus
 from rig.core.errors import ExportFailed
@@ -97,7 +97,7 @@ def _shown(folder: Path, above: Path, objects: Iterable[ExportedObject]) -> Iter
 
 def _pictures(enrollment: Enrollment, files: dict[str, Path]) -> Iterator[Image]:
     for view in enrollment.views:
-        image = decode(checked(files[view.image], view.image_sha256))
+        image = decode(read_stored(files[view.image], view.image_sha256))
         yield thumbnail(image, TILE, region_of_view(view))
 
 

@@ -60,7 +60,7 @@ def write_bundle(path: Path, objects: Iterable[ExportedObject]) -> int:
                 if name is not None
             }
             for name, sha256 in wanted.items():
-                archive.writestr(_member(name), checked(files[name], sha256), ZIP_STORED)
+                archive.writestr(_member(name), read_stored(files[name], sha256), ZIP_STORED)
             lines.append(item.model_dump_json() + "\n")
             count += 1
             views += sum(len(enrollment.views) for enrollment in item.enrollments)
@@ -105,7 +105,7 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
             part.unlink()
 
 
-def checked(path: Path, sha256: str | None) -> bytes:
+def read_stored(path: Path, sha256: str | None) -> bytes:
     """Return the bytes of an image of the catalog. `ExportFailed` if it is not the stored one."""
     fix = "check the catalog: rig catalog verify --repair"
     try:

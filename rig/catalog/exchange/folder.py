@@ -20,7 +20,7 @@ from rig.catalog.exchange.batch import (
     region_of_view,
     region_text,
 )
-from rig.catalog.exchange.bundle import checked
+from rig.catalog.exchange.bundle import read_stored
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
@@ -123,7 +123,7 @@ def write_folder(folder: Path, objects: Iterable[ExportedObject]) -> int:
                         f"{item.name!r} has two views from {angle}°",
                         next_step="export a bundle instead",
                     )
-                target.write_bytes(checked(files[view.image], view.image_sha256))
+                target.write_bytes(read_stored(files[view.image], view.image_sha256))
     return count
 
 

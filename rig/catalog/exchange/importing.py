@@ -73,7 +73,7 @@ def import_objects(
     rejected = list(batch.rejected)
     if strict and rejected:
         raise _import_error(batch, rejected)
-    with catalog.database.in_words(), staging(catalog.path) as folder:
+    with catalog.database.catalog_errors(), staging(catalog.path) as folder:
         items = list(items_of(plan, tuple(descriptors)))
         staged: dict[str, StagedImage] = {}
         yield JobProgress(0, len(items))

@@ -22,7 +22,7 @@ from rig.catalog.exchange.batch import (
     region_of_view,
     region_text,
 )
-from rig.catalog.exchange.bundle import checked, new_file
+from rig.catalog.exchange.bundle import new_file, read_stored
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.core.errors import ExportFailed, ImportRejected
@@ -95,7 +95,7 @@ def write_table(folder: Path, objects: Iterable[ExportedObject]) -> int:
             for row, view in _rows(item):
                 target = made / view.image
                 target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(checked(files[view.image], view.image_sha256))
+                target.write_bytes(read_stored(files[view.image], view.image_sha256))
                 rows.writerow({key: "" if value is None else value for key, value in row.items() if key in _COLUMNS})
     return count
 

@@ -1,9 +1,9 @@
-"""Views for the tests of the catalog; as a program, a process that enrolls them.
+"""Sample views for the tests of the catalog. As a program: enroll such views in a process of its own.
 
     python catalog_samples.py CATALOG NAME COUNT [DIE_BEFORE]
 
-It reports each view on a line once it is stored, and kills itself before durable step DIE_BEFORE (from 1: sync of the
-image, rename, sync of the folder, commit; then those of the next view).
+It prints the index of each stored view, and kills itself before durable step DIE_BEFORE. Steps count from 1: sync of
+the image, rename, sync of the folder, commit, then those of the next view.
 """
 
 import os
@@ -31,7 +31,7 @@ PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, 
 
 
 def without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have nothing but the database wait for the disk: what is durable is proved in test_catalog_durability."""
+    """Skip waiting for the disk, except in the database. `test_durability` tests what is durable."""
     monkeypatch.setattr(os, "fsync", lambda _: None)
     monkeypatch.setattr(os, "sync", lambda: None)
 
@@ -78,7 +78,7 @@ def described(
 def true_fill(
     catalog: Catalog, name: str, views: int, seed: int, region: tuple[int, int, int, int] | None = None, **begin: Any
 ) -> None:
-    """Enroll an object whose descriptors and images belong together."""
+    """Enroll an object with the descriptors of its images."""
     enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **begin)
     for index in range(views):
         enrollment.add(described(index, seed + index, region), image(seed + index))
@@ -86,7 +86,7 @@ def true_fill(
 
 
 def finished(job: Generator[JobProgress, None, _T]) -> _T:
-    """Carry a job of the catalog out and return its result."""
+    """Run a job of the catalog and return its result."""
     while True:
         try:
             next(job)
