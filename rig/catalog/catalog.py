@@ -317,15 +317,8 @@ class Catalog:
         provenance: Provenance,
     ) -> Enrollment:
         now = self.clock.utc()
-        enrollment = Enrollment(
-            self.database,
-            self.clock,
-            id=enrollment_id,
-            object_id=object_id,
-            object_name=object_name,
-            session=Session(insert_session(connection, enrollment_id, now, provenance), now, provenance),
-            planned_azimuth_deg=plan,
-        )
+        session = Session(insert_session(connection, enrollment_id, now, provenance), now, provenance)
+        enrollment = Enrollment(self.database, self.clock, enrollment_id, object_id, object_name, session, plan)
         make_folder(self.path / enrollment.folder, within=self.path)
         return enrollment
 

@@ -1,6 +1,6 @@
 """An enrollment in progress: add views, then finish or abandon it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
 
 
+@dataclass(eq=False)
 class Enrollment:
     """An enrollment in progress, as `Catalog.begin` or `Catalog.resume` returns it.
 
@@ -36,24 +37,13 @@ class Enrollment:
         Azimuth planned for view 0, 1, ....
     """
 
-    def __init__(
-        self,
-        database: Database,
-        clock: Clock,
-        *,
-        id: int,
-        object_id: int,
-        object_name: str,
-        session: Session,
-        planned_azimuth_deg: tuple[float, ...],
-    ) -> None:
-        self._database = database
-        self._clock = clock
-        self.id = id
-        self.object_id = object_id
-        self.object_name = object_name
-        self.session = session
-        self.planned_azimuth_deg = planned_azimuth_deg
+    _database: Database
+    _clock: Clock
+    id: int
+    object_id: int
+    object_name: str
+    session: Session
+    planned_azimuth_deg: tuple[float, ...]
 
     @property
     def folder(self) -> Path:

@@ -4,7 +4,7 @@ import json
 import math
 import operator
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
@@ -150,36 +150,28 @@ class ViewRecord:
     segmentation: JsonObject | None = None
 
     def __post_init__(self) -> None:
-        for name in ("index", "captured_ns"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, operator.index(getattr(self, name)))
-        for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):
-            value = getattr(self, name)
-            if value is None:
-                continue
-            if not math.isfinite(value):
-                raise UsageError(f"view {self.index} has {name} = {value}", next_step="store measured angles")
-            object.__setattr__(self, name, float(value))
+        def convert(to: Callable[[Any], object], *names: str) -> None:
+            for name in names:
+                if (value := getattr(self, name)) is not None:
+                    object.__setattr__(self, name, to(value))
+
+        convert(operator.index, "index", "captured_ns")
+        convert(float, "commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg")
         if self.index < 0:
             raise UsageError(f"view index {self.index} is negative", next_step="number the views of a plan from 0")
-        if (self.imu_deg is None) != (self.imu_sigma_deg is None):
+        for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):
+            if not math.isfinite(getattr(self, name) or 0.0):
+                raise UsageError(
+                    f"view {self.index} has {name} = {getattr(self, name)}", next_step="store measured angles"
+                )
+        check_azimuth(self.azimuth_deg)
+        if (self.imu_deg is None) != (self.imu_sigma_deg is None) or (self.imu_sigma_deg or 0.0) < 0:
             raise UsageError(
                 f"view {self.index} has an IMU angle of {self.imu_deg} with an uncertainty of {self.imu_sigma_deg}",
-                next_step="give both, or None for both",
+                next_step="give both, with an uncertainty of 0 or more, or None for both",
             )
-        check_azimuth(self.azimuth_deg)
-        if self.imu_sigma_deg is not None and self.imu_sigma_deg < 0:
-            raise UsageError(
-                f"view {self.index} has imu_sigma_deg = {self.imu_sigma_deg}",
-                next_step="give a standard uncertainty of 0 or more",
-            )
-        object.__setattr__(self, "evidence", as_json(self.evidence, f"the evidence of view {self.index}"))
-        if self.segmentation is not None:
-            object.__setattr__(
-                self, "segmentation", as_json(self.segmentation, f"the segmentation of view {self.index}")
-            )
-        if self.region is not None:
-            object.__setattr__(self, "region", tuple(operator.index(number) for number in self.region))
+        convert(lambda values: as_json(values, f"the evidence of view {self.index}"), "evidence", "segmentation")
+        convert(lambda region: tuple(map(operator.index, region)), "region")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

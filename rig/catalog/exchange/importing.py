@@ -1,12 +1,13 @@
 """Import objects: check and describe their images in a staging folder, then insert all of them at once."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import known_descriptor
-from rig.catalog.exchange.batch import Gap, ImportBatch, Object, RejectedFile
+from rig.catalog.exchange.batch import Gap, Object, RejectedFile
 from rig.catalog.exchange.insert import insert_objects
 from rig.catalog.exchange.plan import Plan
 from rig.catalog.exchange.stage import StagedImage, items_of, stage
@@ -68,38 +69,17 @@ def import_objects(
     """
     for name in descriptors:
         known_descriptor(name)
-    batch = plan.batch
-    strict = strict or batch.strict
-    rejected = list(batch.rejected)
-    if strict and rejected:
-        raise _import_error(batch, rejected)
+    strict = strict or plan.batch.strict
+    if strict and plan.batch.rejected:
+        raise _import_error(plan, plan.batch.rejected)
     with catalog.database.catalog_errors(), staging(catalog.path) as folder:
-        items = list(items_of(plan, tuple(descriptors)))
-        staged: dict[str, StagedImage] = {}
-        yield JobProgress(0, len(items))
-        work = partial(stage, folder)
-        for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
-            for item, one in zip(portion, found, strict=True):
-                staged[item.image] = one
-                if one.reason:
-                    rejected.append(RejectedFile(item.image, one.reason))
-            if strict and rejected:
-                raise _import_error(batch, rejected)
-            yield JobProgress(len(staged), len(items))
-        wanted = [left for left in (_without_rejected(item, staged) for item in plan.wanted) if left.enrollments]
-        if not wanted and items:
-            raise _import_error(batch, rejected)
+        staged = yield from _stage_all(plan, folder, tuple(descriptors), strict, jobs)
+        result, wanted = _result(plan, staged)
+        if staged and not wanted:
+            raise _import_error(plan, result.rejected)
         sync_tree(folder)
         insert_objects(catalog, plan, wanted, staged, folder, label)
-    return Imported(
-        len(wanted),
-        sum(len(enrollment.views) for item in wanted for enrollment in item.enrollments),
-        sum(one.size for one in staged.values()),
-        plan.skipped,
-        plan.replaced,
-        tuple(rejected),
-        batch.gaps,
-    )
+    return result
 
 
 def preview_import(
@@ -112,39 +92,56 @@ def preview_import(
     ImportRejected
         An image was rejected and the import is strict.
     """
-    batch = plan.batch
-    rejected = list(batch.rejected)
-    items = list(items_of(plan))
-    size = done = 0
+    staged = yield from _stage_all(plan, None, (), False, jobs)
+    result, _ = _result(plan, staged)
+    if result.rejected and (strict or plan.batch.strict):
+        raise _import_error(plan, result.rejected)
+    return result
+
+
+def _stage_all(
+    plan: Plan, folder: Path | None, descriptors: tuple[str, ...], strict: bool, jobs: int | None
+) -> Generator[JobProgress, None, dict[str, StagedImage]]:
+    """Stage the images of a plan and return them by name; ``strict`` ends at the first portion with a rejected one."""
+    items = list(items_of(plan, descriptors))
+    staged: dict[str, StagedImage] = {}
     yield JobProgress(0, len(items))
-    for portion, found in map_in_processes(partial(stage, None), portions(items), processes(jobs, len(items))):
-        for item, one in zip(portion, found, strict=True):
-            size += one.size
-            if one.reason:
-                rejected.append(RejectedFile(item.image, one.reason))
-        done += len(portion)
-        yield JobProgress(done, len(items))
-    if rejected and (strict or batch.strict):
-        raise _import_error(batch, rejected)
-    bad = {file.path for file in rejected}
-    left = [
-        sum(view.image not in bad for enrollment in item.enrollments for view in enrollment.views)
-        for item in plan.wanted
-    ]
-    return Imported(
-        sum(count > 0 for count in left), sum(left), size, plan.skipped, plan.replaced, tuple(rejected), batch.gaps
+    for portion, found in map_in_processes(partial(stage, folder), portions(items), processes(jobs, len(items))):
+        staged.update(zip((item.image for item in portion), found, strict=True))
+        if strict and any(one.reason for one in found):
+            raise _import_error(plan, _rejected(staged))
+        yield JobProgress(len(staged), len(items))
+    return staged
+
+
+def _result(plan: Plan, staged: Mapping[str, StagedImage]) -> tuple[Imported, list[Object]]:
+    """Return the result of an import and the objects without their rejected views."""
+    wanted = [left for left in (_without_rejected(item, staged) for item in plan.wanted) if left.enrollments]
+    result = Imported(
+        len(wanted),
+        sum(len(enrollment.views) for item in wanted for enrollment in item.enrollments),
+        sum(one.size for one in staged.values()),
+        plan.skipped,
+        plan.replaced,
+        (*plan.batch.rejected, *_rejected(staged)),
+        plan.batch.gaps,
     )
+    return result, wanted
 
 
-def _import_error(batch: ImportBatch, rejected: list[RejectedFile]) -> ImportRejected:
+def _rejected(staged: Mapping[str, StagedImage]) -> list[RejectedFile]:
+    return [RejectedFile(image, one.reason) for image, one in staged.items() if one.reason]
+
+
+def _import_error(plan: Plan, rejected: Sequence[RejectedFile]) -> ImportRejected:
     return ImportRejected(
-        f"{batch.origin} was not imported: {len(rejected)} of its files cannot be used",
+        f"{plan.batch.origin} was not imported: {len(rejected)} of its files cannot be used",
         next_step="fix or remove the listed files and import it again",
         evidence={"rejected": [f"{file.path}: {file.reason}" for file in rejected[:20]]},
     )
 
 
-def _without_rejected(item: Object, staged: dict[str, StagedImage]) -> Object:
+def _without_rejected(item: Object, staged: Mapping[str, StagedImage]) -> Object:
     """The object without the views whose images were rejected."""
     if not any(staged[view.image].reason for enrollment in item.enrollments for view in enrollment.views):
         return item
