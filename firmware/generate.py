@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Write the protocol's C header, Python module and documentation tables from protocol.toml (standard library only).
 
-With ``--check`` it writes nothing, and exits with 1 where something differs.
+With ``--check``, write nothing and exit with 1 if a file is not up to date.
 """
 
 import re
@@ -99,7 +99,7 @@ def header(table: Table) -> str:
         ]
         lines += [f"    out = put_{kind}(out, m->{name});" for name, kind, _ in fields]
         lines += [f"    return SIZE_{message['name'].upper()};", "}"]
-    lines += ["", "/* Where a request's fields are in its body. */"]
+    lines += ["", "/* Offsets of a request's fields in its body. */"]
     for message in table["message"]:
         at = 0
         for name, kind, _ in message["fields"] if message["from"] == "host" else []:
@@ -128,7 +128,7 @@ def module(table: Table) -> str:
         "",
         f"PROTOCOL_VERSION = {table['version']}",
         f"FIRMWARE = ({major}, {minor}, {patch})",
-        '"""The firmware that belongs to this table."""',
+        '"""Firmware version of this protocol table."""',
         f"MAX_BODY = {table['max_body']}",
     ]
     for name, (value, doc) in table["constants"].items():
@@ -161,7 +161,7 @@ def module(table: Table) -> str:
     lines += ["    message.ID: message for message in (*get_args(Request), *get_args(Answer))", "}"]
     lines += ["", "REPLIES: dict[type[Request], type[Answer]] = {"]
     lines += [f"    {camel(m['name'])}: {camel(m['reply'])}," for m in table["message"] if m["from"] == "host"]
-    return "\n".join([*lines, "}", '"""The answer to a request that was not refused."""', ""])
+    return "\n".join([*lines, "}", '"""The reply to a request that is not rejected."""', ""])
 
 
 def tables(table: Table) -> str:
@@ -183,7 +183,7 @@ def tables(table: Table) -> str:
 
 
 def outputs() -> dict[Path, str]:
-    """Return what each generated file must contain."""
+    """Return the content of each generated file."""
     table = tomllib.loads((HERE / "protocol.toml").read_text(encoding="utf-8"))
     check(table)
     document = HERE / "PROTOCOL.md"
@@ -200,7 +200,7 @@ def main() -> int:
     stale = [(path, text) for path, text in outputs().items() if not path.exists() or path.read_text("utf-8") != text]
     if "--check" in sys.argv:
         for path, _ in stale:
-            print(f"{path} is not what protocol.toml says: run python3 firmware/generate.py")
+            print(f"{path} is not up to date with protocol.toml: run python3 firmware/generate.py")
         return 1 if stale else 0
     for path, text in stale:
         path.write_text(text, encoding="utf-8")

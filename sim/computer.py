@@ -13,7 +13,7 @@ from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import control_table, protocol_of
-from rig.devices.opencv_camera import Capture
+from rig.devices.opencv_capture import Capture
 from sim.devices import SimDevices
 from sim.i2c import SimI2cBus
 

@@ -3,7 +3,7 @@
 uint16_t frame_crc(const uint8_t *bytes, uint8_t length) {
     uint16_t crc = 0xFFFF;
     while (length--) {
-        /* One byte of the polynomial 0x1021 without a table: x = top ^ byte, folded onto itself. */
+        /* One byte of the polynomial 0x1021 without a table: x = top ^ byte, folded. */
         uint8_t x = (uint8_t)(crc >> 8 ^ *bytes++);
         x = (uint8_t)(x ^ x >> 4);
         crc = (uint16_t)(crc << 8 ^ (uint16_t)x << 12 ^ (uint16_t)x << 5 ^ x);

@@ -52,7 +52,7 @@ static void outputs_off(struct head *head) {
     head->inputs &= (uint8_t)~INPUT_RELAY_CLOSED;
 }
 
-/* -- what goes out ----------------------------------------------------------------------------------------------- */
+/* -- transmission ----------------------------------------------------------------------------------------------- */
 
 /* Queue the frame whose body is in frame[FRAME_HEADER...]. */
 static bool transmit(uint8_t *frame, uint8_t id, uint8_t sequence, uint8_t body_length) {
@@ -79,7 +79,7 @@ static void tell_change(struct head *head) {
     if (transmit(frame, MESSAGE_STATUS_CHANGED, head->sequence, put_status_changed(frame + FRAME_HEADER, &m))) {
         head->sequence++;
     } else {
-        head->changed = true; /* again as soon as there is room */
+        head->changed = true; /* send it again when there is room */
     }
 }
 
@@ -105,7 +105,7 @@ static void tell_sample(struct head *head, const struct imu_sample *sample) {
     }
 }
 
-/* -- what comes in ----------------------------------------------------------------------------------------------- */
+/* -- reception ----------------------------------------------------------------------------------------------- */
 
 static uint8_t set_light(struct head *head, uint8_t level) {
     uint8_t rejection = REJECTION_NONE;
@@ -143,7 +143,7 @@ static uint8_t acknowledge(struct head *head, uint8_t seen) {
     } else if (head->state == HEAD_STATE_FAULT) {
         head->faults &= (uint8_t)~seen;
         if (!head->faults) {
-            head->state = HEAD_STATE_IDLE; /* outputs stay off until the host asks anew */
+            head->state = HEAD_STATE_IDLE; /* outputs stay off until the host requests them again */
         }
         head->changed = true;
     }
@@ -222,7 +222,7 @@ static uint8_t trigger(struct head *head, uint16_t width_us, uint8_t *body) {
     return rejection;
 }
 
-/* The length of each request's body by its id; 0xFF where there is no such request. */
+/* Length of each request's body by its id; 0xFF if the request does not exist. */
 static uint8_t length_of(uint8_t id) {
     static const uint8_t sizes[] = {
         [MESSAGE_HELLO] = SIZE_HELLO, [MESSAGE_HEARTBEAT] = SIZE_HEARTBEAT,   [MESSAGE_SHUTDOWN] = SIZE_SHUTDOWN,
@@ -233,7 +233,7 @@ static uint8_t length_of(uint8_t id) {
     return id >= MESSAGE_HELLO && id < sizeof sizes ? sizes[id] : UINT8_MAX;
 }
 
-/* Do what is asked; the reply's body goes to `out`, its id to `*reply`. Returns the length of the reply's body. */
+/* Carry out a request; write the reply's body to `out`, its id to `*reply`. Returns the length of the body. */
 static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8_t length, uint8_t *out, uint8_t *reply) {
     uint8_t rejection = REJECTION_NONE;
     uint8_t answer = 0;
@@ -245,7 +245,7 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
     } else {
         switch (id) {
         case MESSAGE_HELLO:
-            *reply = MESSAGE_IDENTITY; /* whatever the host speaks: it must learn what we speak */
+            *reply = MESSAGE_IDENTITY; /* for any version of the host: it must learn this version */
             answer = put_own_identity(head, out);
             break;
         case MESSAGE_HEARTBEAT:
@@ -294,8 +294,8 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
     return answer;
 }
 
-/* A frame is complete. A request that comes twice in a row was not heard to be answered: it is answered again, but
- * not done again. */
+/* A frame is complete. If a request arrives twice in a row, its reply was lost: it is answered again, but not carried
+ * out again. */
 static void take_frame(struct head *head) {
     int8_t length = frame_decode(head->received, head->received_length);
     if (length < 0) {
@@ -322,7 +322,7 @@ static void receive(struct head *head) {
                 head->received[head->received_length++] = byte;
             }
         } else {
-            if (head->received_length) { /* zeros in a row separate nothing */
+            if (head->received_length) { /* repeated zeros have no effect */
                 take_frame(head);
             }
             head->received_length = 0;
@@ -347,8 +347,8 @@ void head_init(struct head *head) {
         latch(head, HEAD_FAULT_BROWN_OUT);
     }
     uint8_t end = 0;
-    hal_uart_write(&end, 1); /* of a frame that was broken off by the reset */
-    head->changed = true;    /* the first word after a start */
+    hal_uart_write(&end, 1); /* ends a frame that the reset interrupted */
+    head->changed = true;    /* the first message after a start */
 }
 
 void head_step(struct head *head) {

@@ -1,7 +1,7 @@
-/* The rig head: talks to the host, and makes the bench safe when it must.
+/* The rig head: communicates with the host, and switches its outputs off when necessary.
  *
- * Two contexts: `head_tick` in a timer interrupt, every TICK_US, holds the safety and never waits for the other;
- * `head_step` in the main loop does everything else. What both touch is written with the tick kept out. */
+ * Two contexts: `head_tick` in a timer interrupt, every TICK_US, does the safety functions and never waits;
+ * `head_step` in the main loop does everything else. Shared data is written with the tick locked out. */
 #ifndef HEAD_HEAD_H
 #define HEAD_HEAD_H
 
@@ -15,9 +15,9 @@ struct head {
     /* Shared with the tick. */
     volatile uint8_t state, faults, inputs;
     volatile bool changed;
-    volatile uint16_t silence; /* ticks since the last beat */
-    uint16_t deadman;          /* ticks that a silence may last */
-    uint8_t open_ticks;        /* how long the e-stop's loop has been open */
+    volatile uint16_t silence; /* ticks since the last heartbeat */
+    uint16_t deadman;          /* longest silence in ticks */
+    uint8_t open_ticks;        /* ticks for which the e-stop loop has been open */
     uint8_t light;
 
     /* Main loop only. */
@@ -26,7 +26,7 @@ struct head {
     uint8_t sequence; /* of the events */
     uint8_t received[FRAME_LINE];
     uint8_t received_length;
-    bool answered; /* the reply to the last request is kept, for a host that did not hear it */
+    bool answered; /* the reply to the last request is stored in case the host missed it */
     uint8_t reply[FRAME_MAX];
     uint8_t reply_length;
     uint8_t request[FRAME_HEADER];

@@ -16,7 +16,7 @@
 #define MPU_WHO_AM_I 0x75
 #define MPU_ID 0x68
 #define MPU_FRAME 14   /* accelerometer, temperature, gyro: seven words */
-#define MPU_FULL 1008  /* the last count at which another frame fits into 1024 bytes, less one frame */
+#define MPU_FULL 1008  /* largest count at which another frame fits into 1024 bytes, minus one frame */
 
 #define BNO_CHIP_ID 0x00
 #define BNO_ACC_DATA 0x08
@@ -30,15 +30,15 @@
 #define BNO_MODE_IMU 0x08
 #define BNO_BURST 20         /* gyro, Euler angles, quaternion */
 #define BNO_PERIOD_US ((uint32_t)10000) /* of its fusion */
-#define BNO_POLL_US ((uint32_t)8000) /* shorter: none of its samples is missed, and one seen twice is recognised */
+#define BNO_POLL_US ((uint32_t)8000) /* shorter than its period: no sample is missed, repeated ones are recognised */
 #define BNO_FEEL 10          /* samples between two readings of the accelerometer */
-#define BNO_LOOK 100         /* samples between two looks at temperature and mode */
-#define BNO_LEARN_US ((uint32_t)3000000) /* longest wait for its gyro's calibration: on a table that moves it never comes */
+#define BNO_LOOK 100         /* samples between two checks of temperature and mode */
+#define BNO_LEARN_US ((uint32_t)3000000) /* longest wait for the gyro's calibration, which never completes on a moving table */
 
 #define ATTEMPTS 3
 #define TRANSFER_US 5000 /* the longest takes 0.6 ms at 400 kHz; a sensor may stretch the clock */
-#define LOOK_US 50000    /* without an edge, ask the FIFO itself: is the line not wired, or the sensor gone? */
-#define AGAIN_US 100000  /* between two tries to get a lost sensor back */
+#define LOOK_US 50000    /* without an edge, check the FIFO: the pin is not connected, or the sensor is gone */
+#define AGAIN_US 100000  /* between two attempts to get a lost sensor back */
 
 enum phase {
     OFF,
@@ -61,7 +61,7 @@ enum phase {
     LOST,
 };
 
-/* A step of the set-up: bytes to write, the register first, and the wait after them. */
+/* A step of the set-up: bytes to write (register first), and the wait after them. */
 struct step {
     uint8_t length;
     uint8_t bytes[5];
@@ -126,7 +126,7 @@ static void empty_fifo(struct imu *imu) {
     imu->phase = WRITE;
 }
 
-/* Whether the transfer has ended well. Where it failed, `again` is the phase that repeats it. */
+/* Whether the transfer succeeded. If it failed, `again` is the phase that repeats it. */
 static bool ended(struct imu *imu, struct counters *counters, uint8_t again) {
     enum hal_i2c_result result = hal_i2c_result();
     uint8_t status = IMU_STATUS_ABSENT;
@@ -150,7 +150,7 @@ static bool ended(struct imu *imu, struct counters *counters, uint8_t again) {
     if (++imu->attempts >= ATTEMPTS) {
         lost(imu, status);
     } else if (again == MPU_FETCH && result != HAL_I2C_NACK) {
-        /* It broke off and took some of a frame along: what the FIFO holds no longer begins with one. */
+        /* It was interrupted within a frame: the FIFO's content no longer begins with a frame. */
         empty_fifo(imu);
     } else {
         imu->phase = again;
@@ -187,7 +187,7 @@ uint8_t imu_setup(struct imu *imu, uint8_t model, uint8_t address, uint8_t divid
     return REJECTION_NONE;
 }
 
-/* Put the bytes of step `at` into `sent`; returns their number. */
+/* Write the bytes of step `at` to `sent`; returns their number. */
 static uint8_t load_step(struct imu *imu) {
     const struct step *step = is_mpu(imu) ? &mpu_steps[imu->at] : &bno_steps[imu->at];
     memcpy(imu->sent, step->bytes, sizeof step->bytes);
@@ -216,7 +216,7 @@ static void feel(struct imu *imu) {
     imu->phase = BNO_FELT;
 }
 
-/* The BNO055 learns its gyro's zero at rest; until then its rates would jump. Looks again until it has. */
+/* The BNO055 calibrates its gyro at rest; its rates may jump before that. Checks again until it is done. */
 static bool calibrated(struct imu *imu, uint32_t now) {
     if (imu->phase == BNO_LEARNING && ((imu->got[BNO_CALIB_STAT - BNO_TEMP] & 0x30) == 0x30 || passed(now, imu->learnt_us))) {
         return true;
@@ -229,7 +229,7 @@ static bool calibrated(struct imu *imu, uint32_t now) {
     return false;
 }
 
-/* The sensor runs, for the first time or again: what it did not take meanwhile counts as lost. */
+/* The sensor runs, for the first time or again: samples that it did not take count as lost. */
 static void run(struct imu *imu, struct counters *counters) {
     uint32_t now = hal_micros(), edge_us;
     if (!is_mpu(imu) && !calibrated(imu, now)) {
@@ -264,7 +264,7 @@ static void fetch(struct imu *imu) {
     imu->phase = MPU_FETCHED;
 }
 
-/* The FIFO's count is known: date what it holds. The newest sample belongs to the last edge if none came meanwhile. */
+/* The FIFO's count is known: date its samples. The newest belongs to the last edge unless a new edge occurred. */
 static void look(struct imu *imu, struct counters *counters) {
     uint32_t now = hal_micros(), edge_us;
     uint16_t bytes = (uint16_t)(imu->got[0] << 8 | imu->got[1]);
@@ -277,18 +277,18 @@ static void look(struct imu *imu, struct counters *counters) {
         return;
     }
     if (edges != imu->edges && passed(edge_us, imu->began_us + 1)) {
-        return; /* an edge came while we asked: whether the count knows of it cannot be told. Ask again */
+        return; /* an edge occurred during the request: the count may include it or not. Ask again */
     }
     if (!frames) {
         bool silent = edges == imu->edges && passed(now, imu->last_us + LOOK_US + imu->period_us);
         imu->edges = edges;
         imu->due_us = now + (imu->edges_come ? LOOK_US : imu->period_us / 2);
         if (silent) {
-            lost(imu, IMU_STATUS_SETTINGS_LOST); /* it takes no samples: browned out, it fell asleep */
+            lost(imu, IMU_STATUS_SETTINGS_LOST); /* it takes no samples: it fell asleep after a brown-out */
         }
         return;
     }
-    if (bytes % MPU_FRAME) { /* a frame that is just being written, or one that was cut */
+    if (bytes % MPU_FRAME) { /* a frame that is being written, or an incomplete one */
         if (++imu->polls > ATTEMPTS) {
             imu->polls = 0;
             empty_fifo(imu);
@@ -332,8 +332,8 @@ static void mpu_sample(struct imu *imu, struct imu_sample *sample) {
     }
 }
 
-/* The fusion tells nobody when it has a new sample, so that it is polled faster than that. What has not changed is the
- * last sample once more, unless it is overdue: at rest, samples may be alike. */
+/* The fusion does not signal a new sample, so it is polled faster than that. Unchanged data is the last sample again,
+ * unless a sample is overdue: at rest, samples may be equal. */
 static bool bno_sample(struct imu *imu, struct imu_sample *sample) {
     uint16_t seen = frame_crc(imu->got, BNO_BURST);
     bool fresh = seen != imu->seen;
@@ -343,7 +343,7 @@ static bool bno_sample(struct imu *imu, struct imu_sample *sample) {
     }
     uint32_t gap_us = imu->began_us - imu->last_us;
     if (gap_us > 5 * BNO_PERIOD_US / 2) {
-        imu->newest = (uint16_t)(imu->newest + gap_us / BNO_PERIOD_US - 1); /* the bus was not there for so long */
+        imu->newest = (uint16_t)(imu->newest + gap_us / BNO_PERIOD_US - 1); /* the bus was not available for so long */
     }
     imu->seen = seen;
     imu->newest_us = fresh ? imu->began_us + BNO_PERIOD_US + BNO_POLL_US / 4 : imu->newest_us + BNO_PERIOD_US;

@@ -17,22 +17,22 @@ struct imu_sample {
 struct imu {
     uint8_t status, who_am_i;
 
-    /* As asked for. */
+    /* Settings. */
     uint8_t model, address, divider, filter, range;
     uint32_t period_us;
 
-    /* Where we are. */
+    /* Progress. */
     uint8_t phase;
     uint8_t at;       /* step of the script */
-    uint8_t attempts; /* at the present transfer */
-    bool sampled;     /* there was a sample since the last set-up was asked for */
-    bool edges_come;  /* the data-ready line is wired */
-    uint8_t frames;   /* still to be read of the FIFO */
-    uint8_t polls;    /* MPU-6050: odd counts in a row; BNO055: samples since its mode was looked at */
+    uint8_t attempts; /* of the present transfer */
+    bool sampled;     /* there was a sample since the last set-up request */
+    bool edges_come;  /* the data-ready pin is connected */
+    uint8_t frames;   /* still to be read from the FIFO */
+    uint8_t polls;    /* MPU-6050: odd counts in a row; BNO055: samples since the last check of its mode */
     uint16_t seen;    /* BNO055: checksum of the last sample */
     int16_t accel[3]; /* BNO055: read less often than the gyro */
-    uint16_t edges;   /* counted when the FIFO was last looked at */
-    uint16_t base;    /* added to the count of edges it makes the index */
+    uint16_t edges;   /* count at the last check of the FIFO */
+    uint16_t base;    /* index = base + count of edges */
     uint16_t newest;  /* index of the newest sample that the sensor took */
     uint32_t due_us, began_us, newest_us, last_us, learnt_us;
     int16_t temperature;
@@ -45,7 +45,7 @@ void imu_init(struct imu *imu);
 /* Begin to set the sensor up; returns a rejection. */
 uint8_t imu_setup(struct imu *imu, uint8_t model, uint8_t address, uint8_t divider, uint8_t filter, uint8_t range);
 
-/* Go on; true where `*sample` has a new one. */
+/* Continue; returns true if `*sample` has a new sample. */
 bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sample);
 
 #endif

@@ -14,15 +14,15 @@
 
 #define BAUD 250000UL /* bits per second; exact on 16 MHz */
 #define TICK_US 200 /* period of the safety tick */
-#define ESTOP_TICKS 5 /* ticks that the e-stop loop must be open before it counts: 1 ms */
+#define ESTOP_TICKS 5 /* ticks for which the e-stop loop must be open: 1 ms */
 #define DEADMAN_MIN_MS 50 /* shortest deadman */
-#define DEADMAN_DEFAULT_MS 250 /* deadman before the first beat says otherwise */
+#define DEADMAN_DEFAULT_MS 250 /* deadman before the first heartbeat sets it */
 #define DEADMAN_MAX_MS 2000 /* longest deadman */
 #define TRIGGER_MIN_US 10 /* shortest trigger pulse */
 #define TRIGGER_MAX_US 30000 /* longest trigger pulse */
-#define SERIAL_UNSET 4294967295UL /* serial number of a board that was given none */
+#define SERIAL_UNSET 4294967295UL /* serial number of a board without one */
 
-/* What the firmware was built for. */
+/* Board of the firmware. */
 #define BOARD_HOST 1
 #define BOARD_ATMEGA328P 2
 
@@ -40,27 +40,27 @@
 #define RESET_BROWN_OUT 3
 #define RESET_WATCHDOG 4
 
-/* Outputs are off in `idle` and in `fault`; beats keep it `active`. */
+/* State of the head; outputs are off in `idle` and `fault`, heartbeats keep it `active`. */
 #define HEAD_STATE_IDLE 0
 #define HEAD_STATE_ACTIVE 1
 #define HEAD_STATE_FAULT 2
 
-/* Bits of the latched reasons. */
+/* Bits of the latched faults. */
 #define HEAD_FAULT_DEADMAN 1
 #define HEAD_FAULT_ESTOP 2
 #define HEAD_FAULT_WATCHDOG 4
 #define HEAD_FAULT_BROWN_OUT 8
 
-/* Bits of the inputs as they are now. */
+/* Bits of the present inputs. */
 #define INPUT_ESTOP_OPEN 1
 #define INPUT_RELAY_CLOSED 2
 
-/* Sensors that the head knows. */
+/* Sensors that the head supports. */
 #define IMU_MODEL_NONE 0
 #define IMU_MODEL_MPU6050 1
 #define IMU_MODEL_BNO055 2
 
-/* How the sensor does. */
+/* Status of the sensor. */
 #define IMU_STATUS_OFF 0
 #define IMU_STATUS_STARTING 1
 #define IMU_STATUS_RUNNING 2
@@ -69,7 +69,7 @@
 #define IMU_STATUS_BUS_STUCK 5
 #define IMU_STATUS_SETTINGS_LOST 6
 
-/* Why a request was not done. */
+/* Why a request was rejected. */
 #define REJECTION_NONE 0
 #define REJECTION_UNKNOWN_REQUEST 1
 #define REJECTION_MALFORMED 2
@@ -287,7 +287,7 @@ static inline uint8_t put_status_changed(uint8_t *out, const struct status_chang
     return SIZE_STATUS_CHANGED;
 }
 
-/* Where a request's fields are in its body. */
+/* Offsets of a request's fields in its body. */
 #define HELLO_PROTOCOL 0
 #define HEARTBEAT_DEADMAN_MS 0
 #define HEARTBEAT_PAD_0 2

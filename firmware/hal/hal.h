@@ -1,4 +1,4 @@
-/* What the core asks of a board. Everything here is short and never waits. */
+/* Interface between core and board. All functions are short and never wait. */
 #ifndef HEAD_HAL_H
 #define HEAD_HAL_H
 
@@ -10,40 +10,40 @@
 /* Microseconds since the start; wraps after 71.6 minutes. */
 uint32_t hal_micros(void);
 
-/* Keep the safety tick out between the two; `hal_unlock` takes what `hal_lock` returned. */
+/* Lock the safety tick out between the two calls; pass the result of `hal_lock` to `hal_unlock`. */
 uint8_t hal_lock(void);
 void hal_unlock(uint8_t before);
 
 void hal_feed_watchdog(void);
 
-/* -- the line to the host ---------------------------------------------------------------------------------------- */
+/* -- connection to the host ---------------------------------------------------------------------------------------- */
 
-/* Take the next byte received; false where there is none. */
+/* Take the next received byte; returns false if there is none. */
 bool hal_uart_read(uint8_t *byte);
 
 /* When the last zero byte (the end of a frame) was received. */
 uint32_t hal_uart_frame_us(void);
 
-/* Bytes that the receiver has lost since the last call. */
+/* Bytes that the receiver lost since the last call. */
 uint8_t hal_uart_overruns(void);
 
-/* Queue all of it, or nothing and return false. */
+/* Queue all bytes, or none and return false. */
 bool hal_uart_write(const uint8_t *bytes, uint8_t length);
 
-/* Microseconds until a byte that is queued now would begin to leave. */
+/* Microseconds until a byte that is queued now starts to be sent. */
 uint16_t hal_uart_backlog_us(void);
 
 /* -- I2C, one transfer at a time, in the background -------------------------------------------------------------- */
 
 enum hal_i2c_result { HAL_I2C_BUSY, HAL_I2C_DONE, HAL_I2C_NACK, HAL_I2C_ERROR };
 
-/* Write `write_length` bytes, then after a repeated start read `read_length`; the buffers stay with the board until
+/* Write `write_length` bytes, then after a repeated start read `read_length`; the board uses the buffers until
  * the transfer has ended. At least one of the lengths is not 0. */
 void hal_i2c_start(uint8_t address, const uint8_t *write, uint8_t write_length, uint8_t *read, uint8_t read_length);
 enum hal_i2c_result hal_i2c_result(void);
 
-/* Give the transfer up, clock out (at most nine pulses) what a sensor still wants to say, and end with a stop.
- * Returns whether the bus is free: both lines high. */
+/* Abort the transfer, free the bus with up to nine clock pulses, and end with a stop.
+ * Returns whether the bus is free: SDA and SCL high. */
 bool hal_i2c_free(void);
 
 /* Count of the sensor's data-ready edges, and when the last one was. */
@@ -54,14 +54,14 @@ uint16_t hal_imu_edges(uint32_t *last_us);
 void hal_light(uint8_t level);
 void hal_relay(bool closed);
 
-/* Begin one pulse of `width_us`; false while one is under way. `*begins_us` is its leading edge. */
+/* Start one pulse of `width_us`; returns false during another pulse. `*begins_us` is its leading edge. */
 bool hal_trigger(uint16_t width_us, uint32_t *begins_us);
 void hal_trigger_rest(void);
 
-/* Whether the loop of the e-stop is open: pressed, unplugged or torn. */
+/* Whether the e-stop loop is open: pressed, unplugged or broken. */
 bool hal_estop_open(void);
 
-/* -- who we are -------------------------------------------------------------------------------------------------- */
+/* -- identity -------------------------------------------------------------------------------------------------- */
 
 uint8_t hal_board(void);
 uint8_t hal_reset_cause(void);

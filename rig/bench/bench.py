@@ -1,6 +1,6 @@
-"""What a bench is, and how one is opened by name.
+"""A bench, and opening one by name.
 
-Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, or anybody else's.
+Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, and those of other packages.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,27 +30,27 @@ GROUP = "rig.benches"
 
 
 class Operator(Protocol):
-    """Whoever puts objects on the table."""
+    """Puts objects on the table."""
 
     def place(self, name: str | None) -> None:
-        """Have the object ``name`` on the table (None: the one to be identified), and the hands away, on return."""
+        """Return when the object ``name`` (None: the one to identify) is on the table, and the hands are away."""
         ...
 
 
 @runtime_checkable
 class TableClearer(Protocol):
-    """An operator who empties the table without being asked by anybody."""
+    """An operator that can empty the table without a prompt."""
 
     def clear(self) -> bool:
-        """Have nothing on the table, and the hands away, on return; False where that cannot be."""
+        """Return True when the table is empty; False if that is not possible."""
         ...
 
 
 class ObjectAlreadyPlaced:
-    """The operator of a bench where the object is on the table before the command is given."""
+    """The operator of a bench on which the object is placed before the command starts."""
 
     def place(self, name: str | None) -> None:
-        """Do nothing: ``name`` stands there already."""
+        """Do nothing: the object is already on the table."""
 
 
 @dataclass(slots=True)
@@ -102,15 +102,12 @@ class Bench(AbstractContextManager["Bench"]):
         try:
             self.close()
         except (RigError, OSError) as failure:
-            if error is None:  # otherwise the first error is the one that people must see
+            if error is None:  # otherwise the first error is the important one
                 raise
-            error.add_note(f"The bench could not be closed properly: {failure}")
+            error.add_note(f"Closing the bench failed: {failure}")
 
     def close(self) -> None:
-        """Torque off, then let go of the devices; a device that fails here does not keep the others open.
-
-        A second call does nothing.
-        """
+        """Switch the torque off and close all devices, also if one of them fails; a second call does nothing."""
         if not self._open:
             return
         self._open = False
@@ -131,11 +128,11 @@ class Bench(AbstractContextManager["Bench"]):
             raise failures[0]
 
     def _unpowered(self) -> bool:
-        """Return whether the servo is without its supply, by the rig head's relay: then it has no torque either."""
+        """Return whether the rig head's relay cuts the servo's supply: then it has no torque either."""
         return self.head is not None and self.config.head.power and not self.head.status.relay_closed
 
     def devices(self) -> dict[str, Any]:
-        """Return the identities of the devices, for the record."""
+        """Return the identities of the devices, for records."""
         return {
             "servo": _plain(self.servo.identity),
             "imu": _plain(self.imu.identity),
@@ -143,13 +140,13 @@ class Bench(AbstractContextManager["Bench"]):
         }
 
     def apparatus(self, *parts: str) -> dict[str, Any]:
-        """Return what a calibration of some of the devices (all of them by default) is bound to."""
+        """Return the part of the bench that a calibration of ``parts`` (default: all devices) depends on."""
         whole = apparatus(self.name, self.devices(), self.config, self.conditions)
         return {key: value for key, value in whole.items() if not parts or key in ("bench", "conditions", *parts)}
 
 
 class BenchKind(Protocol):
-    """A plug-in: its options, checked with the rest of the configuration, and how it is opened."""
+    """A plug-in: the options of a kind of bench, and how to open it."""
 
     @property
     def options(self) -> type[BaseModel]:
@@ -157,13 +154,13 @@ class BenchKind(Protocol):
         ...
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
-        """Open the devices; what was opened is closed again when a later one fails."""
+        """Open the devices; if one fails, close those already opened."""
         ...
 
 
 @runtime_checkable
 class ServoAlone(Protocol):
-    """A kind of bench whose servo can be opened without the other devices: to stop it, whatever else is broken."""
+    """A kind of bench whose servo can be opened without the other devices, to stop it when another device fails."""
 
     def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Servo]: ...
 
@@ -183,16 +180,16 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
     config
         The configuration; None takes the defaults.
     seed
-        Seed of a simulated bench; real ones ignore it.
+        Seed of a simulated bench; a real one ignores it.
 
     Raises
     ------
     ConfigError
-        There is no such bench, or its options have mistakes.
+        The bench does not exist, or its options have mistakes.
     DeviceNotFound, DeviceMismatch, DeviceSilent
-        A device is not there, is another one, or does not answer.
+        A device is missing, is another one, or does not answer.
     BenchBusy
-        Another program holds the bench.
+        Another program uses the bench.
     """
     config = config or RigConfig()
     kind, options = _kind(name or config.default_bench, config)
@@ -207,12 +204,12 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
 
 @contextmanager
 def open_servo(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Iterator[Servo]:
-    """Open the servo of a bench alone, where its kind knows how, else with all devices; writes nothing to it.
+    """Open only the servo of a bench (all devices if its kind cannot do that); write nothing to it.
 
     Raises
     ------
     ConfigError, DeviceNotFound, DeviceMismatch, DeviceSilent, BenchBusy
-        As of `open_bench`.
+        As in `open_bench`.
     """
     config = config or RigConfig()
     kind, options = _kind(name or config.default_bench, config)
@@ -256,7 +253,7 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
 def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:
     """Return the kind of bench called ``name``, and its options."""
     for wrong in sorted(set(config.bench) - set(bench_names())):
-        bench_kind(wrong)  # a misspelt section is told before anything is opened
+        bench_kind(wrong)  # report a misspelt section before anything is opened
     kind = bench_kind(name)
     where = "the configuration"
     return kind, validate(kind.options, config.bench.get(name, {}), where=where, prefix=f"bench.{name}")
@@ -268,7 +265,7 @@ def bench_kind(name: str) -> BenchKind:
     Raises
     ------
     ConfigError
-        There is no such bench.
+        The bench does not exist.
     """
     points = {point.name: point for point in entry_points(group=GROUP)}
     if name in points:
@@ -277,7 +274,7 @@ def bench_kind(name: str) -> BenchKind:
     near = get_close_matches(name, points, n=1)
     raise ConfigError(
         f"There is no bench {name!r}.",
-        next_step=f"Did you mean {near[0]}?" if near else "Choose one of the benches listed.",
+        next_step=f"Did you mean {near[0]}?" if near else "Use one of the listed benches.",
         evidence={"benches": sorted(points)},
     )
 
@@ -288,7 +285,7 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
     Raises
     ------
     ConfigError
-        All mistakes at once, those in the benches' own sections included.
+        The evidence lists all mistakes, including those in the benches' own sections.
     """
     found: list[str] = []
     config, options = RigConfig(), {}
@@ -299,7 +296,7 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
         found += error.evidence["mistakes"]
     sections = read.values.get("bench", {})
     if not isinstance(sections, dict) or not all(isinstance(section, dict) for section in sections.values()):
-        sections = {}  # told above
+        sections = {}  # already reported above
     for name in sorted({*bench_names(), *sections}):
         try:
             kind = bench_kind(name)

@@ -1,7 +1,7 @@
-"""The computer that a bench hangs on: its ports, buses and cameras, who holds them, and who may use them.
+"""The computer of a bench: its ports, buses and cameras, the programs that use them, and the user's permissions.
 
-Facts are read from files of Linux (sysfs, /proc, /etc) below a root folder, so that a simulated bench and a test lay
-out a computer of their own; devices are opened by the same functions as for a bench.
+Everything is read from Linux files (sysfs, /proc, /etc) below a root folder, so that a simulated bench or a test can
+provide its own computer. Devices are opened by the same functions as for a bench.
 """
 
 import grp
@@ -20,7 +20,7 @@ from rig.core.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
     from rig.devices.dynamixel.port import SerialConnection
-    from rig.devices.opencv_camera import Capture
+    from rig.devices.opencv_capture import Capture
 
 SERIAL_NAMES = re.compile(r"tty(USB|ACM|AMA|S)\d+")
 _NETWORK_FILE_SYSTEMS = frozenset({"nfs", "nfs4", "cifs", "smb3", "smbfs", "sshfs", "fuse.sshfs", "9p", "afs"})
@@ -39,10 +39,10 @@ class Process:
 
 @dataclass(frozen=True, slots=True)
 class DeviceFile:
-    """A device file and what is known of it without opening it.
+    """A device file, and what is known about it without opening it.
 
-    ``stable`` is a name of it that outlives replugging, ``group`` whom it belongs to; ``usable`` says whether this user
-    may open it, ``holders`` who has it open, as far as this user may know.
+    ``stable`` is its name that stays the same after replugging, ``group`` its user group. ``usable`` says whether this
+    user may open it. ``holders`` are the programs that have it open, as far as this user may see them.
     """
 
     path: str
@@ -55,7 +55,7 @@ class DeviceFile:
 
 @dataclass(frozen=True, slots=True)
 class SerialPort(DeviceFile):
-    """A serial port; ``latency_ms`` is the adapter's latency timer, None where it has none (`latency_file`)."""
+    """A serial port; ``latency_ms`` is the adapter's latency timer (in `latency_file`), None if it has none."""
 
     latency_ms: int | None
     latency_file: str
@@ -64,7 +64,7 @@ class SerialPort(DeviceFile):
 
 @dataclass(frozen=True, slots=True)
 class User:
-    """Who runs the program: ``gids`` are the groups of this login."""
+    """The user of this program; ``gids`` are the groups of this login."""
 
     name: str
     uid: int
@@ -82,7 +82,7 @@ class User:
 
 @dataclass(frozen=True, slots=True)
 class Disk:
-    """The disk below a folder; ``network`` where it is another computer's, ``writable`` where this user may write."""
+    """The disk of a folder: whether it is on the network, and whether this user may write."""
 
     free_bytes: int
     network: bool
@@ -90,7 +90,7 @@ class Disk:
 
 
 class Computer(Protocol):
-    """Where devices are looked for, and how they are opened."""
+    """Finds and opens devices."""
 
     @property
     def clock(self) -> Clock: ...
@@ -100,41 +100,41 @@ class Computer(Protocol):
 
     @property
     def model(self) -> str:
-        """What kind of computer it is; empty where it does not say."""
+        """The computer's model; empty if it is not known."""
         ...
 
     def serial_ports(self) -> list[SerialPort]: ...
 
     def serial_port(self, path: str) -> SerialPort | None:
-        """Return the port of that name, whatever is behind it (a pseudo-terminal, too); None where there is none."""
+        """Return the port ``path``, which may be a pseudo-terminal; None if it does not exist."""
         ...
 
     def i2c_buses(self) -> list[DeviceFile]: ...
     def cameras(self) -> list[DeviceFile]: ...
 
     def same_file(self, one: str, other: str) -> bool:
-        """Return whether two paths, one of which may be a link, are one device."""
+        """Return whether two paths, which may be links, are the same device."""
         ...
 
     def joined(self, group: str) -> bool:
-        """Return whether the user is listed as a member of the group, in this login or only from the next one on."""
+        """Return whether the user is a member of the group, in this login or only after the next one."""
         ...
 
     def time_synchronised(self) -> bool | None:
-        """Return whether the civil time is kept by a time server; None where no service tells."""
+        """Return whether a time server sets the clock; None if no service reports it."""
         ...
 
     def disk(self, path: Path) -> Disk:
-        """Return the disk on which ``path`` is, or would be."""
+        """Return the disk of ``path``, which need not exist yet."""
         ...
 
     def open_serial(self, path: str, baud: int) -> "SerialConnection": ...
     def i2c_name(self, bus: int | str) -> str:
-        """Return what people call a bus: its device file."""
+        """Return the name of a bus: its device file."""
         ...
 
     def i2c_path(self, bus: int | str) -> str:
-        """Return the path under which smbus2 opens a bus."""
+        """Return the path by which smbus2 opens a bus."""
         ...
 
     def open_capture(self, source: int | str) -> "Capture": ...
@@ -142,7 +142,7 @@ class Computer(Protocol):
 
 @runtime_checkable
 class ComputerProvider(Protocol):
-    """A kind of bench whose computer can be looked at while the bench is not open."""
+    """A kind of bench whose computer can be examined while the bench is not open."""
 
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Computer]: ...
 
@@ -186,15 +186,15 @@ class LinuxComputer:
         known = next((port for port in self.serial_ports() if self.same_file(port.path, path)), None)
         if known is not None or not self._at(path).exists():
             return known
-        node = self._node(path, "no adapter of this computer's", "")
-        node["holders"] = ()  # a pseudo-terminal is always held, by the program that is its other end
+        node = self._node(path, "not an adapter of this computer", "")
+        node["holders"] = ()  # a pseudo-terminal is always open in the program at its other end
         return SerialPort(**node, latency_ms=None, latency_file="", usb={})
 
     def i2c_buses(self) -> list[DeviceFile]:
         return self._nodes("sys/class/i2c-dev", "")
 
     def cameras(self) -> list[DeviceFile]:
-        """Return the cameras; a device's further nodes, which carry no images, are left out."""
+        """Return the cameras, without the further device files of a camera that deliver no images."""
         nodes = self._nodes("sys/class/video4linux", "dev/v4l/by-id")
         return [n for n in nodes if self._text(f"/sys/class/video4linux/{Path(n.path).name}/index") in ("", "0")]
 
@@ -237,7 +237,7 @@ class LinuxComputer:
         return self.i2c_name(bus)
 
     def open_capture(self, source: int | str) -> "Capture":
-        from rig.devices.opencv_camera import open_capture
+        from rig.devices.opencv_capture import open_capture
 
         return open_capture(source)
 
@@ -247,7 +247,7 @@ class LinuxComputer:
         return self.root / path.lstrip("/")
 
     def _text(self, path: str) -> str:
-        """Return what a small file says, nothing where it says nothing."""
+        """Return the text of a small file; empty if it cannot be read."""
         try:
             return self._at(path).read_text(encoding="utf-8", errors="replace").strip("\0\n ")
         except OSError:
@@ -285,7 +285,7 @@ class LinuxComputer:
 
     def _may_use(self, file: Path, status: os.stat_result) -> bool:
         if self.user == User.current():
-            return os.access(file, os.R_OK | os.W_OK)  # knows of access lists, too
+            return os.access(file, os.R_OK | os.W_OK)  # also checks access control lists
         shift = 6 if status.st_uid == self.user.uid else 3 if status.st_gid in self.user.gids else 0
         return self.user.uid == 0 or status.st_mode >> shift & 0o6 == 0o6
 
@@ -305,14 +305,14 @@ class LinuxComputer:
                 continue
             try:
                 handles = [str(handle.readlink()) for handle in (process / "fd").iterdir()]
-            except OSError:  # another user's, or gone meanwhile
+            except OSError:  # another user's process, or it has ended
                 continue
             if path in handles or wanted in handles:
                 command = self._text(f"/proc/{process.name}/cmdline").replace("\0", " ")
                 yield Process(int(process.name), command or self._text(f"/proc/{process.name}/comm"))
 
     def _usb(self, device: Path) -> dict[str, str]:
-        """Return what the USB device says of itself, nothing for a port that is none."""
+        """Return the USB device's description; empty if the port is not on USB."""
         for folder in [(real := device.resolve()), *real.parents]:
             if (folder / "idVendor").is_file():
                 names = ("idVendor", "idProduct", "manufacturer", "product", "serial")

@@ -1,4 +1,4 @@
-"""The bench of real devices: servo on a serial port, IMU on I2C, camera through OpenCV."""
+"""The bench with real devices: servo on a serial port, IMU on I2C or a rig head, camera through OpenCV."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -18,34 +18,35 @@ from rig.devices.head.opening import open_head, powered, switch_on
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu
 from rig.devices.open_imu import open_imu
-from rig.devices.opencv_camera import CameraSettings, Capture, OpenCvCamera, open_capture
+from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+from rig.devices.opencv_capture import Capture, open_capture
 from rig.devices.servo import Servo
 from rig.safety.saved_state import BenchLock, FileStore, StateStore
 
 
 class NoOptions(Section):
-    """The real bench is described by [servo], [table], [imu] and [camera] alone."""
+    """The real bench has no options: [servo], [table], [imu] and [camera] describe it."""
 
 
 class HardwareBench:
-    """Opens the devices named in the configuration."""
+    """Opens the devices in the configuration."""
 
     options: type[BaseModel] = NoOptions
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:  # noqa: ARG002
-        """Open the real devices on the system's clock; it has no options, and ``seed`` no meaning."""
+        """Open the real devices on the system's clock; there are no options, and ``seed`` is not used."""
         clock, state_path = SystemClock(), config.state_path("hardware")
-        with ExitStack() as wires:
-            wires.callback(BenchLock(state_path, clock).close)
-            wire = open_serial(config.servo.port, config.servo.baud)
-            wires.callback(wire.close)
+        with ExitStack() as connections:
+            connections.callback(BenchLock(state_path, clock).close)
+            connection = open_serial(config.servo.port, config.servo.baud)
+            connections.callback(connection.close)
             capture = open_capture(config.camera.source)
-            wires.callback(capture.release)
+            connections.callback(capture.release)
             bench = assemble(
                 "hardware",
                 config,
                 clock,
-                wire=wire,
+                connection=connection,
                 reopen_serial=lambda: open_serial(config.servo.port, config.servo.baud),
                 i2c_bus=config.imu.bus,
                 capture=capture,
@@ -53,20 +54,20 @@ class HardwareBench:
                 state=FileStore(state_path),
                 head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
-            bench.connections = wires.pop_all()
+            bench.connections = connections.pop_all()
             return bench
 
     @contextmanager
     def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:  # noqa: ARG002
-        """Open the servo alone; to stop it, it must be reached although nothing can be written to the disk."""
+        """Open only the servo, also if the disk cannot be written: it must be possible to stop it."""
         clock = SystemClock()
-        with ExitStack() as wires:
+        with ExitStack() as connections:
             with suppress(StateNotStored):
-                wires.callback(BenchLock(config.state_path("hardware"), clock).close)
-            wires.enter_context(powered(config, lambda: open_serial(config.head.port, BAUD, "head"), clock))
-            wire = open_serial(config.servo.port, config.servo.baud)
-            wires.callback(wire.close)
-            yield open_servo(wire, config.servo, clock, config.table.mode)
+                connections.callback(BenchLock(config.state_path("hardware"), clock).close)
+            connections.enter_context(powered(config, lambda: open_serial(config.head.port, BAUD, "head"), clock))
+            connection = open_serial(config.servo.port, config.servo.baud)
+            connections.callback(connection.close)
+            yield open_servo(connection, config.servo, clock, config.table.mode)
 
 
 def assemble(
@@ -74,7 +75,7 @@ def assemble(
     config: RigConfig,
     clock: Clock,
     *,
-    wire: SerialConnection,
+    connection: SerialConnection,
     reopen_serial: Callable[[], SerialConnection] | None = None,
     i2c_bus: int | str,
     capture: Capture,
@@ -82,16 +83,16 @@ def assemble(
     state: StateStore,
     head_port: Callable[[], SerialConnection] | None = None,
 ) -> Bench:
-    """Put the drivers on their wires; a simulated bench is assembled by the same lines as a real one.
+    """Open the drivers on their connections, for simulated and real benches alike.
 
-    Nothing moves, and torque stays as it was found; whether the table may move is then known (`Bench.safety`).
+    Nothing moves, and the torque stays as it is. `Bench.safety` then knows whether the table may move.
 
     Raises
     ------
     DeviceNotFound, DeviceMismatch, DeviceSilent
-        A device is not there, is another one, or does not answer. The wires are left to the caller.
+        A device is missing, is another one, or does not answer. The caller closes the connections.
     ConfigError
-        The servo cannot be what the configuration wants it to be, or does not reach the table's limits.
+        The servo does not support the configuration, or does not reach the table's limits.
     """
     with ExitStack() as opened:
         head: RigHead | None = None
@@ -99,8 +100,8 @@ def assemble(
         if config.imu.connection == "head" and head_port is not None:
             head = open_head(config, head_port, clock)
             opened.callback(head.close)
-            fault = switch_on(head, config.head, clock)  # first: the servo's supply may go through it
-        servo = open_servo(wire, config.servo, clock, config.table.mode, reopen_serial)
+            fault = switch_on(head, config.head, clock)  # first, because the servo's supply may go through it
+        servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial)
         findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
         _check_reach(config, servo)
         imu: Imu = head or open_imu(config.imu, i2c_bus, clock)
@@ -113,7 +114,7 @@ def assemble(
             reopen=reopen_camera,
         )
         findings += tuple(
-            f"camera: {n.setting} was asked to be {n.asked:g}, the camera reports {n.reported:g}"
+            f"camera: {n.setting} was set to {n.asked:g}, but the camera reports {n.reported:g}"
             for n in camera.rejected_settings
         )
         bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
@@ -131,17 +132,16 @@ def assemble(
 
 
 def _check_reach(config: RigConfig, servo: Servo) -> None:
-    """Raise `ConfigError` where the table's limits lie beyond what the servo reaches."""
+    """Raise `ConfigError` if the table's limits exceed the servo's reach."""
     table, (low, high) = config.table, servo.reach_deg
     first, last = sorted(table.direction * limit + table.zero_deg for limit in table.limits_deg)
     if low - servo.resolution_deg <= first and last <= high + servo.resolution_deg:
         return
     reached = sorted(table.direction * (end - table.zero_deg) for end in (low, high))
     raise ConfigError(
-        f"The servo reaches {low:.0f}° to {high:.0f}°; the table's limits would take it from {first:.0f}° to "
-        f"{last:.0f}°.",
-        next_step=f"Set table.limits_deg within [{reached[0]:.0f}, {reached[1]:.0f}], or put table.zero_deg, the "
-        "servo's angle at table angle 0, into the middle of what it reaches.",
+        f"The servo reaches {low:.0f}° to {high:.0f}°, but the table's limits need {first:.0f}° to {last:.0f}°.",
+        next_step=f"Set table.limits_deg within [{reached[0]:.0f}, {reached[1]:.0f}], or set table.zero_deg, the "
+        "servo's angle at home, to the middle of its reach.",
         evidence={"limits_deg": list(table.limits_deg), "zero_deg": table.zero_deg, "reach_deg": [low, high]},
     )
 

@@ -1,4 +1,4 @@
-"""The configuration `rig.toml`: every key with its unit, range and default."""
+"""The configuration `rig.toml`: all keys with unit, range and default."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,11 +10,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from rig.config.values import APP, read_values, validate
 
 MAX_LIMIT_DEG = 90_000.0
-"""250 turns: extended position mode reaches 256 either way (e-manual, Operating Mode)."""
+"""250 revolutions; extended position mode reaches 256 in each direction (e-manual, Operating Mode)."""
 
 
 class Section(BaseModel):
-    """Base of every section: unknown keys are errors, values are fixed once read."""
+    """Base of all sections: unknown keys are errors, and values cannot change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -25,65 +25,74 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class ServoConfig(Section):
-    """Where the servo is and what it should be."""
+    """The servo: its connection and its model."""
 
     port: str = Field("/dev/ttyUSB0", description="serial port of the U2D2 or another adapter")
-    baud: int = Field(57600, ge=9600, le=4_500_000, description="bits per second; the servo's factory setting is 57600")
+    baud: int = Field(57600, ge=9600, le=4_500_000, description="baud rate; the servo's factory setting is 57600")
     id: int = Field(1, ge=0, le=252, description="id on the bus")
     model: str = Field("xl430_w250", description="model as in the SDK's control tables, or ax_12a")
     gear_ratio: float = Field(
-        1.0, gt=0, le=1000, description="turns of the servo for one of the table; table.direction tells the sense"
+        1.0,
+        gt=0,
+        le=1000,
+        description="revolutions of the servo for one revolution of the table; table.direction sets the direction",
     )
     retries: int = Field(
-        3, ge=0, le=20, description="repetitions of a spoiled transaction before the servo counts as silent"
+        3, ge=0, le=20, description="repetitions of a failed transaction before the servo counts as silent"
     )
-    write_settings: bool = Field(False, description="write EEPROM settings that differ from what the rig needs")
+    write_settings: bool = Field(
+        False, description="write EEPROM settings that differ from the ones that the rig needs"
+    )
 
 
 class TableConfig(Section):
-    """How the table moves and when it counts as settled."""
+    """The table: how it moves, and when it has settled."""
 
     mode: Literal["turntable", "pan"] = Field(
-        "turntable", description="turntable: turns beyond one revolution, and counts the turns; pan: stays within one"
+        "turntable",
+        description="turntable: rotates beyond one revolution and counts revolutions; pan: stays within one revolution",
     )
     direction: Literal[1, -1] = Field(
-        1, description="+1: rising servo position turns counter-clockwise seen from above"
+        1, description="+1: a rising servo position rotates the table counter-clockwise, seen from above"
     )
     carries: Literal["object", "camera"] = Field(
-        "object", description="what the servo turns: the object before the camera, or the camera around the object"
+        "object",
+        description="what the servo rotates: the object in front of the camera, or the camera around the object",
     )
-    zero_deg: Degrees = Field(180.0, description="servo angle at table angle 0, on the table's side of the gear")
+    zero_deg: Degrees = Field(180.0, description="servo angle at home (table angle 0), on the table's side of the gear")
     limits_deg: tuple[Degrees, Degrees] = Field(
         (-400.0, 400.0), description="cable budget: lowest and highest table angle"
     )
-    velocity_dps: float = Field(90.0, gt=0, le=200, description="cruise speed; the gyro's range must hold it")
-    acceleration_dps2: float = Field(240.0, gt=0, le=5000, description="ramp")
+    velocity_dps: float = Field(90.0, gt=0, le=200, description="cruise speed; must be within the gyro's range")
+    acceleration_dps2: float = Field(240.0, gt=0, le=5000, description="acceleration of the ramp")
     approach_deg: float = Field(
         3.0,
         ge=0,
         le=30,
-        description="every stop is approached upwards from at least this far below: takes up the gears' play",
+        description="each stop is approached upwards from at least this far below, which takes up the gears' backlash",
     )
     tolerance_deg: float = Field(0.6, gt=0, le=5, description="largest distance from the goal that counts as arrived")
     encoder_harmonics_deg: tuple[Degrees, Degrees, Degrees, Degrees] = Field(
         (0.0, 0.0, 0.0, 0.0),
-        description="what the encoder reads too much over its turn: cosine and sine of the first and of the second "
-        "harmonic, by calibration",
+        description="encoder error over a revolution: cosine and sine of the first and the second harmonic, from "
+        "calibration",
     )
     backlash_deg: float = Field(
-        0.5, ge=0, le=10, description="largest play between encoder and platter that is no fault"
+        0.5, ge=0, le=10, description="largest backlash between encoder and platter that is not a fault"
     )
     settle_s: float = Field(
-        0.46, gt=0, le=10, description="time from the end of a motion until the table is found at rest, for estimates"
+        0.46, gt=0, le=10, description="time from the end of a motion until the table is at rest, for estimates"
     )
     orientation: Literal["encoder", "imu"] = Field(
         "encoder",
-        description="what a view's angle is taken from: the servo's encoder, or the gyro on the platter alone",
+        description="source of a view's angle: the servo's encoder, or only the gyro on the platter",
     )
-    quiet_dps: float = Field(0.35, gt=0, le=10, description="largest rate that the gyro may see at rest")
+    quiet_dps: float = Field(0.35, gt=0, le=10, description="largest rate that the gyro may measure at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
-    watchdog_s: float = Field(0.5, ge=0.1, le=2.5, description="the servo stops by itself after this much silence")
+    watchdog_s: float = Field(
+        0.5, ge=0.1, le=2.5, description="the servo stops by itself after this time without instructions"
+    )
 
     @field_validator("limits_deg")
     @classmethod
@@ -91,11 +100,11 @@ class TableConfig(Section):
         low, high = limits_deg
         pan = others.data.get("mode") == "pan"
         if pan and not (low <= 0 <= high and low < high):
-            raise ValueError("must be the lowest and the highest angle, and hold 0, e.g. [-150, 150]")
+            raise ValueError("must be the lowest and the highest angle and include 0, e.g. [-150, 150]")
         if not pan and not (low <= 0 <= high and high - low >= 360):
-            raise ValueError('must span at least one turn and hold 0, e.g. [-400, 400], unless mode = "pan"')
+            raise ValueError('must span at least one revolution and include 0, e.g. [-400, 400], unless mode = "pan"')
         if max(-low, high) > MAX_LIMIT_DEG:
-            raise ValueError(f"must stay within ±{MAX_LIMIT_DEG:g}, which a servo in extended position mode reaches")
+            raise ValueError(f"must be within ±{MAX_LIMIT_DEG:g}, the range of a servo in extended position mode")
         return limits_deg
 
     @field_validator("watchdog_s")
@@ -108,36 +117,45 @@ class TableConfig(Section):
 
     @property
     def orientation_sign(self) -> int:
-        """Sense of the camera's orientation o around the object: o = −θ where the table θ turns the object, else θ."""
+        """Sign of the camera's azimuth around the object: −1 if the table angle θ rotates the object, else +1."""
         return 1 if self.carries == "camera" else -1
 
 
 class SafetyConfig(Section):
-    """When a motion is broken off: before the servo would shut down by itself, and long before something breaks."""
+    """When a motion is stopped: before the servo shuts down by itself, and long before something breaks."""
 
     following_error_deg: float = Field(
-        12.0, gt=0, le=90, description="largest distance of the shaft from the servo's profile, and from its way"
+        12.0,
+        gt=0,
+        le=90,
+        description="largest distance of the shaft from the servo's motion profile, and from its path",
     )
     max_load_percent: float = Field(
-        70.0, gt=0, le=100, description="largest share of the servo's torque (or current limit) that is no overload"
+        70.0, gt=0, le=100, description="largest part of the servo's torque (or current limit) that is not an overload"
     )
-    stall_s: float = Field(0.25, ge=0.05, le=1, description="how long the servo may push without turning")
-    overload_s: float = Field(0.8, ge=0.1, le=5, description="how long it may turn overloaded, or lag behind")
-    no_progress_s: float = Field(1.0, ge=0.3, le=5, description="how long nothing may happen on the way to a goal")
-    temperature_margin_c: float = Field(5.0, ge=0, le=40, description="distance kept from the servo's own limit")
-    voltage_margin_v: float = Field(0.2, ge=0, le=2, description="distance kept from the servo's own limits")
+    stall_s: float = Field(0.25, ge=0.05, le=1, description="how long the servo may push without rotating")
+    overload_s: float = Field(
+        0.8, ge=0.1, le=5, description="how long the servo may rotate with overload, or lag behind its profile"
+    )
+    no_progress_s: float = Field(1.0, ge=0.3, le=5, description="how long the servo may stand still before its goal")
+    temperature_margin_c: float = Field(
+        5.0, ge=0, le=40, description="distance from the temperature at which the servo shuts down"
+    )
+    voltage_margin_v: float = Field(
+        0.2, ge=0, le=2, description="distance from the voltages at which the servo shuts down"
+    )
     slip_deg: float = Field(
-        10.0, gt=0, le=90, description="difference of encoder and gyro (beyond 4 sigma) that breaks a motion off"
+        10.0, gt=0, le=90, description="difference of encoder and gyro (beyond 4 sigma) that stops a motion"
     )
 
 
 class ImuConfig(Section):
-    """Where the IMU is and how it is mounted."""
+    """The IMU: its connection and its mounting."""
 
     connection: Literal["i2c", "head"] = Field(
-        "i2c", description="where the sensor hangs: on the computer's own I2C bus, or on a rig head, see [head]"
+        "i2c", description="what the sensor is connected to: the computer's own I2C bus, or a rig head, see [head]"
     )
-    model: Literal["mpu6050", "bno055"] = Field("mpu6050", description="which sensor rides on the platter")
+    model: Literal["mpu6050", "bno055"] = Field("mpu6050", description="sensor on the platter")
     bus: int | str = Field(1, description="I2C bus number, or the path of its device")
     address: int = Field(
         0x68,
@@ -146,22 +164,22 @@ class ImuConfig(Section):
         validate_default=True,
         description="I2C address; an MPU-6050 has 0x68, or 0x69 with AD0 high; a BNO055 0x28, or 0x29 with ADR high",
     )
-    axis: Literal["x", "y", "z"] = Field("z", description="the sensor's axis along the table's")
-    sign: Literal[1, -1] = Field(1, description="+1 where a counter-clockwise turn reads positive")
+    axis: Literal["x", "y", "z"] = Field("z", description="the sensor's axis that is parallel to the table's axis")
+    sign: Literal[1, -1] = Field(1, description="+1 if a counter-clockwise rotation reads positive")
     range_dps: Literal[250, 500, 1000, 2000] = Field(250, description="full scale of the gyro")
     rate_hz: float = Field(200.0, ge=4, le=1000, description="samples per second (MPU-6050; a BNO055 has 100)")
     bandwidth_hz: Literal[188, 98, 42, 20, 10, 5] = Field(
-        42, description="of the MPU-6050's low-pass; below half of rate_hz, or noise folds down"
+        42, description="bandwidth of the MPU-6050's low-pass filter; must be below half of rate_hz to avoid aliasing"
     )
-    scale: float = Field(1.0, ge=0.8, le=1.25, description="true rate per rate read, from calibration")
+    scale: float = Field(1.0, ge=0.8, le=1.25, description="true rate divided by measured rate, from calibration")
     scale_uncertainty: float = Field(
-        0.012, ge=0, le=0.1, description="standard uncertainty of the scale; 0.012 uncalibrated"
+        0.012, ge=0, le=0.1, description="standard uncertainty of the scale; 0.012 without calibration"
     )
 
     @field_validator("address")
     @classmethod
     def _address_of_the_model(cls, address: int, others: ValidationInfo) -> int:
-        # The default is an MPU-6050's; no BNO055 can have it.
+        # The default is the MPU-6050's address, which no BNO055 can have.
         return 0x28 if others.data.get("model") == "bno055" and address == 0x68 else address
 
 
@@ -170,67 +188,81 @@ class HeadConfig(Section):
 
     port: str = Field("/dev/ttyUSB1", description="serial port of the board")
     deadman_s: float = Field(
-        0.25, ge=0.05, le=2, description="silence of this computer after which the head makes the bench safe"
+        0.25, ge=0.05, le=2, description="silence of this computer after which the head switches its outputs off"
     )
     light: float | None = Field(
-        None, gt=0, le=1, description="duty of the ring light while the bench is open; none: none is wired to the head"
+        None,
+        gt=0,
+        le=1,
+        description="duty cycle of the ring light while the bench is open; none: no light is connected to the head",
     )
     power: bool = Field(False, description="whether the servo's supply goes through the head's relay")
-    power_up_s: float = Field(0.6, ge=0.1, le=5, description="from closing that relay until the servo answers")
+    power_up_s: float = Field(0.6, ge=0.1, le=5, description="time from closing that relay until the servo answers")
 
 
 class CameraConfig(Section):
-    """Which camera, and the settings that are locked."""
+    """The camera and its locked settings."""
 
-    source: int | str = Field(0, description="index or path for OpenCV")
+    source: int | str = Field(0, description="index or path of the camera, for OpenCV")
     width: int = Field(640, ge=80, le=8000, description="pixels")
     height: int = Field(480, ge=80, le=8000, description="pixels")
     fps: float = Field(30.0, gt=0, le=500, description="frames per second")
-    exposure_us: float | None = Field(8000.0, gt=0, le=1e6, description="locked exposure; none leaves the camera's")
-    gain: float | None = Field(None, ge=0, description="locked gain in the camera's own unit; none leaves the camera's")
-    white_balance_k: float | None = Field(5000.0, ge=1000, le=20000, description="locked white balance")
+    exposure_us: float | None = Field(
+        8000.0, gt=0, le=1e6, description="locked exposure time; none keeps the camera's own"
+    )
+    gain: float | None = Field(None, ge=0, description="locked gain in the camera's unit; none keeps the camera's own")
+    white_balance_k: float | None = Field(
+        5000.0, ge=1000, le=20000, description="locked white balance; none keeps the camera's own"
+    )
     focus: float | None = Field(
-        None, ge=0, description="locked focus in the camera's own unit; none leaves the camera's"
+        None, ge=0, description="locked focus in the camera's unit; none keeps the camera's own"
     )
 
 
 class ViewConfig(Section):
-    """When a view is good enough."""
+    """Quality that a view needs."""
 
     roi: tuple[int, int, int, int] | None = Field(
-        (80, 0, 480, 480), description="x, y, width, height of the part that is described"
+        (80, 0, 480, 480), description="x, y, width and height of the image region that is described"
     )
-    min_sharpness: NotNegative = Field(3.0, description="smallest variance of the Laplacian of the grey image's region")
-    max_dark: Fraction = Field(0.95, description="largest share of pixels below level 8")
-    max_saturated: Fraction = Field(0.25, description="largest share of pixels at level 255")
+    min_sharpness: NotNegative = Field(3.0, description="smallest variance of the Laplacian of the region in grey")
+    max_dark: Fraction = Field(0.95, description="largest part of pixels below level 8")
+    max_saturated: Fraction = Field(0.25, description="largest part of pixels at level 255")
     min_mean: float = Field(4.0, ge=0, le=255, description="smallest mean level")
-    retakes: int = Field(3, ge=0, le=20, description="further frames taken before a view is given up")
+    retakes: int = Field(3, ge=0, le=20, description="further frames that are taken before a view fails")
 
 
 class CatalogConfig(Section):
-    """Where enrolled objects live."""
+    """Where enrolled objects are stored."""
 
-    path: Path | None = Field(None, description="folder; none: the user's data folder, one catalog a bench")
+    path: Path | None = Field(
+        None, description="folder of the catalog; none: one catalog for each bench in the user's data folder"
+    )
 
 
 class EnrollConfig(Section):
     """How an object is enrolled."""
 
-    views: int = Field(72, ge=4, le=720, description="views in a turn")
+    views: int = Field(72, ge=4, le=720, description="views in a revolution")
 
 
 class IdentifyConfig(Section):
-    """How an object is found."""
+    """How an object is identified."""
 
     strategy: str | None = Field(
-        None, description="how the next view is chosen; none: dense where the catalog is described for it, else ahbr"
+        None,
+        description="strategy that chooses the next view; none: dense if the catalog has its descriptors, else ahbr",
     )
-    max_views: int = Field(8, ge=1, le=72, description="give the best answer after this many views")
+    max_views: int = Field(8, ge=1, le=72, description="largest number of views")
     min_views: int = Field(
-        2, ge=1, le=72, validate_default=True, description="never decide before; dense goes by its rules"
+        2,
+        ge=1,
+        le=72,
+        validate_default=True,
+        description="smallest number of views before a decision; dense uses its stopping rule instead",
     )
     first_step_deg: float = Field(
-        90.0, ge=-180, le=180, description="rotation between the first two views, + to the left"
+        90.0, ge=-180, le=180, description="rotation between the first two views; positive is counter-clockwise"
     )
     omega: float = Field(0.5, ge=0, le=100, description="weight of the orientation term")
     list_length: int = Field(10, ge=1, le=1000, description="views on a retrieval list")
@@ -238,16 +270,22 @@ class IdentifyConfig(Section):
         "orient_all", description="how missing views are filled in"
     )
     margin: float = Field(
-        0.02, ge=0, le=1, description="stop when the best score surely leads by this much a view; not dense"
+        0.02,
+        ge=0,
+        le=1,
+        description="stop when the best score is certain to lead by this margin for each view; not for dense",
     )
     repeatability: float = Field(
-        0.97, ge=0, le=1, description="similarity that the same view of two placings surely keeps, by calibration"
+        0.97,
+        ge=0,
+        le=1,
+        description="lowest similarity of the same view after placing the object again, from calibration",
     )
     min_score: float | None = Field(
         None,
         ge=0,
         le=1,
-        description="below this score a view the object is unknown, not dense; none: as the enrolled views suggest",
+        description="an object with a lower score per view is unknown; none: from the enrolled views; not for dense",
     )
 
     @field_validator("min_views")
@@ -262,12 +300,12 @@ class IdentifyConfig(Section):
 class RigConfig(Section):
     """Everything in `rig.toml`."""
 
-    default_bench: str = Field("hardware", description="bench that is opened where --bench does not say")
+    default_bench: str = Field("hardware", description="bench that is opened without --bench")
     state_dir: Path | None = Field(
-        None, description="folder of what a bench must not forget, one folder in it a bench; none: the user's"
+        None, description="folder of the benches' states, with one folder for each bench; none: the user's state folder"
     )
     calibration_dir: Path | None = Field(
-        None, description="folder of the calibrations, one folder in it a bench; none: the user's data folder"
+        None, description="folder of the calibrations, with one folder for each bench; none: the user's data folder"
     )
     servo: ServoConfig = ServoConfig()
     table: TableConfig = TableConfig()
@@ -280,7 +318,7 @@ class RigConfig(Section):
     enroll: EnrollConfig = EnrollConfig()
     identify: IdentifyConfig = IdentifyConfig()
     bench: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="options of the benches, by name: [bench.sim]"
+        default_factory=dict, description="options of each bench, by name: [bench.sim]"
     )
 
     @field_validator("view")
@@ -291,12 +329,12 @@ class RigConfig(Section):
             x, y, width, height = view.roi
             if min(x, y) < 0 or min(width, height) < 1 or x + width > camera.width or y + height > camera.height:
                 raise ValueError(
-                    f"roi {list(view.roi)} does not lie within the camera's frame of {camera.width}x{camera.height}"
+                    f"roi {list(view.roi)} is not within the camera's frame of {camera.width}x{camera.height}"
                 )
         return view
 
     def catalog_path(self, bench_name: str) -> Path:
-        """Return the catalog's folder: simulated views never mix with real ones unless the configuration says so."""
+        """Return the catalog's folder; by default each bench has its own: simulated and real views do not mix."""
         return self.catalog.path or Path(platformdirs.user_data_dir(APP)) / bench_name
 
     def calibration_path(self, bench_name: str) -> Path:
@@ -304,7 +342,7 @@ class RigConfig(Section):
         return (self.calibration_dir or Path(platformdirs.user_data_dir(APP)) / "calibration") / bench_name
 
     def state_path(self, bench_name: str) -> Path:
-        """Return the folder of the bench's turns, its latched fault, and who holds it."""
+        """Return the folder of the bench's state: revolutions, latched fault, and the program that uses it."""
         return (self.state_dir or Path(platformdirs.user_state_dir(APP))) / bench_name
 
 
@@ -314,7 +352,7 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> RigC
     Raises
     ------
     ConfigError
-        The file is missing, is no TOML, or holds mistakes: all of them at once, each with its key.
+        The file is missing, is not TOML, or has mistakes; the evidence lists all of them with their keys.
     """
     read = read_values(path, overrides)
     where = str(read.path) if read.path else "the command line"

@@ -1,7 +1,8 @@
-"""`rig.toml` as people wrote it: single values are changed, their comments, order and spacing stay.
+"""Edits single values of `rig.toml`; comments, order and spacing stay.
 
-`tomllib` reads and judges; this module only finds where in the text a value stands. Every edit is read back, and given
-up if it would have changed anything else.
+`tomllib` parses; this module only finds the position of a value in the text. Each edit is parsed again and rejected if
+it changed anything else. tomlkit cannot replace it: it drops the comments inside a value of several lines, does not put
+a new key below its commented default, and reports no line numbers.
 """
 
 import difflib
@@ -24,11 +25,11 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """A ``key = value`` or a ``[table]`` of a document; the offsets count characters.
+    """A ``key = value`` or a ``[table]`` of a document; offsets count characters.
 
-    ``key`` is the whole path; ``table`` the path of the table above it. ``start`` is where the line begins, ``value``
-    where the value does (a header has none), ``end`` the end of the value or header, ``comments`` those inside a value
-    of several lines.
+    ``key`` is the whole path, ``table`` the path of the table above it. ``start`` is the start of the line, ``value``
+    the start of the value (None for a header), ``end`` the end of the value or header. ``comments`` are those inside a
+    value of several lines.
     """
 
     key: Key
@@ -41,7 +42,7 @@ class Statement:
 
 
 def statements(text: str) -> Iterator[Statement]:
-    """Yield what a valid document states, in its order; inside arrays of tables nothing is told."""
+    """Yield the statements of a valid document in order, except those inside arrays of tables."""
     position, addressable = 0, True
     table: Key = ()
     while position < len(text):
@@ -78,26 +79,26 @@ def line_numbers(text: str) -> dict[Key, int]:
 
 
 def with_values(text: str, changes: Mapping[Key, Any]) -> str:
-    """Return the document with some values set; what they are already is left as it stands.
+    """Return the document with some values set; values that do not change stay as they are written.
 
     Raises
     ------
     ConfigError
-        The document is no TOML, or holds a key in a form that cannot be changed without touching something else.
+        The document is not TOML, or has a key in a form that cannot be edited without changing something else.
     """
     try:
         before = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
-            "The file is no TOML.", next_step="Mend the line named.", evidence={"reason": str(error)}
-        ) from (error)
+            "The file is not TOML.", next_step="Fix the line in the reason.", evidence={"reason": str(error)}
+        ) from error
     for key, value in changes.items():
         expected = deepcopy(before)
         here = expected
         for part in key[:-1]:
             here = here.setdefault(part, {})
             if not isinstance(here, dict):
-                raise _cannot_edit(key, value, f"{part} is a value, no table")
+                raise _cannot_edit(key, value, f"{part} is a value, not a table")
         if key[-1] in here and _same(here[key[-1]], value):
             continue
         here[key[-1]] = value
@@ -113,31 +114,31 @@ def with_values(text: str, changes: Mapping[Key, Any]) -> str:
 
 
 def changed_lines(old: str, new: str) -> list[str]:
-    """Return the lines that differ, those taken away with ``-`` and those added with ``+`` before them."""
+    """Return the lines that differ: removed ones with ``-``, added ones with ``+``."""
     lines = difflib.ndiff(old.splitlines(), new.splitlines())
     return [line.rstrip() for line in lines if line[0] in "+-" and line[2:].strip()]
 
 
 def read_text(path: Path) -> str:
-    """Return a configuration file's text, its line ends as they are.
+    """Return a configuration file's text with its own line ends.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, or is no text.
+        The file cannot be read, or is not text.
     """
     try:
         return path.read_bytes().decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"Cannot read the configuration {path}.",
-            next_step="Give an existing file with --config, or leave the option out for the defaults.",
+            next_step="Give an existing file with --config, or omit the option to use the defaults.",
             evidence={"reason": getattr(error, "strerror", None) or str(error)},
         ) from error
 
 
 def save(path: Path, text: str) -> None:
-    """Write a configuration file: all of it or, when that fails, nothing; a link keeps pointing to where it does.
+    """Write a configuration file completely or not at all; a symbolic link stays a link.
 
     Raises
     ------
@@ -151,13 +152,13 @@ def save(path: Path, text: str) -> None:
     except OSError as error:
         raise ConfigError(
             f"Cannot write the configuration {path}.",
-            next_step="Give a file in a folder that you may write to: --config FILE.",
+            next_step="Give a file in a writable folder: --config FILE.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
 
 
 def toml(value: Any) -> str:
-    """Return a value in TOML's notation, on one line; a string for what TOML does not know."""
+    """Return a value in TOML on one line; values of other types become strings."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -173,11 +174,11 @@ def toml(value: Any) -> str:
 
 
 def stated(key: Key, value: Any) -> str:
-    """Return a key's value in TOML's notation, as people write it: addresses are hexadecimal."""
+    """Return a key's value in TOML as people write it: addresses are hexadecimal."""
     return f"{value:#04x}" if key[-1] == "address" and type(value) is int else toml(value)
 
 
-# -- where things stand ---------------------------------------------------------------------------------------------
+# -- positions ---------------------------------------------------------------------------------------------------
 
 
 def _edited(text: str, key: Key, value: Any, values: Mapping[str, Any]) -> str:
@@ -208,7 +209,7 @@ def _edited(text: str, key: Key, value: Any, values: Mapping[str, Any]) -> str:
 
 
 def _merged(values: Mapping[str, Any], table: Key, rest: Key, value: Any) -> Any:
-    """Return what an inline table holds once ``rest`` inside it is set; ``value`` where nothing is left of the key."""
+    """Return the inline table ``table`` with ``rest`` in it set to ``value``; ``value`` if ``rest`` is empty."""
     inline: Any = values
     for part in table:
         inline = inline[part]
@@ -223,7 +224,7 @@ def _merged(values: Mapping[str, Any], table: Key, rest: Key, value: Any) -> Any
 
 
 def _default_line_end(text: str, near: Statement, key: Key, known: Iterable[Statement]) -> int | None:
-    """Return where the line ends that holds the key as a comment (``# key = default``) in the same table, if any."""
+    """Return the end of the line with the key's commented default (``# key = default``) in the same table, if any."""
     headers = [s for s in known if s.value is None]
     begin = max((s.end for s in headers if s.start <= near.start), default=0)
     end = min((s.start for s in headers if s.start > near.start), default=len(text))
@@ -232,7 +233,7 @@ def _default_line_end(text: str, near: Statement, key: Key, known: Iterable[Stat
 
 
 def _above_comments(text: str, position: int) -> int:
-    """Return where the lines of comment begin that stand directly above ``position``."""
+    """Return the start of the comment lines directly above ``position``."""
     while position and text[text.rfind("\n", 0, position - 1) + 1 : position].lstrip(" \t").startswith("#"):
         position = text.rfind("\n", 0, position - 1) + 1
     return position
@@ -249,14 +250,14 @@ def _line_end(text: str, position: int) -> int:
 
 
 def _skip(text: str, position: int, wanted: str) -> int:
-    """Return where ``wanted`` stands outside of quotes."""
+    """Return the position of ``wanted`` outside of quotes."""
     while text[position] != wanted:
         position = _string_end(text, position) if text[position] in "\"'" else position + 1
     return position
 
 
 def _value_end(text: str, position: int) -> tuple[int, tuple[str, ...]]:
-    """Return where the value that begins at ``position`` ends, and the comments inside it."""
+    """Return the end of the value that begins at ``position``, and the comments inside it."""
     depth, end = 0, position
     comments = []
     while position < len(text):
@@ -288,7 +289,7 @@ def _string_end(text: str, position: int) -> int:
     while not text.startswith(quote, end):
         end += 2 if text[end] == "\\" and quote[0] == '"' else 1
     end += len(quote)
-    while len(quote) == 3 and text.startswith(quote[0], end):  # up to two more of them belong to the string
+    while len(quote) == 3 and text.startswith(quote[0], end):  # up to two more quotes belong to the string
         end += 1
     return end
 
@@ -308,7 +309,7 @@ def _written(key: Key) -> str:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Compare as TOML does: 1 and 1.0 and true are three values, and not-a-number is itself."""
+    """Compare as TOML does: 1, 1.0 and true are different values, and not-a-number equals itself."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
@@ -318,7 +319,7 @@ def _same(one: Any, other: Any) -> bool:
 
 def _cannot_edit(key: Key, value: Any, reason: str) -> ConfigError:
     return ConfigError(
-        f"Cannot set {'.'.join(key)} in this file without touching something else.",
-        next_step=f"Write it yourself, in [{'.'.join(key[:-1])}]: {key[-1]} = {toml(value)}",
+        f"Cannot set {'.'.join(key)} in this file without changing something else.",
+        next_step=f"Edit the file, in [{'.'.join(key[:-1])}]: {key[-1]} = {toml(value)}",
         evidence={"reason": reason},
     )

@@ -1,4 +1,4 @@
-"""Reads what a configuration file and the command line say, and judges it: every mistake at once, with its place."""
+"""Reads a configuration file and the settings of the command line, and checks them; reports all mistakes with lines."""
 
 import os
 import re
@@ -24,18 +24,18 @@ _PATHS: tuple[Key, ...] = (("catalog", "path"), ("state_dir",), ("calibration_di
 
 
 def default_path() -> Path | None:
-    """Return the configuration in force without `--config`: ./rig.toml, else the user's; None where neither exists."""
+    """Return the configuration in force without `--config`: ./rig.toml, else the user's; None if neither exists."""
     return next((path for path in search_paths() if path.is_file()), None)
 
 
 def search_paths() -> list[Path]:
-    """Return where a configuration is looked for without `--config`, first the one that wins."""
+    """Return where a configuration is searched without `--config`; the first one wins."""
     return [Path(FILE_NAME), Path(platformdirs.user_config_dir(APP)) / FILE_NAME]
 
 
 @dataclass(frozen=True, slots=True)
 class Values:
-    """What a file and the command line say, not yet judged, and where each of it stands."""
+    """Unchecked values of a file and the command line, and where each comes from."""
 
     path: Path | None
     values: dict[str, Any]
@@ -50,12 +50,12 @@ class Values:
 
 
 def read_values(path: Path | None = None, overrides: Iterable[str] = ()) -> Values:
-    """Read a configuration file (None: the one in force, if any) and apply ``overrides``, without judging the values.
+    """Read a configuration file (None: the one in force, if any) and apply ``overrides``, without checking the values.
 
     Raises
     ------
     ConfigError
-        The file is missing or is no TOML, or an override is none.
+        The file is missing or is not TOML, or an override is invalid.
     """
     values: dict[str, Any] = {}
     places: dict[Key, str] = {}
@@ -67,7 +67,7 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = ()) -> Valu
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(
                 f"{source} is not a TOML file.",
-                next_step="Mend the line named.",
+                next_step="Fix this line.",
                 evidence={"reason": str(error), **_line_named(text, str(error))},
             ) from error
         places = {key: f"line {line}" for key, line in line_numbers(text).items()}
@@ -86,9 +86,9 @@ def validate(
     prefix: str = "",
     places: Mapping[Key, str] | None = None,
 ) -> M:
-    """Return ``values`` as ``model``; every mistake at once in one `ConfigError`.
+    """Return ``values`` as ``model``; raises one `ConfigError` with all mistakes.
 
-    ``prefix`` is the model's path in the configuration, ``places`` says where in a file each key stands.
+    ``prefix`` is the model's path in the configuration, ``places`` the place of each key in a file.
     """
     try:
         return model.model_validate(values)
@@ -99,16 +99,16 @@ def validate(
 
 
 def config_mistakes(found: list[str], where: str) -> ConfigError:
-    """Return the error of a configuration with the mistakes that were found."""
+    """Return the error for a configuration with mistakes."""
     return ConfigError(
         f"{len(found)} mistake{'s' if len(found) > 1 else ''} in {where}.",
-        next_step="Mend the keys listed; `rig config check` looks again.",
+        next_step="Fix the listed keys, then run `rig config check`.",
         evidence={"mistakes": found},
     )
 
 
 def _resolve(values: dict[str, Any], key: Key, folder: Path) -> None:
-    """Take a path in a file as relative to that file, not to where the command happens to be run."""
+    """Resolve a path in a file relative to that file, not to the current folder."""
     here: Any = values
     for part in key[:-1]:
         here = here.get(part) if isinstance(here, dict) else None
@@ -135,7 +135,7 @@ def _line_named(text: str, reason: str) -> dict[str, str]:
 
 
 def _apply(values: dict[str, Any], override: str) -> Key:
-    """Set what an override says, and return its key."""
+    """Apply an override, and return its key."""
     key, sign, text = override.partition("=")
     parts = key.strip().split(".")
     if not sign or not all(parts):
@@ -154,7 +154,7 @@ def _apply(values: dict[str, Any], override: str) -> Key:
 
 
 def parsed(text: str) -> Any:
-    """Return a value as a person types it: TOML, or else a bare word."""
+    """Return a typed value: parsed as TOML, or else as a bare word."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -1,4 +1,4 @@
-"""What the configuration's keys mean, in words: for its mistakes, for `rig config`, and for the file that is begun."""
+"""Describes the configuration's keys in words: for mistakes, for `rig config`, and for a new file."""
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,7 +40,7 @@ _KINDS: Mapping[Any, str] = {
 
 @dataclass(frozen=True, slots=True)
 class KeyInfo:
-    """A key of the configuration: what it may be, in which unit (empty where there is none), and what it is for."""
+    """A key of the configuration: its allowed values, its unit (empty if it has none), and its meaning."""
 
     key: Key
     default: Any
@@ -54,7 +54,7 @@ class KeyInfo:
 
 
 def key_info(model: type[BaseModel], above: Key = ()) -> Iterator[KeyInfo]:
-    """Yield the keys of a model and of the sections in it, in their order."""
+    """Yield the keys of a model and of its sections, in order."""
     for name, field in model.model_fields.items():
         if (inner := _section(field)) is not None:
             yield from key_info(inner, (*above, name))
@@ -64,54 +64,54 @@ def key_info(model: type[BaseModel], above: Key = ()) -> Iterator[KeyInfo]:
 
 
 def blank_file(model: type[BaseModel]) -> str:
-    """Return a configuration file that sets nothing: every key that has a default as a comment, with its meaning."""
-    lines = ["# Configuration of the rig. A line without its first # is in force; `rig config check` judges the file."]
+    """Return a configuration file that sets nothing: each key with its default and meaning, as a comment."""
+    lines = ["# Configuration of the rig. Remove the # to set a key. `rig config check` checks the file."]
     section: Key = ()
-    for facts in key_info(model):
-        if isinstance(facts.default, dict):
+    for info in key_info(model):
+        if isinstance(info.default, dict):
             continue  # the benches' own sections
-        if facts.key[:-1] != section:
-            section = facts.key[:-1]
+        if info.key[:-1] != section:
+            section = info.key[:-1]
             lines += ["", f"[{'.'.join(section)}]"]
-        meaning = f"{facts.description} ({facts.allowed}{' ' * bool(facts.unit)}{facts.unit})"
+        meaning = f"{info.description} ({info.allowed}{' ' * bool(info.unit)}{info.unit})"
         lines += wrap(meaning, 100, initial_indent="# ", subsequent_indent="#   ")
-        lines.append(f"#{facts.key[-1]} = {_shown(facts, facts.default)}".rstrip())
+        lines.append(f"#{info.key[-1]} = {_shown(info, info.default)}".rstrip())
     return "\n".join(lines) + "\n"
 
 
-def setting_line(facts: KeyInfo, value: Any, origin: str) -> str:
-    """Return a key in force as a line of TOML (one that is not set as a comment): value, unit, origin and meaning."""
-    stated = f"{'#' * (value is None)}{facts.key[-1]} = {_shown(facts, value)}".rstrip()
-    note = "; ".join(part for part in (facts.unit, origin, facts.description) if part)
+def setting_line(info: KeyInfo, value: Any, origin: str) -> str:
+    """Return a key as a line of TOML (as a comment if it has no value): value, unit, origin and meaning."""
+    stated = f"{'#' * (value is None)}{info.key[-1]} = {_shown(info, value)}".rstrip()
+    note = "; ".join(part for part in (info.unit, origin, info.description) if part)
     return f"{stated:30s} # {note}"
 
 
-def _shown(facts: KeyInfo, value: Any) -> str:
-    return "" if value is None else stated(facts.key, value)
+def _shown(info: KeyInfo, value: Any) -> str:
+    return "" if value is None else stated(info.key, value)
 
 
 def unit(name: str) -> str:
-    """Return the unit that a key's name carries."""
+    """Return the unit in a key's name."""
     return _UNITS.get(name) or next((u for suffix, u in _UNIT_SUFFIXES.items() if name.endswith(suffix)), "")
 
 
 def allowed(field: FieldInfo) -> str:
-    """Return what a field takes: ``a whole number from 9600 to 4500000``."""
+    """Return the values that a field allows: ``a whole number from 9600 to 4500000``."""
     return _kind(field.annotation, field.metadata)
 
 
 def mistakes(
     model: type[BaseModel], values: Mapping[str, Any], errors: Sequence[Any], above: Key, places: Mapping[Key, str]
 ) -> list[str]:
-    """Return pydantic's ``errors`` as one line a key: where it stands, what it must be, and what was found.
+    """Return pydantic's ``errors`` as one line for each key: its place, what it must be, and what was found.
 
-    ``above`` is the path of ``model`` in the whole configuration, ``places`` says where in a file a key stands.
+    ``above`` is the path of ``model`` in the whole configuration, ``places`` the place of each key in a file.
     """
-    told: dict[Key, str] = {}
+    found: dict[Key, str] = {}
     for error in errors:
         key, field = _field(model, error["loc"])
-        told.setdefault(key, _mistake(model, values, key, field, error))
-    return [f"{_place(above + key, places)}{'.'.join(above + key)}: {text}".lstrip(": ") for key, text in told.items()]
+        found.setdefault(key, _mistake(model, values, key, field, error))
+    return [f"{_place(above + key, places)}{'.'.join(above + key)}: {text}".lstrip(": ") for key, text in found.items()]
 
 
 def _mistake(model: type[BaseModel], values: Mapping[str, Any], key: Key, field: FieldInfo | None, error: Any) -> str:
@@ -128,7 +128,7 @@ def _mistake(model: type[BaseModel], values: Mapping[str, Any], key: Key, field:
 
 
 def _field(model: type[BaseModel], path: Sequence[Any]) -> tuple[Key, FieldInfo | None]:
-    """Return the part of pydantic's ``path`` that is a key, and its field; what follows are members of a union."""
+    """Return the part of pydantic's ``path`` that is a key, and its field; the rest are members of a union."""
     key: Key = ()
     field = None
     for part in path:

@@ -1,4 +1,4 @@
-"""The one clock of a bench: the only module that asks the operating system for the time."""
+"""The clock of a bench: the only module that asks the operating system for the time."""
 
 import threading
 import time
@@ -8,14 +8,14 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Time as a bench sees it; injected into everything that waits or stamps."""
+    """The time of a bench; injected into all code that waits or needs the time."""
 
     def now_ns(self) -> int:
         """Return monotonic time in nanoseconds; only differences have a meaning."""
         ...
 
     def sleep(self, seconds: float) -> None:
-        """Let ``seconds`` pass; zero and negative values return at once."""
+        """Wait for ``seconds``; zero and negative values return at once."""
         ...
 
     def utc(self) -> datetime:
@@ -23,9 +23,9 @@ class Clock(Protocol):
         ...
 
     def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
-        """Call ``action`` about every ``seconds`` beside the program, until the function returned is called.
+        """Call ``action`` about every ``seconds`` in the background, until the returned function is called.
 
-        ``action`` raises nothing, and keeps out of what the program is just doing: it may run in another thread.
+        ``action`` may run in another thread: it must not raise, and must lock the data that it shares.
         """
         ...
 
@@ -34,7 +34,7 @@ class SystemClock:
     """The computer's own monotonic clock."""
 
     def now_ns(self) -> int:
-        return time.monotonic_ns()  # noqa: TID251 - this is the clock that everyone else is given
+        return time.monotonic_ns()  # noqa: TID251 - this is the clock that is injected elsewhere
 
     def sleep(self, seconds: float) -> None:
         if seconds > 0:

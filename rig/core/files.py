@@ -1,16 +1,16 @@
-"""Files that survive a power cut: written whole or not at all, under a name that is known to the disk."""
+"""Writes files that survive a power cut: completely or not at all, with their name in the folder."""
 
 import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-FEW: Final = 100
-"""So many files are waited for one by one: the rest of the computer's traffic is none of theirs."""
+MAX_SINGLE_SYNCS: Final = 100
+"""Up to this number, files are synchronised one by one, without waiting for other programs' data."""
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file so that under its name there is all of it or nothing, and all of it once this returns."""
+    """Write a file completely or not at all; on return it is on the disk."""
     temporary = path.with_name(f"{path.name}.part")
     try:
         with temporary.open("wb") as file:
@@ -31,7 +31,7 @@ def sync_folder(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Return when what was written to a file is on the disk."""
+    """Return when a file's content is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -42,15 +42,15 @@ def sync_file(path: Path) -> None:
 def sync_tree(folder: Path) -> None:
     """Return when everything in a folder is on the disk."""
     paths = [folder, *folder.rglob("*")]
-    if len(paths) > FEW:
-        os.sync()  # of thousands of small files all at once; one by one takes minutes on some disks
+    if len(paths) > MAX_SINGLE_SYNCS:
+        os.sync()  # one by one, thousands of small files take minutes on some disks
         return
     for path in paths:
         sync_file(path)
 
 
 def make_folder(path: Path, *, within: Path) -> None:
-    """Create ``path`` and the folders between it and ``within``, each durably known to the one above it."""
+    """Create ``path`` and the folders between it and ``within``, and return when their names are on the disk."""
     path.mkdir(parents=True, exist_ok=True)
     for above in path.parents:
         sync_folder(above)

@@ -35,9 +35,9 @@ class _MovedModules(MetaPathFinder, Loader):
         return ModuleSpec(fullname, self) if fullname in MOVED else None
 
     def exec_module(self, module: ModuleType) -> None:
-        """Put the new module in the place of the empty one that the import system made."""
+        """Replace the empty module, which the import system created, by the new one."""
         new = MOVED[module.__name__]
-        warn(f"{module.__name__} is now {new}; the old path goes with version 0.3", DeprecationWarning, stacklevel=2)
+        warn(f"{module.__name__} is now {new}; version 0.3 removes the old path", DeprecationWarning, stacklevel=2)
         sys.modules[module.__name__] = import_module(new)
 
 

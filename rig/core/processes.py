@@ -1,4 +1,4 @@
-"""The same work on many items, one after the other or several at once in processes."""
+"""Applies a function to many items, in this process or in several."""
 
 import os
 import signal
@@ -16,21 +16,21 @@ _Item = TypeVar("_Item")
 _T = TypeVar("_T")
 _work: Callable[[Any], object]
 
-#: Items that wait at each process, so that none runs dry; of thousands the rest waits here.
 _AHEAD: Final = 4
+"""Items that are queued for each process, so that none waits for work."""
 
 
 def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: int) -> Iterator[tuple[_Item, _T]]:
-    """Yield each item with its result, as they come; closing the generator ends the processes.
+    """Yield each item with its result, in the order of completion; closing the generator ends the processes.
 
     Parameters
     ----------
     work
-        A function that can be pickled, or a partial of one; it reaches each process once.
+        A function that can be pickled, or a partial of one; it is sent to each process once.
     items
-        Any that can be hashed and pickled.
+        Items that can be hashed and pickled.
     jobs
-        How many processes at most; 1 works in this one.
+        Largest number of processes; with 1 the work is done in this process.
     """
     waiting = deque(items)
     jobs = min(jobs, len(waiting))
@@ -38,7 +38,7 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
         for item in waiting:
             yield item, work(item)
         return
-    # a process for each core leaves no core for threads of its own
+    # there is a process for each core, so further threads in a process only slow it down
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (work,))
@@ -47,24 +47,24 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
         while waiting or futures:
             while waiting and len(futures) < jobs * _AHEAD:
                 item = waiting.popleft()
-                with _deaf_to_interrupts():  # a submission may start a process
+                with _ignoring_interrupts():  # a submission may start a process
                     futures[pool.submit(_call, item)] = item  # type: ignore[arg-type]
             for future in wait(futures, return_when=FIRST_COMPLETED).done:
                 yield futures.pop(future), future.result()
     except BrokenProcessPool as error:
         raise RigError(
-            "a process that worked on the images ended before it was done",
-            next_step="see whether the computer ran out of memory; go on with fewer processes (--jobs 1)",
+            "A process that worked on the images ended before it was done.",
+            next_step="Check whether the computer ran out of memory, and try again with fewer processes (--jobs 1).",
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Have the processes that are started inherit that they do not hear Ctrl+C, which reaches all of a terminal's.
+def _ignoring_interrupts() -> Iterator[None]:
+    """Start processes that ignore Ctrl+C, which a terminal sends to all of its processes.
 
-    The one that the person started hears it when this is over, and stops the others after the item they are at.
+    The main process receives it after the block, and stops the others when their present item is done.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -1,8 +1,8 @@
-"""The BNO055 on an I2C bus of the computer: a gyro whose own fusion carries the rotation from one reading to the next.
+"""The BNO055 on an I2C bus of the computer: a gyro with its own sensor fusion.
 
-Registers and times: BST-BNO055-DS000. It is used in its IMU mode (gyro and accelerometer, no magnetometer: servo and
-steel bend the north). It has no FIFO; what happens between two readings is known by the orientation that it integrates
-itself, as long as that turns by less than half a revolution meanwhile.
+Registers and times: BST-BNO055-DS000. It runs in its IMU mode (gyro and accelerometer, no magnetometer, because servo
+and steel distort the magnetic field). It has no FIFO. The rotation between two readings comes from the orientation that
+it integrates itself, if that is less than half a revolution.
 """
 
 from dataclasses import dataclass
@@ -22,32 +22,32 @@ NOISE_DPS_RTHZ = 0.014
 RATE_HZ, RANGE_DPS = 100.0, 2000.0
 LSB_PER_DPS, LSB_PER_MS2, LSB_PER_HEADING_DEG, LSB_PER_QUATERNION = 16.0, 100.0, 16.0, 16384.0
 OTHERS = {
-    0x00: "nothing that drives the bus: SDA held low, or a missing ground",
-    0xFF: "nothing that drives the bus: SDA is not connected",
-    0xFB: "a BNO055 whose registers are read one too far: a bus that loses clocks",
+    0x00: "no device: SDA is held low, or ground is missing",
+    0xFF: "no device: SDA is not connected",
+    0xFB: "a BNO055 whose registers are read at a wrong position: the bus loses clock pulses",
 }
 
 _CHIP_ID, _PAGE_ID, _ACC_DATA, _FIRST, _EUL_DATA, _TEMP = 0x00, 0x07, 0x08, 0x14, 0x1A, 0x34
 _UNIT_SEL, _OPR_MODE, _LAST = 0x3B, 0x3D, 0x3E
 _CONFIG_MODE, _IMU_MODE, _FUSION_RUNNING = 0x00, 0x08, 5
 _TO_CONFIG_S, _FROM_CONFIG_S = 0.02, 0.01
-"""Mode switches of 19 and 7 ms (3.3), and some."""
+"""Mode changes take 19 and 7 ms (3.3), plus a margin."""
 _START_S, _POLL_S = 1.2, 0.05
-"""It is silent for 650 ms after power-up (1.2), and its fusion takes some more."""
+"""The sensor is silent for 650 ms after power-up (1.2), and its fusion needs some more time."""
 _LEARN_S = 3.0
-"""Longest time that the gyro's calibration is waited for."""
+"""Longest time to wait for the gyro's calibration."""
 _GAP_S = 0.5
-"""Longest time between two readings: at the table's fastest (200 °/s) it turns by 100° meanwhile."""
+"""Longest time between two readings: at its highest speed (200 °/s), the table rotates by 100°."""
 _CARRIED_DEG = 0.01
-"""Difference between orientation and rate that is left to the next reading: the orientation's own resolution."""
+"""Difference between orientation and rate that the next reading corrects: the orientation's resolution."""
 _ORIENTATION_AGE_S = 0.015
-"""How old an orientation may be: a period of the fusion, and the reading."""
+"""Largest age of an orientation: a period of the fusion, plus the reading."""
 _G = 9.80665
 
 
 @dataclass(frozen=True, slots=True)
 class Bno055Calibration:
-    """How well the sensor says it is calibrated: 0 not at all, 3 fully. Without magnetometer only ``gyro`` matters."""
+    """The sensor's calibration status: 0 not at all, 3 fully. Without magnetometer only ``gyro`` matters."""
 
     system: int
     gyro: int
@@ -57,7 +57,7 @@ class Bno055Calibration:
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """The registers from the gyro's to the power mode, all of one transfer."""
+    """The registers from the gyro to the power mode, read in one transfer."""
 
     gyro_dps: Floats
     orientation: Floats
@@ -65,11 +65,11 @@ class _Reading:
 
 
 class Bno055:
-    """A BNO055 as a `rig.devices.imu.Imu`.
+    """A BNO055; implements `rig.devices.imu.Imu`.
 
-    Its samples follow the gyro at its readings, and add up to the rotation of the orientation: between two readings
-    that are further apart than the gyro's period they are an interpolation. So it must be read while the table moves,
-    as the control loop does, for its rates to be true at their times.
+    Its samples follow the gyro's readings, and their sum is the rotation of the orientation. Between two readings that
+    are further apart than the gyro's period, they are interpolated. Therefore the rates are only correct if the sensor
+    is read while the table moves, as the control loop does.
 
     Parameters
     ----------
@@ -83,11 +83,11 @@ class Bno055:
     Raises
     ------
     DeviceNotFound
-        When the bus cannot be opened, or nobody acknowledges the address, a second after power-up either.
+        The bus cannot be opened, or no device acknowledges the address, also a second after power-up.
     DeviceMismatch
-        When something else answers there.
+        Another device answers there.
     DeviceFault
-        When its fusion does not run, or it does not keep its settings.
+        Its fusion does not run, or it does not keep its settings.
     """
 
     _last: _Reading
@@ -96,7 +96,7 @@ class Bno055:
 
     def __init__(self, bus: int | str, *, clock: Clock, address: int = 0x28) -> None:
         self._clock = clock
-        self._wire = I2cRegisters(bus, address, clock)
+        self._registers = I2cRegisters(bus, address, clock)
         self._period_ns = round(1e9 / RATE_HZ)
         try:
             self.identity = self._identify()
@@ -107,7 +107,7 @@ class Bno055:
 
     @property
     def statistics(self) -> I2cStatistics:
-        return self._wire.statistics
+        return self._registers.statistics
 
     @property
     def rate_hz(self) -> float:
@@ -118,7 +118,7 @@ class Bno055:
         return RANGE_DPS
 
     def close(self) -> None:
-        self._wire.close()
+        self._registers.close()
 
     def read_samples(self) -> ImuSamples:
         """Return samples for the time since the last call.
@@ -126,9 +126,9 @@ class Bno055:
         Raises
         ------
         DeviceSilent
-            When the sensor does not answer, after retries.
+            The sensor does not answer, also after retries.
         DeviceFault
-            When it was reset, its fusion stopped, or what it says cannot be.
+            The sensor was reset, its fusion stopped, or its data are impossible.
         """
         now_ns = self._clock.now_ns()
         reading = self._read()
@@ -154,21 +154,21 @@ class Bno055:
     def read_gravity_g(self) -> Floats:
         """Return one accelerometer reading (3,), in g; raises as `read_samples` does."""
         self._read()
-        return np.frombuffer(self._wire.read(_ACC_DATA, 6), "<i2") / (LSB_PER_MS2 * _G)
+        return np.frombuffer(self._registers.read(_ACC_DATA, 6), "<i2") / (LSB_PER_MS2 * _G)
 
     def temperature_c(self) -> float:
         """Return the temperature of the sensor's die; raises as `read_samples` does."""
         self._read()
-        return float(int.from_bytes(self._wire.read(_TEMP, 1), "little", signed=True))
+        return float(int.from_bytes(self._registers.read(_TEMP, 1), "little", signed=True))
 
     def heading_deg(self) -> float:
-        """Return the fusion's own heading, counter-clockwise, from where it was at power-up; 0..360."""
+        """Return the fusion's heading in [0, 360), counter-clockwise, relative to power-up."""
         self._read()
-        clockwise = int.from_bytes(self._wire.read(_EUL_DATA, 2), "little", signed=True) / LSB_PER_HEADING_DEG
+        clockwise = int.from_bytes(self._registers.read(_EUL_DATA, 2), "little", signed=True) / LSB_PER_HEADING_DEG
         return -clockwise % 360.0
 
     def calibration(self) -> Bno055Calibration:
-        """Return the calibration status; the gyro's reaches 3 after some seconds of rest."""
+        """Return the calibration status; the gyro's reaches 3 after a few seconds at rest."""
         return self._read().calibration
 
     # -- setting up ---------------------------------------------------------------------------------------------------
@@ -177,30 +177,30 @@ class Bno055:
         give_up_ns = self._clock.now_ns() + round(_START_S * 1e9)
         while True:
             try:
-                got = self._wire.read(_CHIP_ID, 1)[0]
+                got = self._registers.read(_CHIP_ID, 1)[0]
                 break
             except DeviceSilent as silent:
                 if self._clock.now_ns() > give_up_ns:
-                    raise self._wire.nobody(silent, "ADR pin (low 0x28, high 0x29)") from silent
+                    raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent
                 self._clock.sleep(_POLL_S)
-        address, bus = self._wire.address, self._wire.name
+        address, bus = self._registers.address, self._registers.name
         if got != EXPECTED_ID:
-            likely = OTHERS.get(got, "another chip; a BNO080 or BNO085 speaks another language at nearby addresses")
+            likely = OTHERS.get(got, "another chip; a BNO080 or BNO085 uses another protocol at similar addresses")
             raise DeviceMismatch(
                 f"CHIP_ID at I2C address {address:#04x} of {bus} is {got:#04x}, expected {EXPECTED_ID:#04x} (BNO055): "
-                f"probably {likely}",
+                f"probably {likely}.",
                 next_step="Check the wiring, or give the address and model of the sensor (imu.address, imu.model).",
                 evidence={"got": got, "expected": EXPECTED_ID},
             )
         return ImuIdentity("BNO055", address, got, NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
-        self._wire.write(_PAGE_ID, 0)
-        self._wire.write(_OPR_MODE, _CONFIG_MODE)
+        self._registers.write(_PAGE_ID, 0)
+        self._registers.write(_OPR_MODE, _CONFIG_MODE)
         self._clock.sleep(_TO_CONFIG_S)
-        self._wire.write(_UNIT_SEL, 0)  # m/s², °/s, °, °C
-        self._wire.write(_LAST, 0)  # normal power
-        self._wire.write(_OPR_MODE, _IMU_MODE)
+        self._registers.write(_UNIT_SEL, 0)  # m/s², °/s, °, °C
+        self._registers.write(_LAST, 0)  # normal power
+        self._registers.write(_OPR_MODE, _IMU_MODE)
         self._clock.sleep(_FROM_CONFIG_S)
         started_ns = self._clock.now_ns()
         while True:
@@ -212,7 +212,7 @@ class Bno055:
                 if waited_s > _START_S:
                     raise
             else:
-                # Until it has learned its zero it turns by itself. On a table that does not rest it never will.
+                # Without calibration the orientation drifts. On a moving table, calibration never completes.
                 if reading.calibration.gyro == 3 or waited_s > _LEARN_S:
                     break
         self._start_over(reading, self._clock.now_ns())
@@ -223,12 +223,12 @@ class Bno055:
     # -- the bus ------------------------------------------------------------------------------------------------------
 
     def _read(self) -> _Reading:
-        """Read everything that makes a reading, and that says whether to believe it, in one transfer.
+        """Read the data and the status that shows whether they are valid, in one transfer.
 
-        I2C has no checksum; an orientation that is no rotation was spoiled on its way, and is read once more.
+        I2C has no checksum. An orientation whose norm is not 1 was corrupted by the bus, and is read once more.
         """
         for _ in range(2):
-            block = self._wire.read(_FIRST, _LAST + 1 - _FIRST)
+            block = self._registers.read(_FIRST, _LAST + 1 - _FIRST)
             orientation = np.frombuffer(block[0x0C:0x14], "<i2") / LSB_PER_QUATERNION
             status = block[0x25:]  # SYS_STATUS, SYS_ERR, UNIT_SEL, -, OPR_MODE, PWR_MODE
             mode = status[4] & 0x0F  # the upper bits are reserved
@@ -239,12 +239,12 @@ class Bno055:
                 return _Reading(np.frombuffer(block[:6], "<i2") / LSB_PER_DPS, orientation, calibration)
         reset = mode == _CONFIG_MODE
         raise DeviceFault(
-            "the BNO055 was reset: its supply was interrupted"
+            "The BNO055 was reset: its supply was interrupted."
             if reset
-            else "the BNO055's fusion does not run as it was set up, or the bus corrupts bytes",
+            else "The BNO055's fusion does not run with its settings, or the bus corrupts bytes.",
             next_step="Check its supply and cable, then open the bench again."
             if reset
-            else "Open the bench again. On a Raspberry Pi the BNO055 needs a slow bus (it stretches the clock): "
+            else "Open the bench again. On a Raspberry Pi the BNO055 needs a slow bus because it stretches the clock: "
             "dtparam=i2c_arm_baudrate=10000, or a software bus (i2c-gpio).",
             evidence={
                 "system_status": {"got": status[0], "expected": _FUSION_RUNNING},
@@ -262,7 +262,7 @@ def _rotation_deg(before: Floats, after: Floats) -> Floats:
     w0, v0, w1, v1 = before[0], before[1:], after[0], after[1:]
     w = w0 * w1 + v0 @ v1
     v = w0 * v1 - w1 * v0 - np.cross(v0, v1)
-    if w < 0:  # an orientation has two signs
+    if w < 0:  # q and −q are the same orientation
         w, v = -w, -v
     size = float(np.linalg.norm(v))
     return np.asarray(np.degrees(2 * np.arctan2(size, w)) * v / size if size else np.zeros(3))

@@ -1,4 +1,4 @@
-"""What the rig asks of a camera."""
+"""The interface of a camera."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class CameraIdentity:
-    """Which camera it is and the mode it runs in."""
+    """The camera's name and its mode."""
 
     name: str
     width: int
@@ -20,7 +20,7 @@ class CameraIdentity:
 
 @dataclass(frozen=True, slots=True)
 class CameraLocks:
-    """Settings that must not drift between enrollment and query; None where the camera does not tell."""
+    """Settings that must not change between enrollment and identification; None if the camera does not report one."""
 
     exposure_us: float | None
     gain: float | None
@@ -33,7 +33,7 @@ class CameraLocks:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image with its evidence: ``exposed_ns`` is the start of its exposure on the bench's clock."""
+    """An image; ``exposed_ns`` is the start of its exposure on the bench's clock."""
 
     image_bgr: NDArray[np.uint8]
     exposed_ns: int
@@ -48,7 +48,7 @@ class Camera(Protocol):
     def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
 
-        ``meanwhile`` is called several times a second while a slow camera is waited for.
+        ``meanwhile`` is called several times per second while the method waits for a slow camera.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""The registers of one sensor on an I2C bus of the computer, through smbus2, with retries and words for what fails."""
+"""Registers of a sensor on an I2C bus of the computer, through smbus2, with retries and explained errors."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -16,7 +16,7 @@ _SMBUS_BLOCK = 32
 _REASONS = {
     **dict.fromkeys((ENXIO, EREMOTEIO), "it does not acknowledge"),
     **dict.fromkeys((ETIMEDOUT, EBUSY, EAGAIN), "the bus is stuck: something holds SDA or SCL low"),
-    EIO: "a transfer broke off",
+    EIO: "a transfer was interrupted",
 }
 _STUCK = (ETIMEDOUT, EBUSY, EAGAIN)
 
@@ -25,7 +25,7 @@ _T = TypeVar("_T")
 
 @dataclass(slots=True)
 class I2cStatistics:
-    """What the bus has been through since it was opened; ``overflows`` counts the times that samples were lost."""
+    """Statistics since the bus was opened; ``overflows`` counts how often samples were lost."""
 
     transfers: int = 0
     retries: int = 0
@@ -43,7 +43,7 @@ class I2cRegisters:
     bus
         Number of the I2C bus, or the path of its device file.
     address
-        Of the device, 7 bits.
+        The device's address, 7 bits.
     clock
         The bench's clock.
 
@@ -68,7 +68,7 @@ class I2cRegisters:
         return self.transfer(lambda: self.read_once(register, count))
 
     def read_once(self, register: int, count: int) -> bytes:
-        """Return ``count`` bytes from ``register`` on; OSError where the bus fails."""
+        """Return ``count`` bytes from ``register`` on; raises OSError if the bus fails."""
         if count <= _SMBUS_BLOCK:
             return bytes(self._bus.read_i2c_block_data(self.address, register, count))
         answer = i2c_msg.read(self.address, count)
@@ -79,7 +79,7 @@ class I2cRegisters:
         self.transfer(lambda: self._bus.write_i2c_block_data(self.address, register, list(values)))
 
     def transfer(self, transfer: Callable[[], _T]) -> _T:
-        """Return what ``transfer`` does, and try again when the bus fails.
+        """Return the result of ``transfer``; repeat it if the bus fails.
 
         Raises
         ------
@@ -97,21 +97,21 @@ class I2cRegisters:
                 failure = error
         reason = _REASONS.get(failure.errno or 0, failure.strerror)
         raise DeviceSilent(
-            f"the sensor at I2C address {self.address:#04x} of {self.name} stopped answering: {reason}",
-            next_step="Take the supply from all sensors of this bus for a moment, and look for a short at SDA and SCL; "
-            "then open the bench again."
+            f"The sensor at I2C address {self.address:#04x} of {self.name} stopped answering: {reason}.",
+            next_step="Switch the supply of all sensors on this bus off and on, and check SDA and SCL for a short. "
+            "Then open the bench again."
             if failure.errno in _STUCK
             else "Check its plug and supply, then open the bench again.",
             evidence={"errno": failure.errno, "attempts": ATTEMPTS, "retries_so_far": self.statistics.retries},
         ) from failure
 
-    def nobody(self, silent: DeviceSilent, pin: str) -> DeviceNotFound:
-        """Return the error for a sensor that never answered; ``pin`` says which pin sets its address, and how."""
+    def not_found(self, silent: DeviceSilent, pin: str) -> DeviceNotFound:
+        """Return the error for a sensor that never answered; ``pin`` names the pin that sets its address."""
         return DeviceNotFound(
-            f"nobody answers at I2C address {self.address:#04x} of {self.name}",
+            f"No sensor answers at I2C address {self.address:#04x} of {self.name}.",
             next_step=f"Check the sensor's supply, SDA, SCL and ground, and the {pin}; "
-            f"`i2cdetect -y {self.name.removeprefix('/dev/i2c-')}` shows who is there (UU: a kernel driver "
-            "holds the address).",
+            f"`i2cdetect -y {self.name.removeprefix('/dev/i2c-')}` lists the addresses that answer (UU: a "
+            "kernel driver uses the address).",
             evidence=silent.evidence,
         )
 
@@ -124,13 +124,13 @@ def _open(path: str) -> SMBus:
         bus.close()
         match error:
             case FileNotFoundError():
-                next_step = "Enable I2C (on a Raspberry Pi: `raspi-config`); `i2cdetect -l` lists the buses there are."
+                next_step = "Enable I2C (on a Raspberry Pi: `raspi-config`); `i2cdetect -l` lists the buses."
             case PermissionError():
                 next_step = "Join the group i2c (`sudo usermod -aG i2c $USER`), then log in again."
             case _:
                 next_step = "Give the device file of an I2C bus; `i2cdetect -l` lists them."
         raise DeviceNotFound(
-            f"the I2C bus {path} cannot be opened: {error.strerror}",
+            f"The I2C bus {path} cannot be opened: {error.strerror}.",
             next_step=next_step,
             evidence={"errno": error.errno},
         ) from error

@@ -1,4 +1,4 @@
-"""What the rig asks of an inertial sensor on the platter."""
+"""The interface of an inertial sensor on the platter."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class ImuIdentity:
-    """Who answers on the bus, and the noise its datasheet states."""
+    """The sensor that answers on the bus, and its noise by the datasheet."""
 
     model: str
     bus_address: int
@@ -28,10 +28,9 @@ class ImuSamples:
     gyro_dps : float64 (n, 3)
         Angular rate about the sensor's x, y, z.
     lost : int
-        Samples that the sensor took but could not hand over (FIFO overflow) before these; an integral across them is
-        void.
+        Samples that were lost before these (FIFO overflow); an integral across them is not valid.
     time_uncertainty_ns : int or None
-        Largest standard uncertainty of ``time_ns``; None where it is not known.
+        Largest standard uncertainty of ``time_ns``; None if it is not known.
     """
 
     time_ns: NDArray[np.int64]
@@ -41,7 +40,7 @@ class ImuSamples:
 
 
 class Imu(Protocol):
-    """A gyroscope (and accelerometer) that rides on the platter."""
+    """A gyroscope and accelerometer on the platter."""
 
     @property
     def identity(self) -> ImuIdentity: ...

@@ -1,7 +1,7 @@
 """The MPU-6050 on an I2C bus of the computer, through smbus2.
 
-Registers: RM-MPU-6000A rev 4.2; noise and scales: PS-MPU-6000A rev 3.4. The gyro's samples are taken by the sensor's
-own clock and wait in its FIFO, so that a late reader loses no rotation.
+Registers: RM-MPU-6000A rev 4.2; noise and scales: PS-MPU-6000A rev 3.4. The sensor takes the gyro's samples by its own
+clock and stores them in its FIFO, so a late reader loses no rotation.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ _RESET_S, _START_S = 0.1, 0.05
 """After DEVICE_RESET (register 107), and the gyro's start-up of 30 ms (PS 6.1) with the PLL's settling."""
 
 _FRAME, _FIFO_FULL = 6, 1018
-"""A frame of three words, and the last count at which another frame still fits into the 1024 bytes."""
+"""Bytes of a frame of three words, and the largest count at which another frame fits into the 1024 bytes."""
 
 NOISE_DPS_RTHZ = 0.005
 LSB_PER_G = 16384.0
@@ -39,15 +39,15 @@ OTHERS = {
     0x12: "an ICM-20602",
     0x19: "an MPU-6886",
     0x98: "an ICM-20689, or a clone",
-    0x00: "nothing that drives the bus: SDA held low, or a missing ground",
-    0xFF: "nothing that drives the bus: SDA is not connected",
+    0x00: "no device: SDA is held low, or ground is missing",
+    0xFF: "no device: SDA is not connected",
 }
 
 
 class Mpu6050:
-    """An MPU-6050 as a `rig.devices.imu.Imu`.
+    """An MPU-6050; implements `rig.devices.imu.Imu`.
 
-    Opening it resets the sensor, wakes it, sets it and reads the settings back.
+    Opening it resets the sensor, wakes it up, writes the settings and reads them back.
 
     Parameters
     ----------
@@ -60,20 +60,20 @@ class Mpu6050:
     range_dps
         Full scale of the gyro: 250, 500, 1000 or 2000 °/s.
     rate_hz
-        Samples a second, 1000 divided by a whole number up to 256.
+        Samples per second: 1000 divided by a whole number up to 256.
     bandwidth_hz
-        Of the gyro's low-pass: 188, 98, 42, 20, 10 or 5 Hz; below half of ``rate_hz``, or noise folds down.
+        Bandwidth of the gyro's low-pass: 188, 98, 42, 20, 10 or 5 Hz; below half of ``rate_hz`` to avoid aliasing.
 
     Raises
     ------
     ConfigError
-        When a setting is none that the sensor has.
+        The sensor does not have a setting.
     DeviceNotFound
-        When the bus cannot be opened, or nobody acknowledges the address.
+        The bus cannot be opened, or no device acknowledges the address.
     DeviceMismatch
-        When something else answers there.
+        Another device answers there.
     DeviceFault
-        When the sensor does not keep its settings.
+        The sensor does not keep its settings.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Mpu6050:
         self._settings = settings(range_dps, rate_hz, bandwidth_hz)
         self._period_ns = 1_000_000 * (1 + self._settings[SMPLRT_DIV][0])
         self._newest_ns = clock.now_ns()
-        self._wire = I2cRegisters(bus, address, clock)
+        self._registers = I2cRegisters(bus, address, clock)
         try:
             self.identity = self._identify()
             self._set_up()
@@ -102,7 +102,7 @@ class Mpu6050:
 
     @property
     def statistics(self) -> I2cStatistics:
-        return self._wire.statistics
+        return self._registers.statistics
 
     @property
     def rate_hz(self) -> float:
@@ -113,30 +113,32 @@ class Mpu6050:
         return 32767 / LSB_PER_DPS[self._range_dps]
 
     def close(self) -> None:
-        self._wire.close()
+        self._registers.close()
 
     def read_samples(self) -> ImuSamples:
-        """Return what the FIFO holds.
+        """Return the samples in the FIFO.
 
-        The newest sample is dated whole periods after the newest of the last call, corrected where that leaves the
-        period before the count was read; the others are spread evenly between the two. So the sensor's clock may run a
-        little fast or slow, and the times stay in order.
+        The newest sample is dated whole periods after the newest of the last call, corrected to the period before the
+        count was read. The others are evenly spaced between the two. So the times stay in order although the sensor's
+        clock may be a little fast or slow.
 
         Raises
         ------
         DeviceSilent
-            When the sensor does not answer, after retries.
+            The sensor does not answer, also after retries.
         DeviceFault
-            When it fell back to sleep or lost its settings (a brown-out).
+            The sensor fell asleep or lost its settings (a brown-out).
         """
         before_ns = self._clock.now_ns()
         count = self._fifo_count()
         after_ns = self._clock.now_ns()
-        if count > _FIFO_FULL or (self._odd(count, after_ns) and self._odd(count := self._fifo_count(), after_ns)):
-            return self._start_over()  # twice a broken frame: not one that was just being written
+        if count > _FIFO_FULL or (
+            self._implausible(count, after_ns) and self._implausible(count := self._fifo_count(), after_ns)
+        ):
+            return self._start_over()  # an incomplete frame twice: not one that is being written
         samples, missing = count // _FRAME, 0
         due = (before_ns - self._newest_ns) / self._period_ns
-        if samples < 0.9 * due - 2:  # the sensor's clock is off by 5 % at most (PS 6.6): it did not sample all the time
+        if samples < 0.9 * due - 2:  # the sensor's clock is off by at most 5 % (PS 6.6): samples are missing
             self._check_settings()
             missing = round(due) - samples
         data = self._pop(count) if count else b""
@@ -154,50 +156,50 @@ class Mpu6050:
     def read_gravity_g(self) -> NDArray[np.float64]:
         """Return one accelerometer reading (3,), in g; raises as `read_samples` does."""
         self._check_settings()
-        return np.frombuffer(self._wire.read(_ACCEL_XOUT_H, 6), ">i2") / LSB_PER_G
+        return np.frombuffer(self._registers.read(_ACCEL_XOUT_H, 6), ">i2") / LSB_PER_G
 
     def temperature_c(self) -> float:
         """Return the temperature of the sensor's die (register 65); raises as `read_samples` does."""
         self._check_settings()
-        return int.from_bytes(self._wire.read(_TEMP_OUT_H, 2), "big", signed=True) / 340 + 36.53
+        return int.from_bytes(self._registers.read(_TEMP_OUT_H, 2), "big", signed=True) / 340 + 36.53
 
     # -- setting up -----------------------------------------------------------------------------------------------
 
     def _identify(self) -> ImuIdentity:
         try:
-            got = self._wire.read(_WHO_AM_I, 1)[0]
+            got = self._registers.read(_WHO_AM_I, 1)[0]
         except DeviceSilent as silent:
-            raise self._wire.nobody(silent, "AD0 pin (low 0x68, high 0x69)") from silent
+            raise self._registers.not_found(silent, "AD0 pin (low 0x68, high 0x69)") from silent
         if got != EXPECTED_ID:
-            likely = OTHERS.get(got, "another chip; address 0x68 is also that of the clocks DS1307 and DS3231")
+            likely = OTHERS.get(got, "another chip; the clocks DS1307 and DS3231 also have address 0x68")
             raise DeviceMismatch(
-                f"WHO_AM_I at I2C address {self._address:#04x} of {self._wire.name} is {got:#04x}, "
-                f"expected {EXPECTED_ID:#04x} (MPU-6050): probably {likely}",
+                f"WHO_AM_I at I2C address {self._address:#04x} of {self._registers.name} is {got:#04x}, "
+                f"expected {EXPECTED_ID:#04x} (MPU-6050): probably {likely}.",
                 next_step="Check the wiring, or give the address of the MPU-6050; another chip needs its own driver.",
                 evidence={"got": got, "expected": EXPECTED_ID},
             )
         return ImuIdentity("MPU-6050", self._address, got, NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
-        self._wire.write(_PWR_MGMT_1, _DEVICE_RESET)
+        self._registers.write(_PWR_MGMT_1, _DEVICE_RESET)
         self._clock.sleep(_RESET_S)
-        self._wire.write(_PWR_MGMT_1, _CLOCK_PLL_GYRO_X)
+        self._registers.write(_PWR_MGMT_1, _CLOCK_PLL_GYRO_X)
         self._clock.sleep(_START_S)
         for register, values in self._settings.items():
-            self._wire.write(register, *values)
+            self._registers.write(register, *values)
         self._empty_fifo()
         self._check_settings()
 
     def _check_settings(self) -> None:
-        """Raise DeviceFault unless the sensor is awake with the settings it was given."""
-        got = {register: self._wire.read(register, len(values)) for register, values in self._settings.items()}
+        """Raise `DeviceFault` unless the sensor is awake and has its settings."""
+        got = {register: self._registers.read(register, len(values)) for register, values in self._settings.items()}
         if got == self._settings:
             return
         asleep = got[_USER_CTRL][1] & _ASLEEP
         raise DeviceFault(
-            "the MPU-6050 fell asleep: its supply was interrupted"
+            "The MPU-6050 fell asleep: its supply was interrupted."
             if asleep
-            else "the MPU-6050 does not keep its settings: another program changed them, or the bus corrupts bytes",
+            else "The MPU-6050 lost its settings: another program changed them, or the bus corrupts bytes.",
             next_step="Check its supply and cable, then open the bench again."
             if asleep
             else "Close other programs that use the I2C bus, shorten its cable, then open the bench again.",
@@ -205,29 +207,29 @@ class Mpu6050:
         )
 
     def _start_over(self) -> ImuSamples:
-        """Give up what the FIFO holds: it is full, or its frames are broken."""
+        """Drop the FIFO's content: it is full, or its frames are corrupt."""
         self.statistics.overflows += 1
         lost = max(round((self._clock.now_ns() - self._newest_ns) / self._period_ns), 1)
         self._empty_fifo()
         return ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), lost)
 
     def _empty_fifo(self) -> None:
-        self._wire.write(_USER_CTRL, _FIFO_RESET)  # works only while FIFO_EN is 0 (register 106)
-        self._wire.write(_USER_CTRL, _FIFO_ENABLE)
+        self._registers.write(_USER_CTRL, _FIFO_RESET)  # works only while FIFO_EN is 0 (register 106)
+        self._registers.write(_USER_CTRL, _FIFO_ENABLE)
         self._newest_ns = self._clock.now_ns() - self._period_ns // 2  # the next sample comes within a period
 
-    def _odd(self, count: int, now_ns: int) -> bool:
-        """Return whether the FIFO cannot hold so many bytes: a broken frame, or more than was sampled (a misread)."""
+    def _implausible(self, count: int, now_ns: int) -> bool:
+        """Return whether a count is impossible: an incomplete frame, or more bytes than were sampled."""
         due = (now_ns - self._newest_ns) / self._period_ns
         return bool(count % _FRAME) or count > _FRAME * (1.1 * due + 3)
 
     # -- the bus --------------------------------------------------------------------------------------------------
 
     def _fifo_count(self) -> int:
-        return int.from_bytes(self._wire.read(_FIFO_COUNTH, 2), "big")
+        return int.from_bytes(self._registers.read(_FIFO_COUNTH, 2), "big")
 
     def _pop(self, count: int) -> bytes | None:
-        """Read ``count`` bytes of the FIFO; None when a broken transfer took some of them along."""
+        """Read ``count`` bytes of the FIFO; None if an interrupted transfer consumed some of them."""
         repeated = False
 
         def pop() -> bytes | None:
@@ -235,13 +237,13 @@ class Mpu6050:
             if repeated and self._fifo_count() < count:
                 return None
             repeated = True
-            return self._wire.read_once(_FIFO_R_W, count)
+            return self._registers.read_once(_FIFO_R_W, count)
 
-        return self._wire.transfer(pop)
+        return self._registers.transfer(pop)
 
 
 def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:
-    """Return the values to write, and to find again, by their first register."""
+    """Return the values to write and to check, by their first register."""
     mistakes: dict[str, Any] = {}
     divider = round(1000 / rate_hz) if 3.9 < rate_hz <= 1000 else 0
     if not (1 <= divider <= 256 and abs(1000 / divider - rate_hz) < 1e-6 * rate_hz):
@@ -252,7 +254,8 @@ def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, byt
         mistakes["bandwidth_hz"] = f"{bandwidth_hz}: give one of {', '.join(map(str, _FILTERS))}"
     if mistakes:
         raise ConfigError(
-            "the MPU-6050 has no such setting: " + "; ".join(f"{name} = {text}" for name, text in mistakes.items()),
+            "The MPU-6050 does not have these settings: "
+            + "; ".join(f"{name} = {text}" for name, text in mistakes.items()),
             next_step="Correct these values of the IMU in the configuration.",
             evidence=mistakes,
         )

@@ -1,4 +1,4 @@
-"""The inertial sensor that the configuration names, on an I2C bus."""
+"""Opens the configured inertial sensor on an I2C bus."""
 
 from rig.config import ImuConfig
 from rig.core.clock import Clock
@@ -13,7 +13,7 @@ def open_imu(config: ImuConfig, bus: int | str, clock: Clock) -> Imu:
     Raises
     ------
     ConfigError, DeviceNotFound, DeviceMismatch, DeviceFault, DeviceSilent
-        As the driver of the model does.
+        See the driver of the model.
     """
     if config.model == "bno055":
         return Bno055(bus, clock=clock, address=config.address)

@@ -1,25 +1,20 @@
-"""A camera through OpenCV: settings locked and read back, frames chosen by when they were exposed.
+"""A camera through OpenCV: settings are locked and read back, frames are selected by their time of exposure.
 
-A UVC camera's driver keeps up to ten old frames, so what `VideoCapture` hands out next may show the past. Three kinds
-of source tell in different ways when a frame was exposed (`TimeBase`); which one applies is found out when the camera
-is opened:
+A UVC camera's driver buffers up to ten frames, so the next frame of `VideoCapture` may be old. The time of exposure is
+known in one of three ways (`TimeBase`), which is determined when the camera is opened:
 
-- stamped: ``CAP_PROP_POS_MSEC`` is the bench's monotonic clock in milliseconds, as V4L2 has it; each frame is judged by
-  its stamp;
-- paced: a live source whose stamps are something else. A frame for which `grab` had to wait is new, and its exposure
-  began no earlier than ``latency_s`` before it came; the frames before it drain a buffer of any length;
-- recorded: a source with a known number of frames, such as a video file. It has no past: a frame counts as exposed when
-  it is read.
+- stamped: ``CAP_PROP_POS_MSEC`` is the bench's monotonic clock in milliseconds, as in V4L2. Each frame has its time.
+- paced: a live source with other stamps. A frame for which `grab` had to wait is new, and its exposure began at most
+  ``latency_s`` before it arrived. The frames before it empty the buffer.
+- recorded: a source with a known number of frames, such as a video file. A frame counts as exposed when it is read.
 """
 
-import os
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import floor
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,33 +22,18 @@ import numpy as np
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
+from rig.devices.opencv_capture import Capture
 
 V4L2_EXPOSURE_MANUAL = 1
-_V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera chooses the time
+_V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera sets the time
 _EXPOSURE_UNIT_US = 100.0  # V4L2_CID_EXPOSURE_ABSOLUTE
 
-_PROBES = 16  # frames to look at when opened: more than a driver keeps
-_RETRIES = 5  # grabs in a row that may fail
-_FRESH_S = 1.0  # a frame that the camera has just delivered is younger
-_STAMP_ERROR_NS = 2_000_000  # how far a stamp may lie ahead of the clock
-_SLICE_S = 0.2  # how long a frame is waited for without doing what has to be done meanwhile
+_PROBES = 16  # frames to examine when opened: more than a driver buffers
+_RETRIES = 5  # attempts to grab a frame
+_FRESH_S = 1.0  # largest age of a frame that the camera just delivered
+_STAMP_ERROR_NS = 2_000_000  # how far a stamp may be ahead of the clock
+_SLICE_S = 0.2  # longest wait for a frame between two calls of ``meanwhile``
 _REPLUG_PAUSE_S = 0.25
-
-
-class Capture(Protocol):
-    """What the driver uses of `cv2.VideoCapture`."""
-
-    def isOpened(self) -> bool: ...  # noqa: N802
-
-    def grab(self) -> bool: ...
-
-    def retrieve(self) -> tuple[bool, Any]: ...
-
-    def get(self, propId: int, /) -> float: ...
-
-    def set(self, propId: int, value: float, /) -> bool: ...
-
-    def release(self) -> None: ...
 
 
 class TimeBase(Enum):
@@ -66,7 +46,7 @@ class TimeBase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """What the camera is asked for; None leaves a setting to the camera.
+    """Requested settings; None leaves a setting to the camera.
 
     ``gain`` and ``focus`` are in the camera's own units, as `v4l2-ctl --list-ctrls` shows them.
     """
@@ -88,7 +68,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class RejectedSetting:
-    """A setting that the camera did not take: what it was asked for, and what it reports."""
+    """A setting that the camera did not accept: the requested and the reported value."""
 
     setting: str
     asked: float
@@ -101,20 +81,20 @@ class OpenCvCamera:
     Parameters
     ----------
     capture
-        An open source, such as `open_capture` returns. The camera owns it from here on.
+        An open source, for example from `open_capture`. The camera closes it.
     clock
         The bench's clock.
     settings
-        What to ask of the camera. `rejected_settings` lists what it does not take; `read_locks` returns its settings.
+        Requested settings. `rejected_settings` lists those that the camera did not accept.
     name
-        Its name in records.
+        The camera's name in records.
     timeout_s
-        How long `capture` waits for a frame that is new enough.
+        How long `capture` waits for a new frame.
     latency_s
-        For a paced source: the longest time from the start of an exposure until `grab` has it; three frames if None.
+        For a paced source: longest time from the start of the exposure until `grab` returns; None: three frames.
     reopen
-        Opens the source anew (DeviceNotFound while it is not there): a camera that was unplugged and comes back within
-        ``timeout_s`` is set as it was, and goes on.
+        Opens the source again (raises DeviceNotFound while it is missing). A camera that was unplugged for less than
+        ``timeout_s`` gets its settings again and continues.
 
     Raises
     ------
@@ -162,14 +142,14 @@ class OpenCvCamera:
     def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
 
-        ``meanwhile`` is called several times a second while a slow camera is waited for.
+        ``meanwhile`` is called several times per second while the method waits for a slow camera.
 
         Raises
         ------
         DeviceSilent
-            No such frame came within the time-out, or the camera has stopped delivering.
+            No such frame arrived within the time-out, or the camera stopped delivering frames.
         DeviceMismatch
-            The camera that came back after it was unplugged is another one, or in another mode.
+            After it was unplugged, another camera answers, or the camera has another mode.
         """
         deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(self._timeout_s, 3 * max(self._waits_s)) * 1e9)
         dropped = 0
@@ -210,7 +190,7 @@ class OpenCvCamera:
     # -- settings -----------------------------------------------------------------------------------------------------
 
     def _configure(self, settings: CameraSettings) -> tuple[RejectedSetting, ...]:
-        """Ask for every setting; an automatic is switched off before its value is set, as UVC needs it."""
+        """Request all settings; UVC requires that an automatic is switched off before its value is set."""
         asked: list[tuple[str, int, float]] = []
 
         def ask(name: str, prop: int, value: float | None) -> None:
@@ -229,8 +209,8 @@ class OpenCvCamera:
         if settings.white_balance_k is not None:
             ask("auto_white_balance", cv2.CAP_PROP_AUTO_WB, 0)
             ask("white_balance_k", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k)
-        # Focus stays where it is where nobody says where: one that hunts makes another picture of the same thing. A
-        # fixed lens has no autofocus to switch off.
+        # Without a configured focus the present one stays, because an autofocus would change the images. A fixed lens
+        # has no autofocus to switch off.
         if settings.focus is not None or self._capture.get(cv2.CAP_PROP_AUTOFOCUS) > 0:
             ask("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0)
         ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
@@ -242,14 +222,14 @@ class OpenCvCamera:
         )
 
     def _known(self, prop: int) -> float | None:
-        """Return a property, or None where OpenCV's 0 or -1 stands for "does not tell"."""
+        """Return a property; None if the camera does not report it (0 or -1 in OpenCV)."""
         value = self._capture.get(prop)
         return value if value > 0 or (value == 0 and prop in self._supported) else None
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
     def _find_time_base(self) -> TimeBase:
-        """Look at the first frames: past the old ones, those of a stamped source have only just been exposed."""
+        """Examine the first frames: after the old ones, the stamps of a stamped source are recent."""
         if self._capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0:
             return TimeBase.RECORDED
         for _ in range(_PROBES):
@@ -261,7 +241,7 @@ class OpenCvCamera:
         return TimeBase.PACED
 
     def _await(self, meanwhile: Callable[[], object]) -> None:
-        """Let the time pass until the next frame is about to come, as far as the last ones tell: `grab` only blocks."""
+        """Wait until shortly before the next frame, estimated from the last ones, because `grab` blocks."""
         spacing_s, now_ns = max(self._waits_s), self._clock.now_ns()
         frames = 1 + floor(seconds_between(self._arrived_ns, now_ns) / spacing_s)
         due_ns = self._arrived_ns + round((frames * spacing_s - _SLICE_S / 2) * 1e9)
@@ -270,17 +250,17 @@ class OpenCvCamera:
             meanwhile()
 
     def _grab(self) -> int | None:
-        """Take the next frame; return when its exposure began on the bench's clock, or None if that may be long ago."""
+        """Grab the next frame; return the start of its exposure on the bench's clock, or None if it may be old."""
         try:
             return self._grab_now()
         except DeviceSilent:
             if self._reopen is None or self.time_base is TimeBase.RECORDED or self._capture.isOpened():
                 raise
-            self._return(self._reopen)
+            self._reconnect(self._reopen)
             return self._grab_now()
 
-    def _return(self, reopen: Callable[[], Capture]) -> None:
-        """Wait until the camera is back, and set it as it was; raises what `reopen` does when it stays away."""
+    def _reconnect(self, reopen: Callable[[], Capture]) -> None:
+        """Wait until the camera is connected again, and set it up as before."""
         self._capture.release()
         give_up_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
         while True:
@@ -290,7 +270,7 @@ class OpenCvCamera:
             except DeviceNotFound as missing:
                 if self._clock.now_ns() > give_up_ns:
                     raise DeviceSilent(
-                        f"{self._identity.name} is gone, and did not come back in {self._timeout_s:g} s",
+                        f"{self._identity.name} was disconnected for more than {self._timeout_s:g} s.",
                         next_step=missing.next_step,
                         evidence=missing.evidence,
                     ) from missing
@@ -303,8 +283,8 @@ class OpenCvCamera:
         )
         if got != expected or rejected_settings != self.rejected_settings:
             raise DeviceMismatch(
-                f"{self._identity.name} came back as another camera, or with other settings",
-                next_step="Connect the camera that was there, or start again with this one.",
+                f"{self._identity.name} is another camera after it was unplugged, or has other settings.",
+                next_step="Connect the first camera again, or start again with this one.",
                 evidence={
                     "expected": list(expected),
                     "got": list(got),
@@ -316,7 +296,7 @@ class OpenCvCamera:
     def _grab_now(self) -> int | None:
         first_ns = self._clock.now_ns()
         attempts, waited_s = 0, 0.0
-        while attempts < _RETRIES and waited_s <= self._timeout_s:  # V4L2 itself waits long for a stream that hangs
+        while attempts < _RETRIES and waited_s <= self._timeout_s:  # V4L2 itself waits long for a hanging stream
             if attempts:
                 self._clock.sleep(self._period_s)
             asked_ns = self._clock.now_ns()
@@ -326,22 +306,22 @@ class OpenCvCamera:
             attempts += 1
             waited_s = seconds_between(first_ns, self._clock.now_ns())
         raise DeviceSilent(
-            f"{self._identity.name} delivers no frames: {attempts} attempts in a row failed"
+            f"{self._identity.name} delivers no frames: {attempts} attempts failed."
             if attempts > 1
-            else f"{self._identity.name} hangs: no frame in {waited_s:.0f} s",
-            next_step="a recording is at its end"
+            else f"{self._identity.name} hangs: no frame in {waited_s:.0f} s.",
+            next_step="The recording has ended."
             if self._capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0
-            else "check the camera's cable, and that no other program uses it",
+            else "Check the camera's cable, and that no other program uses it.",
             evidence={"attempts": attempts, "still_open": self._capture.isOpened()},
         )
 
     def _note_arrival(self, asked_ns: int) -> None:
-        """Learn how long the camera takes: a frame that was waited for has just come."""
+        """Measure how long the camera takes for a frame, after a wait for one."""
         now_ns = self._clock.now_ns()
         if seconds_between(asked_ns, now_ns) > self._period_s / 4:
             self._waits_s.append(seconds_between(asked_ns, now_ns))
             since_s = seconds_between(self._arrived_ns, now_ns)
-            if since_s < 2 * max(self._waits_s):  # the very next one: the whole of its time, not just the end of it
+            if since_s < 2 * max(self._waits_s):  # the next frame: its whole period, not only the end of it
                 self._waits_s.append(since_s)
             self._arrived_ns = now_ns
 
@@ -354,7 +334,7 @@ class OpenCvCamera:
             if self._last_stamp_ns < stamp_ns <= now_ns + _STAMP_ERROR_NS:
                 self._last_stamp_ns = stamp_ns
                 return stamp_ns
-            self.time_base = TimeBase.PACED  # stamps that repeat or lie in the future are not this clock's
+            self.time_base = TimeBase.PACED  # stamps that repeat or are in the future do not belong to this clock
         waited = seconds_between(asked_ns, now_ns) > self._period_s / 4
         return now_ns - self._latency_ns if waited else None
 
@@ -362,59 +342,20 @@ class OpenCvCamera:
         ok, image = self._capture.retrieve()
         if not ok or image is None:
             raise DeviceSilent(
-                f"{self._identity.name} lost a frame between grabbing and decoding it",
-                next_step="try again; if it repeats, try another cable or USB port",
+                f"{self._identity.name} lost a frame between grabbing and decoding it.",
+                next_step="Try again. If this repeats, try another cable or USB port.",
             )
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise DeviceFault(
-                f"{self._identity.name} delivers {image.dtype} images of shape {image.shape}, not 8-bit colour",
-                next_step="choose a colour format that OpenCV converts (v4l2-ctl --list-formats)",
+                f"{self._identity.name} delivers {image.dtype} images of shape {image.shape}, not 8-bit colour images.",
+                next_step="Choose a colour format that OpenCV converts (`v4l2-ctl --list-formats`).",
             )
         expected, got = (self._identity.width, self._identity.height), (image.shape[1], image.shape[0])
         if got != expected and all(expected):
             raise DeviceFault(
-                f"{self._identity.name} delivers frames of {got[0]}x{got[1]} pixels, it was opened with "
-                f"{expected[0]}x{expected[1]}",
-                next_step="open the bench again; a camera that loses its mode was reset: try another cable or USB port",
+                f"{self._identity.name} delivers frames of {got[0]}x{got[1]} pixels, but it was opened with "
+                f"{expected[0]}x{expected[1]}.",
+                next_step="Open the bench again. If this repeats, the camera resets: try another cable or USB port.",
                 evidence={"got": list(got), "expected": list(expected)},
             )
         return np.asarray(image, dtype=np.uint8)
-
-
-def open_capture(source: int | str | Path) -> cv2.VideoCapture:
-    """Open a camera by number or device path, or a video file, an image sequence (``img_%03d.png``) or a stream's URL.
-
-    Raises
-    ------
-    DeviceNotFound
-        Nothing is there, it may not be opened, or another program holds it; the next step says which.
-    """
-    if isinstance(source, int) or str(source).isdigit():
-        source = f"/dev/video{source}"
-    path = str(source)
-    if not path.startswith("/dev/"):
-        return _opened(path, cv2.CAP_ANY, "check the path or address, and that OpenCV can decode its format")
-    if not Path(path).exists():
-        there = sorted(str(p) for p in Path("/dev").glob("video*"))
-        raise DeviceNotFound(
-            f"there is no camera {path}",
-            next_step=f"connect the camera, or choose one of {', '.join(there)}" if there else "connect the camera",
-            evidence={"path": path, "found": there},
-        )
-    if not os.access(path, os.R_OK | os.W_OK):
-        raise DeviceNotFound(
-            f"no permission to open {path}",
-            next_step="add yourself to the group video (sudo usermod -aG video $USER), log out and in again",
-            evidence={"path": path},
-        )
-    return _opened(
-        path, cv2.CAP_V4L2, f"close the program that uses it (fuser -v {path}), or try the camera's next number"
-    )
-
-
-def _opened(path: str, backend: int, next_step: str) -> cv2.VideoCapture:
-    capture = cv2.VideoCapture(path, backend)
-    if not capture.isOpened():
-        capture.release()
-        raise DeviceNotFound(f"cannot open {path}", next_step=next_step, evidence={"path": path})
-    return capture

@@ -1,6 +1,6 @@
-"""What the rig asks of a servo.
+"""The interface of a servo.
 
-Angles are the encoder's own, unwrapped, on the table's side of a gear, before any zero or direction of the table.
+Angles are the encoder's, unwrapped, on the table's side of a gear, without the table's zero and direction.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class ServoIdentity:
-    """Who answers on the bus."""
+    """The servo that answers on the bus."""
 
     model: str
     model_number: int
@@ -20,7 +20,7 @@ class ServoIdentity:
 
 @dataclass(frozen=True, slots=True)
 class MotionProfile:
-    """Trapezoid profile: cruise speed and ramp."""
+    """Trapezoid profile: cruise speed and acceleration."""
 
     velocity_dps: float
     acceleration_dps2: float
@@ -28,11 +28,11 @@ class MotionProfile:
 
 @dataclass(frozen=True, slots=True)
 class ServoState:
-    """One reading of the servo's status registers, all from one transaction.
+    """One reading of the servo's status registers, from one transaction.
 
-    ``time_ns`` is the middle of the transaction on the bench's clock, ``hardware_errors`` the names of the bits set in
-    Hardware Error Status (a status alert), empty when the servo is well. ``trajectory_deg`` is where the servo's own
-    profile wants the shaft to be now; None where the model does not tell.
+    ``time_ns`` is the middle of the transaction on the bench's clock. ``hardware_errors`` are the names of the bits in
+    Hardware Error Status (a status alert). ``trajectory_deg`` is the present position of the servo's motion profile;
+    None if the model does not report it.
     """
 
     time_ns: int
@@ -49,10 +49,10 @@ class ServoState:
 
 @dataclass(frozen=True, slots=True)
 class ServoCondition:
-    """What a servo was left in; read before anything is written to it.
+    """The servo's condition when it is opened, before anything is written to it.
 
-    ``power_lost`` says that its volatile registers are as after power-up: since the rig last set a profile it was
-    without supply, and with it the count of its turns was lost.
+    ``power_lost`` says that its volatile registers are as after power-up: it lost its supply since the rig last set a
+    profile, and with it the count of its revolutions.
     """
 
     torque: bool
@@ -64,14 +64,14 @@ class ServoCondition:
 
 @dataclass(frozen=True, slots=True)
 class ServoLimits:
-    """Where the servo shuts down by itself."""
+    """Limits at which the servo shuts down."""
 
     temperature_c: float
     voltage_v: tuple[float, float]
 
 
 class Servo(Protocol):
-    """A position servo that turns the table."""
+    """A position servo that rotates the table."""
 
     @property
     def identity(self) -> ServoIdentity: ...
@@ -83,7 +83,7 @@ class Servo(Protocol):
 
     @property
     def turn_deg(self) -> float:
-        """Angle after which the encoder reads the same again: what a servo without supply loses count of."""
+        """Angle after which the encoder repeats; without supply, the servo loses the count of these."""
         ...
 
     @property
@@ -91,12 +91,12 @@ class Servo(Protocol):
 
     @property
     def reach_deg(self) -> tuple[float, float]:
-        """Lowest and highest position that it can go to, in the mode it is used in."""
+        """Lowest and highest position in the present mode."""
         ...
 
     @property
     def bus_statistics(self) -> Mapping[str, int]:
-        """What the line was like since it was opened: transactions, retries and what they were for."""
+        """Statistics since the bus was opened: transactions, retries and their causes."""
         ...
 
     def read_state(self) -> ServoState: ...
@@ -104,22 +104,22 @@ class Servo(Protocol):
     def read_condition(self) -> ServoCondition: ...
 
     def verify(self) -> None:
-        """Raise `DeviceMismatch` unless the servo that answers is the one that was opened, set up as the rig needs it.
+        """Raise `DeviceMismatch` unless the servo that was opened answers, with the settings that the rig needs.
 
-        For what may have happened meanwhile: a pulled cable, a reboot, a servo that was replaced.
+        Call it after a cable was unplugged, after a reboot, or when the servo may have been replaced.
         """
         ...
 
     def reboot(self) -> None:
-        """Restart the servo, which clears its hardware errors, its torque and the count of its turns; then `verify`."""
+        """Restart the servo, which clears its hardware errors, torque and count of revolutions; then `verify` it."""
         ...
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
-        """Set the profile and return the one that the servo's units allow."""
+        """Set the profile; return it rounded to the servo's units."""
         ...
 
     def torque_on(self) -> None:
-        """Hold the present position: goal := present, then torque."""
+        """Set the goal to the present position, then switch the torque on."""
         ...
 
     def torque_off(self) -> None: ...
@@ -129,7 +129,7 @@ class Servo(Protocol):
         ...
 
     def arm_watchdog(self, timeout_s: float) -> None:
-        """Have the servo stop by itself when it hears nothing for ``timeout_s``."""
+        """Make the servo stop by itself if it receives nothing for ``timeout_s``."""
         ...
 
     def disarm_watchdog(self) -> None: ...

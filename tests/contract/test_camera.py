@@ -10,7 +10,8 @@ import pytest
 
 from rig.core.clock import Clock
 from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
-from rig.devices.opencv_camera import OpenCvCamera, open_capture
+from rig.devices.opencv_camera import OpenCvCamera
+from rig.devices.opencv_capture import open_capture
 from sim.camera import SimCapture
 from sim.objects.shelf import shelf
 from sim.world import World

@@ -1,4 +1,4 @@
-"""An AX-12A over Protocol 1.0: a pan servo of 300°, with no count of turns and no watchdog."""
+"""The AX-12A with Protocol 1.0: a pan servo with a range of 300°, without count of revolutions and without watchdog."""
 
 from rig.core.errors import ConfigError, DeviceFault
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
@@ -7,11 +7,11 @@ from rig.devices.servo import MotionProfile, ServoCondition, ServoState
 
 RANGE_DEG, MAX_COUNTS = 300.0, 1023
 DPS_PER_UNIT = 0.111 * 6.0
-_DIRECTION = 0x400  # bit 10 of speed and load: clockwise, falling
+_DIRECTION = 0x400  # bit 10 of speed and load: clockwise, the position falls
 _STEEPEST_DPS2 = 2000.0
-"""It ramps as steeply as it can, and says nowhere how steep that is: an estimate from its 354 °/s."""
+"""Its fastest acceleration, which no document states: an estimate from its 354 °/s."""
 _ARRIVED_COUNTS = 2
-"""Nearest that the compliance margin (1 count either way) lets it come to a goal, and one of noise."""
+"""Largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise."""
 
 
 class Ax12Servo(RegisterServo):
@@ -20,7 +20,7 @@ class Ax12Servo(RegisterServo):
     Raises
     ------
     ConfigError
-        It is to be a turntable: beyond its 300° it knows no angle.
+        The mode is turntable, but the servo measures only 300°.
     """
 
     deg_per_count = RANGE_DEG / MAX_COUNTS
@@ -28,9 +28,9 @@ class Ax12Servo(RegisterServo):
     def __init__(self, *arguments: object, **options: object) -> None:
         if options.get("mode", ServoMode.TURNTABLE) is not ServoMode.PAN:
             raise ConfigError(
-                "An AX-12A cannot be a turntable: it measures its angle over 300° only, and counts no turns.",
+                "An AX-12A cannot be a turntable: it measures only 300° and does not count revolutions.",
                 next_step='In [table] set mode = "pan", zero_deg = 150 and limits_deg = [-150, 150] (its 300°), '
-                "or take a servo of the X series.",
+                "or use a servo of the X series.",
             )
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
 
@@ -44,8 +44,8 @@ class Ax12Servo(RegisterServo):
     @property
     def remarks(self) -> tuple[str, ...]:
         return (
-            "servo: an AX-12A has no watchdog: when the computer dies during a move, it goes on to that move's end",
-            "servo: an AX-12A reaches 300°: an object is seen from a part of its sides only",
+            "servo: an AX-12A has no watchdog: if the computer fails, it completes its present move",
+            "servo: an AX-12A reaches only 300°: some azimuths of an object are not visible",
         )
 
     def read_state(self) -> ServoState:
@@ -70,7 +70,7 @@ class Ax12Servo(RegisterServo):
             torque=bool(values["Torque Enable"]),
             watchdog_armed=False,
             watchdog_tripped=False,
-            power_lost=values["Moving Speed"] == 0,  # power-up's speed; the rig's is never 0
+            power_lost=values["Moving Speed"] == 0,  # 0 after power-up; the rig never sets 0
             hardware_errors=hardware_errors(self._bus.alert(self._id)),
         )
 
@@ -87,14 +87,14 @@ class Ax12Servo(RegisterServo):
                 next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
                 evidence={"hardware_errors": list(errors)},
             )
-        self._write("Goal Position", position)  # switches the torque on by itself
+        self._write("Goal Position", position)  # this also switches the torque on
         self._write("Torque Enable", 1)
 
     def arm_watchdog(self, timeout_s: float) -> None:
-        """Do nothing: it has none, see `remarks`."""
+        """Do nothing: the servo has no watchdog, see `remarks`."""
 
     def disarm_watchdog(self) -> None:
-        """Do nothing: it has none."""
+        """Do nothing: the servo has no watchdog."""
 
     # -- inside ---------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Registers by name on a Dynamixel bus: every answer belongs to its question, or is none."""
+"""Registers by name on a Dynamixel bus; each reply is matched to its request."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -26,20 +26,20 @@ from rig.devices.dynamixel.port import BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import Register
 
 OWED_S = 2.0
-"""How long an answer that never came may still come: longer than any buffer on the way keeps it."""
+"""How long a missing reply may still arrive: longer than any buffer can delay it."""
 
 _ECHO_SIZE = 2
-"""An instruction of Protocol 1.0 that reads so many bytes is, echoed, a valid answer to itself."""
+"""In Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself."""
 
 Answers = tuple[dict[int, Reply], int]
-"""Replies by id, and the SDK's result for those that did not come."""
+"""Replies by id, and the SDK's result for missing ones."""
 
 
 @dataclass(slots=True)
 class BusStatistics:
-    """What the line was like since it was opened.
+    """Statistics since the bus was opened.
 
-    ``late`` counts answers to another question than the one asked, ``foreign`` those of devices that nobody asked.
+    ``late`` counts replies to earlier requests, ``foreign`` replies of devices that were not asked.
     """
 
     transactions: int = 0
@@ -55,11 +55,11 @@ class BusStatistics:
 
 
 class DynamixelBus:
-    """Reads and writes registers; retries what the line spoiled, and never takes a failed read for a value.
+    """Reads and writes registers; repeats failed transactions, and never returns a failed read as a value.
 
-    The protocols number neither questions nor answers, so that an answer that comes after its time-out would pass for
-    the next one. Here the length tells: as long as an answer is owed, no other read asks for as many bytes (it asks for
-    some more, below its address), and a write is read back, because all writes are answered alike.
+    The protocols have no sequence numbers, so a reply after its time-out would be taken for the next one. Here replies
+    are distinguished by their length: while a reply is still owed, no other read asks for the same number of bytes (it
+    asks for some more, below its address). A write is read back, because the replies to all writes are equal.
 
     Parameters
     ----------
@@ -67,9 +67,9 @@ class DynamixelBus:
         An open port.
     retries
         How often a transaction is repeated before the device counts as silent. All instructions used here are absolute
-        (a read, or a write of a value), so that repeating one does no harm.
+        (a read, or a write of a value), so a repetition is harmless.
     protocol
-        2 (X, MX with firmware for it), or 1 (AX-12A).
+        2 (X series, and MX series with firmware for it), or 1 (AX-12A).
     """
 
     def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
@@ -80,18 +80,18 @@ class DynamixelBus:
         self._retries = retries
         self._lock = RLock()
         self._alerts: dict[int, int] = {}
-        self._unanswered = False  # the last question, even when Ctrl+C cut it short: its answer may still be coming
+        self._unanswered = False  # the last request, also if Ctrl+C interrupted it: its reply may still arrive
         self._owed: list[
             tuple[int, int]
-        ] = []  # answers that may still come: their parameters, when they were asked for
+        ] = []  # replies that may still arrive: number of parameters, time of the request
 
     def alert(self, device_id: int) -> int:
-        """Return the alert of the device's last status packet, 0 where its hardware is well: see `Reply`."""
+        """Return the alert of the device's last status packet; 0 if its hardware has no fault, see `Reply`."""
         return self._alerts.get(device_id, 0)
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
-        if self.protocol == 1 or self._owes(3):  # an echoed ping of Protocol 1.0 is a valid answer to itself
+        if self.protocol == 1 or self._owes(3):  # an echoed ping of Protocol 1.0 is a valid reply to itself
             return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
         answer = self._transact("ping", (device_id,), lambda: self._ask(device_id, PING, b"", 3))[device_id]
         return int.from_bytes(answer.data[:2], "little")
@@ -100,12 +100,12 @@ class DynamixelBus:
         return register.decode(self.read_block(device_id, register.address, register.size))
 
     def read_block(self, device_id: int, address: int, size: int) -> bytes:
-        """Return ``size`` bytes from ``address``, all of one moment."""
+        """Return ``size`` bytes from ``address``, read in one transaction."""
         skipped = 0
 
         def attempt() -> Answers:
             nonlocal skipped
-            start, asked = self._unmistakable(address, size)
+            start, asked = self._unambiguous(address, size)
             skipped = address - start
             return self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
 
@@ -121,7 +121,7 @@ class DynamixelBus:
 
         def attempt() -> Answers:
             nonlocal skipped
-            start, asked = self._unmistakable(address, size)
+            start, asked = self._unambiguous(address, size)
             skipped = address - start
             parameters = self._packets.read_parameters(start, asked) + bytes(device_ids)
             return self._ask(BROADCAST_ID, SYNC_READ, parameters, asked, device_ids)
@@ -130,17 +130,17 @@ class DynamixelBus:
         return {device_id: replies[device_id].data[skipped : skipped + size] for device_id in device_ids}
 
     def write(self, device_id: int, register: Register, value: int, *, answered: bool = True) -> None:
-        """Write a register; with ``answered`` False nobody waits for the answer that a servo was told not to give."""
+        """Write a register; with ``answered`` False do not wait for a reply, which the servo may be set not to send."""
         data = register.encode(value)
 
         def attempt() -> Answers:
-            doubtful = self._owes(0)  # somebody else's answer may pass for this one's
+            doubtful = self._owes(0)  # an earlier reply may be taken for this one
             parameters = self._packets.write_parameters(register.address, data)
             answers = self._ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
             reply = answers[0].get(device_id)
             if reply is None or reply.error or not doubtful:
                 return answers
-            start, asked = self._unmistakable(register.address, register.size)
+            start, asked = self._unambiguous(register.address, register.size)
             replies, result = self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
             skipped = register.address - start
             if result == COMM_SUCCESS and replies[device_id].data[skipped : skipped + register.size] == data:
@@ -150,12 +150,12 @@ class DynamixelBus:
         self._transact(f"write of {register.name} = {value}", (device_id,), attempt)
 
     def reboot(self, device_id: int) -> None:
-        """Restart a device; it is silent for some tenths of a second.
+        """Restart a device, which is then silent for some tenths of a second.
 
         Raises
         ------
         UsageError
-            Protocol 1.0 has no such instruction.
+            Protocol 1.0 does not have this instruction.
         """
         if self.protocol == 1:
             raise UsageError(
@@ -167,10 +167,10 @@ class DynamixelBus:
     def close(self) -> None:
         self.port.closePort()
 
-    # -- questions and answers ------------------------------------------------------------------------------------
+    # -- requests and replies ------------------------------------------------------------------------------------
 
     def _transact(self, what: str, device_ids: Sequence[int], attempt: Callable[[], Answers]) -> dict[int, Reply]:
-        """Make attempts until all devices have answered or the retries are used up; return their replies."""
+        """Repeat attempts until all devices have answered or no retries remain; return their replies."""
         with self._lock:
             for number in range(self._retries + 1):
                 self.statistics.transactions += 1
@@ -185,23 +185,23 @@ class DynamixelBus:
                     step = "Check the adapter's USB plug, then start again."
                     raise self._silent(what, device_ids, f"the port failed: {unplugged}", step) from unplugged
                 except (BusBabble, IndexError):
-                    # Of some noise the SDK makes a packet that is shorter than the bytes it then looks at.
+                    # From some noise the SDK builds a packet that is too short for its own parser.
                     replies, result = {}, COMM_RX_CORRUPT
                 finally:
                     self.port.is_using = False
                 if result == COMM_SUCCESS:
                     self._unanswered = False
                     self._alerts |= {reply.bus_id: reply.alert for reply in replies.values()}
-                    refused = next((reply for reply in replies.values() if reply.error), None)
-                    if refused:
+                    rejected = next((reply for reply in replies.values() if reply.error), None)
+                    if rejected:
                         self.statistics.refused += 1
-                        raise self._refused(what, refused)
+                        raise self._rejected(what, rejected)
                     return replies
                 self._count(result)
             missing = [device_id for device_id in device_ids if device_id not in replies]
             step = (
-                "Something answers, but spoiled: two servos with one id, another program at the bus, a bad cable. "
-                "`rig find` shows who is there."
+                "The replies are corrupted: check for two servos with the same id, another program on the bus, or a "
+                "bad cable. `rig find` lists the servos."
                 if result == COMM_RX_CORRUPT
                 else "Check the servo's cable and its supply (its LED blinks at power-up), then start again."
             )
@@ -210,10 +210,10 @@ class DynamixelBus:
     def _ask(
         self, target: int, instruction: int, parameters: bytes, size: int, answering: Sequence[int] | None = None
     ) -> Answers:
-        """Send an instruction to ``target`` and wait for answers with ``size`` parameters, from it or ``answering``.
+        """Send an instruction to ``target``; wait for replies with ``size`` parameters, from it or from ``answering``.
 
-        An answer of another length is not this question's. A refusal has no parameters; while an answer without
-        parameters is owed it is taken only when nothing better comes.
+        A reply of another length does not belong to this request. A rejection has no parameters: while a reply without
+        parameters is owed, it is accepted only if no better one arrives.
         """
         answering = (target,) if answering is None else answering
         ambiguous = size > 0 and self._owes(0)
@@ -241,15 +241,15 @@ class DynamixelBus:
         return replies, COMM_SUCCESS
 
     def _owes(self, size: int) -> bool:
-        """Return whether an answer with ``size`` parameters may still come."""
+        """Return whether a reply with ``size`` parameters may still arrive."""
         if not self._owed:
             return False
         now_ns = self.port.clock.now_ns()
         self._owed = [owed for owed in self._owed if seconds_between(owed[1], now_ns) <= OWED_S]
         return any(owed == size for owed, _ in self._owed)
 
-    def _unmistakable(self, address: int, size: int) -> tuple[int, int]:
-        """Return start and size of a read that holds ``size`` bytes at ``address`` and whose answer is its own."""
+    def _unambiguous(self, address: int, size: int) -> tuple[int, int]:
+        """Return start and size of a read that includes ``size`` bytes at ``address`` and has an unambiguous reply."""
         if not self._owed and self.protocol != 1:
             return address, size
         asked = size
@@ -271,15 +271,15 @@ class DynamixelBus:
             evidence={"reason": reason, "attempts": self._retries + 1, "baud": self.port.baudrate},
         )
 
-    def _refused(self, what: str, reply: Reply) -> RequestRejected:
-        reason = self._packets.refusals.get(reply.error, f"error {reply.error}")
+    def _rejected(self, what: str, reply: Reply) -> RequestRejected:
+        reason = self._packets.rejections.get(reply.error, f"error {reply.error}")
         return RequestRejected(
-            f"Servo {reply.bus_id} refused the {what}: {reason}.",
-            next_step="Run `rig status` to see the servo's state; a tripped watchdog or hardware error forbids motion.",
+            f"Servo {reply.bus_id} rejected the {what}: {reason}.",
+            next_step="Check the servo with `rig status`: a tripped watchdog or a hardware error prevents motion.",
             evidence={"status_error": reply.error, "alert": bool(reply.alert)},
         )
 
 
 def watchdog_units(timeout_s: float) -> int:
-    """Return the Bus Watchdog's register value for a timeout: units of 20 ms, rounded up, within 1..127."""
+    """Return the Bus Watchdog's register value for a timeout: units of 20 ms, rounded up, in 1–127."""
     return min(max(math.ceil(timeout_s / 0.02), 1), 127)

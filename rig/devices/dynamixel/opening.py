@@ -1,4 +1,4 @@
-"""A servo as the configuration describes it, on an open wire."""
+"""Opens the configured servo on an open serial connection."""
 
 from collections.abc import Callable
 
@@ -14,27 +14,27 @@ from rig.devices.dynamixel.settings import ServoMode
 
 
 def open_servo(
-    wire: SerialConnection,
+    connection: SerialConnection,
     config: ServoConfig,
     clock: Clock,
     mode: str = "turntable",
     reopen: Callable[[], SerialConnection] | None = None,
 ) -> RegisterServo:
-    """Find the configured servo on ``wire``, to be used as ``mode`` (`table.mode`) says; writes nothing.
+    """Return the configured servo on ``connection``, for ``mode`` (`table.mode`); write nothing.
 
-    ``reopen`` opens the wire anew after its adapter was unplugged.
+    ``reopen`` opens the connection again after its adapter was unplugged.
 
     Raises
     ------
     ConfigError
-        There is no such model, or it cannot be what it is to be used for.
+        The model does not exist, or does not support the mode.
     DeviceNotFound, DeviceMismatch, DeviceSilent
-        Nobody answers, another model does, or it stops answering.
+        No servo answers, another model answers, or the servo stops answering.
     """
     protocol = protocol_of(config.model)
     kind = Ax12Servo if protocol == 1 else DynamixelServo
     return kind(
-        DynamixelBus(ClockedPort(wire, clock, config.port, reopen), config.retries, protocol),
+        DynamixelBus(ClockedPort(connection, clock, config.port, reopen), config.retries, protocol),
         bus_id=config.id,
         model=config.model,
         clock=clock,

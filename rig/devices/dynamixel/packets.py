@@ -1,7 +1,7 @@
 """Instructions and replies of both Dynamixel protocols, through the SDK's packet handlers.
 
-The SDK finds packets in the stream and checks their sums; here its byte stuffing is set right, and a reply is kept
-whole, with its length, which the SDK's own read functions do not look at.
+The SDK finds packets in the stream and checks their checksums. This module corrects its byte stuffing, and keeps the
+whole reply with its length, which the SDK's own read functions ignore.
 """
 
 from collections.abc import Sequence
@@ -18,15 +18,15 @@ BROADCAST_ID = 0xFE
 _HEADER = b"\xff\xff\xfd"
 _STUFFED = _HEADER + b"\xfd"
 _MALFORMED = -1
-"""Id of a reply that contradicts itself: nobody's."""
+"""Id of an inconsistent reply; no device has it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A status packet: the device's id, why it refused (0: it did not), its parameters.
+    """A status packet: the device's id, why it rejected the instruction (0: it did not), its parameters.
 
-    ``alert`` is not 0 where the hardware is in trouble: the alert bit of Protocol 2.0, of which Hardware Error Status
-    knows more; the bits of the trouble itself in Protocol 1.0, as Hardware Error Status has them.
+    ``alert`` is not 0 if the hardware has a fault: in Protocol 2.0 the alert bit (Hardware Error Status has the
+    details), in Protocol 1.0 the bits of the faults, as in Hardware Error Status.
     """
 
     bus_id: int
@@ -36,13 +36,13 @@ class Reply:
 
 
 class Packets(Protocol):
-    """One of the two protocols, on a port."""
+    """One of the two protocols."""
 
-    refusals: ClassVar[dict[int, str]]
-    """What the error of a `Reply` means."""
+    rejections: ClassVar[dict[int, str]]
+    """Meaning of the error of a `Reply`."""
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
-        """Send an instruction, after throwing away what lies in the port; return the SDK's result."""
+        """Drop unread bytes and send an instruction; return the SDK's result."""
         ...
 
     def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
@@ -50,7 +50,7 @@ class Packets(Protocol):
         ...
 
     def reply_size(self, size: int) -> int:
-        """Return how many bytes a status packet with ``size`` parameters has."""
+        """Return the length of a status packet with ``size`` parameters, in bytes."""
         ...
 
     def read_parameters(self, address: int, size: int) -> bytes: ...
@@ -65,7 +65,7 @@ class Packets(Protocol):
 class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     """Protocol 2.0."""
 
-    refusals: ClassVar[dict[int, str]] = {
+    rejections: ClassVar[dict[int, str]] = {
         1: "result fail",
         2: "instruction error",
         3: "CRC error",
@@ -102,27 +102,27 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
         return _words(self, result)
 
     def addStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802 - the SDK's names
-        """Stuff ``packet`` in place: the SDK's own makes a new list, which its `txPacket` drops."""
+        """Stuff ``packet`` in place: the SDK's own version makes a new list, which its `txPacket` ignores."""
         return _restuff(packet, bytes(packet[7:-2]).replace(_HEADER, _STUFFED))
 
     def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
-        """Return ``packet`` without stuffing, exactly as long as it says.
+        """Return ``packet`` without stuffing, with the length in its header.
 
-        The SDK's own looks back into bytes that it has already moved, and after one stuffed byte takes FF FD FD for
-        another one: it loses a byte of the value, and passes a byte of the CRC for its last.
+        The SDK's own version compares with bytes that it has already moved. After one stuffed byte it takes FF FD FD
+        for another one, loses a byte of the value, and returns a byte of the CRC as the last one.
         """
         end = 7 + (packet[5] | packet[6] << 8)
         return _restuff(packet[:end], bytes(packet[7 : end - 2]).replace(_STUFFED, _HEADER))
 
 
 class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
-    """Protocol 1.0, whose error byte mixes refusals with the state of the hardware.
+    """Protocol 1.0, whose error byte combines rejections with the state of the hardware.
 
-    Its sum has 8 bits: of replies that a bad line spoils in several places, one in 256 passes for good. A line that
-    echoes plays back an instruction that reads two bytes as a valid status packet; `DynamixelBus` never sends one.
+    Its checksum has 8 bits: one in 256 corrupted replies passes as valid. On a bus with echo, an instruction that reads
+    two bytes returns as a valid status packet; `DynamixelBus` never sends one.
     """
 
-    refusals: ClassVar[dict[int, str]] = {
+    rejections: ClassVar[dict[int, str]] = {
         0x02: "outside the angle limits",
         0x08: "value out of range",
         0x10: "checksum error",
@@ -139,8 +139,8 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
         end = 4 + packet[3]
         if packet[3] < 2 or len(packet) < end:
             return Reply(_MALFORMED, 0, 0, b""), result
-        refused = next((bit for bit in self.refusals if packet[4] & bit), 0)
-        return Reply(packet[2], refused, packet[4] & 0x25, bytes(packet[5 : end - 1])), result
+        rejected = next((bit for bit in self.rejections if packet[4] & bit), 0)
+        return Reply(packet[2], rejected, packet[4] & 0x25, bytes(packet[5 : end - 1])), result
 
     def reply_size(self, size: int) -> int:
         return 6 + size

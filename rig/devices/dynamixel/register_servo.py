@@ -1,4 +1,4 @@
-"""What all Dynamixel servos of the rig share: identity, permanent settings, and the gear between servo and table."""
+"""Base of all Dynamixel servos of the rig: identity, permanent settings, and the gear between servo and table."""
 
 from abc import ABC, abstractmethod
 
@@ -11,7 +11,7 @@ from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
 
 BOOT_ALLOWANCE_S = 3.0
-"""How long a servo may be silent after a reboot; the e-manual gives no number, they take some tenths of a second."""
+"""How long a servo may be silent after a reboot: some tenths of a second; the e-manual states no number."""
 
 _HARDWARE_ERRORS = {
     0: "input voltage",
@@ -25,32 +25,32 @@ _HARDWARE_ERRORS = {
 class RegisterServo(ABC):
     """A servo on a `DynamixelBus`; implements `rig.devices.servo.Servo`.
 
-    Opening only reads: the model is compared with the configured one. Nothing moves, torque stays as it is.
+    Opening only reads, to compare the model with the configured one. Nothing moves, and the torque stays as it is.
 
     Parameters
     ----------
     bus
-        The bus that it is on.
+        The servo's bus.
     bus_id, model
-        Its id, and its model by the name of `model_numbers`.
+        The servo's id, and its model as in `model_numbers`.
     clock
         The bench's clock.
     mode
-        What it is used for.
+        How the servo is used.
     gear_ratio
-        Turns of the servo for one turn of the table. All angles and rates of this class are the table's side of the
-        gear; a pair of gears that turns the direction around is told to `table.direction`.
+        Revolutions of the servo for one revolution of the table. All angles and rates of this class are on the table's
+        side of the gear. If the gears reverse the direction, set `table.direction`.
 
     Raises
     ------
     DeviceNotFound
-        Nothing answers at ``bus_id``.
+        No servo answers at ``bus_id``.
     DeviceMismatch
         Another model answers.
     """
 
     deg_per_count: float
-    """Of the servo's own shaft."""
+    """Resolution at the servo's own shaft."""
 
     def __init__(
         self,
@@ -75,20 +75,20 @@ class RegisterServo(ABC):
             raise DeviceNotFound(
                 f"No servo answers at id {bus_id}.",
                 next_step="Check the servo's power and cable, and servo.id, servo.baud and servo.model in the "
-                "configuration: an AX-12A speaks another protocol than the others.",
+                "configuration. An AX-12A uses another protocol than the other models.",
                 evidence=silent.evidence,
             ) from silent
         found = model_numbers().get(number, f"unknown model {number}")
         if found != model:
             raise DeviceMismatch(
-                f"The servo at id {bus_id} is another model than configured.",
-                next_step=f'Set servo.model = "{found}" if this is the right servo, else connect the right one.',
+                f"The servo at id {bus_id} is not the configured model.",
+                next_step=f'Set servo.model = "{found}" if this is the right servo; else connect the right one.',
                 evidence={"expected": model, "got": found, "model_number": number},
             )
         try:
             firmware = bus.read(bus_id, control_table(model)["Firmware Version"])
         except DeviceSilent as silent:
-            silent.add_note("It answers a ping but no read: its Status Return Level is 0, or the line is bad.")
+            silent.add_note("It answers a ping but no read: its Status Return Level is 0, or the bus has errors.")
             raise
         self._table: ControlTable = control_table(model, firmware)
         self._identity = ServoIdentity(model, number, bus_id, firmware)
@@ -123,13 +123,13 @@ class RegisterServo(ABC):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a person should know about this model on a rig."""
+        """Notes for the operator about this model."""
         return ()
 
     def close(self) -> None:
         self._bus.close()
 
-    # -- what the models do differently ---------------------------------------------------------------------------
+    # -- differences between models ---------------------------------------------------------------------------
 
     @property
     @abstractmethod
@@ -162,7 +162,7 @@ class RegisterServo(ABC):
     # -- settings -------------------------------------------------------------------------------------------------
 
     def setting_differences(self) -> list[SettingDifference]:
-        """Return the EEPROM settings that stand in the rig's way."""
+        """Return the EEPROM settings that differ from what the rig needs."""
         return settings.compare(self._bus, self._id, self._table, self._mode)
 
     def write_settings(self, differences: list[SettingDifference]) -> None:
@@ -174,8 +174,8 @@ class RegisterServo(ABC):
         number, firmware = self._bus.ping(self._id), self._read("Firmware Version")
         if (number, firmware) != (self._identity.model_number, self._identity.firmware):
             raise DeviceMismatch(
-                f"Another servo answers at id {self._id} than the one that was there.",
-                next_step="Connect the servo that belongs to this bench, or start again with the other one.",
+                f"The servo that now answers at id {self._id} is a different one.",
+                next_step="Connect the bench's servo again, or start again with the new one.",
                 evidence={
                     "expected": f"{self._identity.model}, firmware {self._identity.firmware}",
                     "got": f"{model_numbers().get(number, f'unknown model {number}')}, firmware {firmware}",
@@ -205,7 +205,7 @@ class RegisterServo(ABC):
         self._bus.write(self._id, self._table[name], value)
 
     def _read_registers(self, first: str, last: str) -> tuple[int, dict[str, int]]:
-        """Read all registers from ``first`` to ``last`` in one transaction; return when, and their values by name."""
+        """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name."""
         block = self._blocks.get((first, last))
         if block is None:
             block = self._blocks[first, last] = Block.of(self._table, first, last)
@@ -221,7 +221,7 @@ def hardware_errors(bits: int) -> tuple[str, ...]:
 
 
 def prepare_servo(servo: RegisterServo, *, write: bool) -> tuple[str, ...]:
-    """Compare the servo's EEPROM with what the rig needs; write the differences where that is allowed.
+    """Compare the servo's EEPROM with what the rig needs; write the differences if ``write``.
 
     Raises
     ------
@@ -233,9 +233,9 @@ def prepare_servo(servo: RegisterServo, *, write: bool) -> tuple[str, ...]:
         return ()
     if not write:
         raise DeviceMismatch(
-            f"{len(differences)} EEPROM settings of the servo are not as the rig needs them.",
-            next_step="`rig servo settings --write` writes these values, with torque off (so does opening the bench "
-            "once with --set servo.write_settings=true).",
+            f"{len(differences)} EEPROM settings of the servo differ from what the rig needs.",
+            next_step="Run `rig servo settings --write` to write these values with the torque off, or open the bench "
+            "once with --set servo.write_settings=true.",
             evidence={d.register: _found_wanted(d) for d in differences},
         )
     servo.write_settings(differences)

@@ -1,6 +1,6 @@
 """Control tables of Dynamixel models: registers by name, values signed.
 
-Those of Protocol 2.0 come from the `.model` files that the SDK ships, that of the AX-12A from its e-manual page.
+The tables for Protocol 2.0 come from the SDK's `.model` files, the one of the AX-12A from its e-manual page.
 """
 
 from collections.abc import Iterator, Mapping
@@ -32,9 +32,9 @@ _SIGNED = frozenset(
         "Position Trajectory",
     }
 )
-# Names that the .model files do not spell as the e-manual does.
+# Names that differ between the .model files and the e-manual.
 _RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdog"}
-# Registers that the .model files lack: (address, size, name), from which firmware on, and in which models.
+# A register that is missing in the .model files: (address, size, name), and its first firmware by model.
 _STARTUP = (60, 1, "Startup Configuration")
 _STARTUP_FIRMWARE = {"xl330": 46, "xc330": 46, "x": 45}
 
@@ -73,10 +73,10 @@ _AX_12A_TABLE = (
     (47, 1, "Lock"),
     (48, 2, "Punch"),
 )
-"""No value of it is signed: speed and load carry their direction in bit 10."""
+"""No value is signed: speed and load have their direction in bit 10."""
 
 
-_LETTERS = {1: "b", 2: "h", 4: "i"}  # of the module struct, signed
+_LETTERS = {1: "b", 2: "h", 4: "i"}  # formats of the module struct, signed
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,14 +93,14 @@ class Register:
         return int.from_bytes(data, "little", signed=self.signed)
 
     def encode(self, value: int) -> bytes:
-        """Return ``value`` as it goes on the wire; OverflowError where it does not fit."""
+        """Return the bytes of ``value`` on the wire; raises OverflowError if it does not fit."""
         return int(value).to_bytes(self.size, "little", signed=self.signed)
 
 
 class ControlTable(Mapping[str, Register]):
     """The registers of one model by their e-manual names.
 
-    Below ``ram_start`` they are EEPROM: kept without supply, and locked while torque is on.
+    Registers below ``ram_start`` are EEPROM: they survive without supply, and are locked while the torque is on.
     """
 
     def __init__(self, model: str, registers: Mapping[str, Register], ram_start: int = 64) -> None:
@@ -120,7 +120,7 @@ class ControlTable(Mapping[str, Register]):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Registers that lie side by side, to be read in one transaction."""
+    """Adjacent registers that are read in one transaction."""
 
     address: int
     layout: Struct
@@ -153,24 +153,24 @@ def _rows(file_name: str, section: str) -> list[list[str]]:
 
 @cache
 def model_numbers() -> Mapping[int, str]:
-    """Return the models that there is a table for, by their Model Number."""
+    """Return the supported models by their Model Number."""
     known = {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel.model", "")}
     return {**known, _AX_12A_NUMBER: _AX_12A}
 
 
 def protocol_of(model: str) -> int:
-    """Return the version of the protocol that ``model`` speaks: 1 or 2."""
+    """Return the protocol version of ``model``: 1 or 2."""
     return 1 if model == _AX_12A else 2
 
 
 @cache
 def control_table(model: str, firmware: int | None = None) -> ControlTable:
-    """Return the control table of ``model`` (e.g. ``"xl430_w250"``); from firmware 52 on some models have another one.
+    """Return the control table of ``model`` (e.g. ``"xl430_w250"``), which may change with firmware 52.
 
     Raises
     ------
     ConfigError
-        There is no such model.
+        The model does not exist.
     """
     if model == _AX_12A:
         rows = (Register(name, address, size, signed=False) for address, size, name in _AX_12A_TABLE)
@@ -179,7 +179,7 @@ def control_table(model: str, firmware: int | None = None) -> ControlTable:
     if model not in known:
         raise ConfigError(
             f"There is no Dynamixel model {model!r}.",
-            next_step="Set servo.model to one of the models listed.",
+            next_step="Set servo.model to one of the listed models.",
             evidence={"models": known},
         )
     name = model

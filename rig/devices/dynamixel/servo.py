@@ -1,4 +1,4 @@
-"""A Dynamixel X or MX (2.0) servo: registers by name, units of the rig."""
+"""A Dynamixel servo of the X or MX (2.0) series."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -30,7 +30,7 @@ class DynamixelServo(RegisterServo):
         super().__init__(*arguments, **options)
         self._dps_per_unit = DPS_PER_UNIT / self._gear_ratio
         self._dps2_per_unit = DPS2_PER_UNIT / self._gear_ratio
-        # Present Current shares the unit of Current Limit, so that their ratio needs no unit of the model.
+        # Present Current and Current Limit have the same unit, so their ratio is independent of the model.
         self._current_limit = self._read("Current Limit") if "Present Current" in self._table else None
 
     @property
@@ -62,21 +62,21 @@ class DynamixelServo(RegisterServo):
             torque=bool(values["Torque Enable"]),
             watchdog_armed=0 < watchdog < WATCHDOG_TRIPPED,
             watchdog_tripped=tripped,
-            # The rig's profile is never 0, power-up's is; a watchdog that trips sets it to 0 as well.
+            # The rig's profile is never 0, but 0 after power-up; a watchdog that trips also sets it to 0.
             power_lost=not tripped and values["Profile Acceleration"] == 0,
             hardware_errors=hardware_errors(values["Hardware Error Status"]),
         )
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
-        velocity = max(round(profile.velocity_dps / self._dps_per_unit), 1)  # 0 would mean: as fast as it can
+        velocity = max(round(profile.velocity_dps / self._dps_per_unit), 1)  # 0 means no limit
         acceleration = max(round(profile.acceleration_dps2 / self._dps2_per_unit), 1)
         self._write("Profile Acceleration", acceleration)
         self._write("Profile Velocity", velocity)
         return MotionProfile(velocity * self._dps_per_unit, acceleration * self._dps2_per_unit)
 
     def torque_on(self) -> None:
-        self._refuse_hardware_errors()
-        # Left on by a host that was killed: the old goal must not go on when its watchdog is cleared.
+        self._check_hardware_errors()
+        # After a killed program the torque may be on: the old goal must not continue when the watchdog is cleared.
         self._write("Torque Enable", 0)
         self._write("Bus Watchdog", 0)
         self._write("Goal Position", self._read("Present Position"))
@@ -89,27 +89,27 @@ class DynamixelServo(RegisterServo):
         self._write("Bus Watchdog", 0)
 
     def spin(self, velocity_dps: float, seconds: float, acceleration_dps2: float = 240.0) -> Iterator[ServoState]:
-        """Turn at a constant speed for some time; yields readings on the way, about 20 a second.
+        """Rotate at a constant speed for some time; yield about 20 readings per second.
 
-        For tables without a cable: no limit of `table.limits_deg` holds here. The Bus Watchdog is armed throughout.
-        However the generator ends, the torque goes off, and the servo back to its own mode; with the mode it forgets
-        whole turns, so that afterwards the table is no longer referenced.
+        Only for tables without a cable: `table.limits_deg` is not checked here. The Bus Watchdog is always armed. When
+        the generator ends, the torque goes off and the servo returns to its own mode. The change of mode clears the
+        count of revolutions, so afterwards the table is not referenced.
 
         Raises
         ------
         UsageError
-            The speed is 0, or beyond the servo's Velocity Limit.
+            The speed is 0, or above the servo's Velocity Limit.
         DeviceFault, DeviceSilent
-            The servo reports a hardware error, or falls silent and stops by its watchdog.
+            The servo reports a hardware error, or stops answering (its watchdog stops it).
         """
         unit_dps, limit = self._dps_per_unit, self._read("Velocity Limit")
         units = round(velocity_dps / unit_dps)
         if not 0 < abs(units) <= limit:
             raise UsageError(
-                f"The servo cannot turn the table at {velocity_dps:g} °/s.",
+                f"The servo cannot rotate the table at {velocity_dps:g} °/s.",
                 next_step=f"Give {unit_dps:.2f} to {limit * unit_dps:.0f} °/s, in either direction.",
             )
-        self._refuse_hardware_errors()
+        self._check_hardware_errors()
         self._change_mode(ServoMode.SPIN)
         try:
             self._write("Bus Watchdog", 0)
@@ -120,9 +120,9 @@ class DynamixelServo(RegisterServo):
             begun_ns = self._clock.now_ns()
             while seconds_between(begun_ns, self._clock.now_ns()) < seconds:
                 self._clock.sleep(_SPIN_POLL_S)
-                yield self._well(self.read_state())
+                yield self._checked(self.read_state())
             self._write("Goal Velocity", 0)
-            while abs(self._well(self.read_state()).velocity_dps) > self._dps_per_unit:
+            while abs(self._checked(self.read_state()).velocity_dps) > self._dps_per_unit:
                 self._clock.sleep(_SPIN_POLL_S)
         finally:
             self.torque_off()
@@ -139,7 +139,7 @@ class DynamixelServo(RegisterServo):
     def _hardware_errors(self) -> tuple[str, ...]:
         return hardware_errors(self._read("Hardware Error Status"))
 
-    def _refuse_hardware_errors(self) -> None:
+    def _check_hardware_errors(self) -> None:
         if errors := self._hardware_errors():
             raise DeviceFault(
                 f"Servo {self._id} reports a hardware error: {', '.join(errors)}.",
@@ -147,7 +147,7 @@ class DynamixelServo(RegisterServo):
                 evidence={"hardware_errors": list(errors)},
             )
 
-    def _well(self, state: ServoState) -> ServoState:
+    def _checked(self, state: ServoState) -> ServoState:
         if state.hardware_errors:
             raise DeviceFault(
                 f"Servo {self._id} reports a hardware error: {', '.join(state.hardware_errors)}.",

@@ -1,4 +1,4 @@
-"""The permanent settings (EEPROM) of a servo: what the rig needs, what differs, and how the difference is written."""
+"""The permanent settings (EEPROM) of a servo: the required values, the differences, and writing them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,19 +10,19 @@ from rig.devices.dynamixel.registers import ControlTable
 
 
 class ServoMode(StrEnum):
-    """What the servo is used for."""
+    """How the servo is used."""
 
     TURNTABLE = "turntable"
-    """Turns without end in both directions, and counts the turns (extended position mode)."""
+    """Rotates over many revolutions in both directions, and counts them (extended position mode)."""
     PAN = "pan"
-    """Stays within one turn (position mode): a camera arm, or a table that swings."""
+    """Stays within one revolution (position mode): a camera arm, or a swinging table."""
     SPIN = "spin"
-    """Turns at a constant speed (velocity mode), for as long as that is asked for."""
+    """Rotates at a constant speed (velocity mode)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SettingDifference:
-    """A setting that is not as the rig needs it, and why that matters."""
+    """A setting that differs from what the rig needs, and why that matters."""
 
     register: str
     found: int
@@ -34,45 +34,45 @@ class SettingDifference:
 
 
 _OPERATING_MODES = {
-    ServoMode.TURNTABLE: (4, "extended position: the table turns beyond one revolution"),
+    ServoMode.TURNTABLE: (4, "extended position: the table rotates beyond one revolution"),
     ServoMode.PAN: (3, "position: the arm stays within one revolution"),
     ServoMode.SPIN: (1, "velocity: a constant speed"),
 }
 _DRIVE_MODE_BITS = 0b1101
 """Drive Mode bits that must be 0: reverse direction, time-based profile, and torque on by goal update."""
 _SHUTDOWN = 0b110100
-"""Overload, electrical shock and overheating must take the torque away."""
+"""Overload, electrical shock and overheating must switch the torque off."""
 _AX_SHUTDOWN = 0b100100
-_RETURN_DELAY = "the answer may come at once; 250 would mean 0.5 ms more a reading"
-_ALL_ANSWERED = "every instruction is answered, so that a lost one is noticed"
+_RETURN_DELAY = "no delay of replies; the factory setting of 250 costs 0.5 ms per reading"
+_ALL_ANSWERED = "the servo answers each instruction, so a lost one is noticed"
 
 
 def wanted(found: Mapping[str, int], mode: ServoMode = ServoMode.TURNTABLE) -> dict[str, tuple[int, str]]:
-    """Return the values that the rig needs, each with its reason, by register.
+    """Return the required values and their reasons, by register.
 
     Parameters
     ----------
     found
-        The settings as they are, by register; those that the model lacks are left out.
+        The present settings by register, without those that the model lacks.
     mode
-        What the servo is used for.
+        How the servo is used.
     """
     if "Operating Mode" not in found:
         return _wanted_of_ax(found)
     needs = {
         "Drive Mode": (
             found["Drive Mode"] & ~_DRIVE_MODE_BITS,
-            "direction is the rig's (table.direction); velocity-based profile; no torque by a mere goal",
+            "the rig sets the direction (table.direction); velocity-based profile; a goal must not switch torque on",
         ),
         "Operating Mode": _OPERATING_MODES[mode],
         "Homing Offset": (
             0,
-            "the zero lives in software (table.zero_deg): an offset here can move the servo by itself",
+            "the software has the zero (table.zero_deg); an offset here can move the servo",
         ),
         "Return Delay Time": (0, _RETURN_DELAY),
-        "Secondary ID": (255, "off: the servo would obey instructions to another id"),
+        "Secondary ID": (255, "off: else the servo obeys instructions to a second id"),
         "Startup Configuration": (0, "no torque and no old goal at power-up"),
-        "Shutdown": (found["Shutdown"] | _SHUTDOWN, "overload, short circuit and overheating take the torque away"),
+        "Shutdown": (found["Shutdown"] | _SHUTDOWN, "overload, short circuit and overheating switch the torque off"),
         "Status Return Level": (2, _ALL_ANSWERED),
     }
     return {name: need for name, need in needs.items() if name in found}
@@ -82,15 +82,18 @@ def _wanted_of_ax(found: Mapping[str, int]) -> dict[str, tuple[int, str]]:
     both_zero = found["CW Angle Limit"] == found["CCW Angle Limit"] == 0
     needs = {
         "Return Delay Time": (0, _RETURN_DELAY),
-        "CCW Angle Limit": (1023 if both_zero else found["CCW Angle Limit"], "joint mode: both limits 0 mean a wheel"),
-        "Shutdown": (found["Shutdown"] | _AX_SHUTDOWN, "overload and overheating take the torque away"),
+        "CCW Angle Limit": (
+            1023 if both_zero else found["CCW Angle Limit"],
+            "joint mode: two limits of 0 mean wheel mode",
+        ),
+        "Shutdown": (found["Shutdown"] | _AX_SHUTDOWN, "overload and overheating switch the torque off"),
         "Status Return Level": (2, _ALL_ANSWERED),
     }
     return {name: need for name, need in needs.items() if name in found}
 
 
 def read(bus: DynamixelBus, bus_id: int, table: ControlTable) -> dict[str, int]:
-    """Return every register that is kept without supply, and the Status Return Level, by name."""
+    """Return the registers that survive without supply, and the Status Return Level, by name."""
     kept = [register for register in table.values() if register.address < table.ram_start]
     kept += [register for name, register in table.items() if name == "Status Return Level" and register not in kept]
     end = max(register.address + register.size for register in kept)
@@ -101,7 +104,7 @@ def read(bus: DynamixelBus, bus_id: int, table: ControlTable) -> dict[str, int]:
 def compare(
     bus: DynamixelBus, bus_id: int, table: ControlTable, mode: ServoMode = ServoMode.TURNTABLE
 ) -> list[SettingDifference]:
-    """Return the settings of a servo that stand in the rig's way; writes nothing."""
+    """Return the settings of a servo that differ from what the rig needs; write nothing."""
     found = read(bus, bus_id, table)
     return [
         SettingDifference(name, found[name], value, reason)
@@ -111,16 +114,16 @@ def compare(
 
 
 def write(bus: DynamixelBus, bus_id: int, table: ControlTable, differences: Sequence[SettingDifference]) -> None:
-    """Write settings, with the torque off (a servo refuses them otherwise), and read each back.
+    """Write settings with the torque off (a servo rejects them otherwise), and read each back.
 
     Raises
     ------
     RequestRejected
-        The servo did not let go of its torque, refused a value, or did not keep it.
+        The servo's torque stays on, or it rejects or loses a value.
     DeviceSilent
-        It stopped answering; what was written so far stays, and a new `compare` tells the rest.
+        The servo stops answering; the values written so far stay, and `compare` returns the others.
     """
-    # A servo that does not answer a write would count as silent: first of all it is told to answer.
+    # A servo that does not answer writes would count as silent, so the setting that makes it answer comes first.
     ordered = sorted(differences, key=lambda difference: difference.register != "Status Return Level")
     silent = any(difference.register == "Status Return Level" for difference in ordered)
     bus.write(bus_id, table["Torque Enable"], 0, answered=not silent)
@@ -134,7 +137,7 @@ def write(bus: DynamixelBus, bus_id: int, table: ControlTable, differences: Sequ
 def _expect(bus: DynamixelBus, bus_id: int, table: ControlTable, name: str, value: int) -> None:
     if (now := bus.read(bus_id, table[name])) != value:
         raise RequestRejected(
-            f"Servo {bus_id} did not keep {name} = {value}.",
-            next_step="Power-cycle the servo and try again; if it persists, its EEPROM may be worn.",
+            f"Servo {bus_id} did not store {name} = {value}.",
+            next_step="Power-cycle the servo and try again. If this repeats, its EEPROM may be worn out.",
             evidence={"register": name, "wrote": value, "read_back": now},
         )

@@ -7,18 +7,18 @@ from typing import ClassVar, get_args
 
 PROTOCOL_VERSION = 1
 FIRMWARE = (1, 0, 0)
-"""The firmware that belongs to this table."""
+"""Firmware version of this protocol table."""
 MAX_BODY = 24
 BAUD = 250_000
 """Bits per second; exact on 16 MHz."""
 TICK_US = 200
 """Period of the safety tick."""
 ESTOP_TICKS = 5
-"""Ticks that the e-stop loop must be open before it counts: 1 ms."""
+"""Ticks for which the e-stop loop must be open: 1 ms."""
 DEADMAN_MIN_MS = 50
 """Shortest deadman."""
 DEADMAN_DEFAULT_MS = 250
-"""Deadman before the first beat says otherwise."""
+"""Deadman before the first heartbeat sets it."""
 DEADMAN_MAX_MS = 2000
 """Longest deadman."""
 TRIGGER_MIN_US = 10
@@ -26,11 +26,11 @@ TRIGGER_MIN_US = 10
 TRIGGER_MAX_US = 30000
 """Longest trigger pulse."""
 SERIAL_UNSET = 0xFFFFFFFF
-"""Serial number of a board that was given none."""
+"""Serial number of a board without one."""
 
 
 class Board(IntEnum):
-    """What the firmware was built for."""
+    """Board of the firmware."""
 
     HOST = 1
     ATMEGA328P = 2
@@ -57,7 +57,7 @@ class Reset(IntEnum):
 
 
 class HeadState(IntEnum):
-    """Outputs are off in `idle` and in `fault`; beats keep it `active`."""
+    """State of the head; outputs are off in `idle` and `fault`, heartbeats keep it `active`."""
 
     IDLE = 0
     ACTIVE = 1
@@ -65,7 +65,7 @@ class HeadState(IntEnum):
 
 
 class HeadFault(IntFlag):
-    """Bits of the latched reasons."""
+    """Bits of the latched faults."""
 
     DEADMAN = 1
     ESTOP = 2
@@ -74,14 +74,14 @@ class HeadFault(IntFlag):
 
 
 class Input(IntFlag):
-    """Bits of the inputs as they are now."""
+    """Bits of the present inputs."""
 
     ESTOP_OPEN = 1
     RELAY_CLOSED = 2
 
 
 class ImuModel(IntEnum):
-    """Sensors that the head knows."""
+    """Sensors that the head supports."""
 
     NONE = 0
     MPU6050 = 1
@@ -89,7 +89,7 @@ class ImuModel(IntEnum):
 
 
 class ImuStatus(IntEnum):
-    """How the sensor does."""
+    """Status of the sensor."""
 
     OFF = 0
     STARTING = 1
@@ -101,7 +101,7 @@ class ImuStatus(IntEnum):
 
 
 class Rejection(IntEnum):
-    """Why a request was not done."""
+    """Why a request was rejected."""
 
     NONE = 0
     UNKNOWN_REQUEST = 1
@@ -122,20 +122,20 @@ class SampleFlag(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Who is there? The host's protocol version; the head answers whatever it is."""
+    """Ask for the head's identity; the head answers any protocol version."""
 
     ID: ClassVar[int] = 0x01
     LAYOUT: ClassVar[Struct] = Struct("<B")
-    protocol: int  # Version that the host speaks.
+    protocol: int  # Protocol version of the host.
 
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The host lives. As long as its reply, so that both take the same time on the line."""
+    """Heartbeat of the host; as long as its reply, so that both take the same time on the wire."""
 
     ID: ClassVar[int] = 0x02
     LAYOUT: ClassVar[Struct] = Struct("<HIII")
-    deadman_ms: int  # How long the next silence may last.
+    deadman_ms: int  # Longest silence until the next heartbeat.
     pad_0: int = 0
     pad_1: int = 0
     pad_2: int = 0
@@ -143,7 +143,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class Shutdown:
-    """The host leaves in peace: outputs off, no deadman, the stream ends."""
+    """Switch the outputs and the deadman off, and end the stream."""
 
     ID: ClassVar[int] = 0x03
     LAYOUT: ClassVar[Struct] = Struct("<")
@@ -155,7 +155,7 @@ class Acknowledge:
 
     ID: ClassVar[int] = 0x04
     LAYOUT: ClassVar[Struct] = Struct("<B")
-    faults: int  # The faults that a person has seen; others stay.
+    faults: int  # The faults that the operator has seen; others stay.
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ class Relay:
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """One pulse for the camera."""
+    """Send one pulse to the camera."""
 
     ID: ClassVar[int] = 0x07
     LAYOUT: ClassVar[Struct] = Struct("<H")
@@ -187,7 +187,7 @@ class Trigger:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Set up the sensor; how that went is told by `changed` and by every pulse."""
+    """Set up the sensor; `status_changed` and each `heartbeat_reply` report the result."""
 
     ID: ClassVar[int] = 0x08
     LAYOUT: ClassVar[Struct] = Struct("<BBBBB")
@@ -200,7 +200,7 @@ class Imu:
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Send each sample as it comes, or no longer."""
+    """Start or stop sending samples."""
 
     ID: ClassVar[int] = 0x09
     LAYOUT: ClassVar[Struct] = Struct("<B")
@@ -209,7 +209,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class ReadCounters:
-    """Tell what has gone wrong since the start."""
+    """Ask for the counters of errors since the start."""
 
     ID: ClassVar[int] = 0x0A
     LAYOUT: ClassVar[Struct] = Struct("<")
@@ -217,50 +217,50 @@ class ReadCounters:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The request was done, or why not; also the reply to whatever cannot be done."""
+    """The request was carried out or rejected; also the reply to unknown requests."""
 
     ID: ClassVar[int] = 0x80
     LAYOUT: ClassVar[Struct] = Struct("<BB")
-    request: int  # Its message id.
-    rejection: int  # Rejection; 0 where it was done.
+    request: int  # Message id of the request.
+    rejection: int  # Rejection; 0 if it was carried out.
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who the head is."""
+    """Identity of the head."""
 
     ID: ClassVar[int] = 0x81
     LAYOUT: ClassVar[Struct] = Struct("<BBBBBBBII")
-    protocol: int  # Version that the head speaks.
+    protocol: int  # Protocol version of the head.
     major: int  # Firmware version.
     minor: int
     patch: int
     board: int  # Board.
     capabilities: int  # Capability bits.
     reset_cause: int  # Reset.
-    serial: int  # Number given when it was flashed.
-    uptime_us: int  # Since its start, wraps with the clock.
+    serial: int  # Serial number, set when the board was flashed.
+    uptime_us: int  # Time since the start; wraps with the clock.
 
 
 @dataclass(frozen=True, slots=True)
 class HeartbeatReply:
-    """Two times of the head's clock, and how it does."""
+    """Two times of the head's clock, and its status."""
 
     ID: ClassVar[int] = 0x82
     LAYOUT: ClassVar[Struct] = Struct("<IIBBBBBB")
-    received_us: int  # When the beat's last byte was there.
-    sent_us: int  # When the first byte of this goes out.
+    received_us: int  # When the heartbeat's last byte arrived.
+    sent_us: int  # When the first byte of this reply leaves.
     state: int  # State.
     faults: int  # Fault bits.
     inputs: int  # Input bits.
     imu_status: int  # Imu_status.
-    who_am_i: int  # What the sensor answered.
+    who_am_i: int  # The sensor's answer.
     light: int  # Duty in 1/255.
 
 
 @dataclass(frozen=True, slots=True)
 class Triggered:
-    """The pulse was begun."""
+    """The pulse started."""
 
     ID: ClassVar[int] = 0x87
     LAYOUT: ClassVar[Struct] = Struct("<IH")
@@ -270,32 +270,32 @@ class Triggered:
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """Counts since the start; they stay at 65535."""
+    """Counters since the start; they stop at 65535."""
 
     ID: ClassVar[int] = 0x8A
     LAYOUT: ClassVar[Struct] = Struct("<HHHHHHHHHH")
     frames: int  # Whole frames received.
     crc_errors: int  # Frames with a wrong CRC.
-    malformed: int  # Frames that are no COBS, too short or too long.
+    malformed: int  # Frames that are not COBS, too short or too long.
     overruns: int  # Bytes lost by the receiver.
-    dropped: int  # Samples without room in the transmitter.
+    dropped: int  # Samples dropped because the transmitter was full.
     nacks: int  # I2C: not acknowledged.
-    timeouts: int  # I2C: transfers without an end.
-    recoveries: int  # I2C: buses freed by clocking out.
-    fifo_overflows: int  # The sensor's FIFO ran over.
-    restarts: int  # Sensor set up anew.
+    timeouts: int  # I2C: transfers that did not end.
+    recoveries: int  # I2C: buses freed by clock pulses.
+    fifo_overflows: int  # Overflows of the sensor's FIFO.
+    restarts: int  # Sensor set up again.
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One sample, as the sensor gave it."""
+    """One sample of the sensor."""
 
     ID: ClassVar[int] = 0xC0
     LAYOUT: ClassVar[Struct] = Struct("<HIBBhhhhhhh")
-    index: int  # Counts what the sensor took, lost samples included.
+    index: int  # Count of the sensor's samples, including lost ones.
     time_us: int  # The head's clock.
     flags: int  # Sample_flag bits.
-    dropped: int  # Counters.dropped, its low byte.
+    dropped: int  # Low byte of counters.dropped.
     accel_x: int
     accel_y: int
     accel_z: int
@@ -307,7 +307,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class StatusChanged:
-    """The state, a fault, the e-stop or the sensor changed; also the first word after a start."""
+    """The state, a fault, the e-stop or the sensor changed; also the first message after a start."""
 
     ID: ClassVar[int] = 0xC1
     LAYOUT: ClassVar[Struct] = Struct("<IBBBBBB")
@@ -316,7 +316,7 @@ class StatusChanged:
     faults: int  # Fault bits.
     inputs: int  # Input bits.
     imu_status: int  # Imu_status.
-    who_am_i: int  # What the sensor answered.
+    who_am_i: int  # The sensor's answer.
     reset_cause: int  # Reset.
 
 
@@ -340,4 +340,4 @@ REPLIES: dict[type[Request], type[Answer]] = {
     Stream: Done,
     ReadCounters: Counters,
 }
-"""The answer to a request that was not refused."""
+"""The reply to a request that is not rejected."""

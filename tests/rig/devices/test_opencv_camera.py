@@ -12,7 +12,8 @@ import pytest
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
-from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase, open_capture
+from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
+from rig.devices.opencv_capture import open_capture
 from rig.events.events import Rejected
 from rig.plans.enroll import enroll
 from sim.camera import FPS, SimCapture

@@ -1,0 +1,64 @@
+"""Opens cameras, video files and streams through OpenCV."""
+
+import os
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+
+from rig.core.errors import DeviceNotFound
+
+
+class Capture(Protocol):
+    """The part of `cv2.VideoCapture` that the driver uses."""
+
+    def isOpened(self) -> bool: ...  # noqa: N802
+
+    def grab(self) -> bool: ...
+
+    def retrieve(self) -> tuple[bool, Any]: ...
+
+    def get(self, propId: int, /) -> float: ...
+
+    def set(self, propId: int, value: float, /) -> bool: ...
+
+    def release(self) -> None: ...
+
+
+def open_capture(source: int | str | Path) -> cv2.VideoCapture:
+    """Open a camera by number or device path, or a video file, an image sequence (``img_%03d.png``) or a stream's URL.
+
+    Raises
+    ------
+    DeviceNotFound
+        The source does not exist, the user may not open it, or another program uses it; the next step says which.
+    """
+    if isinstance(source, int) or str(source).isdigit():
+        source = f"/dev/video{source}"
+    path = str(source)
+    if not path.startswith("/dev/"):
+        return _opened(path, cv2.CAP_ANY, "Check the path or address, and that OpenCV can decode its format.")
+    if not Path(path).exists():
+        there = sorted(str(p) for p in Path("/dev").glob("video*"))
+        raise DeviceNotFound(
+            f"The camera {path} does not exist.",
+            next_step=f"Connect the camera, or choose one of {', '.join(there)}." if there else "Connect the camera.",
+            evidence={"path": path, "found": there},
+        )
+    if not os.access(path, os.R_OK | os.W_OK):
+        raise DeviceNotFound(
+            f"You have no permission to open {path}.",
+            next_step="Join the group video (`sudo usermod -aG video $USER`), then log out and in again.",
+            evidence={"path": path},
+        )
+    return _opened(
+        path, cv2.CAP_V4L2, f"Close the program that uses it (`fuser -v {path}`), or try the camera's next number."
+    )
+
+
+def _opened(path: str, backend: int, next_step: str) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(path, backend)
+    if not capture.isOpened():
+        capture.release()
+        raise DeviceNotFound(f"Cannot open {path}.", next_step=next_step, evidence={"path": path})
+    return capture
