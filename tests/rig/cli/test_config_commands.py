@@ -56,7 +56,7 @@ def test_init_writes_the_defaults_as_comments_and_never_overwrites(rig, tmp_path
     file = tmp_path / "rig.toml"
     assert load_config(file) == RigConfig()
     text = file.read_text(encoding="utf-8")
-    assert "# bits per second; the servo's factory setting is 57600 (a whole number from 9600 to 4500000 bit/s)" in text
+    assert "# baud rate; the servo's factory setting is 57600 (a whole number from 9600 to 4500000 bit/s)" in text
     uncommented = "\n".join(
         line[1:] if line.startswith("#") and line[1:2].isalpha() else line for line in text.splitlines()
     )

@@ -74,7 +74,7 @@ def test_a_table_that_never_rests_does_not_hold_up_opening_for_ever(bench: Bench
         assert bench.clock.now_ns() < 6.5e9
 
 
-@pytest.mark.parametrize(("chip_id", "likely"), [(0x00, "SDA held low"), (0xFF, "not connected"), (0x42, "BNO085")])
+@pytest.mark.parametrize(("chip_id", "likely"), [(0x00, "SDA is held low"), (0xFF, "not connected"), (0x42, "BNO085")])
 def test_another_chip_is_named(chip_id: int, likely: str) -> None:
     bench = Bench(chip_id=chip_id)
     with closing(bench.bus), pytest.raises(DeviceMismatch, match=likely) as caught:

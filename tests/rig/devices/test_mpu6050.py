@@ -88,7 +88,7 @@ def test_opening_forgets_what_the_sensor_did_before(bench: Bench) -> None:
 
 @pytest.mark.parametrize(
     ("who_am_i", "likely"),
-    [(0x70, "MPU-6500"), (0x71, "MPU-9250"), (0x73, "MPU-9255"), (0x00, "SDA held low"), (0xFF, "not connected")],
+    [(0x70, "MPU-6500"), (0x71, "MPU-9250"), (0x73, "MPU-9255"), (0x00, "SDA is held low"), (0xFF, "not connected")],
 )
 def test_another_chip_is_named(who_am_i: int, likely: str) -> None:
     with Bench(who_am_i=who_am_i) as bench:

@@ -321,7 +321,7 @@ FOUND = {
     "babble": ("servo", "do not belong to a servo"),
     "unplug": ("servo", "Cannot open"),
     "duplicate_id": ("servo", "two servos"),
-    "wrong_model": ("servo", "another model"),
+    "wrong_model": ("servo", "not the configured model"),
     "brownout": ("servo", "no servo answers"),
     "overload": ("servo", "overload"),
     "overheat": ("servo", "overheating"),
