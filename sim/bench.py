@@ -202,7 +202,7 @@ def open_sim_bench(
             "sim",
             config,
             world.clock,
-            wire=devices.adapter,
+            connection=devices.adapter,
             reopen_serial=devices.reopen_adapter,
             i2c_bus=devices.i2c.path,
             capture=devices.camera,
