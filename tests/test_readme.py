@@ -19,7 +19,7 @@ COMMANDS = (
     "identify --bench sim --set bench.sim.object=mug-white --seed 3",
 )
 LEFT_OUT = re.compile(
-    r"view \d+ of|(Picture|Image) of the empty|Empty-table image|  Unwinding|  at |Note|.*views, about"
+    r"view \d+ of|(Picture|Image) of the empty|Empty-table image|  Unwinding|  table at |Note|.*views, about"
 )
 
 

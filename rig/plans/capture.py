@@ -80,7 +80,7 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
     evidence = attempt.evidence
     texts = "; ".join(rejection_text(reason, evidence) for reason in attempt.reasons)
     raise ViewRejected(
-        f"View {index} was rejected: {texts}.",
+        f"View {index + 1} was rejected: {texts}.",
         next_step="Check the light, the focus and the scene. The limits and view.retakes are in [view].",
         evidence={
             "reasons": [reason.value for reason in attempt.reasons],

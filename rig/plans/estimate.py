@@ -1,6 +1,6 @@
 """The course of an enrollment before anything moves: table angles, duration, and whether it is possible."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
@@ -116,7 +116,7 @@ class DryRun:
 def dry_run(
     bench: Bench,
     catalog: Catalog | None,
-    names: Sequence[str],
+    names: Mapping[str, int | None],
     *,
     views: int | None = None,
     resume: bool = False,
@@ -131,7 +131,8 @@ def dry_run(
     catalog
         None if there is none yet.
     names
-        Names of the objects. Of several objects, complete ones are skipped and interrupted ones resumed, as in a tray.
+        Names of the objects, with their own number of views if they have one. Of several objects, complete ones are
+        skipped and interrupted ones resumed, as in a tray.
     views, resume, replace
         As for `enroll`.
 
@@ -147,12 +148,13 @@ def dry_run(
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     model = MotionModel(bench.config)
     found = []
-    for name in map(clean_name, names):
+    for given, own_views in names.items():
+        name = clean_name(given)
         summary = known.get(name)
         action, obstacle = _action(summary, resume=resume, replace=replace, tray=len(names) > 1)
         azimuths: Sequence[float] = ()
         if action in ("enroll", "replace"):
-            azimuths = even_azimuths(views or bench.config.enroll.views, limits_deg, sign)
+            azimuths = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
             angles = table_angles(azimuths, limits_deg, sign)
         elif action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
             every = table_angles(kept.planned_azimuth_deg, limits_deg, sign)

@@ -14,6 +14,8 @@ from rig.cli.ui.complete import object_names
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rig.bench import Bench
     from rig.catalog import Catalog
     from rig.events.events import Event
@@ -82,7 +84,8 @@ def enroll(
         _check_writable(report)
     items = read_tray(tray) if tray else ()
     if dry_run:
-        _dry_run(settings, [name] if name else [item.name for item in items], views, resume=resume, replace=replace)
+        names = {name: None} if name else {item.name: item.views for item in items}
+        _dry_run(settings, names, views, resume=resume, replace=replace)
         return
 
     with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
@@ -262,7 +265,9 @@ def _check_writable(report: Path) -> None:
         )
 
 
-def _dry_run(settings: Settings, names: list[str], views: int | None, *, resume: bool, replace: bool) -> None:
+def _dry_run(
+    settings: Settings, names: "Mapping[str, int | None]", views: int | None, *, resume: bool, replace: bool
+) -> None:
     """Print the plan of an enrollment; nothing moves and nothing is stored."""
     from rig.cli.ui.present import console, dry_run_lines
     from rig.events.events import plain

@@ -60,7 +60,7 @@ def test_enrollment_with_a_short_cable_stays_within_it_and_sees_all_sides(simula
 def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_path, views):
     s = simulated(*SMALL, seed=3)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        (before,) = dry_run(s.bench, catalog, ["dice"], views=views)
+        (before,) = dry_run(s.bench, catalog, {"dice": None}, views=views)
         left = TimeLeft(MotionModel(s.bench.config), before.angles_deg)
         predicted = []
         for event in enroll(s.bench, catalog, "dice", views=views):
@@ -90,7 +90,7 @@ def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_p
         stands_deg = s.world.table_deg()
 
         def actions(*names: str, **options: bool) -> list[tuple[str, str, int]]:
-            found = dry_run(s.bench, catalog, names, views=5, **options)
+            found = dry_run(s.bench, catalog, dict.fromkeys(names), views=5, **options)
             return [(one.name, one.action, one.views) for one in found]
 
         assert actions("dice", "lamp", "clock") == [("dice", "skip", 0), ("lamp", "resume", 4), ("clock", "enroll", 5)]
@@ -99,13 +99,14 @@ def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_p
         assert actions("lamp") == [("lamp", "reject", 0)]
         assert actions("lamp", resume=True) == [("lamp", "resume", 4)]
         assert actions("clock", resume=True) == [("clock", "reject", 0)]
-        (resumed,) = dry_run(s.bench, catalog, ["lamp"], resume=True)
+        (resumed,) = dry_run(s.bench, catalog, {"lamp": None}, resume=True)
         assert resumed.angles_deg == (120.0, 180.0, 240.0, 300.0)
         assert resumed.table_deg == pytest.approx(60.0, abs=0.3)
         assert resumed.travel_deg == pytest.approx(60 + 180 + 300, abs=1)
         assert {o.name for o in catalog.objects()} == {"dice", "lamp"}
     assert s.world.table_deg() == pytest.approx(stands_deg, abs=0.01)
-    assert dry_run(s.bench, None, ["new"], views=4)[0].action == "enroll"
+    found = dry_run(s.bench, None, {"new": None, "own": 6}, views=4)
+    assert [(one.action, one.views) for one in found] == [("enroll", 4), ("enroll", 6)]
 
 
 def test_downward_moves_take_longer():
