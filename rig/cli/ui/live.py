@@ -45,7 +45,7 @@ from rig.views.capture import ViewEvidence, rejection_text
 
 ROWS: Final = 12
 """Largest number of rows in the live table."""
-WIDE, NARROW = 84, 60
+WIDE, NARROW = 88, 60
 """Width of a terminal, in characters, that fits all columns of a table, and most of them."""
 
 
