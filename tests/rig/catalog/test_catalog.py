@@ -330,7 +330,7 @@ def test_read_image_rejects_changed_and_missing_images(catalog: Catalog) -> None
     fill(catalog, "mug", 2)
     first, second = catalog.object("mug").views
     catalog.image_path(first).write_bytes(catalog.image_path(second).read_bytes())
-    with pytest.raises(CatalogError, match="not the stored one"):
+    with pytest.raises(CatalogError, match="not the one that was stored"):
         catalog.read_image(first)
     catalog.image_path(second).unlink()
     with pytest.raises(CatalogError, match="missing"):

@@ -209,7 +209,7 @@ def test_full_disk_is_reported_and_the_previous_image_stays(simulated: Open, tmp
                 free()
 
     s.bench.state = Full(tmp_path)
-    with pytest.raises(StateNotStored, match="cannot be kept") as caught:
+    with pytest.raises(StateNotStored, match="cannot be stored") as caught:
         photographed(s.bench)
     assert "Make room" in caught.value.next_step
     s.bench.state = store
