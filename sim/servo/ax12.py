@@ -1,4 +1,4 @@
-"""One simulated AX-12A: its control table, what it answers in Protocol 1.0, and what tests may do to it in the world.
+"""One simulated AX-12A: its control table, its answers in Protocol 1.0, and methods for tests.
 
 Source: e-manual page "AX-12+, AX-12A". Addresses are written down here once more, not shared with the driver, so that
 an error in one does not hide in the other. Kept but without effect: LEDs, compliance, punch, Max Torque.
@@ -33,7 +33,7 @@ BAUD_RATES = {
     103: 19_200,
     207: 9_600,
 }
-"""Baud rates by the register's value n: 2,000,000 / (n + 1), as near as it comes."""
+"""Baud rates by the register's value n: the nearest to 2,000,000 / (n + 1)."""
 
 _COUNTS = range(1024)
 _BYTE = range(256)
@@ -53,7 +53,7 @@ AX_12A = ServoModel(
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A register: where it is, what it begins with, and what may be written (nothing: it is read only)."""
+    """A register: its address, its initial value, and its valid values (none: it is read only)."""
 
     address: int
     size: int
@@ -120,21 +120,21 @@ class Image:
         return bytes(self._bytes[_LIVE])
 
     def set_live(self, data: bytes) -> None:
-        """Have them report something else."""
+        """Set them to other values."""
         self._bytes[_LIVE] = data
 
     def restore(self, start: int) -> None:
-        """Set everything from address ``start`` on to its initial value."""
+        """Set all registers from address ``start`` to their initial values."""
         for name, entry in ENTRIES.items():
             if entry.address >= start:
                 self[name] = entry.initial
 
     def read(self, address: int, size: int) -> bytes | None:
-        """Return ``size`` bytes, or None where they leave the table."""
+        """Return ``size`` bytes, or None if they exceed the table."""
         return bytes(self._bytes[address : address + size]) if size > 0 and address + size <= SIZE else None
 
     def entries(self, address: int, data: bytes) -> list[tuple[str, int]] | None:
-        """Return the registers that a write sets, or None where one is cut, out of its range or read only."""
+        """Return the registers that a write sets, or None if one is cut, out of range or read only."""
         at = {entry.address: (name, entry) for name, entry in ENTRIES.items()}
         found, i = [], 0
         while i < len(data):
@@ -150,7 +150,7 @@ class Image:
 
 
 class Ax12Servo:
-    """A servo of Protocol 1.0 whose horn is the table's shaft: 0..300° in joint mode, turning without end as a wheel.
+    """A servo of Protocol 1.0 on the table's shaft: 0..300° in joint mode, endless rotation in wheel mode.
 
     Both angle limits 0 make a wheel. As on the device, a goal written while torque is off switches it on. After a
     shutdown (overload, heat) Torque Limit is 0, and holds nothing until it is written again.
@@ -208,7 +208,7 @@ class Ax12Servo:
         }
         self._powered = True
 
-    # -- the bus's side -------------------------------------------------------------------------------------------
+    # -- on the bus -----------------------------------------------------------------------------------------------
 
     @property
     def bus_id(self) -> int:
@@ -228,7 +228,7 @@ class Ax12Servo:
         return self._powered
 
     def execute(self, packet: InstructionPacket) -> Status | None:
-        """Do what ``packet`` asks if it concerns this servo, and return the answer if there is one to give."""
+        """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
         everyones = packet.bus_id == BROADCAST_ID
         if not self._powered or not (everyones or packet.bus_id == self.bus_id):
             return None
@@ -296,10 +296,10 @@ class Ax12Servo:
                 return Error.INSTRUCTION
         return 0
 
-    # -- the world's side -----------------------------------------------------------------------------------------
+    # -- for tests and faults -------------------------------------------------------------------------------------
 
     def turn_by_hand(self, angle_deg: float, speed_dps: float = 90.0) -> float:
-        """Turn the shaft by ``angle_deg``, with torque off; return how many seconds the hand takes.
+        """Rotate the shaft by hand by ``angle_deg``, with torque off; return how many seconds that takes.
 
         Raises
         ------
@@ -327,21 +327,21 @@ class Ax12Servo:
         self._supervise()
 
     def fail(self, error: int) -> None:
-        """Raise bits of the error byte, until the next power-up."""
+        """Set bits of the error byte until the next power-up."""
         self._failed |= error
         self._supervise()
 
     def trip_watchdog(self) -> None:
-        """Do nothing: it has none."""
+        """Do nothing: this servo has no watchdog."""
 
     def slip_encoder(self, angle_deg: float) -> None:
-        """Let the potentiometer slip by ``angle_deg``; the shaft follows what it now reads."""
+        """Let the potentiometer slip by ``angle_deg``; the shaft follows the new reading."""
         self._center += round(angle_deg / DEG_PER_COUNT)
         if self.motor.driven:
             self._on_goal()
 
     def power_on(self) -> None:
-        """Give the supply back; the servo answers after `BOOT_S`."""
+        """Restore the supply; the servo answers after `BOOT_S`."""
         if not self._powered:
             self.power_cycle()
 
@@ -355,7 +355,7 @@ class Ax12Servo:
                 timer.cancel()
 
     def power_cycle(self) -> None:
-        """Cut the supply and give it back; the servo answers after `BOOT_S`."""
+        """Cut the supply and restore it; the servo answers after `BOOT_S`."""
         self.power_off()
         self._booting = self._clock.call_at(self._clock.now_ns() + round(BOOT_S * 1e9), self._start)
 
@@ -381,7 +381,7 @@ class Ax12Servo:
         return bits | self._failed | (Error.OVERLOAD if self._overload else 0)
 
     def _supervise(self) -> None:
-        """Judge the servo's health now, and again and again while its load varies."""
+        """Check load, temperature and supply now, and repeatedly while the load varies."""
         if self._supervision:
             self._supervision.cancel()
             self._supervision = None
@@ -432,14 +432,14 @@ class Ax12Servo:
             self._supervise()
 
     def _position(self) -> int:
-        """Return the position's reading: beyond the 300° of its potentiometer it stays at the end."""
+        """Return the position reading; outside the 300° of the potentiometer it is the nearest end."""
         noise_deg = self._shaft.noise.encoder_noise_deg
         error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
         counts = round((self._shaft.shaft()[0] + error_deg) / DEG_PER_COUNT + self._center)
         return min(max(counts, 0), 1023)
 
     def _refresh(self) -> None:
-        """Fill in the registers that follow the world."""
+        """Update the registers that follow the world."""
         memory, motor = self.memory, self.motor
         state = motor.state()
         memory["Present Position"] = self._position()

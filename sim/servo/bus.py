@@ -1,4 +1,4 @@
-"""The half-duplex line between host and servos, byte by byte in time."""
+"""The half-duplex bus between host and servos, byte by byte in time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from sim.servo.requests import CHAINED_READS, FAST_READS, chained_reads
 BITS_PER_BYTE = 10
 """A start bit, 8 data bits, a stop bit."""
 ABANDON_S = 0.05
-"""Silence after which a device gives up a packet that has begun; the e-manual gives no number."""
+"""Silence after which a device drops an incomplete packet; the e-manual states no value."""
 PING_SLOT_S = 0.003
 PING_STATUS_BYTES = 14
 """Broadcast Ping: each id has a slot of one status packet and 3 ms, which is what the SDK's timeout reckons with."""
@@ -36,7 +36,7 @@ class Source(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Bytes that go over the line without a gap; ``start_ns`` is when the first start bit begins."""
+    """Bytes that are sent without a gap; ``start_ns`` is the beginning of the first start bit."""
 
     source: Source
     start_ns: int
@@ -59,7 +59,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a device answers, under which id and after which delay."""
+    """The answer of a device, with its id and its delay."""
 
     bus_id: int
     delay_ns: int
@@ -67,11 +67,11 @@ class Answer:
 
 
 class Device(Protocol):
-    """What the bus asks of a servo."""
+    """The interface of a servo on the bus."""
 
     @property
     def protocol(self) -> int:
-        """Which protocol it speaks: 1 or 2."""
+        """Its protocol: 1 or 2."""
         ...
 
     @property
@@ -119,15 +119,15 @@ class ServoBus:
         self._heard = Frame(Source.HOST, 0, 1, b"")
 
     def attach(self, device: Device) -> None:
-        """Plug a servo into the line."""
+        """Connect a servo to the bus."""
         self._devices.append(device)
 
     def detach(self, device: Device) -> None:
-        """Pull a servo's cable out of the line; ValueError if it is not there."""
+        """Disconnect a servo from the bus; ValueError if it is not connected."""
         self._devices.remove(device)
 
     def connect(self, deliver: Callable[[Frame], None]) -> bool:
-        """Give the line's one host its receiver; return False where there is a host already."""
+        """Connect the receiver of the host; return False if the bus already has a host."""
         if self._deliver is not None:
             return False
         self._deliver = deliver
@@ -137,7 +137,7 @@ class ServoBus:
         self._deliver = None
 
     def send(self, data: bytes, baudrate: int) -> int:
-        """Put the host's bytes on the line, after those still going out; return when the last one has arrived."""
+        """Send the host's bytes after those still being sent; return when the last one arrives."""
         frame = Frame(Source.HOST, max(self.clock.now_ns(), self._sent_until_ns), baudrate, data)
         self._sent_until_ns = frame.end_ns
         for tap in self.taps:
@@ -149,7 +149,7 @@ class ServoBus:
         return frame.end_ns
 
     def disturb(self, data: bytes, baudrate: int) -> None:
-        """Put bytes of nobody on the line, for the host to hear."""
+        """Send bytes to the host that no servo has sent."""
         if self._deliver is not None:
             self._deliver(Frame(Source.DEVICE, self.clock.now_ns(), baudrate, data))
 
@@ -163,7 +163,7 @@ class ServoBus:
                 self._dispatch(packet, frame.baudrate, protocol)
 
     def _dispatch(self, packet: InstructionPacket, baudrate: int, protocol: int) -> None:
-        # Ids and delays as they were before the instruction: what it changes holds from the next one on.
+        # Ids and delays are those before the instruction; its changes apply from the next instruction.
         called = [
             (d, d.bus_id, d.return_delay_ns)
             for d in self._devices
@@ -196,7 +196,7 @@ class ServoBus:
             self._reply(frame)
 
     def _chain(self, packet: InstructionPacket, answers: list[Answer], baudrate: int) -> list[Frame]:
-        """Return the answers to a chained read: each waits for the one before, those of a fast read are one packet."""
+        """Return the answers to a chained read: one after the other; a fast read gives one packet."""
         requests = chained_reads(packet)
         links = ([answer for answer in answers if answer.bus_id == bus_id] for bus_id in requests)
         chain = list(takewhile(bool, links))
@@ -227,7 +227,7 @@ class ServoBus:
 
 
 def superpose(frames: list[Frame]) -> list[Frame]:
-    """Return what the line carries when ``frames`` are sent: those that overlap in time spoil each other."""
+    """Return the bytes on the bus when ``frames`` are sent: frames that overlap in time collide."""
     line: list[Frame] = []
     for frame in sorted(frames, key=lambda f: f.start_ns):
         if line and frame.start_ns < line[-1].end_ns:
@@ -238,7 +238,7 @@ def superpose(frames: list[Frame]) -> list[Frame]:
 
 
 def _collide(first: Frame, second: Frame) -> Frame:
-    """Return what a receiver makes of two senders: a line with a pull-up is low where one of them drives it low."""
+    """Return the bytes received from two senders: a bus with a pull-up is low if one of them drives it low."""
     shift = COLLISION_SHIFT_BITS + (second.start_ns - first.start_ns) * first.baudrate // 1_000_000_000
     ones, others = _levels(first.data), _levels(second.data)
     length = max(len(ones), shift + len(others)) + BITS_PER_BYTE
@@ -258,5 +258,5 @@ def _collide(first: Frame, second: Frame) -> Frame:
 
 
 def _levels(data: bytes) -> list[int]:
-    """Return the line's levels, one a bit time, for ``data`` as a UART sends it."""
+    """Return the levels of the bus, one for each bit, for ``data`` as a UART sends it."""
     return [level for byte in data for level in (0, *(byte >> bit & 1 for bit in range(8)), 1)]

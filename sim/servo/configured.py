@@ -12,7 +12,7 @@ SimulatedServo = XSeriesServo | Ax12Servo
 
 
 def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
-    """Return the servo that ``config`` describes, on the table's shaft or behind its gear, as from the factory.
+    """Return the servo that ``config`` describes, with factory settings, on the table's shaft or behind its gear.
 
     Raises
     ------

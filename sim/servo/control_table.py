@@ -1,4 +1,4 @@
-"""The memory of one servo: an image of bytes, the registers in it, what survives a reboot, and who may write what."""
+"""The memory of one servo: its bytes, its registers, its EEPROM and its access rules."""
 
 from collections.abc import Iterator
 
@@ -35,7 +35,7 @@ _READ_ONLY = frozenset(
 
 
 class Refusal(Exception):
-    """The device answers with an error instead of doing what was asked."""
+    """The device rejects an instruction with an error."""
 
     def __init__(self, error: StatusError) -> None:
         super().__init__(error.name)
@@ -43,7 +43,7 @@ class Refusal(Exception):
 
 
 class Memory:
-    """Control table image of one servo; values by register name, as signed as the register is.
+    """Control table of one servo; values by register name, signed if the register is.
 
     Indirect Data is resolved through its Indirect Address, to the byte that it stands for.
     """
@@ -79,7 +79,7 @@ class Memory:
         return register.decode(bytes(self._image[register.address : register.address + register.size]))
 
     def __setitem__(self, name: str, value: int) -> None:
-        """Set a register from inside, without any check of access; OverflowError where the value does not fit."""
+        """Set a register without a check of access; OverflowError if the value does not fit."""
         register = self._registers[name]
         self._image[register.address : register.address + register.size] = register.encode(value)
 
@@ -93,7 +93,7 @@ class Memory:
 
     @property
     def starts_with_torque(self) -> bool:
-        """Whether the Startup Configuration, which not all models have, asks for torque at power-up."""
+        """Whether the Startup Configuration enables torque at power-up; not all models have it."""
         return "Startup Configuration" in self._registers and self["Startup Configuration"] == 1
 
     def forget_ram(self) -> None:
@@ -101,7 +101,7 @@ class Memory:
         self._restore(RAM_START, self._size)
 
     def forget_all(self, keep: tuple[str, ...] = ()) -> None:
-        """Set everything to its initial value but the registers named in ``keep``."""
+        """Set all registers but those named in ``keep`` to their initial values."""
         kept = {name: self[name] for name in keep}
         self._restore(0, self._size)
         for name, value in kept.items():

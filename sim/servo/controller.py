@@ -1,4 +1,4 @@
-"""The servo's motion control: registers in, trajectories out, and the registers that report how it goes."""
+"""The servo's motion control: from goal registers to trajectories, and the registers that report the motion."""
 
 from enum import IntEnum
 from math import cos, radians, sin
@@ -20,7 +20,7 @@ from sim.servo.shaft import Shaft
 
 IN_POSITION_COUNTS = 4
 FOLLOWING_ERROR_COUNTS = 100
-"""The e-manual calls these two thresholds of Moving Status predefined and gives no numbers."""
+"""The e-manual calls these two thresholds of Moving Status predefined and states no values."""
 SINGLE_TURN_HOMING_COUNTS = 1024
 """A Homing Offset beyond it is ignored in position mode."""
 TICK_MODULUS_MS = 32_768
@@ -72,7 +72,7 @@ class Controller:
     # -- commands -------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin at power-up, with torque off and the initial values in RAM."""
+        """Start at power-up, with torque off and the initial values in RAM."""
         self._started_ns = self._world.clock.now_ns()
         self._profile = Profile.STEP
         self._memory["Goal PWM"] = self._memory["PWM Limit"]
@@ -91,7 +91,7 @@ class Controller:
             self.wrap_position()
 
     def torque_on(self) -> None:
-        """Take the shaft as it stands: a goal written while torque was off does not count."""
+        """Hold the shaft where it is: a goal written while torque was off is ignored."""
         if self._memory["Operating Mode"] == POSITION_MODE:
             self.wrap_position()
         self._motor.hold()
@@ -100,13 +100,13 @@ class Controller:
         self._profile = Profile.STEP
 
     def stop(self) -> None:
-        """Stop and hold, as a tripped Bus Watchdog does; the goal stays, for the next one to replace."""
+        """Stop and hold, as a tripped Bus Watchdog does; the goal register does not change."""
         self._memory["Profile Velocity"] = self._memory["Profile Acceleration"] = 0
         self._profile = Profile.STEP
         self._motor.brake()
 
     def pursue_position(self) -> None:
-        """Plan the profile to Goal Position (e-manual, "What is the Profile"); other modes take no notice."""
+        """Plan the profile to Goal Position (e-manual, "What is the Profile"); other modes ignore it."""
         if self._memory["Operating Mode"] == VELOCITY_MODE:
             return
         goal_deg = self._degrees(self._memory["Goal Position"])
@@ -131,7 +131,7 @@ class Controller:
             self._profile = Profile.TRAPEZOIDAL if peak >= v_max * (1 - 1e-9) else Profile.TRIANGULAR
 
     def pursue_velocity(self) -> None:
-        """Ramp to Goal Velocity; other modes take no notice."""
+        """Ramp to Goal Velocity; other modes ignore it."""
         if self._memory["Operating Mode"] != VELOCITY_MODE:
             return
         fastest = self._motor.fastest_dps
@@ -145,14 +145,14 @@ class Controller:
         self._profile = Profile.TRAPEZOIDAL if acceleration else Profile.STEP
 
     def wrap_position(self) -> None:
-        """Forget the turns: from here on the position counts from within one revolution."""
+        """Reset the count of revolutions: the position continues from within one revolution."""
         self._turns_counts = 0
         present = self._present_position() - self._homing
         self._turns_counts = present - present % COUNTS_PER_TURN
         self._memory["Goal Position"] = self._present_position()
 
     def slip_encoder(self, angle_deg: float) -> None:
-        """Read ``angle_deg`` more than before, and go to the goal as the encoder now sees it."""
+        """Increase the encoder's reading by ``angle_deg``, and go to the goal by the new reading."""
         self._center += round(angle_deg / DEG_PER_COUNT)
         if self._motor.driven:
             self.pursue_position()
@@ -160,7 +160,7 @@ class Controller:
     # -- reports --------------------------------------------------------------------------------------------------
 
     def refresh(self) -> None:
-        """Fill in the registers that follow the world."""
+        """Update the registers that follow the world."""
         memory, motor, state = self._memory, self._motor, self._motor.state()
         present, target = self._present_position(), self._counts(state.target_deg)
         velocity = self._sign * round(state.speed_dps / DPS_PER_UNIT)
@@ -224,7 +224,7 @@ class Controller:
         return angle_deg
 
     def _encoder_error_deg(self, angle_deg: float) -> float:
-        """Return what the encoder reads too much at a shaft angle: its magnet sits a little off the axis."""
+        """Return the encoder's error at a shaft angle: its magnet is a little off the axis."""
         if not self._world.noise.encoder_harmonic_deg:
             return 0.0
         turn = radians(angle_deg)
@@ -239,4 +239,4 @@ class Controller:
 
 
 _STANDSTILL = 1e-9
-"""Smallest limit of a profile: one planned to where the shaft is already has no speed of its own."""
+"""Smallest limit of a profile: a profile of length 0 has no speed."""

@@ -1,4 +1,4 @@
-"""One simulated X-series (or MX 2.0) servo: what it answers on the bus, and what tests may do to it in the world."""
+"""One simulated X-series (or MX 2.0) servo: its answers on the bus, and methods for tests."""
 
 from collections.abc import Callable
 
@@ -13,9 +13,9 @@ from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
 from sim.servo.shaft import Shaft
 
 BOOT_S = 0.2
-"""How long a servo is silent after power-up or Reboot; the e-manual gives no number."""
+"""How long a servo is silent after power-up or Reboot; the e-manual states no value."""
 SUPERVISION_S = 0.1
-"""How often the servo judges load and heat while it works."""
+"""How often the servo checks load and temperature while it works."""
 WATCHDOG_UNIT_NS = 20_000_000
 WATCHDOG_TRIPPED = 0xFF
 RETURN_DELAY_UNIT_NS = 2_000
@@ -104,7 +104,7 @@ class XSeriesServo:
         }
         self._start()
 
-    # -- the bus's side -------------------------------------------------------------------------------------------
+    # -- on the bus -----------------------------------------------------------------------------------------------
 
     @property
     def bus_id(self) -> int:
@@ -120,11 +120,11 @@ class XSeriesServo:
 
     @property
     def powered(self) -> bool:
-        """Whether the servo is up: it has power and has booted."""
+        """Whether the servo has power and has booted."""
         return self._powered
 
     def execute(self, packet: InstructionPacket) -> Status | None:
-        """Do what ``packet`` asks if it concerns this servo, and return the answer if there is one to give."""
+        """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
         if not self._powered:
             return None
         mine, everyones = packet.bus_id == self.bus_id, packet.bus_id == BROADCAST_ID
@@ -149,7 +149,7 @@ class XSeriesServo:
         return self._status(StatusError.NONE, data) if answers else None
 
     def _perform(self, packet: InstructionPacket, everyones: bool, in_group: bool) -> bytes:
-        """Carry out an instruction; return what a read reads."""
+        """Execute an instruction; return the data of a read."""
         parameters = packet.parameters
         match packet.instruction:
             case Instruction.PING:
@@ -200,7 +200,7 @@ class XSeriesServo:
                 hook()
 
     def _permit(self, entries: list[tuple[Register, int]], in_group: bool) -> None:
-        """Refuse values that the servo's state forbids."""
+        """Reject values that are invalid in the servo's state."""
         locked = in_group or self.memory["Torque Enable"]
         tripped = self.memory["Bus Watchdog"] == WATCHDOG_TRIPPED
         for register, value in entries:
@@ -213,7 +213,7 @@ class XSeriesServo:
                 raise Refusal(StatusError.DATA_LIMIT)
 
     def _limits(self, name: str, value: int) -> tuple[int, int]:
-        """Return the limits that other registers set to ``name``; around ``value`` where none do."""
+        """Return the limits of ``name`` from other registers; ``value`` itself if there are none."""
         memory = self.memory
         match name:
             case "Goal Position" if memory["Operating Mode"] == POSITION_MODE:
@@ -225,10 +225,10 @@ class XSeriesServo:
                 return -limit, limit
         return value, value
 
-    # -- the world's side -----------------------------------------------------------------------------------------
+    # -- for tests and faults -------------------------------------------------------------------------------------
 
     def turn_by_hand(self, angle_deg: float, speed_dps: float = 90.0) -> float:
-        """Turn the shaft by ``angle_deg``, with torque off; return how many seconds the hand takes.
+        """Rotate the shaft by hand by ``angle_deg``, with torque off; return how many seconds that takes.
 
         Raises
         ------
@@ -248,24 +248,24 @@ class XSeriesServo:
         self._supervise()
 
     def set_voltage(self, supply_v: float) -> None:
-        """Set the supply's voltage; the servo notices at once."""
+        """Set the supply voltage; the servo checks it at once."""
         self.motor.supply_v = supply_v
         self._judge()
 
     def set_temperature(self, temperature_c: float) -> None:
-        """Set the case's temperature; from there on it follows the thermal model again."""
+        """Set the temperature of the case; then it follows the thermal model again."""
         self.motor.set_temperature(temperature_c)
         self._judge()
 
     def fail(self, error: int) -> None:
-        """Raise bits of Hardware Error Status, such as `ENCODER_ERROR`."""
+        """Set bits of Hardware Error Status, such as `ENCODER_ERROR`."""
         self.memory["Hardware Error Status"] |= error
         if error & self.memory["Shutdown"] and self.memory["Torque Enable"]:
             self.memory["Torque Enable"] = 0
             self.motor.release()
 
     def trip_watchdog(self) -> None:
-        """Let the Bus Watchdog expire now, if it is armed: as after a silence of the host."""
+        """Let the Bus Watchdog expire now if it is enabled, as after a pause of the host."""
         if self.memory["Torque Enable"] and 0 < self.memory["Bus Watchdog"] < WATCHDOG_TRIPPED:
             self._trip()
 
@@ -284,12 +284,12 @@ class XSeriesServo:
                 timer.cancel()
 
     def power_on(self) -> None:
-        """Give it back; the servo answers after `BOOT_S`."""
+        """Restore the supply; the servo answers after `BOOT_S`."""
         if not self._powered:
             self.power_cycle()
 
     def power_cycle(self) -> None:
-        """Cut the supply and give it back, as Reboot does from inside."""
+        """Cut the supply and restore it, like Reboot."""
         self.power_off()
         self._booting = self._clock.call_at(self._clock.now_ns() + round(BOOT_S * 1e9), self._start)
 
@@ -307,12 +307,12 @@ class XSeriesServo:
 
     def _factory_reset(self, option: int, everyones: bool) -> None:
         if everyones and option == 0xFF:
-            return  # from firmware 42 on: every servo of the bus would end up with the same id
+            return  # from firmware 42 on: else all servos of the bus would get the same id
         self.memory.forget_all(keep={0xFF: (), 0x01: ("ID",), 0x02: ("ID", "Baud Rate")}[option])
         self.power_cycle()
 
     def _shut_down(self) -> bool:
-        """Return whether a hardware error keeps torque off; after such a shutdown only a reboot brings it back."""
+        """Return whether a hardware error keeps torque off until a reboot."""
         return bool(self.memory["Hardware Error Status"] & self.memory["Shutdown"])
 
     def _on_torque_enable(self) -> None:
@@ -341,7 +341,7 @@ class XSeriesServo:
         self._supervise()
 
     def _supervise(self) -> None:
-        """Judge the servo's health now, and again and again while its load varies."""
+        """Check load, temperature and supply now, and repeatedly while the load varies."""
         if self._supervision:
             self._supervision.cancel()
             self._supervision = None
@@ -366,7 +366,7 @@ class XSeriesServo:
             self.fail(errors)
 
     def _arm_watchdog(self) -> None:
-        """Wait until the time after the last instruction is up; only while torque is on."""
+        """Schedule the watchdog after the last instruction; only while torque is on."""
         if self._watchdog:
             self._watchdog.cancel()
             self._watchdog = None

@@ -1,4 +1,4 @@
-"""What distinguishes one model from another, as data: initial values, ranges, speed, current.
+"""The differences between servo models as data: initial values, ranges, speed, current.
 
 Source: the e-manual's control tables and specifications of each model. A further X-series or MX (2.0) model is one more
 `ServoModel`; its register addresses come from the SDK's `.model` file.
@@ -44,7 +44,7 @@ _RANGES: dict[str, Container[int]] = {
     "Baud Rate": range(len(BAUD_RATES)),
     "Return Delay Time": range(255),
     "Drive Mode": frozenset(bits for bits in range(14) if not bits & ~0b1101),
-    # Current and PWM control are not emulated: refusing them is better than accepting a mode in which nothing moves.
+    # Current and PWM control are not emulated. They are rejected, because nothing would move in them.
     "Operating Mode": frozenset({VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE}),
     "Protocol Type": frozenset({2}),
     "Homing Offset": range(-1_044_479, 1_044_480),

@@ -1,4 +1,4 @@
-"""The gear motor on the world's shaft: how it follows a commanded trajectory, what that costs, and what holds it up."""
+"""The gear motor on the world's shaft: trajectory, load, temperature and jams."""
 
 from dataclasses import dataclass
 from math import exp
@@ -8,7 +8,7 @@ from sim.servo.models import DEG_PER_COUNT, PWM_FULL, ServoModel
 from sim.servo.shaft import Shaft
 
 FRICTION_LOAD = 0.04
-"""Part of the stall torque that the gears' friction takes while the shaft turns."""
+"""Friction of the gears while the shaft rotates, as a part of the stall torque."""
 PWM_PER_COUNT = 5.0
 """PWM that the position controller adds for each count of error: Position P Gain 640 / 128 (e-manual, XL430-W250)."""
 SUPPLY_DROP_V = 0.4
@@ -18,18 +18,18 @@ AMBIENT_C = 25.0
 STANDBY_RISE_C = 8.0
 """Warming by the electronics alone."""
 STALL_RISE_C = 90.0
-"""Warming at stall torque in the long run; it goes with the square of the load."""
+"""Final warming at stall torque; it is proportional to the square of the load."""
 THERMAL_TIME_S = 400.0
 """Time constant of the case."""
 
 OVERLOAD = 0.99
 OVERLOAD_S = 2.0
-"""How long the motor may push with all it has before the servo calls it an overload; the e-manual gives no number."""
+"""How long the motor may push with full torque before the servo reports an overload; the e-manual states no value."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotorState:
-    """The shaft, where it should be, and what that takes; positive counter-clockwise.
+    """True and commanded state of the shaft and the load; positive counter-clockwise.
 
     ``load`` is a fraction of the stall torque, ``pwm`` of the supply, both -1..1.
     """
@@ -78,12 +78,12 @@ class Motor:
 
     @property
     def profile_ongoing(self) -> bool:
-        """Whether the commanded trajectory has not come to its end."""
+        """Whether the commanded trajectory has not ended."""
         return self._driven and self._now_s() < self.commanded.end_s
 
     @property
     def busy(self) -> bool:
-        """Whether the load varies: the shaft turns, or is held up while driven."""
+        """Whether the load varies: the shaft rotates, or is blocked while driven."""
         return self._driven and (self._jammed or self.profile_ongoing or bool(self.commanded.velocity_dps[-1]))
 
     @property
@@ -125,14 +125,14 @@ class Motor:
         self._overloaded_s = self._overloaded_s + now_s - self._settled_s if abs(load) >= OVERLOAD else 0.0
         self._settled_s = now_s
 
-    # -- what the controller commands -----------------------------------------------------------------------------
+    # -- commands of the controller -------------------------------------------------------------------------------
 
     def hold(self) -> None:
-        """Drive the shaft, to stay where it is."""
+        """Hold the shaft where it is."""
         self._follow(rest(self._now_s(), self._world.shaft()[0]), driven=True)
 
     def release(self) -> None:
-        """Drive the shaft no longer; friction stops it."""
+        """Stop driving the shaft; friction stops it."""
         self._follow(self._stop(), driven=False)
 
     def brake(self) -> None:
@@ -147,7 +147,7 @@ class Motor:
         state = self.state()
         self._follow(to_velocity(self._now_s(), state.target_deg, state.target_dps, speed_dps, a_max))
 
-    # -- what happens to the shaft --------------------------------------------------------------------------------
+    # -- for tests and faults -------------------------------------------------------------------------------------
 
     def jam(self) -> None:
         """Block the shaft where it is, against whatever drives it."""
@@ -156,7 +156,7 @@ class Motor:
         self._world.drive(rest(self._now_s(), self._world.shaft()[0]))
 
     def free(self) -> None:
-        """Let a jammed shaft go: it makes up for the error as fast as it can."""
+        """Release a jammed shaft; it moves to its commanded angle at maximum speed."""
         self.settle()
         self._jammed = False
         if not self._driven:
@@ -169,7 +169,7 @@ class Motor:
             self._follow(to_position(self._now_s(), angle, 0.0, goal, self.fastest_dps, self.steepest_dps2))
 
     def push(self, angle_deg: float, v_max: float, a_max: float) -> float:
-        """Turn the released shaft by ``angle_deg`` from outside; return how many seconds that takes.
+        """Rotate the released shaft by hand by ``angle_deg``; return how many seconds that takes.
 
         Raises
         ------

@@ -12,7 +12,7 @@ _HEADER = b"\xff\xff"
 _FIXED = 4  # header, id, length
 MAX_ID = 0xFD
 MAX_LENGTH = 143
-"""Largest value of a length field that is taken for one (Protocol 1.0 buffers hold so many bytes)."""
+"""Largest valid value of a length field (the size of Protocol 1.0 buffers)."""
 
 
 class Error(IntFlag):
@@ -33,13 +33,13 @@ def checksum(body: bytes) -> int:
 
 
 class PacketParser1:
-    """Finds instruction packets in a stream of bytes that may come in any pieces and among any noise."""
+    """Finds instruction packets in a stream of bytes, in pieces of any size and in noise."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def reset(self) -> None:
-        """Forget a packet that has begun."""
+        """Drop an incomplete packet."""
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[InstructionPacket]:

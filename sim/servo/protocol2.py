@@ -13,7 +13,7 @@ ALERT = 0x80
 """Bit of a status packet's error byte: Hardware Error Status is not 0."""
 
 MAX_LENGTH = 1024
-"""Largest value of a length field that is taken for one; a longer one is noise that looks like a header."""
+"""Largest valid value of a length field; a larger one is noise that looks like a header."""
 
 _HEADER = b"\xff\xff\xfd"
 _STUFFED = _HEADER + b"\xfd"
@@ -51,7 +51,7 @@ class StatusError(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class InstructionPacket:
-    """What the host asks; of a packet that is not ``intact`` (its CRC is wrong) only the id is worth anything."""
+    """An instruction of the host; if it is not ``intact`` (its CRC is wrong), only the id is valid."""
 
     bus_id: int
     instruction: int
@@ -61,7 +61,7 @@ class InstructionPacket:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What a device answers: the error byte and the parameters."""
+    """The answer of a device: the error byte and the parameters."""
 
     error: int
     data: bytes = b""
@@ -89,13 +89,13 @@ def with_crc(frame: bytes) -> bytes:
 
 
 class PacketParser:
-    """Finds instruction packets in a stream of bytes that may come in any pieces and among any noise."""
+    """Finds instruction packets in a stream of bytes, in pieces of any size and in noise."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def reset(self) -> None:
-        """Forget a packet that has begun."""
+        """Drop an incomplete packet."""
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[InstructionPacket]:
@@ -124,7 +124,7 @@ class PacketParser:
                 del buffer[:end]
             else:
                 packets.append(InstructionPacket(frame[4], frame[_FIXED], b"", intact=False))
-                del buffer[: len(_HEADER)]  # a damaged length may have swallowed the next packet: look again inside
+                del buffer[: len(_HEADER)]  # a damaged length may include the next packet: search inside
         del buffer[: max(len(buffer) - len(_HEADER) + 1, 0)]
         return packets
 
@@ -137,7 +137,7 @@ def status_packet(bus_id: int, status: Status) -> bytes:
 
 
 def fast_status_parts(sizes: list[int], answers: list[tuple[int, Status]]) -> list[bytes]:
-    """Return what each device adds to the one status packet of a Fast Sync Read or Fast Bulk Read.
+    """Return the part of each device in the status packet of a Fast Sync Read or Fast Bulk Read.
 
     The packet's length counts all devices asked (``sizes``: bytes asked of each), also those that stay silent; the CRC
     of each part covers everything before it, so the last one is the packet's own. Nothing is byte-stuffed (e-manual,

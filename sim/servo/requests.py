@@ -19,7 +19,7 @@ def word(data: bytes, start: int = 0) -> int:
 
 
 def chained_reads(packet: InstructionPacket) -> dict[int, tuple[int, int]]:
-    """Return address and size that each device is asked for; devices of an incomplete entry are left out."""
+    """Return address and size for each device; incomplete entries are left out."""
     parameters = packet.parameters
     if packet.instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ):
         starts = range(0, len(parameters) - 4, 5)
@@ -30,7 +30,7 @@ def chained_reads(packet: InstructionPacket) -> dict[int, tuple[int, int]]:
 
 
 def group_writes(packet: InstructionPacket) -> dict[int, tuple[int, bytes]]:
-    """Return address and data for each device; devices of an incomplete entry are left out."""
+    """Return address and data for each device; incomplete entries are left out."""
     parameters = packet.parameters
     writes = {}
     if packet.instruction == Instruction.SYNC_WRITE and len(parameters) > 4:

@@ -1,4 +1,4 @@
-"""An in-memory serial port: pyserial's interface, on the virtual clock, with the simulated bus at its other end."""
+"""A simulated serial port on the simulated servo bus: pyserial's interface on the virtual clock."""
 
 import errno
 from bisect import insort
@@ -59,12 +59,12 @@ class SimSerial:
             self._taken = 0
 
     def unplug(self) -> None:
-        """Pull the adapter out of the computer: what is on its way is lost, and every use fails from now on."""
+        """Unplug the adapter: bytes on their way are lost, and every later call fails."""
         self.close()
         self._unplugged = True
 
     def replug(self) -> None:
-        """Plug the adapter in again; the port must be opened anew."""
+        """Plug the adapter in; the port must be opened again."""
         self._unplugged = False
 
     @property
@@ -106,13 +106,13 @@ class SimSerial:
         return len(data)
 
     def flush(self) -> None:
-        """Wait until everything written is on the line."""
+        """Wait until all written bytes are sent."""
         self._require_open()
         if self._sent_until_ns > self._bus.clock.now_ns():
             self._bus.clock.advance_to(self._sent_until_ns)
 
     def reset_input_buffer(self) -> None:
-        """Throw away what has arrived; what is still on the line arrives later."""
+        """Drop the received bytes; bytes on their way arrive later."""
         self._require_open()
         self._collect()
         self._received.clear()
@@ -124,10 +124,10 @@ class SimSerial:
             raise serial.PortNotOpenError()
 
     def _deliver(self, frame: Frame) -> None:
-        insort(self._coming, frame, key=lambda f: f.start_ns)  # a frame may have been held up
+        insort(self._coming, frame, key=lambda f: f.start_ns)  # a frame may be delayed
 
     def _collect(self) -> None:
-        """Take over the bytes that have arrived by now; what came at another baud rate than the port's is lost."""
+        """Receive the bytes that have arrived; those with another baud rate than the port's are lost."""
         now_ns = self._bus.clock.now_ns()
         while self._coming:
             frame = self._coming[0]
@@ -147,7 +147,7 @@ class SimSerial:
         arrival_ns = None
         for frame in self._coming:
             available = len(frame.data) - taken
-            # Frames that overlap are handed over one after the other, so that none is there before the one ahead of it.
+            # Frames that overlap are received one after the other.
             arrival_ns = max(arrival_ns or 0, frame.arrival_ns(taken + min(missing, available)))
             missing -= available
             if missing <= 0:

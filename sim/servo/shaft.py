@@ -1,4 +1,4 @@
-"""What a servo turns: the table's shaft itself, or a gear on it."""
+"""The shaft that a servo rotates: the table's shaft itself, or a gear on it."""
 
 from dataclasses import replace
 from typing import Protocol
@@ -23,7 +23,7 @@ class Shaft(Protocol):
 
 
 class Geared:
-    """The servo's side of a gear: ``ratio`` turns of the servo for one of the table."""
+    """The servo's side of a gear: ``ratio`` revolutions of the servo for one of the table."""
 
     def __init__(self, world: World, ratio: float) -> None:
         self.clock, self.noise = world.clock, world.noise
@@ -34,7 +34,7 @@ class Geared:
         return self._world.rng(name)
 
     def drive(self, shaft: Trajectory) -> None:
-        """Let the servo follow ``shaft``, in degrees of its own."""
+        """Make the servo follow ``shaft``, in degrees of the servo."""
         ratio = self._ratio
         self._world.drive(
             replace(

@@ -1,4 +1,4 @@
-"""Simulated servos behind a pseudo-terminal, in real time: for programs that want a serial port to open."""
+"""Simulated servos in real time on a pseudo-terminal, for any program that opens a serial port."""
 
 import os
 import select
@@ -15,7 +15,7 @@ LONGEST_WAIT_S = 0.1
 
 
 class ServoTerminal(AbstractContextManager["ServoTerminal"]):
-    """The host's end of a `ServoBus` as a pseudo-terminal; leaving the ``with`` block takes it away.
+    """The host's end of a `ServoBus` as a pseudo-terminal; the end of the ``with`` block removes it.
 
     A pseudo-terminal has no baud rate: whatever a program asks for, the line runs at the servos'.
 
@@ -34,7 +34,7 @@ class ServoTerminal(AbstractContextManager["ServoTerminal"]):
         self._baudrate = baudrate
         self._clock = clock
         self._coming: list[Frame] = []
-        # The near end stays open here as well: without any program on it, reading the far end would fail.
+        # The near end stays open here, because reading the far end fails if no program has the near end open.
         self._far, self._near = os.openpty()
         tty.setraw(self._near)
         os.set_blocking(self._far, False)
@@ -53,7 +53,7 @@ class ServoTerminal(AbstractContextManager["ServoTerminal"]):
         return self
 
     def serve(self, seconds: float | None = None) -> None:
-        """Answer for ``seconds``, or for ever."""
+        """Answer for ``seconds``, or without end."""
         begun_ns = self._clock.now_ns()
         ahead_ns = self._bus.clock.now_ns() - begun_ns
         while seconds is None or self._clock.now_ns() - begun_ns < seconds * 1e9:
@@ -66,7 +66,7 @@ class ServoTerminal(AbstractContextManager["ServoTerminal"]):
                     self._bus.send(os.read(self._far, 4096), self._baudrate)
 
     def _pass_on(self, now_ns: int) -> None:
-        """Hand over the answers that have arrived as a whole; a program that does not read them loses them."""
+        """Send the complete answers; they are lost if no program reads them."""
         while self._coming and self._coming[0].end_ns <= now_ns:
             frame = self._coming.pop(0)
             with suppress(BlockingIOError):
