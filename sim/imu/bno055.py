@@ -38,15 +38,15 @@ IDLE, SYSTEM_ERROR, FUSION_RUNNING = 0, 1, 5  # values of SYS_STATUS
 RST_SYS = 0x20
 
 SILENT_S = 0.65
-"""From reset or power-up until it answers again."""
+"""Time from reset or power-up until it answers."""
 TO_CONFIG_S, FROM_CONFIG_S = 0.019, 0.007
 TICK_NS = 10_000_000
-"""The fusion's period."""
+"""Period of the fusion."""
 GYRO_BANDWIDTH_HZ = 32.0
 GYRO_NOISIER, GYRO_TRUER = 2.8, 0.2
 """Its gyro's noise, 0.014 °/s/√Hz, and zero rate, ±1 °/s, over those of the bench's noise model."""
 REST_TICKS, JUDGE_TICKS = 100, 20
-"""How long it must be still to learn its bias, and how often it looks."""
+"""How long the sensor must be still to measure its bias, and how often it checks that."""
 REST_DPS, REST_SPREAD_DPS = 3.0, 0.5
 
 _IDENTITY = {CHIP_ID: 0xA0, 0x01: 0xFB, 0x02: 0x32, 0x03: 0x0F, 0x04: 0x11, 0x05: 0x03, 0x06: 0x15}
@@ -76,18 +76,18 @@ class SimBno055:
 
     @property
     def rate_hz(self) -> float:
-        """Samples a second, by a true clock."""
+        """Samples per second of a true clock."""
         return 1e9 / self._tick_ns
 
     def run_clock(self, error: float) -> None:
-        """Let its clock run wrong by ``error``, relatively, from now on; it does not know."""
+        """Set the relative error of its clock from now on."""
         self._catch_up()
         self.clock_error = error
         self._epoch_ns, self._ticks = self._clock.now_ns(), 0
         self.inertial.restart()
 
     def power_cycle(self) -> None:
-        """Lose everything: what a brown-out or a reset leaves behind."""
+        """Lose all registers, as after a brown-out or a reset."""
         self._registers = bytearray(0x80)
         self._registers[UNIT_SEL] = 0x80
         self._silent_until_ns = self._clock.now_ns() + round(SILENT_S * 1e9)
@@ -99,7 +99,7 @@ class SimBno055:
         self._begin()
 
     def fail(self, error: int = 0x0A) -> None:
-        """Stop the fusion with a system error, as a part does whose configuration broke."""
+        """Stop the fusion with a system error, as with a damaged configuration."""
         self._catch_up()
         self._registers[SYS_STATUS], self._registers[SYS_ERR] = SYSTEM_ERROR, error
 
@@ -107,7 +107,7 @@ class SimBno055:
 
     @property
     def answers(self) -> bool:
-        """Whether it acknowledges its address: not while it starts up."""
+        """Whether it acknowledges its address: not during start-up."""
         return self._clock.now_ns() >= self._silent_until_ns
 
     def start(self, reading: bool) -> None:
@@ -146,7 +146,7 @@ class SimBno055:
         mode = self._registers[OPR_MODE]
         switching = self._clock.now_ns() < self._switching_until_ns
         if register not in _WRITABLE or switching or (register in _ONLY_IN_CONFIG and mode != CONFIG_MODE):
-            return  # lost, without a word
+            return  # lost without an error
         self._catch_up()
         self._registers[register] = value & _WRITABLE[register]
         if register == OPR_MODE and value != mode:
@@ -157,7 +157,7 @@ class SimBno055:
     # -- fusion -------------------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
-        """Start (or stop) what the operating mode asks for, once the switch is over."""
+        """Start or stop the fusion after the change of the operating mode."""
         self._registers[ACC_DATA:TEMP] = bytes(TEMP - ACC_DATA)
         self._registers[CALIB_STAT] = 0
         self._registers[SYS_STATUS], self._registers[SYS_ERR] = IDLE, 0
@@ -168,7 +168,7 @@ class SimBno055:
         self.inertial.restart()
 
     def _catch_up(self) -> None:
-        """Take the samples that fell due since somebody last looked."""
+        """Take the samples that are due since the last call."""
         registers, now_ns = self._registers, self._clock.now_ns()
         if registers[OPR_MODE] not in FUSION_MODES or registers[SYS_STATUS] == SYSTEM_ERROR:
             return
@@ -210,16 +210,16 @@ class SimBno055:
         recent = self._recent
         if np.abs(recent.mean(axis=0)).max() < REST_DPS and np.ptp(recent, axis=0).max() < 2 * REST_SPREAD_DPS:
             self._bias_dps = recent.mean(axis=0)
-            self._registers[CALIB_STAT] = 0x30  # the gyro's part; in the IMU mode the others stay where they are
+            self._registers[CALIB_STAT] = 0x30  # the gyro's bits; in the IMU mode the others do not change
 
     def _show(self, rate_dps: Floats, accel_g: Floats) -> None:
-        """Fill in the data registers; all units but degrees are bits of UNIT_SEL."""
+        """Update the data registers; UNIT_SEL selects the units."""
         units = self._registers[UNIT_SEL]
         force = accel_g * (1000.0 if units & 0x01 else _G * 100.0)
         gravity = self.inertial.up * (1000.0 if units & 0x01 else _G * 100.0)
         rate = rate_dps * (radians(1.0) * 900.0 if units & 0x02 else 16.0)
         angle = 900.0 * radians(1.0) if units & 0x04 else 16.0
-        heading_deg = -self._yaw_deg % 360.0  # turning clockwise increases it
+        heading_deg = -self._yaw_deg % 360.0  # a clockwise rotation increases it
         words = np.zeros(22)
         words[0:3], words[6:9], words[9] = force, rate, heading_deg * angle
         words[12:16] = self._quaternion() * 2**14
@@ -230,7 +230,7 @@ class SimBno055:
     def _quaternion(self) -> Floats:
         """Return the orientation as w, x, y, z: the tilt of this part, then the yaw about the vertical."""
         x, y, z = self.inertial.up
-        half = np.array([1.0 + z, y, -x, 0.0])  # turns the sensor's vertical to the world's
+        half = np.array([1.0 + z, y, -x, 0.0])  # rotates the sensor's vertical to the world's
         tilt = half / np.linalg.norm(half)
         c, s = cos(self._yaw_deg * pi / 360), sin(self._yaw_deg * pi / 360)
         w, i, j, k = tilt

@@ -1,4 +1,4 @@
-"""What an inertial sensor on the platter feels and how it errs, whatever chip it is."""
+"""The signals of an inertial sensor on the platter and their errors, for any chip."""
 
 from functools import cache
 from math import cos, pi, radians, sin, sqrt, tan
@@ -10,7 +10,7 @@ from sim.motion import Floats
 from sim.world import World
 
 WARM_UP_S = 300.0
-"""Time constant of the warming up, of a sensor on a small board in still air."""
+"""Time constant of the warming of a sensor on a small board in still air."""
 _NOTHING = 1e-12
 """Share of an input that a 16-bit register cannot show."""
 
@@ -57,13 +57,13 @@ class InertialModel:
         self.restart()
 
     def restart(self) -> None:
-        """Begin to sample now, with an empty filter: the chip was asleep, or its settings have changed."""
+        """Start sampling now with an empty filter, after sleep or a change of settings."""
         self._last_ns = self._world.clock.now_ns()
         self._last_deg = self._world.table_deg()
         self._filter_state: tuple[Floats, Floats] | None = None
 
     def warmth_c(self, times_ns: NDArray[np.int64]) -> Floats:
-        """Return how much warmer than its surroundings the sensor is at the given times, (n,)."""
+        """Return the sensor's temperature above its surroundings at the given times, (n,)."""
         since_s = np.maximum(times_ns - self._powered_ns, 0) * 1e-9
         return -self._world.noise.imu_warm_up_c * np.expm1(-since_s / WARM_UP_S)
 
@@ -132,7 +132,7 @@ def _filtered(felt: Floats, filtered_before: Floats, rate_hz: float, bandwidth_h
 
 
 def _steps(before: float, values: NDArray[np.int64] | Floats) -> Floats:
-    """Return the differences from each value's predecessor, ``before`` being the first one's."""
+    """Return the differences of consecutive values; ``before`` is the value before the first."""
     steps = np.empty(len(values))
     steps[0], steps[1:] = values[0] - before, values[1:] - values[:-1]
     return steps

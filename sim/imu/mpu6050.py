@@ -30,9 +30,9 @@ FIFO_SIZE = 1024
 LSB_PER_DPS = (131.0, 65.5, 32.8, 16.4)
 LSB_PER_G = (16384.0, 8192.0, 4096.0, 2048.0)
 BANDWIDTH_HZ = (256.0, 188.0, 98.0, 42.0, 20.0, 10.0, 5.0, 256.0)
-"""Of the gyro, by DLPF_CFG; 7 is reserved and taken as 0."""
+"""Bandwidth of the gyro by DLPF_CFG; 7 is reserved and treated as 0."""
 
-_WRITABLE = {  # the bits that keep what is written; all others of the map read as 0
+_WRITABLE = {  # the bits that can be written; all others read as 0
     **dict.fromkeys((0x0D, 0x0E, 0x0F, 0x10, SMPLRT_DIV, 0x1F, FIFO_EN, 0x6C), 0xFF),
     **dict.fromkeys((GYRO_CONFIG, ACCEL_CONFIG), 0xF8),
     CONFIG: 0x3F,
@@ -73,19 +73,19 @@ class SimMpu6050:
 
     @property
     def rate_hz(self) -> float:
-        """Samples a second, by a true clock."""
+        """Samples per second of a true clock."""
         registers = self._registers
         internal_hz = 8000 if registers[CONFIG] & 0x07 in (0, 7) else 1000
         return internal_hz / (1 + registers[SMPLRT_DIV]) * (1 + self.clock_error)
 
     def run_clock(self, error: float) -> None:
-        """Let its clock run wrong by ``error``, relatively, from now on."""
+        """Set the relative error of its clock from now on."""
         self._take_samples()
         self.clock_error = error
         self._begin_sampling()
 
     def power_cycle(self) -> None:
-        """Lose everything: what a brown-out or DEVICE_RESET leaves behind."""
+        """Lose all registers, as after a brown-out or DEVICE_RESET."""
         self._registers = bytearray(0x80)
         self._registers[PWR_MGMT_1] = SLEEP
         self._fifo = bytearray()
@@ -95,7 +95,7 @@ class SimMpu6050:
         self._begin_sampling()
 
     def next_edge_ns(self, after_ns: int) -> int | None:
-        """Return when the interrupt pin rises next after ``after_ns``: at each sample, where that is enabled."""
+        """Return when the interrupt pin next rises after ``after_ns``: at each sample, if enabled."""
         if self._registers[PWR_MGMT_1] & SLEEP or not self._registers[INT_ENABLE] & DATA_RDY:
             return None
         period_ns = self._internal_clock()[1] * (1 + self._registers[SMPLRT_DIV])
@@ -104,7 +104,7 @@ class SimMpu6050:
     # -- bus side -------------------------------------------------------------------------------------------------
 
     def start(self, reading: bool) -> None:
-        self._pointed = reading  # a write begins with the register's number, a read goes on from where the pointer is
+        self._pointed = reading  # a write starts with the register's number, a read continues at the pointer
 
     def write(self, data: bytes) -> int:
         acknowledged = len(data)
@@ -117,7 +117,7 @@ class SimMpu6050:
         return acknowledged
 
     def read(self, count: int) -> bytes:
-        self._take_samples()  # once a burst: its bytes belong to one sample
+        self._take_samples()  # once for each burst: its bytes belong to one sample
         answer = bytearray()
         while len(answer) < count:
             if self._pointer == FIFO_R_W:
@@ -147,7 +147,7 @@ class SimMpu6050:
         if register == PWR_MGMT_1 and value & DEVICE_RESET:
             self.power_cycle()
             return
-        self._take_samples()  # under the settings that were in force
+        self._take_samples()  # with the settings before the write
         changed = (self._registers[register] ^ value) & _WRITABLE.get(register, 0)
         self._registers[register] ^= changed
         if register == USER_CTRL:
@@ -180,7 +180,7 @@ class SimMpu6050:
         self._registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = bytes(GYRO_ZOUT_L + 1 - ACCEL_XOUT_H)
 
     def _take_samples(self) -> None:
-        """Catch up with the samples that fell due since somebody last looked."""
+        """Take the samples that are due since the last call."""
         registers = self._registers
         if registers[PWR_MGMT_1] & SLEEP:
             return
@@ -189,7 +189,7 @@ class SimMpu6050:
         due = (self._clock.now_ns() - self._epoch_ns) // (tick_ns * decimation)
         if due == self._taken:
             return
-        first = max(self._taken, due - FIFO_SIZE // 2)  # the FIFO holds no more: a frame has a word at least
+        first = max(self._taken, due - FIFO_SIZE // 2)  # the size of the FIFO: a frame has at least one word
         self._taken = due
         ticks = np.arange(first * decimation + 1, due * decimation + 1)
         times_ns = self._epoch_ns + tick_ns * ticks

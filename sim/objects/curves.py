@@ -1,4 +1,4 @@
-"""Curves that bodies are made of: a point is any tuple of numbers, such as (radius, height) or (x, y, z, thickness)."""
+"""Curves that describe bodies. A point is a tuple of numbers, such as (radius, height) or (x, y, z, thickness)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ _ROUNDS = 4
 
 
 def smooth(*corners: tuple[float, ...]) -> Curve:
-    """Return the curve through ``corners`` with its edges rounded (Chaikin's corner cutting); its ends stay."""
+    """Return the curve through ``corners`` with rounded edges (Chaikin's corner cutting); its ends do not move."""
     points = np.array(corners, dtype=np.float64)
     for _ in range(_ROUNDS):
         cut = np.stack([0.75 * points[:-1] + 0.25 * points[1:], 0.25 * points[:-1] + 0.75 * points[1:]], axis=1)

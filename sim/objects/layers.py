@@ -1,4 +1,4 @@
-"""Laying drawn pixels over an image."""
+"""Functions that draw pixels over an image."""
 
 import cv2
 import numpy as np
@@ -7,7 +7,7 @@ from sim.objects.projection import Floats, Image
 
 
 def blend(below: Image, above: Image, cover: Image) -> None:
-    """Lay ``above`` over ``below`` (in place), both uint8 (h, w, 3), where ``cover`` (h, w) is 255."""
+    """Draw ``above`` over ``below`` (in place), both uint8 (h, w, 3), weighted by ``cover`` (h, w), 255 for opaque."""
     weight = cv2.cvtColor(cover, cv2.COLOR_GRAY2BGR)
     laid = cv2.multiply(above, weight, scale=1 / 255)
     cv2.bitwise_not(weight, dst=weight)

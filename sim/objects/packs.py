@@ -1,4 +1,4 @@
-"""Bottles, cans, tins, books and cartons: what stands on kitchen shelves and desks."""
+"""Built-in objects: bottles, cans, tins, books and cartons."""
 
 from sim.objects import paint as p
 from sim.objects.curves import smooth
@@ -256,7 +256,7 @@ def _tissues() -> Solid:
 
 
 def packs() -> tuple[Solid, ...]:
-    """Return the bottles, cans, tins, books and cartons of the shelf."""
+    """Return the bottles, cans, tins, books and cartons."""
     return (
         _bottle("bottle-green", p.DARK_GREEN, p.RED, _wine_label),
         _bottle("bottle-harvest", p.DARK_GREEN, p.RED, _wine_label, _harvest_label),

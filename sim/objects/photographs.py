@@ -1,7 +1,7 @@
 """A folder of photographs in COIL layout, ``obj{N}__{A}.png`` or ``.jpg``, as objects on the platter.
 
-N names the object, A is the table's angle in degrees, which may have decimals. A turned object shows its nearest
-photograph.
+N is the number of the object, A the table's angle in degrees, with optional decimals. The camera sees the photograph
+nearest to the table's angle.
 """
 
 import re
@@ -51,7 +51,7 @@ class PhotographedObject:
 
 
 def photographs(folder: str | Path) -> Mapping[str, PhotographedObject]:
-    """Return the objects of a folder by name, ``obj2`` before ``obj10``; the photographs are read when they are seen.
+    """Return the objects of a folder by name, ``obj2`` before ``obj10``; photographs are read when they are drawn.
 
     Raises
     ------
@@ -61,7 +61,8 @@ def photographs(folder: str | Path) -> Mapping[str, PhotographedObject]:
     folder = Path(folder)
     if not folder.is_dir():
         raise UsageError(
-            f"There is no folder {folder}.", next_step="Give one with photographs named obj1__0.png, obj1__5.png, ..."
+            f"The folder {folder} does not exist.",
+            next_step="Give a folder with photographs named obj1__0.png, obj1__5.png, ...",
         )
     views: dict[int, dict[float, Path]] = defaultdict(dict)
     for path in sorted(folder.iterdir()):
@@ -87,7 +88,7 @@ def _object(name: str, views: Mapping[float, Path]) -> PhotographedObject:
 
 @lru_cache(maxsize=_KEPT)
 def _framed(path: Path) -> Image:
-    """Return a photograph scaled to the frame's height, in the middle of a frame of its own border's colour."""
+    """Return a photograph scaled to the frame's height, centred on the colour of its border."""
     photo = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if photo is None:
         raise UsageError(f"{path} cannot be read as an image.", next_step="Replace or remove the file.")

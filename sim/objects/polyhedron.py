@@ -1,4 +1,4 @@
-"""Convex solids with flat faces: boxes, prisms, roofs, lying cylinders. A face is one affine warp of its texture."""
+"""Convex solids with flat faces: boxes, prisms, roofs, level cylinders. Each face is an affine warp of its texture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from sim.objects.layers import blend
 from sim.objects.projection import Colour, Drawing, Floats, Image, Paint, Pose, nearness, shade
 
 TEXELS_PER_MM = 2.0
-_EDGE_ON = 0.004  # a face seen flatter than this is less than half a pixel wide
-_SHIFT = 4  # fractional bits of the coordinates that OpenCV draws with
+_EDGE_ON = 0.004  # a face at a smaller angle is less than half a pixel wide
+_SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Polyhedron:
         solid = np.empty((size[1], size[0], 3), dtype=np.uint8)
         facing = nearness(normals)
         lights = shade(normals).tolist()
-        # The face seen best goes everywhere first, so that the smoothed seams show nothing but the solid itself.
+        # The best visible face is drawn over the whole outline first, so smoothed edges show only the solid.
         for n, i in enumerate(i for i in np.argsort(-facing).tolist() if facing[i] > _EDGE_ON):
             face, polygon = self.faces[i], None if n == 0 else corners[slices[i]]
             if isinstance(face.printed, tuple):
@@ -165,7 +165,7 @@ def box(
     turned_deg: float = 0.0,
     layer: int = 0,
 ) -> Polyhedron:
-    """Return a box (width, depth, height) that stands at ``at``, turned about its own axis; it needs no bottom."""
+    """Return a box (width, depth, height) at ``at``, rotated about its own axis, without a bottom."""
     w, d, h = size_mm[0] / 2, size_mm[1] / 2, size_mm[2]
     ring = [(-w, -d), (w, -d), (w, d), (-w, d)]
     walls = [
@@ -177,7 +177,7 @@ def box(
 
 
 def prism(sides: int, radius_mm: float, height_mm: float, *, wall: Paint | Colour, top: Paint | Colour) -> Polyhedron:
-    """Return an upright prism over a regular polygon, a face to the front; every wall is printed alike."""
+    """Return an upright prism over a regular polygon with a face to the front; all walls have the same print."""
     ring = [
         (radius_mm * cos(a), radius_mm * sin(a))
         for a in (radians(-90) + (2 * i - 1) * pi / sides for i in range(sides + 1))
@@ -200,7 +200,7 @@ def lying_cylinder(
     depth_at: tuple[float, float] | None = None,
     sides: int = 36,
 ) -> Polyhedron:
-    """Return a cylinder whose axis lies level, its printed end to the front, its back end at ``at``."""
+    """Return a horizontal cylinder with its printed end to the front and its back end at ``at``."""
     ring = [(radius_mm * cos(2 * pi * i / sides), radius_mm * sin(2 * pi * i / sides)) for i in range(sides + 1)]
     y = -length_mm
     walls = [
@@ -231,7 +231,7 @@ def roof(
 
 
 def moved(solid: Polyhedron, at: tuple[float, float, float], turned_deg: float) -> Polyhedron:
-    """Return ``solid`` turned about its own axis and put at ``at`` in the object's frame."""
+    """Return ``solid`` rotated about its own axis and moved to ``at`` in the object's frame."""
     turn = Pose(turned_deg)
 
     def there(points: Floats) -> Floats:

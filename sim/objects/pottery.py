@@ -1,4 +1,4 @@
-"""Vessels, lamps and balls: bodies of revolution, with handles and spouts where they have them."""
+"""Built-in objects: vessels, lamps and balls. They are bodies of revolution, some with handles and spouts."""
 
 from math import cos, pi, sin
 
@@ -170,7 +170,7 @@ def _candle() -> Solid:
 
 
 def pottery() -> tuple[Solid, ...]:
-    """Return the vessels, lamps and balls of the shelf."""
+    """Return the vessels, lamps and balls."""
     return (
         _mug("mug-white", p.WHITE, _rings),
         _mug("mug-star", p.WHITE, _rings, lambda s: s.around(-60, _star)),

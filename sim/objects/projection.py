@@ -1,9 +1,9 @@
-"""How the simulated camera looks at the platter: geometry, light, and what a object must offer to be seen.
+"""The simulated camera's view of the platter: geometry, light, and the interface of visible objects.
 
 Room frame, millimetres: origin at the centre of the platter's top, x to the camera's right, y away from it, z up. The
-camera stands at the front (-y), `ELEVATION_DEG` above the horizon. Turning counter-clockwise seen from above moves the
-front of a object to the right of the image. The projection is weak perspective: parallel, at the scale of the platter's
-centre, as through a long lens.
+camera stands at the front (-y), `ELEVATION_DEG` above the horizon. A counter-clockwise rotation seen from above moves
+the front of an object to the right of the image. The projection is weak perspective: parallel, at the scale of the
+platter's centre, as through a long lens.
 """
 
 from collections.abc import Callable
@@ -44,8 +44,8 @@ class Visible(Protocol):
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
         """Draw the object into ``image``, uint8 (480, 640, 3), which shows the empty platter.
 
-        ``azimuth_deg`` is how far the object is turned, counter-clockwise seen from above; ``offset_mm`` where its axis
-        stands in the room.
+        ``azimuth_deg`` is the object's counter-clockwise rotation seen from above; ``offset_mm`` is the position of its
+        axis in the room.
         """
         ...
 
@@ -59,20 +59,20 @@ class Drawing(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a object stands: turned by ``azimuth_deg``, its axis at (``x_mm``, ``y_mm``) in the room."""
+    """Position of an object: rotated by ``azimuth_deg``, its axis at (``x_mm``, ``y_mm``) in the room."""
 
     azimuth_deg: float = 0.0
     x_mm: float = 0.0
     y_mm: float = 0.0
 
     def to_room(self, points_mm: Floats) -> Floats:
-        """Return points (n, 3) of the object as the room sees them."""
+        """Return points (n, 3) of the object in the room's frame."""
         turned = self.turn(points_mm)
         turned[:, :2] += self.x_mm, self.y_mm
         return turned
 
     def turn(self, vectors: Floats) -> Floats:
-        """Return vectors (n, 3) turned by the azimuth."""
+        """Return vectors (n, 3) rotated by the azimuth."""
         c, s = cos(radians(self.azimuth_deg)), sin(radians(self.azimuth_deg))
         return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 

@@ -1,4 +1,4 @@
-"""A object made of parts, as it stands on the platter."""
+"""An object made of parts on the platter."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +16,7 @@ class Part(Protocol):
 
     @property
     def reach_mm(self) -> float:
-        """How far from the axis it darkens the platter."""
+        """Radius of its shadow on the platter."""
         ...
 
     def drawings(self, pose: Pose) -> list[Drawing]: ...
@@ -24,16 +24,16 @@ class Part(Protocol):
 
 @dataclass(frozen=True)
 class Solid:
-    """A object of the built-in shelf.
+    """A built-in object.
 
     Parameters
     ----------
     name
         Its name in catalogs and reports.
     parts
-        What it is made of.
+        Its parts.
     symmetry_deg
-        The smallest turn after which it looks the same: 360 for none, 360 / n for n-fold, 0 for any turn at all.
+        The smallest rotation after which it looks the same: 360 for none, 360 / n for n-fold, 0 for free symmetry.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Solid:
 
     @cached_property
     def _shadow(self) -> tuple[Image, Floats]:
-        """The soft dark spot where it touches the platter: (what is left of the light there, its centre in pixels)."""
+        """The soft shadow on the platter: (remaining light, its centre in pixels)."""
         reach = max(part.reach_mm for part in self.parts) * PX_PER_MM * 1.08
         half = (int(reach * 1.25) + 6, int(reach * 1.25 * SIN) + 6)
         clear = np.full((2 * half[1] + 1, 2 * half[0] + 1, 3), 255, dtype=np.uint8)
@@ -64,7 +64,7 @@ class Solid:
 
 
 def empty_platter() -> Image:
-    """Return what the camera sees without a object: a plain backdrop and the platter, uint8 (480, 640, 3)."""
+    """Return the image without an object: a plain backdrop and the platter, uint8 (480, 640, 3)."""
     image = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
     image[:] = (44, 40, 38)
     x, y = CENTRE_PX

@@ -1,4 +1,4 @@
-"""Toys and apparatus: compounds of boxes, lying cylinders, roofs and turned bodies."""
+"""Built-in objects: toys and apparatus made of boxes, horizontal cylinders, roofs and bodies of revolution."""
 
 from math import cos, pi, sin
 
@@ -283,7 +283,7 @@ def _nutcracker() -> Solid:
 
 
 def toys() -> tuple[Solid, ...]:
-    """Return the toys and apparatus of the shelf."""
+    """Return the toys and apparatus."""
     return (
         _house("toy-house"),
         _house("toy-house-green", _wreath),

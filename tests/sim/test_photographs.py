@@ -84,7 +84,7 @@ def test_photograph_is_centred_on_the_colour_of_its_border(
 
 
 def test_invalid_folder_is_rejected_with_a_message(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no folder"):
+    with pytest.raises(UsageError, match="does not exist"):
         photographs(tmp_path / "nowhere")
     with pytest.raises(UsageError, match="named like"):
         photographs(tmp_path)
