@@ -28,6 +28,12 @@ class RigError(Exception):
     latches: ClassVar[bool] = False
     """Whether the error latches a fault when it ends a motion: the operator must look at the bench."""
 
+    def __init_subclass__(cls, *, code: int, title: str, latches: bool | None = None) -> None:
+        super().__init_subclass__()
+        cls.code, cls.title = code, title
+        if latches is not None:
+            cls.latches = latches
+
     def __init__(self, what: str, *, next_step: str, evidence: Evidence | None = None) -> None:
         super().__init__(what)
         self.what = what
@@ -57,314 +63,173 @@ class RigError(Exception):
         }
 
 
-class UsageError(RigError):
+class UsageError(RigError, code=200, title="usage"):
     """A command or function was called with arguments that are not possible."""
 
-    code = 200
-    title = "usage"
 
-
-class ConfigError(RigError):
+class ConfigError(RigError, code=300, title="configuration"):
     """The configuration has mistakes; the evidence lists all of them."""
 
-    code = 300
-    title = "configuration"
 
-
-class DeviceNotFound(RigError):
+class DeviceNotFound(RigError, code=400, title="device not found"):
     """No device answers at the place that the configuration names."""
 
-    code = 400
-    title = "device not found"
 
-
-class DeviceMismatch(RigError):
+class DeviceMismatch(RigError, code=401, title="wrong device"):
     """The device that answers is not the expected one."""
 
-    code = 401
-    title = "wrong device"
 
-
-class DeviceSilent(RigError):
+class DeviceSilent(RigError, code=402, title="device silent"):
     """A device stopped answering, also after all retries."""
 
-    code = 402
-    title = "device silent"
 
-
-class RequestRejected(RigError):
+class RequestRejected(RigError, code=403, title="request rejected"):
     """A device answered a request with an error status."""
 
-    code = 403
-    title = "request rejected"
 
-
-class DeviceFault(RigError):
+class DeviceFault(RigError, code=404, title="device fault", latches=True):
     """A device reports that it is broken, overheated, overloaded or without supply."""
 
-    code = 404
-    title = "device fault"
-    latches = True
 
-
-class SeveralServos(DeviceMismatch):
+class SeveralServos(DeviceMismatch, code=405, title="several servos"):
     """More than one servo is on a bus that may have only one."""
 
-    code = 405
-    title = "several servos"
 
-
-class FirmwareMismatch(DeviceMismatch):
+class FirmwareMismatch(DeviceMismatch, code=420, title="firmware mismatch"):
     """The rig head's firmware and this program use different versions of the protocol."""
 
-    code = 420
-    title = "firmware mismatch"
 
-
-class DeviceUnplugged(DeviceSilent):
+class DeviceUnplugged(DeviceSilent, code=421, title="unplugged"):
     """The port of a device disappeared from the computer."""
 
-    code = 421
-    title = "unplugged"
 
-
-class LimitExceeded(RigError):
+class LimitExceeded(RigError, code=500, title="limit"):
     """A motion would exceed the table's limits, which protect its cable."""
 
-    code = 500
-    title = "limit"
 
-
-class MotionTimeout(RigError):
+class MotionTimeout(RigError, code=501, title="motion timeout", latches=True):
     """The table did not arrive and settle within the computed time."""
 
-    code = 501
-    title = "motion timeout"
-    latches = True
 
-
-class RotationDisagreement(RigError):
+class RotationDisagreement(RigError, code=502, title="rotation disagreement", latches=True):
     """Encoder and gyro differ by more than their uncertainty: slip, backlash or a loose platter."""
 
-    code = 502
-    title = "rotation disagreement"
-    latches = True
 
-
-class NotReady(RigError):
+class NotReady(RigError, code=503, title="not ready"):
     """A motion was requested in a state that does not allow it."""
 
-    code = 503
-    title = "not ready"
 
-
-class FollowingError(RigError):
+class FollowingError(RigError, code=504, title="following error", latches=True):
     """The shaft does not follow the servo's motion profile, or left the path to its goal."""
 
-    code = 504
-    title = "following error"
-    latches = True
 
-
-class Stalled(RigError):
+class Stalled(RigError, code=505, title="stalled", latches=True):
     """The servo pushes but the shaft does not rotate: something blocks the table."""
 
-    code = 505
-    title = "stalled"
-    latches = True
 
-
-class Overloaded(RigError):
+class Overloaded(RigError, code=506, title="overloaded", latches=True):
     """The table rotates, but its load is too high for longer than a start takes."""
 
-    code = 506
-    title = "overloaded"
-    latches = True
 
-
-class Overheated(RigError):
+class Overheated(RigError, code=507, title="overheated", latches=True):
     """The servo is close to the temperature at which it shuts down."""
 
-    code = 507
-    title = "overheated"
-    latches = True
 
-
-class SupplyOutOfRange(RigError):
+class SupplyOutOfRange(RigError, code=508, title="supply voltage", latches=True):
     """The servo's supply is close to a voltage at which it shuts down."""
 
-    code = 508
-    title = "supply voltage"
-    latches = True
 
-
-class NoProgress(RigError):
+class NoProgress(RigError, code=509, title="no progress", latches=True):
     """The servo has a goal, but it neither rotates nor pushes."""
 
-    code = 509
-    title = "no progress"
-    latches = True
 
-
-class WatchdogTripped(RigError):
+class WatchdogTripped(RigError, code=510, title="watchdog"):
     """The servo received nothing from the computer for too long, and its watchdog stopped it."""
 
-    code = 510
-    title = "watchdog"
 
-
-class SupplyLost(RigError):
+class SupplyLost(RigError, code=511, title="supply lost"):
     """The servo lost its supply during a motion, and with it the count of its revolutions."""
 
-    code = 511
-    title = "supply lost"
 
-
-class MotionStopped(RigError):
+class MotionStopped(RigError, code=512, title="stopped"):
     """The operator stopped the table with `rig stop`."""
 
-    code = 512
-    title = "stopped"
 
-
-class Unreferenced(NotReady):
+class Unreferenced(NotReady, code=513, title="not referenced"):
     """It is not known how far the cable is wound up; the operator must look at it."""
 
-    code = 513
-    title = "not referenced"
 
-
-class FaultLatched(NotReady):
+class FaultLatched(NotReady, code=514, title="fault latched"):
     """A fault is latched, and the operator has not acknowledged it yet."""
 
-    code = 514
-    title = "fault latched"
 
-
-class StateNotStored(RigError):
+class StateNotStored(RigError, code=515, title="bench state"):
     """The bench's state (revolutions, latched fault), which the next program needs, cannot be written to disk."""
 
-    code = 515
-    title = "bench state"
 
-
-class EmergencyStop(RigError):
+class EmergencyStop(RigError, code=520, title="e-stop", latches=True):
     """The e-stop is pressed, or its loop is open: the rig head switched off light and servo power."""
 
-    code = 520
-    title = "e-stop"
-    latches = True
 
-
-class HeartbeatLost(RigError):
+class HeartbeatLost(RigError, code=521, title="deadman", latches=True):
     """The rig head received no heartbeat from this computer for too long, and switched its outputs off."""
 
-    code = 521
-    title = "deadman"
-    latches = True
 
-
-class HeadRestarted(RigError):
+class HeadRestarted(RigError, code=522, title="rig head restarted", latches=True):
     """The rig head restarted during its work (brown-out, watchdog, reset), which switched its outputs off."""
 
-    code = 522
-    title = "rig head restarted"
-    latches = True
 
-
-class ViewRejected(RigError):
+class ViewRejected(RigError, code=600, title="view rejected"):
     """No view was acceptable within the allowed retakes."""
 
-    code = 600
-    title = "view rejected"
 
-
-class ObjectMoved(RigError):
+class ObjectMoved(RigError, code=601, title="object moved"):
     """The object moved on the table since its first view."""
 
-    code = 601
-    title = "object moved"
 
-
-class ReplayMismatch(RigError):
+class ReplayMismatch(RigError, code=602, title="replay mismatch"):
     """A saved run leads to different decisions when it is computed again."""
 
-    code = 602
-    title = "replay mismatch"
 
-
-class TableNotEmpty(RigError):
+class TableNotEmpty(RigError, code=603, title="table not empty"):
     """Something is on the table, which should be empty."""
 
-    code = 603
-    title = "table not empty"
 
-
-class CatalogError(RigError):
+class CatalogError(RigError, code=700, title="catalog"):
     """The catalog cannot do what was requested."""
 
-    code = 700
-    title = "catalog"
 
-
-class ObjectExists(CatalogError):
+class ObjectExists(CatalogError, code=701, title="object exists"):
     """An object of that name is already enrolled."""
 
-    code = 701
-    title = "object exists"
 
-
-class ObjectNotFound(CatalogError):
+class ObjectNotFound(CatalogError, code=702, title="object not found"):
     """No object of that name is in the catalog."""
 
-    code = 702
-    title = "object not found"
 
-
-class DescriptorOutdated(CatalogError):
+class DescriptorOutdated(CatalogError, code=703, title="descriptor outdated"):
     """Views lack the descriptor, or the version of it, that this program compares."""
 
-    code = 703
-    title = "descriptor outdated"
 
-
-class CatalogOutdated(CatalogError):
+class CatalogOutdated(CatalogError, code=704, title="catalog outdated"):
     """The catalog has an earlier version and must be migrated first."""
 
-    code = 704
-    title = "catalog outdated"
 
-
-class ImportRejected(CatalogError):
+class ImportRejected(CatalogError, code=705, title="import rejected"):
     """The import cannot be used; the catalog did not change."""
 
-    code = 705
-    title = "import rejected"
 
-
-class ExportFailed(CatalogError):
+class ExportFailed(CatalogError, code=706, title="export failed"):
     """The catalog cannot be exported in this way."""
 
-    code = 706
-    title = "export failed"
 
-
-class CatalogDamaged(CatalogError):
+class CatalogDamaged(CatalogError, code=707, title="catalog damaged"):
     """A check found that something in the catalog is not as it was stored."""
 
-    code = 707
-    title = "catalog damaged"
 
-
-class CatalogBusy(RigError):
+class CatalogBusy(RigError, code=900, title="busy"):
     """Another process uses the catalog."""
 
-    code = 900
-    title = "busy"
 
-
-class BenchBusy(RigError):
+class BenchBusy(RigError, code=901, title="bench in use"):
     """Another process uses the bench."""
-
-    code = 901
-    title = "bench in use"
