@@ -1,4 +1,7 @@
-"""Virtual time: integer nanoseconds that pass only while a program sleeps."""
+"""Virtual time: integer nanoseconds that pass only while a program sleeps.
+
+Decision: docs/decisions/0003.
+"""
 
 import heapq
 from collections.abc import Callable

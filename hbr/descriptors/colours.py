@@ -1,4 +1,7 @@
-"""Distribution of colours over the object, in 32 bytes."""
+"""Distribution of colours over the object, in 32 bytes.
+
+Decision: docs/decisions/0023.
+"""
 
 from dataclasses import dataclass
 from typing import Final

@@ -1,4 +1,7 @@
-"""Edge directions over the object: a coarse histogram of oriented gradients, in 128 bytes."""
+"""Edge directions over the object: a coarse histogram of oriented gradients, in 128 bytes.
+
+Decision: docs/decisions/0023.
+"""
 
 from dataclasses import dataclass
 from typing import Final

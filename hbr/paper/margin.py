@@ -1,4 +1,7 @@
-"""Margin of the best object over all enrolled objects, not only over those on the retrieval lists."""
+"""Margin of the best object over all enrolled objects, not only over those on the retrieval lists.
+
+Decision: docs/decisions/0007.
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike

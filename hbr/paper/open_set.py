@@ -1,4 +1,7 @@
-"""Open-set threshold of the paper's retrieval, computed from the enrolled views."""
+"""Open-set threshold of the paper's retrieval, computed from the enrolled views.
+
+Decision: docs/decisions/0007.
+"""
 
 from typing import Final
 

@@ -2,6 +2,8 @@
 
 The comparison uses small images and the logarithm of the grey levels. There a change of exposure, of white balance or
 of a lamp's position adds a plane to each channel, and a shadow subtracts the same amount from all three channels.
+
+Decision: docs/decisions/0024.
 """
 
 from collections.abc import Sequence

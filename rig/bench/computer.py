@@ -2,6 +2,8 @@
 
 Everything is read from Linux files (sysfs, /proc, /etc) below a root folder, so that a simulated bench or a test can
 provide its own computer. Devices are opened by the same functions as for a bench.
+
+Decision: docs/decisions/0013.
 """
 
 import grp

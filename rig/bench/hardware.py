@@ -1,4 +1,7 @@
-"""The bench with real devices: servo on a serial port, IMU on I2C or a rig head, camera through OpenCV."""
+"""The bench with real devices: servo on a serial port, IMU on I2C or a rig head, camera through OpenCV.
+
+Decision: docs/decisions/0001.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress

@@ -1,4 +1,7 @@
-"""Apply the settings of calibration results to the configuration."""
+"""Apply the settings of calibration results to the configuration.
+
+Decision: docs/decisions/0027.
+"""
 
 from collections.abc import Iterable
 from typing import Any

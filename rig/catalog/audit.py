@@ -1,4 +1,7 @@
-"""The audit log: who did what and when. Entries are only added, in the transaction of the change itself."""
+"""The audit log: who did what and when. Entries are only added, in the transaction of the change itself.
+
+Decision: docs/decisions/0016.
+"""
 
 import os
 import pwd

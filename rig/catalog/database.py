@@ -1,4 +1,7 @@
-"""The SQLite file of a catalog: how it is opened, and its transactions."""
+"""The SQLite file of a catalog: how it is opened, and its transactions.
+
+Decision: docs/decisions/0014.
+"""
 
 import os
 import sqlite3

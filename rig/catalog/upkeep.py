@@ -1,4 +1,7 @@
-"""Statistics of a catalog, and the final removal of deleted data."""
+"""Statistics of a catalog, and the final removal of deleted data.
+
+Decision: docs/decisions/0016.
+"""
 
 import shutil
 from collections.abc import Sequence

@@ -3,6 +3,8 @@
 Registers and times: BST-BNO055-DS000. It runs in its IMU mode (gyro and accelerometer, no magnetometer, because servo
 and steel distort the magnetic field). It has no FIFO. The rotation between two readings comes from the orientation that
 it integrates itself, if that is less than half a revolution.
+
+Decision: docs/decisions/0011.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""The table: rotates to an angle, always from the same side, detects its rest, and measures how far it rotated."""
+"""The table: rotates to an angle, always from the same side, detects its rest, and measures how far it rotated.
+
+Decision: docs/decisions/0004.
+"""
 
 from collections import deque
 from contextlib import AbstractContextManager

@@ -1,6 +1,8 @@
 """The plan that enrolls an object: one revolution, with a checked view at every step.
 
 Each view is stored before the table rotates to the next one.
+
+Decision: docs/decisions/0002.
 """
 
 from collections.abc import Generator, Mapping

@@ -1,4 +1,7 @@
-"""The plan that finds out what stands on the table: look, vote, decide, turn, until the answer is clear."""
+"""The plan that finds out what stands on the table: look, vote, decide, turn, until the answer is clear.
+
+Decision: docs/decisions/0002.
+"""
 
 from collections.abc import Generator
 

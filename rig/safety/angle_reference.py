@@ -1,6 +1,8 @@
 """The table's angle from the servo's position, and whether it can still be trusted after a pause.
 
 The servo counts its own revolutions, but only as long as it has its supply.
+
+Decision: docs/decisions/0009.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,7 @@
-"""State of a bench that survives its program: how far the cable is wound up, a latched fault, who uses the bench."""
+"""State of a bench that survives its program: how far the cable is wound up, a latched fault, who uses the bench.
+
+Decision: docs/decisions/0009.
+"""
 
 import errno
 import fcntl

@@ -7,6 +7,8 @@
     any state ──lose──▶ DISCONNECTED;   any state ──latch──▶ FAULT ──acknowledge──▶ CONNECTED
 
 A state cannot be set: it changes only by an event in the table of transitions.
+
+Decision: docs/decisions/0008.
 """
 
 from collections.abc import Mapping

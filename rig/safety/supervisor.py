@@ -3,6 +3,8 @@
 `rig.safety.state_machine` has the states and their transitions. A motion is a `with` block that can only end by
 arriving, by a stop or by a latched fault. A fault outlives the process and an unplugged cable. It ends when its cause
 is gone and the operator acknowledges it.
+
+Decision: docs/decisions/0008.
 """
 
 from collections.abc import Callable, Iterator

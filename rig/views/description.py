@@ -1,4 +1,7 @@
-"""Description of views: the levels of several descriptors, and the evidence of the segmentation."""
+"""Description of views: the levels of several descriptors, and the evidence of the segmentation.
+
+Decision: docs/decisions/0029.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,4 +1,7 @@
-"""The empty-table image of a bench: stored beside the bench's state, and checked before it is used."""
+"""The empty-table image of a bench: stored beside the bench's state, and checked before it is used.
+
+Decision: docs/decisions/0028.
+"""
 
 import hashlib
 import re

@@ -1,4 +1,7 @@
-"""Image files of views: encoding, decoding and names."""
+"""Image files of views: encoding, decoding and names.
+
+Decision: docs/decisions/0005.
+"""
 
 import hashlib
 import re

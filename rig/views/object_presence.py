@@ -1,4 +1,7 @@
-"""Detects by the camera that the next object is on the table, for benches without an operator at the keyboard."""
+"""Detects by the camera that the next object is on the table, for benches without an operator at the keyboard.
+
+Decision: docs/decisions/0019.
+"""
 
 from typing import Final
 

@@ -1,4 +1,7 @@
-"""A kind of simulated fault: its name, description, parameters, beginning and end."""
+"""A kind of simulated fault: its name, description, parameters, beginning and end.
+
+Decision: docs/decisions/0012.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

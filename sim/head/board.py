@@ -2,6 +2,8 @@
 
 The board runs up to the virtual clock's time whenever its state is read, and every few milliseconds. The world answers
 its requests, such as reading a register over I2C, as of the board's own time. So nothing depends on how often it runs.
+
+Decision: docs/decisions/0021.
 """
 
 import ctypes

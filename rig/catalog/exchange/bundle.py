@@ -4,6 +4,8 @@ The same objects give the same bytes: one order, and no dates but those of the o
 bundle: it checks names against paths outside, sizes against limits, and every image against its SHA-256.
 
 Version 2 says session, empty table and segmentation for what version 1 called sitting, reference and front end.
+
+Decision: docs/decisions/0015.
 """
 
 import hashlib

@@ -1,4 +1,7 @@
-"""The AX-12A with Protocol 1.0: a pan servo with a range of 300°, without count of revolutions and without watchdog."""
+"""The AX-12A with Protocol 1.0: a pan servo with a range of 300°, without count of revolutions and without watchdog.
+
+Decision: docs/decisions/0011.
+"""
 
 from rig.core.errors import ConfigError, DeviceFault
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors

@@ -1,4 +1,7 @@
-"""Registers by name on a Dynamixel bus; each reply is matched to its request."""
+"""Registers by name on a Dynamixel bus; each reply is matched to its request.
+
+Decision: docs/decisions/0010.
+"""
 
 import math
 from collections.abc import Callable, Sequence

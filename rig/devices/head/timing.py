@@ -5,6 +5,8 @@ t3. Both frames have the same length. If the delays are equal in both directions
 bench's time t = (t0 + t3)/2. The error is at most half of the time by which the round trip d = (t3 − t0) − (u2 − u1)
 exceeds the transmission time of the bytes. Delayed heartbeats have less weight. The drift of a ceramic resonator is up
 to 0.5 %.
+
+Decision: docs/decisions/0022.
 """
 
 from collections import deque
