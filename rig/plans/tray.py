@@ -46,11 +46,11 @@ class TrayDecision(StrEnum):
 class TrayOperator(Protocol):
     """Puts the objects on the table and decides what happens with each."""
 
-    def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:
+    def request(self, item: TrayItem, number: int, of: int, interrupted: ObjectSummary | None) -> TrayDecision:
         """Return once the object is on the table.
 
-        ``kept`` is its interrupted enrollment, if there is one: PROCEED resumes it, RESTART repeats it because the
-        object was moved.
+        ``interrupted`` is the object's interrupted enrollment, if it has one: PROCEED resumes it, RESTART repeats it
+        because the object was moved.
         """
         ...
 
@@ -62,7 +62,7 @@ class TrayOperator(Protocol):
 class AutomaticOperator:
     """An operator that is never asked, for benches that put each object on the same mark by themselves."""
 
-    def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:  # noqa: ARG002
+    def request(self, item: TrayItem, number: int, of: int, interrupted: ObjectSummary | None) -> TrayDecision:  # noqa: ARG002
         return TrayDecision.PROCEED
 
     def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:  # noqa: ARG002
@@ -158,18 +158,18 @@ def enroll_tray(
     for number, item in enumerate(items, 1):
         while True:
             known = {summary.name: summary for summary in catalog.objects()}.get(item.name)
-            kept = known if known is not None and known.unfinished_views is not None else None
-            if known is not None and kept is None and known.views:
+            interrupted = known if known is not None and known.unfinished_views is not None else None
+            if known is not None and interrupted is None and known.views:
                 yield Item(number, len(items), item.name, "skip", SkipReason.ALREADY_ENROLLED)
                 break
-            decision = operator.request(item, number, len(items), kept)
+            decision = operator.request(item, number, len(items), interrupted)
             if decision is TrayDecision.STOP:
                 return
             if decision is TrayDecision.SKIP:
                 yield Item(number, len(items), item.name, "skip", SkipReason.OPERATOR)
                 break
-            resume = kept is not None and decision is TrayDecision.PROCEED
-            action = "resume" if resume else "replace" if kept else "enroll"
+            resume = interrupted is not None and decision is TrayDecision.PROCEED
+            action = "resume" if resume else "replace" if interrupted else "enroll"
             yield Item(number, len(items), item.name, action)
             try:
                 yield from enroll(
@@ -180,7 +180,7 @@ def enroll_tray(
                     label=item.label,
                     note=item.note,
                     resume=resume,
-                    replace=kept is not None and not resume,
+                    replace=interrupted is not None and not resume,
                 )
             except OBJECT_ERRORS as error:
                 decision = operator.decide_after_error(item, error)

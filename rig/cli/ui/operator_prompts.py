@@ -34,15 +34,15 @@ class OperatorPrompts:
         self._questions = questions or sys.stderr
         self._answers = answers or sys.stdin
 
-    def request(self, item: TrayItem, number: int, of: int, kept: ObjectSummary | None) -> TrayDecision:
+    def request(self, item: TrayItem, number: int, of: int, interrupted: ObjectSummary | None) -> TrayDecision:
         label = f" ({item.label})" if item.label else ""
-        if kept is None:
+        if interrupted is None:
             return self._ask(
                 f"{number} of {of}: put {item.name}{label} on the table and take your hands away.",
                 _KEYS,
                 "Enter: continue",
             )
-        views = kept.unfinished_views or 0
+        views = interrupted.unfinished_views or 0
         return self._ask(
             f"{number} of {of}: {item.name} has {views} view{'' if views == 1 else 's'} of an interrupted enrollment. "
             "You can resume it if the object was not moved.",

@@ -51,11 +51,11 @@ def test_demo_enrolls_and_finds_objects_and_recognizes_unknown_ones(small):
         re.MULTILINE,
     )
     assert moves
-    for asked, encoder, imu, leader, odds in moves:
+    for asked, encoder, imu, leader, percent in moves:
         assert float(encoder) == pytest.approx(float(asked), abs=0.5)
         assert float(imu) == pytest.approx(float(encoder), abs=0.3 + 0.04 * abs(float(encoder)))
         assert leader
-        assert 0 < float(odds) < 100
+        assert 0 < float(percent) < 100
     assert text.count("(not enrolled)") == 2
     assert "3 objects enrolled with 36 views" in text
 

@@ -50,8 +50,8 @@ class StillImu:
 def go(settings: Settings) -> None:
     config = settings.load()
     lock = BenchLock(config.state_path("hardware"), CLOCK)
-    wire = open_serial(config.servo.port, config.servo.baud)
-    servo = open_servo(wire, config.servo, CLOCK)
+    bus = open_serial(config.servo.port, config.servo.baud)
+    servo = open_servo(bus, config.servo, CLOCK)
     prepare_servo(servo, write=True)
     bench = Bench("hardware", config, CLOCK, servo, StillImu(), None, state=FileStore(config.state_path("hardware")))
     bench.safety.connect()
@@ -110,19 +110,19 @@ def ended(process: subprocess.Popen) -> tuple[int, str]:
     return process.returncode, errors
 
 
-def look(settings: list[str]) -> tuple[bool, bool, bool]:
+def observed(settings: list[str]) -> tuple[bool, bool, bool]:
     """Return whether the servo rotates, whether its torque is on, and whether its watchdog has tripped."""
     config = load_config(None, settings)
-    wire = open_serial(config.servo.port, config.servo.baud)
+    bus = open_serial(config.servo.port, config.servo.baud)
     try:
-        servo = open_servo(wire, config.servo, CLOCK)
+        servo = open_servo(bus, config.servo, CLOCK)
         first = servo.read_state()
         CLOCK.sleep(0.1)
-        turns = abs(servo.read_state().position_deg - first.position_deg) > 0.3
+        rotates = abs(servo.read_state().position_deg - first.position_deg) > 0.3
         condition = servo.read_condition()
-        return turns, condition.torque, condition.watchdog_tripped
+        return rotates, condition.torque, condition.watchdog_tripped
     finally:
-        wire.close()
+        bus.close()
 
 
 def rig(settings: list[str], *words: str):
@@ -136,7 +136,7 @@ def test_table_stops_however_the_program_ends(servo, tmp_path):
     process.send_signal(signal.SIGKILL)
     ended(process)
     CLOCK.sleep(load_config(None, servo).table.watchdog_s + 0.3)
-    assert look(servo) == (False, True, True)
+    assert observed(servo) == (False, True, True)
     path = json.loads(Path(tmp_path, "state", "hardware", "state.json").read_text())["table"]["path_deg"]
     assert path == pytest.approx([180.0, 530.0], abs=0.5)
 
@@ -149,17 +149,17 @@ def test_table_stops_however_the_program_ends(servo, tmp_path):
     code, errors = ended(process)
     assert code == 5
     assert "Error 512 (stopped)" in errors
-    assert look(servo) == (False, False, False)
+    assert observed(servo) == (False, False, False)
 
     process, _ = moving(servo)
     process.send_signal(signal.SIGTERM)
     assert ended(process)[0] == 143
-    assert look(servo) == (False, False, False)
+    assert observed(servo) == (False, False, False)
 
     process, _ = moving(servo)
     process.send_signal(signal.SIGINT)
     assert ended(process)[0] == 130
-    assert look(servo) == (False, False, False)
+    assert observed(servo) == (False, False, False)
 
     process, _ = moving(servo)
     process.send_signal(signal.SIGKILL)
@@ -167,4 +167,4 @@ def test_table_stops_however_the_program_ends(servo, tmp_path):
     (tmp_path / "full").write_text("")  # the state cannot be written; the servo is stopped all the same
     result = json.loads(rig([*servo, f"state_dir={str(tmp_path / 'full')!r}"], "stop", "--json").stdout)
     assert (result["pid"], result["torque_was_on"]) == (None, True)
-    assert look(servo) == (False, False, False)
+    assert observed(servo) == (False, False, False)

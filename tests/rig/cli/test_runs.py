@@ -70,9 +70,9 @@ def rig(enrolled, monkeypatch):
 def test_enrollment_ends_with_similar_objects_and_a_report(enrolled):
     folder, outputs = enrolled
     assert "looks like no other enrolled object" in outputs["lamp"].stdout
-    told = [json.loads(line) for line in outputs["dice"].stdout.splitlines()]
-    assert told[-2].keys() == {"event", *(SimilarObjects.__dataclass_fields__)}
-    assert told[-1]["event"] == "enrolled"
+    events = [json.loads(line) for line in outputs["dice"].stdout.splitlines()]
+    assert events[-2].keys() == {"event", *(SimilarObjects.__dataclass_fields__)}
+    assert events[-1]["event"] == "enrolled"
     page = (folder / "lamp.html").read_text(encoding="utf-8")
     assert "Contact sheet of lamp: 8 views" in page
     assert "Ring of 8 views by azimuth" in page
@@ -225,8 +225,8 @@ def test_dry_run_shows_the_plan_and_stores_nothing(rig):
     assert "Table angles: 0.0°, 60.0°, 120.0°, 180.0°, 240.0°, 300.0°" in done.stdout
     assert "600° of rotation" in done.stdout
     assert "not possible, it is already enrolled" in rig("enroll", "lamp", "--dry-run").stdout
-    (told,) = json.loads(rig("enroll", "lamp", "--replace", "--dry-run", "--json").stdout)["dry_run"]
-    assert (told["action"], told["views"]) == ("replace", 8)
+    (planned,) = json.loads(rig("enroll", "lamp", "--replace", "--dry-run", "--json").stdout)["dry_run"]
+    assert (planned["action"], planned["views"]) == ("replace", 8)
     assert sorted(Path("catalog").rglob("*.png")) == before
 
 
