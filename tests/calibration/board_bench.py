@@ -1,6 +1,6 @@
 """Views of a simulated board, without a bench around it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 
 import cv2
@@ -15,17 +15,18 @@ from sim.optics import Optics
 Picture = np.ndarray
 
 
+@cache
 def seen(
     optics: Optics,
-    stands: Sequence[str],
-    angles_deg: Sequence[float],
+    stands: tuple[str, ...],
+    angles_deg: tuple[float, ...],
     *,
     board: Board | None = None,
     change: Callable[[BoardOnPlatter], BoardOnPlatter] = lambda board: board,
     spoil: Callable[[Picture], Picture] = lambda picture: picture,
     ratio: float = 1.0,
 ) -> list[BoardView]:
-    """Return what the camera sees of the board; the encoder says ``ratio`` times the table's angle."""
+    """Return the camera's views of the board; the encoder reads ``ratio`` times the table's angle."""
     rng = np.random.default_rng(0)
     views = []
     for number, stand in enumerate(stands):

@@ -2,24 +2,40 @@
 
 import json
 from datetime import timedelta
+from shutil import copytree
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from calibration import camera_light, camera_model, encoder, table_axis
+from calibration.procedures import Encoder, GyroRotation, ImuMounting, MotionModel
 from calibration.report import plots
 from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.cli.main import app
 from rig.core.clock import SystemClock
 from rig.views.charuco_board import Board
 
+CONFIG = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
+
+
+@pytest.fixture(scope="module")
+def imu_calibration(tmp_path_factory):
+    """Calibrate the IMU once; return the folder of the results, and the output."""
+    folder = tmp_path_factory.mktemp("imu")
+    (folder / "rig.toml").write_text(CONFIG, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        arguments = ["calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4"]
+        done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    return folder / "calibrations", done.stdout
+
 
 @pytest.fixture
 def rig(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
-    (tmp_path / "rig.toml").write_text(config, encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(CONFIG, encoding="utf-8")
 
     def run(*arguments: str):
         return CliRunner().invoke(app, list(arguments))
@@ -32,35 +48,37 @@ def test_help_has_an_example_and_lists_the_procedures(rig):
     assert "imu" in rig("calibrate", "--help").output
 
 
-def test_passed_results_are_stored_and_in_force(rig, tmp_path):
-    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4", "--seed", "6")
-    assert done.exit_code == 0, done.output
-    paths = sorted((tmp_path / "calibrations" / "sim").iterdir())
+def test_passed_results_are_stored_and_in_force(rig, tmp_path, imu_calibration):
+    folder, output = imu_calibration
+    paths = sorted((folder / "sim").iterdir())
     results = [CalibrationResult.from_file(path) for path in paths]
     assert [result.name for result in results] == ["imu.scale", "imu.mounting", "imu.noise", "imu.rotation"]
     for path, result in zip(paths, results, strict=True):
-        assert f"PASS {result.name}" in done.stdout
-        assert path.name in "".join(done.stdout.split())
+        assert f"PASS {result.name}" in output
+        assert path.name in "".join(output.split())
     assert results[0].device["imu"]["range_dps"] == 250
-    told = json.loads(rig("goto", "90", "--seed", "6", "--json").stdout)
+    copytree(folder, tmp_path / "calibrations")
+    told = json.loads(rig("goto", "90", "--json").stdout)
     assert told["agrees"] is True
     assert told["bound_deg"] < 1.5
     other = json.loads(rig("goto", "90", "--seed", "7", "--json").stdout)
     assert other["bound_deg"] > 1.5, "another world has another gyro"
 
 
-def test_json_is_one_object_per_line_and_ends_with_the_result(rig):
-    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4", "--seed", "6", "--json")
+def test_json_is_one_object_per_line_and_ends_with_the_result(rig, monkeypatch):
+    for slow in (ImuMounting, GyroRotation):
+        monkeypatch.setattr(slow, "measure", lambda *_: (event for event in ()))
+    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--seed", "6", "--json")
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert {event["event"] for event in events} == {"moved", "progress", "calibrated"}
-    scale, *_, rotation = [event for event in events if event["event"] == "calibrated"]
+    scale, noise = [event for event in events if event["event"] == "calibrated"]
     assert (scale["passed"], scale["refusals"]) == (True, [])
     assert scale["estimates"]["scale"]["uncertainty"] < 1.5e-4
-    assert rotation == events[-1]
+    assert noise == events[-1]
 
 
-def test_refused_calibration_exits_with_6_and_changes_nothing(rig, tmp_path):
-    assert rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4").exit_code == 0
+def test_refused_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, imu_calibration):
+    copytree(imu_calibration[0], tmp_path / "calibrations")
     done = rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert done.exit_code == 6
     assert "FAIL imu.scale" in done.stdout
@@ -76,22 +94,25 @@ def test_too_few_revolutions_are_a_usage_error(rig):
     assert rig("calibrate", "imu", "--turns", "3").exit_code == 2
 
 
-def test_servo_results_replace_earlier_ones(rig, tmp_path):
+def test_servo_results_replace_earlier_ones(rig, tmp_path, monkeypatch):
     done = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
     assert done.exit_code == 0, done.output
     results = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "calibrations" / "sim").iterdir())]
     assert [result.name for result in results] == ["servo.backlash", "servo.encoder", "servo.motion"]
+    for slow in (Encoder, MotionModel):
+        monkeypatch.setattr(slow, "measure", lambda *_: (event for event in ()))
     again = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
     assert again.exit_code == 0, "a newer result takes the place of an older one"
     assert "of the configuration takes precedence" not in again.output
 
 
-def test_show_and_history_list_results(rig):
+def test_show_and_history_list_results(rig, tmp_path, imu_calibration):
     assert "No calibrations in" in rig("calibrate", "show").output
     assert "No calibrations of imu.scale in" in rig("calibrate", "history", "imu.scale").output
     rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert "imu.scale never passed" in rig("calibrate", "show").output
-    rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4")
+    for path in sorted((imu_calibration[0] / "sim").iterdir()):
+        CalibrationStore(tmp_path / "calibrations" / "sim").add(CalibrationResult.from_file(path))
     assert "✓ imu.scale was calibrated 0 days ago" in rig("calibrate", "show").output
     assert "conditions.seed was 0, is 9" in rig("calibrate", "show", "--seed", "9").output
     failed, passed = rig("calibrate", "history", "imu.scale").output.splitlines()

@@ -19,7 +19,7 @@ from tests.calibration.board_bench import blurred, optics, seen
 from tests.calibration.refused import codes
 
 WHEN = datetime(2026, 3, 1, tzinfo=UTC)
-ALL = list(STANDS)
+ALL = tuple(STANDS)
 
 
 def camera(views: list[BoardView], board: Board | None = None) -> CalibrationResult:
@@ -31,11 +31,11 @@ def axis(views: list[BoardView], intrinsics: CalibrationResult) -> Evaluation:
 
 
 @cache
-def calibrated(seed: int, wobble_deg: float = 0.0) -> CalibrationResult:
-    return camera(seen(optics(seed, wobble_deg), ALL, camera_model.ANGLES_DEG))
+def calibrated(seed: int) -> CalibrationResult:
+    return camera(seen(optics(seed), ALL, camera_model.ANGLES_DEG))
 
 
-@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.nightly)])
 def test_true_camera_lies_within_the_stated_uncertainty(seed):
     result, true = calibrated(seed), optics(seed)
     assert result.passed, result.refusals
@@ -48,10 +48,12 @@ def test_true_camera_lies_within_the_stated_uncertainty(seed):
     assert result.estimates["fx"].value == pytest.approx(true.focal_px[0], rel=0.003)
 
 
-@pytest.mark.parametrize(("seed", "wobble_deg"), [(0, 0.0), (4, 0.15)])
+@pytest.mark.parametrize(
+    ("seed", "wobble_deg"), [(0, 0.0), (0, 0.15), pytest.param(4, 0.15, marks=pytest.mark.nightly)]
+)
 def test_true_axis_lies_within_the_stated_uncertainty(seed, wobble_deg):
     true = optics(seed, wobble_deg)
-    result = axis(seen(true, table_axis.STANDS, table_axis.ANGLES_DEG[::2]), calibrated(seed, wobble_deg))
+    result = axis(seen(true, table_axis.STANDS, table_axis.ANGLES_DEG[::2]), calibrated(seed))
     assert result.passed, result.refusals
     up, origin = np.array(true.rotation).reshape(3, 3)[:, 2], np.array(true.translation_mm)
     rotation, translation = boards(true)[table_axis.STANDS[0]].pose(0.0)
@@ -85,7 +87,7 @@ def test_region_of_interest_holds_the_rotating_object():
 
 
 def test_objects_cut_off_by_the_frame_are_refused():
-    views = seen(optics(0), table_axis.STANDS, ANGLES)
+    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::2])
     room = ObjectSpace(height_mm=260.0)
     result = table_axis.evaluate(views, Board(), calibrated(0), space=room)
     (refusal,) = result.refusals
@@ -95,7 +97,7 @@ def test_objects_cut_off_by_the_frame_are_refused():
 
 
 def test_wrong_board_size_is_found_by_the_measured_distance():
-    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
+    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::2])
 
     def measured(square_mm: float) -> Evaluation:
         room, board = ObjectSpace(lens_mm=480.0), Board(square_mm=square_mm, marker_mm=square_mm * 11 / 15)
@@ -141,7 +143,7 @@ def test_wrong_board_is_refused():
 
 
 def test_low_coverage_is_refused():
-    views = seen(optics(1), ["calibration-board upright"] * 3, camera_model.ANGLES_DEG[::2])
+    views = seen(optics(1), ("calibration-board upright",) * 3, camera_model.ANGLES_DEG[::2])
     assert RefusalCode.COVERAGE_TOO_SMALL in codes(camera(views))
 
 
