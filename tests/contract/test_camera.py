@@ -54,7 +54,7 @@ def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Opened:
     return kind(tmp_path)
 
 
-def test_the_identity_tells_the_size_of_the_images(opened: Opened) -> None:
+def test_identity_has_the_image_size(opened: Opened) -> None:
     camera, clock = opened
     identity = camera.identity
     assert isinstance(identity, CameraIdentity)
@@ -63,7 +63,7 @@ def test_the_identity_tells_the_size_of_the_images(opened: Opened) -> None:
     assert camera.capture(clock.now_ns()).image_bgr.shape == (identity.height, identity.width, 3)
 
 
-def test_a_frame_is_eight_bit_colour_with_its_time(opened: Opened) -> None:
+def test_frame_is_eight_bit_colour_with_its_time(opened: Opened) -> None:
     camera, clock = opened
     frame = camera.capture(clock.now_ns())
     assert isinstance(frame, Frame)
@@ -73,7 +73,7 @@ def test_a_frame_is_eight_bit_colour_with_its_time(opened: Opened) -> None:
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 1, 5_000_000, 400_000_000])
-def test_no_frame_is_older_than_asked(opened: Opened, ahead_ns: int) -> None:
+def test_no_frame_is_older_than_requested(opened: Opened, ahead_ns: int) -> None:
     camera, clock = opened
     for pause_s in (0.0, 0.02, 1.0):
         clock.sleep(pause_s)
@@ -81,7 +81,7 @@ def test_no_frame_is_older_than_asked(opened: Opened, ahead_ns: int) -> None:
         assert camera.capture(after_ns).exposed_ns >= after_ns
 
 
-def test_frames_follow_each_other_and_are_not_repeated(opened: Opened) -> None:
+def test_frames_are_not_repeated(opened: Opened) -> None:
     camera, _ = opened
     frames = [camera.capture(0)]
     for _ in range(4):
@@ -92,7 +92,7 @@ def test_frames_follow_each_other_and_are_not_repeated(opened: Opened) -> None:
         assert (one.image_bgr != other.image_bgr).any()
 
 
-def test_a_frame_keeps_its_pixels_when_the_next_one_comes(opened: Opened) -> None:
+def test_frame_keeps_its_pixels_after_the_next_one(opened: Opened) -> None:
     camera, _ = opened
     frame = camera.capture(0)
     before = frame.image_bgr.copy()
@@ -100,7 +100,7 @@ def test_a_frame_keeps_its_pixels_when_the_next_one_comes(opened: Opened) -> Non
     np.testing.assert_array_equal(frame.image_bgr, before)
 
 
-def test_locks_are_known_or_none(opened: Opened) -> None:
+def test_locks_are_numbers_or_none(opened: Opened) -> None:
     camera, clock = opened
     locks = camera.read_locks()
     assert isinstance(locks, CameraLocks)
@@ -111,7 +111,7 @@ def test_locks_are_known_or_none(opened: Opened) -> None:
     assert camera.read_locks() == locks
 
 
-def test_it_can_be_closed_twice(opened: Opened) -> None:
+def test_close_can_be_called_twice(opened: Opened) -> None:
     camera, _ = opened
     camera.close()
     camera.close()

@@ -119,7 +119,7 @@ def spin(world: World, dps: float) -> None:
     world.drive(to_velocity(world.clock.now_ns() * 1e-9, world.table_deg(), dps, dps, 1.0))
 
 
-def test_it_says_who_it_is(sensor: Sensor) -> None:
+def test_identity_is_complete(sensor: Sensor) -> None:
     assert sensor.imu.identity.model
     assert 0 < sensor.imu.identity.gyro_noise_dps_rthz < 0.1
     assert sensor.imu.rate_hz > 0

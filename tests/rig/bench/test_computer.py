@@ -19,7 +19,7 @@ def host(computer: ComputerFiles, *gids: int, uid: int = 4242) -> LinuxComputer:
     return LinuxComputer(computer.root, user=User("ada", uid, frozenset(gids)))
 
 
-def test_a_serial_port_tells_its_adapter_its_lasting_name_and_its_latency(computer):
+def test_serial_port_has_adapter_stable_name_and_latency(computer):
     computer.serial_port("ttyUSB10", serial="FT1", latency_ms=16)
     computer.serial_port("ttyUSB9", serial="FT2", latency_ms=None)
     first, second = host(computer).serial_ports()
@@ -32,7 +32,7 @@ def test_a_serial_port_tells_its_adapter_its_lasting_name_and_its_latency(comput
     assert not host(computer).same_file(second.stable, first.path)
 
 
-def test_terminals_and_ports_with_nothing_behind_them_are_no_ports(computer):
+def test_terminals_and_unused_ports_are_not_listed(computer):
     computer.write("sys/class/tty/tty1/dev", "4:1")
     computer.write("sys/class/tty/ttyUSB0/dev", "188:0")  # no device: it was pulled out just now
     reserved = computer.root / "sys/devices/platform/serial8250/ttyS3"
@@ -47,7 +47,7 @@ def test_terminals_and_ports_with_nothing_behind_them_are_no_ports(computer):
     assert ports[0].usb == {}
 
 
-def test_a_port_that_no_adapter_makes_can_be_named(computer):
+def test_port_without_adapter_can_be_named(computer):
     computer.write("dev/pts/3")
     named = host(computer, uid=0).serial_port("/dev/pts/3")
     assert (named.path, named.usb, named.usable) == ("/dev/pts/3", {}, True)
@@ -78,7 +78,7 @@ def test_ports_on_usb_come_first(computer):
         (0o000, (), 0, True),
     ],
 )
-def test_permissions_are_those_of_the_file_for_this_user(computer, mode, gids, uid, usable):
+def test_permissions_follow_the_file_and_the_user(computer, mode, gids, uid, usable):
     computer.group("dialout", GID, "ada")
     computer.serial_port(mode=mode)
     (port,) = host(computer, *gids, uid=uid).serial_ports()
@@ -86,7 +86,7 @@ def test_permissions_are_those_of_the_file_for_this_user(computer, mode, gids, u
     assert port.group == "dialout"
 
 
-def test_a_membership_counts_from_the_next_login_on(computer):
+def test_new_group_membership_is_found(computer):
     computer.group("dialout", GID, "eve", "ada")
     computer.group("i2c", GID + 1)
     outside = host(computer)
@@ -96,7 +96,7 @@ def test_a_membership_counts_from_the_next_login_on(computer):
     assert not outside.joined("video")
 
 
-def test_who_has_a_port_open_is_found_under_either_of_its_names(computer):
+def test_program_that_uses_a_port_is_found_by_either_name(computer):
     computer.serial_port()
     (port,) = host(computer).serial_ports()
     computer.process(312, "dynamixel_wizard --fast", port.stable)
@@ -106,7 +106,7 @@ def test_who_has_a_port_open_is_found_under_either_of_its_names(computer):
     assert port.holders == (Process(312, "dynamixel_wizard --fast"),)
 
 
-def test_a_camera_is_the_node_that_carries_images(computer):
+def test_camera_is_the_device_file_with_images(computer):
     computer.camera(0, "HD Webcam", index=0)
     computer.camera(1, "HD Webcam", index=1)
     (camera,) = host(computer).cameras()
@@ -114,20 +114,20 @@ def test_a_camera_is_the_node_that_carries_images(computer):
     assert camera.stable == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
 
 
-def test_an_empty_computer_has_nothing_and_says_so(tmp_path):
+def test_computer_without_devices_lists_nothing(tmp_path):
     bare = host(ComputerFiles(tmp_path))
     assert (bare.serial_ports(), bare.i2c_buses(), bare.cameras()) == ([], [], [])
     assert bare.time_synchronised() is None
 
 
-def test_the_service_that_keeps_the_time_tells_whether_it_reached_a_server(computer):
+def test_time_service_reports_synchronisation(computer):
     computer.keeps_time(synchronised=False)
     assert host(computer).time_synchronised() is False
     computer.keeps_time()
     assert host(computer).time_synchronised() is True
 
 
-def test_a_network_disk_is_told_from_a_local_one(computer, tmp_path):
+def test_network_disk_is_detected(computer, tmp_path):
     computer.write("proc/mounts", f"/dev/sda1 / ext4 rw 0 0\nnas:/x {tmp_path}/with\\040space nfs4 rw 0 0\n")
     (tmp_path / "with space").mkdir()
     assert host(computer).disk(tmp_path / "with space" / "not" / "yet").network
@@ -135,7 +135,7 @@ def test_a_network_disk_is_told_from_a_local_one(computer, tmp_path):
     assert host(computer).disk(tmp_path).free_bytes > 0
 
 
-def test_this_very_computer_can_be_looked_at():
+def test_this_computer_can_be_examined():
     here = LinuxComputer()
     for node in [*here.serial_ports(), *here.i2c_buses(), *here.cameras()]:
         assert node.path.startswith("/dev/")

@@ -11,12 +11,12 @@ from rig.config import RigConfig, load_config
 from rig.core.errors import ConfigError, DeviceNotFound
 
 
-def test_the_defaults_are_valid_and_need_no_file(tmp_path, monkeypatch):
+def test_defaults_are_valid_without_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert load_config() == RigConfig()
 
 
-def test_all_mistakes_are_told_at_once_with_range_and_suggestion(tmp_path):
+def test_all_mistakes_are_reported_with_range_and_suggestion(tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text(
         '[servo]\nbaud = 3\nprot = "/dev/ttyUSB1"\n[table]\nlimits_deg = [0, 90]\nvelocity_dps = -1\n'
@@ -37,7 +37,7 @@ def test_all_mistakes_are_told_at_once_with_range_and_suggestion(tmp_path):
     assert caught.value.exit_code == 3
 
 
-def test_a_file_that_is_not_there_and_one_that_is_no_toml(tmp_path):
+def test_missing_or_invalid_file_raises_config_error(tmp_path):
     with pytest.raises(ConfigError, match="Cannot read"):
         load_config(tmp_path / "none.toml")
     broken = tmp_path / "rig.toml"
@@ -48,13 +48,13 @@ def test_a_file_that_is_not_there_and_one_that_is_no_toml(tmp_path):
 
 
 @pytest.mark.parametrize("roi", ["[-1, 0, 9, 9]", "[0, 0, 0, 9]", "[0, 0, 641, 480]", "[0, 1, 640, 480]"])
-def test_a_region_outside_the_frame_is_refused(roi):
+def test_region_outside_the_frame_is_rejected(roi):
     with pytest.raises(ConfigError, match="1 mistake"):
         load_config(None, [f"view.roi={roi}"])
     assert load_config(None, ["view.roi=[0, 0, 640, 480]"]).view.roi == (0, 0, 640, 480)
 
 
-def test_overrides_win_over_the_file_and_bare_words_are_strings(tmp_path):
+def test_overrides_replace_values_of_the_file(tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text("[identify]\nmax_views = 3\n", encoding="utf-8")
     config = load_config(file, ["identify.max_views=5", "servo.port=/dev/ttyACM0", "table.limits_deg=[-720, 720]"])
@@ -64,12 +64,12 @@ def test_overrides_win_over_the_file_and_bare_words_are_strings(tmp_path):
 
 
 @given(st.text(max_size=30).filter(lambda text: "=" not in text or text.startswith("=")))
-def test_a_setting_without_key_or_value_is_a_configuration_error(text):
+def test_override_without_key_or_value_raises_config_error(text):
     with pytest.raises(ConfigError):
         load_config(None, [text])
 
 
-def test_a_catalog_path_is_relative_to_its_file_and_benches_do_not_share_by_default(tmp_path):
+def test_paths_are_relative_to_the_file_and_benches_do_not_share_catalogs(tmp_path):
     file = tmp_path / "rig.toml"
     text = 'state_dir = "kept"\ncalibration_dir = "/facts"\n[catalog]\npath = "data/objects"\n'
     file.write_text(text, encoding="utf-8")
@@ -79,7 +79,7 @@ def test_a_catalog_path_is_relative_to_its_file_and_benches_do_not_share_by_defa
     assert RigConfig().catalog_path("sim") != RigConfig().catalog_path("hardware")
 
 
-def test_benches_are_plugins_and_an_unknown_one_is_named_with_those_there_are():
+def test_unknown_bench_is_rejected_with_the_known_ones():
     assert {"hardware", "sim"} <= set(bench_names())
     with pytest.raises(ConfigError) as caught:
         open_bench("simm")
@@ -88,7 +88,7 @@ def test_benches_are_plugins_and_an_unknown_one_is_named_with_those_there_are():
         open_bench("sim", load_config(None, ["bench.sin.object=dice"]))
 
 
-def test_mistakes_in_a_benchs_own_section_carry_its_key():
+def test_mistakes_in_bench_options_name_their_key():
     with pytest.raises(ConfigError) as caught:
         open_bench("sim", load_config(None, ["bench.sim.noise={backlash_degrees=1.0}", "bench.sim.objekt=dice"]))
     mistakes = "\n".join(caught.value.evidence["mistakes"])
@@ -97,7 +97,7 @@ def test_mistakes_in_a_benchs_own_section_carry_its_key():
 
 
 @pytest.mark.parametrize("setting", ["servo.port=nowhere", "servo.port=/dev/null"])
-def test_a_real_bench_without_its_servo_says_what_to_check(setting):
+def test_real_bench_without_servo_names_what_to_check(setting):
     with pytest.raises(DeviceNotFound, match="servo") as caught:
         open_bench("hardware", load_config(None, [setting]))
     assert caught.value.next_step
@@ -110,7 +110,7 @@ def test_a_real_bench_without_its_servo_says_what_to_check(setting):
         ("table.limits_deg=[-1e9, 1e9]", "within ±90000"),
     ],
 )
-def test_settings_that_would_stop_or_overrun_the_servo_are_refused(setting, words):
+def test_settings_beyond_the_servos_limits_are_rejected(setting, words):
     with pytest.raises(ConfigError) as caught:
         load_config(None, [setting, "table.poll_s=0.06"])
     assert words in caught.value.evidence["mistakes"][0]

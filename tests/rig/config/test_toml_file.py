@@ -30,7 +30,7 @@ port = "no" # no comment\"\"\"
 """
 
 
-def test_a_value_is_changed_where_it_stands():
+def test_value_is_changed_in_place():
     edited = with_values(BY_HAND, {("servo", "port"): "/dev/ttyUSB7"})
     assert changed_lines(BY_HAND, edited) == [
         "-   port = '/dev/ttyUSB0' # the U2D2 with the red dot",
@@ -38,12 +38,12 @@ def test_a_value_is_changed_where_it_stands():
     ]
 
 
-def test_a_new_value_stands_below_its_commented_default_indented_as_its_table():
+def test_new_value_is_inserted_below_its_commented_default():
     edited = with_values(BY_HAND, {("servo", "baud"): 1_000_000})
     assert "#baud = 57600\n  baud = 1000000\n" in edited
 
 
-def test_new_keys_tables_and_top_level_keys_find_their_place():
+def test_new_keys_and_tables_are_inserted_in_their_places():
     edited = with_values(BY_HAND, {("servo", "id"): 3, ("imu", "bus"): "/dev/i2c-3", ("state_dir",): "x"})
     assert edited.startswith(
         '# The bench by the window.\n\ndefault_bench = "hardware"   # not the simulated one\nstate_dir'
@@ -52,43 +52,43 @@ def test_new_keys_tables_and_top_level_keys_find_their_place():
     assert edited.endswith('\n[imu]\nbus = "/dev/i2c-3"\n')
 
 
-def test_comments_inside_a_value_of_several_lines_move_above_it():
+def test_comments_inside_a_multiline_value_move_above_it():
     edited = with_values(BY_HAND, {("table", "limits_deg"): [-720, 720]})
     assert "# the cable\n# taut here\nlimits_deg = [-720, 720]\n" in edited
 
 
-def test_an_inline_table_keeps_its_other_values():
+def test_inline_table_keeps_its_other_values():
     edited = with_values(BY_HAND, {("bench", "sim", "noise", "camera_read"): 2.5})
     assert "noise = { backlash_deg = 0.1, camera_read = 2.5 }" in edited
 
 
-def test_the_first_key_of_a_file_of_comments_stands_before_the_first_table():
+def test_first_top_level_key_is_inserted_before_the_first_table():
     text = "# mine\n\n# about the servo\n[servo]\nid = 1"
     edited = with_values(text, {("default_bench",): "sim", ("servo", "baud"): 57600})
     assert edited == '# mine\n\ndefault_bench = "sim"\n\n# about the servo\n[servo]\nid = 1\nbaud = 57600\n'
 
 
-def test_windows_line_ends_stay_and_an_empty_file_is_filled():
+def test_windows_line_ends_stay_and_empty_file_gets_a_table():
     assert with_values("a = 1\r\n", {("servo", "id"): 2}) == "a = 1\r\n\r\n[servo]\r\nid = 2\r\n"
     assert with_values("", {("servo", "id"): 2}) == "[servo]\nid = 2\n"
 
 
-def test_dotted_keys_get_a_sister():
+def test_new_key_follows_dotted_keys():
     assert with_values('servo.port = "x"\n', {("servo", "id"): 2}) == 'servo.port = "x"\nservo.id = 2\n'
 
 
-def test_what_is_so_already_is_not_touched():
+def test_unchanged_values_stay_as_written():
     assert with_values(BY_HAND, {("servo", "port"): "/dev/ttyUSB0", ("table", "limits_deg"): [-400, 400]}) == BY_HAND
 
 
 @pytest.mark.parametrize("text", ["[[servo]]\nid = 1\n", "servo = 3\n"])
-def test_a_form_that_cannot_be_edited_is_refused_with_the_line_to_write(text):
+def test_uneditable_form_is_rejected_with_the_line_to_write(text):
     with pytest.raises(ConfigError, match=r"Cannot set servo\.id") as caught:
         with_values(text, {("servo", "id"): 2})
     assert "id = 2" in caught.value.next_step
 
 
-def test_a_file_is_replaced_whole_and_a_link_stays_a_link(tmp_path):
+def test_file_is_replaced_atomically_and_link_stays_a_link(tmp_path):
     real, link = tmp_path / "real.toml", tmp_path / "rig.toml"
     real.write_text("old = 1\n")
     link.symlink_to(real)
@@ -168,7 +168,7 @@ def impossible(text: str, key: tuple[str, ...]) -> bool:
 
 
 @given(documents(), st.lists(names, min_size=1, max_size=3, unique=True).map(tuple), values)
-def test_in_any_document_one_value_changes_and_all_comments_and_other_lines_stay(text, key, value):
+def test_edit_keeps_all_comments_and_other_lines_of_any_document(text, key, value):
     if impossible(text, key):
         event("refused")
         with pytest.raises(ConfigError):

@@ -9,13 +9,13 @@ def every_class(base=errors.RigError):
         yield from every_class(sub)
 
 
-def test_codes_are_distinct_and_give_the_exit_codes():
+def test_codes_are_distinct_and_give_exit_codes():
     kinds = [*every_class()]
     assert len({kind.code for kind in kinds}) == len(kinds)
     assert {kind.code // 100 for kind in kinds} <= {2, 3, 4, 5, 6, 7, 9}
 
 
-def test_an_error_carries_what_evidence_and_next_step():
+def test_error_has_text_evidence_and_next_step():
     error = errors.DeviceSilent("Servo 1 does not answer.", next_step="Check the cable.", evidence={"baud": 57600})
     assert error.exit_code == 4
     assert error.as_dict() == {

@@ -10,7 +10,7 @@ from rig.core.moved import MOVED
 
 
 @pytest.mark.parametrize("old", sorted(MOVED))
-def test_old_path_warns_and_gives_the_same_module(old: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_path_warns_and_returns_the_same_module(old: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, old, raising=False)
     with pytest.warns(DeprecationWarning, match=f"{old} is now {MOVED[old]}"):
         module = import_module(old)

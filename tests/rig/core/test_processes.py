@@ -15,11 +15,11 @@ def work(item: int) -> int:
     return item * item
 
 
-def test_a_killed_process_is_told_with_the_way_out() -> None:
+def test_killed_process_raises_an_error_with_a_next_step() -> None:
     with pytest.raises(RigError, match="ended before it was done") as lost:
         list(map_in_processes(work, range(6), 2))
     assert "--jobs 1" in lost.value.next_step
 
 
-def test_one_process_is_this_one() -> None:
+def test_one_job_runs_in_this_process() -> None:
     assert list(map_in_processes(work, [1, 2], 1)) == [(1, 1), (2, 4)]

@@ -48,14 +48,14 @@ def bench() -> Iterator[Bench]:
 # -- opening -----------------------------------------------------------------------------------------------------------
 
 
-def test_it_waits_for_a_sensor_that_has_just_been_switched_on() -> None:
+def test_opening_waits_for_a_starting_sensor() -> None:
     bench = Bench(powered_s=0.0)
     with closing(bench.bus), closing(bench.open()) as imu:
         assert bench.clock.now_ns() > SILENT_S * 1e9
         assert (imu.identity.model, imu.identity.who_am_i) == ("BNO055", 0xA0)
 
 
-def test_opening_waits_until_the_sensor_has_learned_its_zero() -> None:
+def test_opening_waits_for_the_gyro_calibration() -> None:
     bench = Bench(NoiseModel())
     with closing(bench.bus), closing(bench.open()) as imu:
         assert imu.calibration().gyro == 3
@@ -67,7 +67,7 @@ def test_opening_waits_until_the_sensor_has_learned_its_zero() -> None:
         assert abs(turned) < 0.3
 
 
-def test_a_table_that_never_rests_does_not_hold_up_opening_for_ever(bench: Bench) -> None:
+def test_opening_on_a_moving_table_ends_in_bounded_time(bench: Bench) -> None:
     bench.turn(20.0)
     with closing(bench.open()) as imu:
         assert imu.calibration().gyro == 0
@@ -75,7 +75,7 @@ def test_a_table_that_never_rests_does_not_hold_up_opening_for_ever(bench: Bench
 
 
 @pytest.mark.parametrize(("chip_id", "likely"), [(0x00, "SDA is held low"), (0xFF, "not connected"), (0x42, "BNO085")])
-def test_another_chip_is_named(chip_id: int, likely: str) -> None:
+def test_wrong_chip_is_named(chip_id: int, likely: str) -> None:
     bench = Bench(chip_id=chip_id)
     with closing(bench.bus), pytest.raises(DeviceMismatch, match=likely) as caught:
         bench.open()
@@ -83,7 +83,7 @@ def test_another_chip_is_named(chip_id: int, likely: str) -> None:
     assert bench.sensor._registers[0x3D] == 0  # nothing was written to the unknown device
 
 
-def test_nobody_there_says_where_and_what_to_do(bench: Bench) -> None:
+def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:
     bench.bus.detach(AT)
     with pytest.raises(DeviceNotFound, match="0x28") as caught:
         bench.open()
@@ -100,9 +100,7 @@ def test_nobody_there_says_where_and_what_to_do(bench: Bench) -> None:
     pause_s=st.floats(0.012, 0.3),
     speed=st.floats(20.0, 200.0),
 )
-def test_however_it_is_read_the_samples_add_up_to_the_rotation(
-    angles: list[float], pause_s: float, speed: float
-) -> None:
+def test_samples_sum_to_the_rotation_for_any_reading_pattern(angles: list[float], pause_s: float, speed: float) -> None:
     bench = Bench()
     with closing(bench.bus), closing(bench.open()) as imu:
         imu.read_samples()
@@ -118,7 +116,7 @@ def test_however_it_is_read_the_samples_add_up_to_the_rotation(
             assert turned == pytest.approx(angle, abs=0.03)
 
 
-def test_the_heading_is_counter_clockwise_and_within_a_turn(bench: Bench) -> None:
+def test_heading_is_counter_clockwise_and_within_a_revolution(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         start = imu.heading_deg()
         now_s = bench.clock.now_ns() * 1e-9
@@ -127,7 +125,7 @@ def test_the_heading_is_counter_clockwise_and_within_a_turn(bench: Bench) -> Non
         assert (imu.heading_deg() - start) % 360 == pytest.approx(90.0, abs=0.1)
 
 
-def test_a_gap_that_may_hide_half_a_turn_is_told(bench: Bench) -> None:
+def test_long_gap_counts_as_lost_samples(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         imu.read_samples()
         bench.clock.sleep(0.6)
@@ -137,7 +135,7 @@ def test_a_gap_that_may_hide_half_a_turn_is_told(bench: Bench) -> None:
         assert imu.read_samples().lost == 0
 
 
-def test_saturation_reaches_the_stated_range(bench: Bench) -> None:
+def test_saturation_matches_the_stated_range(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         imu.read_samples()
         bench.turn(2100.0)
@@ -150,7 +148,7 @@ def test_saturation_reaches_the_stated_range(bench: Bench) -> None:
 # -- what goes wrong ---------------------------------------------------------------------------------------------------
 
 
-def test_a_reset_while_running_is_found(bench: Bench) -> None:
+def test_reset_while_running_is_detected(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         bench.sensor.power_cycle()
         with pytest.raises(DeviceSilent, match="acknowledge"):
@@ -162,7 +160,7 @@ def test_a_reset_while_running_is_found(bench: Bench) -> None:
         assert caught.value.evidence["operating_mode"] == {"got": 0, "expected": 8}
 
 
-def test_a_fusion_that_stopped_is_found(bench: Bench) -> None:
+def test_stopped_fusion_is_detected(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         bench.sensor.fail(0x0A)
         with pytest.raises(DeviceFault, match="fusion") as caught:
@@ -171,7 +169,7 @@ def test_a_fusion_that_stopped_is_found(bench: Bench) -> None:
         assert "i2c-gpio" in caught.value.next_step
 
 
-def test_other_units_are_found(bench: Bench) -> None:
+def test_changed_units_are_detected(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         bench.sensor._registers[0x3B] = 0x02  # another program wants radians
         with pytest.raises(DeviceFault) as caught:
@@ -179,7 +177,7 @@ def test_other_units_are_found(bench: Bench) -> None:
         assert caught.value.evidence["unit_selection"] == {"got": 2, "expected": 0}
 
 
-def test_a_stuck_bus_is_told_from_a_missing_sensor(bench: Bench) -> None:
+def test_stuck_bus_and_missing_sensor_are_distinguished(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         bench.bus.stuck = True
         with pytest.raises(DeviceSilent, match="stuck") as caught:
@@ -187,7 +185,7 @@ def test_a_stuck_bus_is_told_from_a_missing_sensor(bench: Bench) -> None:
         assert "SDA" in caught.value.next_step
 
 
-def test_one_broken_transfer_is_repeated(bench: Bench) -> None:
+def test_failed_transfer_is_repeated(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         imu.read_samples()
         bench.clock.sleep(0.1)
@@ -199,7 +197,7 @@ def test_one_broken_transfer_is_repeated(bench: Bench) -> None:
 # -- on a bench --------------------------------------------------------------------------------------------------------
 
 
-def test_a_bench_with_a_bno055_turns_settles_and_agrees(simulated) -> None:
+def test_bench_with_bno055_moves_settles_and_agrees(simulated) -> None:
     b = simulated("imu.model=bno055", seed=3)
     assert b.bench.imu.identity.bus_address == AT
     with Turntable(b.bench) as table:

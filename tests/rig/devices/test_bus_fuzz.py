@@ -93,7 +93,7 @@ def intact(stream: bytes, protocol: int) -> list[bytes]:
 @pytest.mark.parametrize("protocol", [2, 1])
 @fuzz_settings()
 @given(data=st.data(), value=st.integers(0, 0xFFFF_FFFF))
-def test_a_block_that_is_read_is_one_that_was_sent(protocol: int, data: st.DataObject, value: int) -> None:
+def test_read_block_was_sent_by_the_device(protocol: int, data: st.DataObject, value: int) -> None:
     """Four bytes, three attempts: the value of an intact packet with four parameters, a refusal, or silence."""
     block = value.to_bytes(4, "little")
     # The driver asks for one byte more each time an answer is owed, from one address lower.
@@ -116,7 +116,7 @@ def test_a_block_that_is_read_is_one_that_was_sent(protocol: int, data: st.DataO
 @pytest.mark.parametrize("protocol", [2, 1])
 @fuzz_settings(0.4)
 @given(noise=st.lists(st.binary(max_size=60), min_size=6, max_size=6))
-def test_noise_alone_is_no_value_and_no_acknowledgement(protocol: int, noise: list[bytes]) -> None:
+def test_noise_is_never_a_value_or_an_acknowledgement(protocol: int, noise: list[bytes]) -> None:
     bus, _ = scripted_bus(*noise, retries=2, protocol=protocol)
     register = TABLES[protocol]["Goal Position"]
     if not any(intact(part, protocol) for part in noise):
@@ -198,7 +198,7 @@ replacements = st.lists(
 
 @fuzz_settings()
 @given(spoil=replacements, waits=st.lists(st.floats(0.0, 0.4), min_size=1, max_size=3))
-def test_an_imus_registers_may_say_anything(
+def test_any_register_values_of_an_imu_are_handled(
     sensor: Sensor, spoil: list[Callable[[bytes], bytes]], waits: list[float]
 ) -> None:
     imu, clock = sensor.imu, sensor.clock

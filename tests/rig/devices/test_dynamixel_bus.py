@@ -19,7 +19,7 @@ from tests.rig.bench_parts import open_bus, servo_wires
 TABLE = control_table("xl430_w250")
 
 
-def test_the_bytes_on_the_wire_are_the_sdks():
+def test_bytes_on_the_wire_match_the_sdk():
     wires = servo_wires()
     open_bus(wires).write(1, TABLE["Goal Velocity"], -5)
     sdk = Protocol2PacketHandler()
@@ -30,14 +30,14 @@ def test_the_bytes_on_the_wire_are_the_sdks():
     assert int.from_bytes(sent[14:], "little") == sdk.updateCRC(0, list(sent), len(sent) - 2)
 
 
-def test_values_come_back_signed():
+def test_values_are_signed_on_reading():
     wires = servo_wires()
     bus = open_bus(wires)
     bus.write(1, TABLE["Goal Velocity"], -5)
     assert bus.read(1, TABLE["Goal Velocity"]) == -5
 
 
-def test_a_crc_error_on_the_wire_is_retried_and_counted():
+def test_crc_error_is_retried_and_counted():
     wires = servo_wires()
     bus = open_bus(wires)
     spoiled = []
@@ -54,7 +54,7 @@ def test_a_crc_error_on_the_wire_is_retried_and_counted():
     assert len(wires.instructions) == 2  # the question really went out again
 
 
-def test_a_line_that_always_spoils_ends_in_device_silent_with_the_sdks_reason():
+def test_permanent_corruption_raises_device_silent():
     wires = servo_wires()
     bus = open_bus(wires, retries=2)
     wires.bus.filters.append(lambda frame: replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 0xFF])))
@@ -65,7 +65,7 @@ def test_a_line_that_always_spoils_ends_in_device_silent_with_the_sdks_reason():
     assert bus.statistics.corrupt == 3
 
 
-def test_a_lost_reply_is_asked_for_again():
+def test_lost_reply_is_requested_again():
     wires = servo_wires()
     bus = open_bus(wires)
     lost = iter([None])
@@ -74,7 +74,7 @@ def test_a_lost_reply_is_asked_for_again():
     assert bus.statistics.timeouts == 1
 
 
-def test_a_reply_that_comes_too_late_is_never_taken_for_the_next_answer():
+def test_late_reply_is_never_taken_for_the_next_one():
     wires = servo_wires()
     bus = open_bus(wires)
     late = iter([50_000_000])  # past the timeout, while the next question could already be out
@@ -88,7 +88,7 @@ def test_a_reply_that_comes_too_late_is_never_taken_for_the_next_answer():
     assert bus.statistics.retries >= 1
 
 
-def test_a_babbling_line_ends_instead_of_hanging():
+def test_babbling_bus_does_not_hang():
     wires = servo_wires()
     bus = open_bus(wires, retries=1)
 
@@ -103,7 +103,7 @@ def test_a_babbling_line_ends_instead_of_hanging():
     assert not bus.port.is_using
 
 
-def test_a_refusal_names_the_status_error_and_is_not_retried():
+def test_rejection_names_the_status_error_and_is_not_retried():
     wires = servo_wires()
     bus = open_bus(wires)
     bus.write(1, TABLE["Torque Enable"], 1)
@@ -112,7 +112,7 @@ def test_a_refusal_names_the_status_error_and_is_not_retried():
     assert bus.statistics.retries == 0
 
 
-def test_the_alert_bit_is_no_failure():
+def test_alert_bit_is_not_a_failure():
     wires = servo_wires()
     bus = open_bus(wires)
     wires.device.set_voltage(3.0)
@@ -121,7 +121,7 @@ def test_the_alert_bit_is_no_failure():
     assert bus.alert(1)
 
 
-def test_an_unplugged_adapter_is_silent_and_leaves_the_port_usable():
+def test_unplugged_adapter_raises_device_silent():
     wires = servo_wires()
     bus = open_bus(wires)
     wires.serial.unplug()
@@ -131,7 +131,7 @@ def test_an_unplugged_adapter_is_silent_and_leaves_the_port_usable():
     assert not bus.port.is_using
 
 
-def test_waiting_for_a_device_that_is_not_there_takes_virtual_time_only():
+def test_waiting_for_a_missing_device_takes_only_virtual_time():
     wires = servo_wires()
     bus = open_bus(wires, retries=0)
     with pytest.raises(DeviceSilent):
@@ -141,7 +141,7 @@ def test_waiting_for_a_device_that_is_not_there_takes_virtual_time_only():
 
 @settings(max_examples=40, deadline=None)
 @given(noise=st.lists(st.binary(min_size=0, max_size=30), min_size=1, max_size=4))
-def test_garbage_in_place_of_replies_never_becomes_a_value(noise):
+def test_garbage_is_never_returned_as_a_value(noise):
     wires = servo_wires()
     bus = open_bus(wires, retries=len(noise))
     garbage = iter(noise)
@@ -151,13 +151,13 @@ def test_garbage_in_place_of_replies_never_becomes_a_value(noise):
 
 
 @given(timeout_s=st.floats(0.001, 10))
-def test_the_watchdogs_register_holds_at_least_the_time_asked_for_and_never_switches_it_off(timeout_s):
+def test_watchdog_units_round_up_and_never_disable_it(timeout_s):
     units = watchdog_units(timeout_s)
     assert 1 <= units <= 127
     assert units * 0.02 >= min(timeout_s, 2.54) - 1e-9
 
 
-def test_an_adapter_pulled_out_of_a_real_port_is_silent():
+def test_adapter_unplugged_from_a_real_port_raises_device_silent():
     """pyserial itself, on a pseudo-terminal whose other end goes away: it then raises what is no OSError."""
     far, near = os.openpty()
     path = os.ttyname(near)
@@ -169,7 +169,7 @@ def test_an_adapter_pulled_out_of_a_real_port_is_silent():
     assert "port failed" in caught.value.evidence["reason"]
 
 
-def test_an_adapter_pulled_while_the_line_is_drained_is_silent(monkeypatch):
+def test_adapter_unplugged_while_draining_raises_device_silent(monkeypatch):
     wires = servo_wires()
     bus = open_bus(wires)
     wires.bus.detach(wires.device)
@@ -184,7 +184,7 @@ def test_an_adapter_pulled_while_the_line_is_drained_is_silent(monkeypatch):
         bus.ping(1)
 
 
-def test_the_answer_to_a_question_that_was_cut_short_is_never_taken_for_the_next_one():
+def test_reply_to_an_interrupted_request_is_never_taken_for_the_next_one():
     """Ctrl+C in the middle of a transaction, and then torque off with its own questions: Protocol 2.0 numbers none."""
     wires = servo_wires()
     bus = open_bus(wires)

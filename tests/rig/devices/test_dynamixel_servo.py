@@ -13,7 +13,7 @@ from sim.noise import NoiseModel
 from tests.rig.bench_parts import open_bus, open_servo, servo_wires
 
 
-def test_a_factory_fresh_servo_is_refused_with_a_list_of_what_differs():
+def test_factory_settings_are_rejected_with_a_list_of_differences():
     wires = servo_wires()
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
     with pytest.raises(DeviceMismatch) as caught:
@@ -24,7 +24,7 @@ def test_a_factory_fresh_servo_is_refused_with_a_list_of_what_differs():
     assert "write_settings" in caught.value.next_step
 
 
-def test_settings_are_written_once_and_told():
+def test_settings_are_written_once_and_reported():
     wires = servo_wires()
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
     assert prepare_servo(servo, write=True) == (
@@ -41,7 +41,7 @@ def test_opening_moves_nothing_and_writes_nothing():
     assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_another_model_is_named():
+def test_wrong_model_is_named():
     wires = servo_wires(model="xm430_w350")
     with pytest.raises(DeviceMismatch) as caught:
         DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
@@ -49,13 +49,13 @@ def test_another_model_is_named():
     assert 'servo.model = "xm430_w350"' in caught.value.next_step
 
 
-def test_nobody_at_the_id():
+def test_missing_servo_raises_device_not_found():
     wires = servo_wires()
     with pytest.raises(DeviceNotFound, match="id 9"):
         DynamixelServo(open_bus(wires, retries=0), bus_id=9, model="xl430_w250", clock=wires.world.clock)
 
 
-def test_torque_on_holds_the_present_position_before_it_acts():
+def test_torque_on_sets_the_goal_to_the_present_position_first():
     wires = servo_wires()
     servo = open_servo(wires)
     wires.device.turn_by_hand(123.0)
@@ -68,7 +68,7 @@ def test_torque_on_holds_the_present_position_before_it_acts():
 
 @settings(max_examples=15, deadline=None)
 @given(goal_deg=st.floats(-700, 700))
-def test_a_goal_is_reached_within_one_count_over_many_turns(goal_deg):
+def test_goal_is_reached_within_one_count_over_many_revolutions(goal_deg):
     wires = servo_wires(NoiseModel.none())
     servo = open_servo(wires)
     servo.set_profile(MotionProfile(300.0, 3000.0))
@@ -82,7 +82,7 @@ def test_a_goal_is_reached_within_one_count_over_many_turns(goal_deg):
     assert not state.moving
 
 
-def test_the_profile_is_never_the_servos_unlimited_zero():
+def test_profile_is_never_zero():
     wires = servo_wires()
     got = open_servo(wires).set_profile(MotionProfile(0.01, 0.01))
     assert got.velocity_dps > 0
@@ -90,7 +90,7 @@ def test_the_profile_is_never_the_servos_unlimited_zero():
     assert wires.device.memory["Profile Velocity"] == 1
 
 
-def test_a_hardware_error_is_told_and_forbids_torque():
+def test_hardware_error_is_reported_and_prevents_torque():
     wires = servo_wires()
     servo = open_servo(wires)
     wires.device.set_temperature(95.0)
@@ -100,7 +100,7 @@ def test_a_hardware_error_is_told_and_forbids_torque():
         servo.torque_on()
 
 
-def test_one_transaction_reads_the_whole_state():
+def test_state_is_read_in_one_transaction():
     wires = servo_wires()
     servo = open_servo(wires)
     before = len(wires.instructions)
@@ -110,7 +110,7 @@ def test_one_transaction_reads_the_whole_state():
     assert 15 < state.temperature_c < 60
 
 
-def test_a_tripped_watchdog_is_cleared_only_when_torque_is_asked_for():
+def test_tripped_watchdog_is_cleared_only_by_torque_on():
     wires = servo_wires()
     servo = open_servo(wires)
     servo.torque_on()
@@ -123,7 +123,7 @@ def test_a_tripped_watchdog_is_cleared_only_when_torque_is_asked_for():
     assert wires.device.memory["Bus Watchdog"] == 0
 
 
-def test_the_sdk_knows_the_model_tables_and_an_unknown_model_is_a_configuration_error():
+def test_unknown_model_raises_config_error():
     assert model_numbers()[1060] == "xl430_w250"
     assert control_table("xl430_w250")["Present Position"].address == 132
     assert control_table("xl330_m288", 52)["Indirect Data 1"].address == 208
@@ -143,7 +143,7 @@ def test_registers_round_trip(name):
         register.encode(high + 1)
 
 
-def test_torque_that_comes_on_with_a_goal_is_switched_off():
+def test_drive_mode_with_torque_by_goal_is_corrected():
     """After a dip of the supply such a servo would obey the next goal, as fast as it can and perhaps a turn away."""
     wires = servo_wires()
     wires.device.memory["Drive Mode"] = 0b1000

@@ -46,7 +46,7 @@ def switch_on(h):
 # -- opening -----------------------------------------------------------------------------------------------------
 
 
-def test_opening_tells_who_it_is_and_leaves_the_outputs_off(opened):
+def test_opening_reads_the_identity_and_leaves_outputs_off(opened):
     who = opened.imu.identity
     assert (who.model, who.who_am_i, who.bus_address) == ("MPU-6050", 0x68, 0x68)
     board = {"memory": "host", "avr": "atmega328p"}[opened.head.kind]
@@ -59,7 +59,7 @@ def test_opening_tells_who_it_is_and_leaves_the_outputs_off(opened):
 @pytest.mark.parametrize(
     ("version", "step"), [(PROTOCOL_VERSION - 1, "make -C firmware flash"), (PROTOCOL_VERSION + 1, "Update")]
 )
-def test_another_version_says_which_side_to_update(version, step):
+def test_version_mismatch_names_the_side_to_update(version, step):
     needs("memory")
     world = World()
     head = SimHead(world, library=build.host_library(f"-DPROTOCOL_VERSION={version}"))
@@ -70,7 +70,7 @@ def test_another_version_says_which_side_to_update(version, step):
     head.close()
 
 
-def test_nobody_at_the_port(opened):
+def test_port_without_head_raises_device_not_found(opened):
     class Deaf:
         baudrate, in_waiting = BAUD, 0
 
@@ -94,7 +94,7 @@ def test_nobody_at_the_port(opened):
     assert clock.now_ns() < 4e9
 
 
-def test_a_board_that_starts_slowly_is_waited_for():
+def test_opening_waits_for_a_slow_board():
     with simulated_head(noise=NoiseModel.none()) as (head, world):
         head.attach(0x68, SimMpu6050(head.world_at_board_time))
         wire = HeadSerial(head)
@@ -105,7 +105,7 @@ def test_a_board_that_starts_slowly_is_waited_for():
         imu.close()
 
 
-def test_no_sensor_and_another_sensor():
+def test_missing_or_wrong_sensor_is_reported():
     with simulated_head() as (head, world):
         with pytest.raises(DeviceSilent, match="does not answer") as caught:
             RigHead(HeadSerial(head), world.clock, mpu6050())
@@ -115,7 +115,7 @@ def test_no_sensor_and_another_sensor():
             RigHead(HeadSerial(head), world.clock, mpu6050())
 
 
-def test_an_impossible_deadman(opened):
+def test_impossible_deadman_is_rejected(opened):
     with pytest.raises(ConfigError, match="deadman"):
         RigHead(HeadSerial(opened.head), opened.clock, mpu6050(), deadman_s=3.0)
 
@@ -123,7 +123,7 @@ def test_an_impossible_deadman(opened):
 # -- outputs -----------------------------------------------------------------------------------------------------
 
 
-def test_light_and_power_follow_while_the_program_lives(opened):
+def test_light_and_power_follow_requests(opened):
     switch_on(opened)
     opened.imu.set_light(0.2)
     assert opened.head.light == pytest.approx(0.2, abs=0.005)
@@ -139,7 +139,7 @@ def test_light_and_power_follow_while_the_program_lives(opened):
     assert not opened.imu.status.faults  # it rests in peace
 
 
-def test_a_pulse_is_as_wide_as_asked_and_dated(opened):
+def test_trigger_pulse_has_the_requested_width_and_time(opened):
     opened.clock.sleep(1.0)
     began_ns = opened.imu.trigger(0.002)
     opened.clock.sleep(0.01)
@@ -151,7 +151,7 @@ def test_a_pulse_is_as_wide_as_asked_and_dated(opened):
         opened.imu.trigger(0.04)
 
 
-def test_a_second_pulse_within_the_first_is_refused(opened):
+def test_overlapping_trigger_pulse_is_rejected(opened):
     opened.imu.trigger(0.03)
     with pytest.raises(RequestRejected, match="still processes"):
         opened.imu.trigger(0.001)
@@ -160,7 +160,7 @@ def test_a_second_pulse_within_the_first_is_refused(opened):
 # -- what makes the bench safe --------------------------------------------------------------------------------------
 
 
-def test_a_silent_host_leaves_the_bench_dark_and_unpowered(opened):
+def test_silent_computer_switches_outputs_off(opened):
     switch_on(opened)
     opened.imu._cancel()  # the program is killed: nothing beats any more
     last_ns = opened.clock.now_ns()
@@ -183,7 +183,7 @@ def test_a_silent_host_leaves_the_bench_dark_and_unpowered(opened):
 
 
 @pytest.mark.parametrize("deadman_s", [0.05, 0.25, 2.0])
-def test_the_deadman_is_as_long_as_set(deadman_s):
+def test_deadman_has_the_configured_duration(deadman_s):
     with opened_head(noise=NoiseModel.none(), deadman_s=deadman_s) as h:
         h.imu.set_power(True)
         h.imu._cancel()
@@ -193,7 +193,7 @@ def test_the_deadman_is_as_long_as_set(deadman_s):
         assert deadman_s * 0.99 - 0.002 <= silent_s <= deadman_s * 1.01 + 0.001
 
 
-def test_the_estop_acts_within_a_millisecond_and_without_the_host(opened):
+def test_estop_acts_within_a_millisecond_without_the_computer(opened):
     switch_on(opened)
     opened.clock.sleep(0.1)
     opened.imu._cancel()
@@ -214,7 +214,7 @@ def test_the_estop_acts_within_a_millisecond_and_without_the_host(opened):
     assert not opened.head.relay_closed
 
 
-def test_a_head_that_restarts_says_so_and_goes_on_measuring(opened):
+def test_restarted_head_reports_it_and_continues_to_measure(opened):
     switch_on(opened)
     opened.clock.sleep(0.5)
     opened.imu.read_samples()
@@ -234,7 +234,7 @@ def test_a_head_that_restarts_says_so_and_goes_on_measuring(opened):
     assert opened.imu.fault is None
 
 
-def test_a_program_that_hangs_on_the_head_is_restarted_by_its_watchdog(opened):
+def test_hanging_firmware_is_restarted_by_its_watchdog(opened):
     switch_on(opened)
     opened.head.hang()
     opened.clock.sleep(1.0)
@@ -262,7 +262,7 @@ def test_outputs_and_faults_do_not_depend_on_the_sensor(opened):
 # -- a bad line ---------------------------------------------------------------------------------------------------
 
 
-def test_corrupt_frames_are_counted_and_cost_samples_but_no_wrong_value(opened):
+def test_corrupt_frames_cost_samples_but_give_no_wrong_value(opened):
     rng = np.random.default_rng(1)
     opened.world.drive(to_velocity(opened.clock.now_ns() * 1e-9, 0.0, 60.0, 60.0, 1e3))
     opened.clock.sleep(0.5)
@@ -287,7 +287,7 @@ def test_corrupt_frames_are_counted_and_cost_samples_but_no_wrong_value(opened):
     assert opened.imu.status.state is HeadState.ACTIVE  # a beat that is lost is beaten again in time
 
 
-def test_babble_in_both_directions_is_outlived(opened):
+def test_noise_in_both_directions_is_tolerated(opened):
     rng = np.random.default_rng(2)
     for _ in range(20):
         opened.head.send(rng.bytes(60))
@@ -302,7 +302,7 @@ def test_babble_in_both_directions_is_outlived(opened):
     assert counters.malformed + counters.crc_errors > 0
 
 
-def test_an_answer_that_comes_too_late_answers_nothing_else():
+def test_late_reply_answers_no_other_request():
     with opened_head(noise=NoiseModel.none()) as h:
         h.imu._cancel()
         wire = HeadSerial(h.head)
@@ -317,7 +317,7 @@ def test_an_answer_that_comes_too_late_answers_nothing_else():
         assert link.request(Trigger(700), Triggered).width_us == 700
 
 
-def test_a_request_whose_answer_was_lost_is_repeated_but_not_done_twice(opened):
+def test_repeated_request_is_carried_out_once(opened):
     opened.imu._cancel()
     deaf_until_ns = opened.clock.now_ns() + 30 * MS
     opened.head.filters.append(lambda to_head, byte: byte if to_head or opened.clock.now_ns() > deaf_until_ns else None)
@@ -327,7 +327,7 @@ def test_a_request_whose_answer_was_lost_is_repeated_but_not_done_twice(opened):
     assert opened.imu.health()["retries"] == 1
 
 
-def test_a_message_of_an_unknown_kind_is_refused_in_words(opened):
+def test_unknown_message_is_rejected(opened):
     class Future(Light):
         ID = 0x55
 
@@ -338,7 +338,7 @@ def test_a_message_of_an_unknown_kind_is_refused_in_words(opened):
 # -- a pulled cable -------------------------------------------------------------------------------------------------
 
 
-def test_a_cable_that_is_put_in_again_is_taken_up_by_itself_with_everything_off():
+def test_replugged_head_reconnects_with_outputs_off():
     with opened_head(noise=NoiseModel.none(), reopen=HeadSerial) as h:
         switch_on(h)
         h.clock.sleep(0.2)
@@ -360,7 +360,7 @@ def test_a_cable_that_is_put_in_again_is_taken_up_by_itself_with_everything_off(
         assert isinstance(h.imu.fault, HeartbeatLost)
 
 
-def test_another_head_in_its_place_is_not_taken_for_it():
+def test_different_head_after_replugging_is_rejected():
     with opened_head(noise=NoiseModel.none(), reopen=lambda _head: HeadSerial(other)) as h:
         other = SimHead(h.world, serial=2)
         other.attach(0x68, SimMpu6050(other.world_at_board_time))
@@ -373,7 +373,7 @@ def test_another_head_in_its_place_is_not_taken_for_it():
         other.close()
 
 
-def test_a_port_that_somebody_else_has_is_an_error_of_the_port():
+def test_port_in_use_is_reported():
     class Taken:
         baudrate = BAUD
 
@@ -390,7 +390,7 @@ def test_a_port_that_somebody_else_has_is_an_error_of_the_port():
 # -- the sensor ------------------------------------------------------------------------------------------------------
 
 
-def test_a_sensor_that_stops_answering_is_found_and_taken_back(opened):
+def test_lost_sensor_is_reported_and_recovered(opened):
     opened.clock.sleep(0.2)
     opened.imu.read_samples()
     opened.head.detach(0x68)
@@ -407,7 +407,7 @@ def test_a_sensor_that_stops_answering_is_found_and_taken_back(opened):
     assert opened.imu.read_samples().lost == 0
 
 
-def test_a_sensor_that_browned_out_is_set_up_anew_and_its_samples_count_as_lost(opened):
+def test_sensor_is_set_up_again_after_a_brown_out(opened):
     opened.clock.sleep(0.2)
     opened.imu.read_samples()
     opened.sensor.power_cycle()
@@ -418,7 +418,7 @@ def test_a_sensor_that_browned_out_is_set_up_anew_and_its_samples_count_as_lost(
 
 
 @pytest.mark.parametrize("clocks", [1, 4, 9])
-def test_a_stuck_bus_is_clocked_free_without_losing_a_sample(opened, clocks):
+def test_stuck_bus_is_freed_without_losing_samples(opened, clocks):
     opened.clock.sleep(0.2)
     opened.imu.read_samples()
     opened.head.stuck = clocks
@@ -429,14 +429,14 @@ def test_a_stuck_bus_is_clocked_free_without_losing_a_sample(opened, clocks):
     assert (counters.timeouts, counters.recoveries) == (1, 1)
 
 
-def test_a_bus_that_stays_stuck_is_told(opened):
+def test_permanently_stuck_bus_is_reported(opened):
     opened.head.stuck = True
     opened.clock.sleep(1.0)
     with pytest.raises(DeviceSilent, match="stuck"):
         opened.imu.read_samples()
 
 
-def test_refused_addresses_cost_no_sample(opened):
+def test_unacknowledged_addresses_cost_no_sample(opened):
     opened.clock.sleep(0.2)
     opened.imu.read_samples()
     for _ in range(20):
@@ -446,7 +446,7 @@ def test_refused_addresses_cost_no_sample(opened):
     assert opened.imu.counters().nacks == 40
 
 
-def test_samples_without_the_ready_line_come_just_the_same_but_dated_less_well(opened):
+def test_samples_without_data_ready_have_a_larger_time_uncertainty(opened):
     opened.sensor.next_edge_ns = lambda _after_ns: None  # INT is not wired
     opened.clock.sleep(0.3)
     opened.imu.read_samples()

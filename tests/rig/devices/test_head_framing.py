@@ -21,7 +21,7 @@ def test_the_checksum_is_crc_16_ccitt_false():
 
 
 @given(FRAMES)
-def test_every_frame_comes_back(frame):
+def test_frames_round_trip(frame):
     line = encode(frame)
     assert line.endswith(b"\0")
     assert line.count(b"\0") == 1
@@ -30,7 +30,7 @@ def test_every_frame_comes_back(frame):
 
 
 @given(FRAMES, st.data())
-def test_a_flipped_bit_is_never_taken_for_good(frame, data):
+def test_flipped_bit_is_always_detected(frame, data):
     line = bytearray(encode(frame)[:-1])
     bit = data.draw(st.integers(0, 8 * len(line) - 1))
     line[bit // 8] ^= 1 << bit % 8
@@ -41,7 +41,7 @@ def test_a_flipped_bit_is_never_taken_for_good(frame, data):
 
 @fuzz_settings()
 @given(st.binary(max_size=3 * LONGEST))
-def test_garbage_raises_nothing_but_frame_errors(line):
+def test_garbage_raises_only_frame_errors(line):
     try:
         frame = decode(line)
     except FrameError:
@@ -51,7 +51,7 @@ def test_garbage_raises_nothing_but_frame_errors(line):
 
 @fuzz_settings(0.4)
 @given(st.lists(FRAMES | st.binary(min_size=1, max_size=60), max_size=12), st.data())
-def test_frames_come_out_of_a_stream_however_it_is_cut(parts, data):
+def test_frames_are_found_however_the_stream_is_split(parts, data):
     stream, expected = b"\0", []
     for part in parts:
         if isinstance(part, Frame):
@@ -68,7 +68,7 @@ def test_frames_come_out_of_a_stream_however_it_is_cut(parts, data):
         assert encode(frame) == cobs.encode(content + binascii.crc_hqx(content, 0xFFFF).to_bytes(2, "big")) + b"\0"
 
 
-def test_an_endless_line_takes_no_memory():
+def test_endless_frame_uses_bounded_memory():
     deframer = Deframer()
     for _ in range(1000):
         assert list(deframer.feed(b"\xff" * 4096)) == []
@@ -76,7 +76,7 @@ def test_an_endless_line_takes_no_memory():
     assert list(deframer.feed(b"\0" + encode(Frame(1, 2, b"3")))) == [Frame(1, 2, b"3")]
 
 
-def test_a_wrong_checksum_is_told_from_garbage():
+def test_wrong_checksum_and_garbage_are_distinguished():
     line = bytearray(encode(Frame(1, 2, b"abc"))[:-1])
     line[3] ^= 0x10
     with pytest.raises(CrcError):

@@ -40,7 +40,7 @@ class Line:
 
 
 @given(drift=st.floats(-5e-3, 5e-3), start_us=st.integers(0, 2**32 - 1))
-def test_an_even_line_tells_the_time_to_microseconds(drift, start_us):
+def test_symmetric_delays_give_microsecond_times(drift, start_us):
     line = Line(drift, start_us)
     for k in range(8):
         line.beat(2_000_000 * k)
@@ -54,7 +54,7 @@ def test_an_even_line_tells_the_time_to_microseconds(drift, start_us):
 
 @settings(max_examples=40)
 @given(drift=st.floats(-5e-3, 5e-3), seed=st.integers(0, 10_000), typical_us=st.floats(10, 1500))
-def test_on_an_uneven_line_the_error_stays_within_what_is_stated(drift, seed, typical_us):
+def test_error_with_asymmetric_delays_is_within_the_uncertainty(drift, seed, typical_us):
     line = Line(drift, 0, seed)
     for k in range(100):
         hold = line.held_up
@@ -63,7 +63,7 @@ def test_on_an_uneven_line_the_error_stays_within_what_is_stated(drift, seed, ty
     assert abs(error_ns) < 5 * sigma_ns
 
 
-def test_a_line_that_is_faster_than_its_baud_rate_says_states_half_its_round_trip():
+def test_faster_than_baud_rate_gives_half_the_round_trip_as_uncertainty():
     clock = HeadClock(LINE_NS)
     for k in range(20):
         at_ns = 62_500_000 * k
@@ -71,7 +71,7 @@ def test_a_line_that_is_faster_than_its_baud_rate_says_states_half_its_round_tri
     assert clock.uncertainty_ns > 100_000
 
 
-def test_the_clock_wraps_and_times_go_on():
+def test_times_continue_after_the_clock_wraps():
     line = Line(1e-3, 2**32 - 1_000_000)
     for k in range(100):
         line.beat(62_500_000 * k)
@@ -79,7 +79,7 @@ def test_the_clock_wraps_and_times_go_on():
     assert abs(error_ns) < 10_000
 
 
-def test_a_time_before_the_newest_is_not_taken_for_a_wrap():
+def test_earlier_time_is_not_taken_for_a_wrap():
     clock = HeadClock(LINE_NS)
     assert clock.unwrap(1000) == 1000
     assert clock.unwrap(5000) == 5000

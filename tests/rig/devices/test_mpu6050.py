@@ -65,7 +65,7 @@ def bench() -> Iterator[Bench]:
 # -- opening ------------------------------------------------------------------------------------------------------
 
 
-def test_opening_wakes_and_sets_the_sensor(bench: Bench) -> None:
+def test_opening_wakes_and_configures_the_sensor(bench: Bench) -> None:
     imu = bench.open(range_dps=500, rate_hz=100, bandwidth_hz=20)
     written = bytes(bench.sensor._registers)
     assert written[0x19:0x1D] == bytes([9, 4, 0x08, 0x00])
@@ -76,7 +76,7 @@ def test_opening_wakes_and_sets_the_sensor(bench: Bench) -> None:
     assert imu.range_dps == pytest.approx(500, rel=0.002)
 
 
-def test_opening_forgets_what_the_sensor_did_before(bench: Bench) -> None:
+def test_opening_resets_the_sensor(bench: Bench) -> None:
     bench.open(range_dps=2000, rate_hz=1000).close()
     bench.turn(90.0)
     bench.clock.sleep(2.0)
@@ -90,7 +90,7 @@ def test_opening_forgets_what_the_sensor_did_before(bench: Bench) -> None:
     ("who_am_i", "likely"),
     [(0x70, "MPU-6500"), (0x71, "MPU-9250"), (0x73, "MPU-9255"), (0x00, "SDA is held low"), (0xFF, "not connected")],
 )
-def test_another_chip_is_named(who_am_i: int, likely: str) -> None:
+def test_wrong_chip_is_named(who_am_i: int, likely: str) -> None:
     with Bench(who_am_i=who_am_i) as bench:
         with pytest.raises(DeviceMismatch, match=likely) as caught:
             bench.open()
@@ -99,12 +99,12 @@ def test_another_chip_is_named(who_am_i: int, likely: str) -> None:
         assert bench.sensor._registers[0x6B] == 0x40  # nothing was written to the unknown device
 
 
-def test_an_unknown_chip_may_be_a_clock() -> None:
+def test_unknown_chip_may_be_a_real_time_clock() -> None:
     with Bench(who_am_i=0x42) as bench, pytest.raises(DeviceMismatch, match="DS3231"):
         bench.open()
 
 
-def test_nobody_there_says_where_and_what_to_do(bench: Bench) -> None:
+def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:
     bench.bus.detach(AT)
     with pytest.raises(DeviceNotFound, match="0x68") as caught:
         bench.open()
@@ -112,18 +112,18 @@ def test_nobody_there_says_where_and_what_to_do(bench: Bench) -> None:
         assert hint in caught.value.next_step
 
 
-def test_a_missing_bus_says_how_to_get_one(tmp_path: Path) -> None:
+def test_missing_bus_names_how_to_enable_it(tmp_path: Path) -> None:
     with pytest.raises(DeviceNotFound, match=str(tmp_path)) as caught:
         Mpu6050(str(tmp_path / "i2c-1"), clock=VirtualClock())
     assert "raspi-config" in caught.value.next_step
 
 
-def test_a_bus_number_names_its_device_file() -> None:
+def test_bus_number_selects_its_device_file() -> None:
     with pytest.raises(DeviceNotFound, match="/dev/i2c-987"):
         Mpu6050(987, clock=VirtualClock())
 
 
-def test_a_forbidden_bus_names_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_permission_names_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "i2c-1"
     path.touch(stat.S_IRUSR)
 
@@ -140,7 +140,7 @@ def open_files() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def test_a_file_that_is_no_bus_is_refused_and_closed(tmp_path: Path) -> None:
+def test_file_that_is_not_a_bus_is_rejected_and_closed(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.touch()
     before = open_files()
@@ -157,7 +157,7 @@ def test_all_wrong_settings_are_reported_at_once(bench: Bench) -> None:
 
 
 @given(rate_hz=st.floats(allow_nan=True, allow_infinity=True) | st.integers(1, 1000).map(lambda n: 1000 / n))
-def test_a_rate_is_taken_exactly_or_refused(rate_hz: float) -> None:
+def test_rate_is_set_exactly_or_rejected(rate_hz: float) -> None:
     with Bench() as bench:
         divides = rate_hz in [1000 / n for n in range(1, 257)]
         try:
@@ -168,7 +168,7 @@ def test_a_rate_is_taken_exactly_or_refused(rate_hz: float) -> None:
             assert any(rate_hz == pytest.approx(1000 / n) for n in range(1, 257))
 
 
-def test_a_sensor_that_keeps_no_settings_is_a_fault(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensor_that_loses_settings_is_a_fault(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = bench.sensor.write
     monkeypatch.setattr(bench.sensor, "write", lambda data: kept(data[:1]) + len(data) - 1)
     with pytest.raises(DeviceFault) as caught:
@@ -180,7 +180,7 @@ def test_a_sensor_that_keeps_no_settings_is_a_fault(bench: Bench, monkeypatch: p
 
 
 @pytest.mark.parametrize("range_dps", [250, 500, 1000, 2000])
-def test_rates_come_in_degrees_a_second_in_every_range(bench: Bench, range_dps: int) -> None:
+def test_rates_are_in_degrees_per_second_in_all_ranges(bench: Bench, range_dps: int) -> None:
     imu = bench.open(range_dps=range_dps)
     bench.turn(-123.4)
     bench.clock.sleep(0.3)
@@ -189,7 +189,7 @@ def test_rates_come_in_degrees_a_second_in_every_range(bench: Bench, range_dps: 
 
 
 @pytest.mark.parametrize("range_dps", [250, 500, 1000, 2000])
-def test_saturation_reaches_the_range(bench: Bench, range_dps: int) -> None:
+def test_saturation_matches_the_range(bench: Bench, range_dps: int) -> None:
     imu = bench.open(range_dps=range_dps)
     for sign in (1, -1):
         bench.turn(sign * 2 * range_dps)
@@ -199,7 +199,7 @@ def test_saturation_reaches_the_range(bench: Bench, range_dps: int) -> None:
 
 @given(pauses_ms=st.lists(st.integers(0, 300), min_size=2, max_size=10), divider=st.integers(2, 40))
 @settings(max_examples=50)
-def test_sample_times_are_even_and_true(pauses_ms: list[int], divider: int) -> None:
+def test_sample_times_are_even_and_correct(pauses_ms: list[int], divider: int) -> None:
     """Times come out of the count and the rate alone; they must still be those at which the sensor sampled."""
     period_ns = divider * 1_000_000
     with Bench() as bench:
@@ -237,7 +237,7 @@ def test_times_follow_a_sensor_whose_clock_is_off(bench: Bench, clock_error: flo
         last_ns = samples.time_ns[-1]
 
 
-def test_samples_are_where_the_motion_was(bench: Bench) -> None:
+def test_samples_match_the_motion(bench: Bench) -> None:
     """The order within the FIFO and the times: each sample shows the rate of its own moment (less the filter's lag)."""
     imu = bench.open(bandwidth_hz=188)
     now_s = bench.clock.now_ns() * 1e-9
@@ -253,7 +253,7 @@ def test_samples_are_where_the_motion_was(bench: Bench) -> None:
     np.testing.assert_allclose(rate, bench.world.table_motion(time_ns)[1], atol=400 * 0.006)
 
 
-def test_one_drain_is_two_transactions(bench: Bench) -> None:
+def test_reading_samples_takes_two_transactions(bench: Bench) -> None:
     imu = bench.open()
     bench.clock.sleep(0.5)
     before = imu.statistics.transfers
@@ -287,7 +287,7 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
 # -- faults -------------------------------------------------------------------------------------------------------
 
 
-def test_a_single_nack_is_retried_and_counted(bench: Bench) -> None:
+def test_nack_is_retried_and_counted(bench: Bench) -> None:
     imu = bench.open()
     bench.clock.sleep(0.1)
     bench.bus.nack(1)
@@ -298,7 +298,7 @@ def test_a_single_nack_is_retried_and_counted(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("fault", ["unplugged", "stuck"])
-def test_a_sensor_that_went_away_is_silent_not_still(bench: Bench, fault: str) -> None:
+def test_missing_sensor_raises_device_silent(bench: Bench, fault: str) -> None:
     imu = bench.open()
     bench.clock.sleep(0.1)
     if fault == "unplugged":
@@ -310,7 +310,7 @@ def test_a_sensor_that_went_away_is_silent_not_still(bench: Bench, fault: str) -
     assert caught.value.evidence["attempts"] == 3
 
 
-def test_an_overflow_is_told_and_the_fifo_starts_afresh(bench: Bench) -> None:
+def test_fifo_overflow_is_reported_and_cleared(bench: Bench) -> None:
     imu = bench.open()
     bench.turn(30.0)
     bench.clock.sleep(1.5)
@@ -327,7 +327,7 @@ def test_an_overflow_is_told_and_the_fifo_starts_afresh(bench: Bench) -> None:
 
 @given(frames=st.integers(168, 172), early_us=st.integers(-50, 250))
 @settings(max_examples=100)
-def test_around_a_full_fifo_no_sample_is_ever_garbled(frames: int, early_us: int) -> None:
+def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
     """Another sample may arrive between the reading of the count and that of the data."""
     with Bench() as bench:
         imu = bench.open()
@@ -343,7 +343,7 @@ def test_around_a_full_fifo_no_sample_is_ever_garbled(frames: int, early_us: int
 
 
 @pytest.mark.parametrize("after_bytes", [2, 6, 12, 100])
-def test_a_transfer_that_broke_off_loses_its_samples_openly(bench: Bench, after_bytes: int) -> None:
+def test_interrupted_transfer_counts_lost_samples(bench: Bench, after_bytes: int) -> None:
     imu = bench.open()
     bench.turn(10.0)
     bench.clock.sleep(0.2)
@@ -358,7 +358,7 @@ def test_a_transfer_that_broke_off_loses_its_samples_openly(bench: Bench, after_
     assert after.gyro_dps[:, 2] == pytest.approx(10.0, abs=0.01)
 
 
-def test_a_transfer_that_never_began_loses_nothing(bench: Bench) -> None:
+def test_transfer_that_never_began_loses_nothing(bench: Bench) -> None:
     imu = bench.open()
     bench.clock.sleep(0.2)
     bench.clock.call_at(
@@ -371,7 +371,7 @@ def test_a_transfer_that_never_began_loses_nothing(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("polled_ms", [5, 20, 100, 500])
-def test_a_power_cycle_is_noticed_not_read_as_standing_still(bench: Bench, polled_ms: int) -> None:
+def test_power_cycle_is_detected(bench: Bench, polled_ms: int) -> None:
     imu = bench.open()
     bench.turn(45.0)
     bench.clock.sleep(0.1)
@@ -390,7 +390,7 @@ def test_a_power_cycle_is_noticed_not_read_as_standing_still(bench: Bench, polle
             reading()
 
 
-def test_a_sensor_put_to_sleep_is_noticed(bench: Bench) -> None:
+def test_sleeping_sensor_is_detected(bench: Bench) -> None:
     imu = bench.open()
     bench.write(0x6B, 0x41)
     bench.clock.sleep(0.2)
@@ -398,7 +398,7 @@ def test_a_sensor_put_to_sleep_is_noticed(bench: Bench) -> None:
         imu.read_samples()
 
 
-def test_settings_changed_by_another_program_are_noticed_where_they_show(bench: Bench) -> None:
+def test_settings_changed_by_another_program_are_detected(bench: Bench) -> None:
     imu = bench.open()
     bench.write(0x19, 19)  # a quarter of the rate
     bench.clock.sleep(0.4)
@@ -407,7 +407,7 @@ def test_settings_changed_by_another_program_are_noticed_where_they_show(bench: 
     assert caught.value.evidence["register_0x19"] == {"got": "13030000", "expected": "04030000"}
 
 
-def test_samples_that_another_reader_took_are_counted_as_lost(bench: Bench) -> None:
+def test_samples_read_by_another_program_count_as_lost(bench: Bench) -> None:
     imu = bench.open()
     bench.clock.sleep(0.3)
     bench.write(0x6A, 0x04)
@@ -418,7 +418,7 @@ def test_samples_that_another_reader_took_are_counted_as_lost(bench: Bench) -> N
     assert samples.lost == pytest.approx(60, abs=1)
 
 
-def test_a_closed_driver_leaves_no_open_file(bench: Bench) -> None:
+def test_closed_driver_leaves_no_open_file(bench: Bench) -> None:
     before = open_files()
     imu = bench.open()
     assert open_files() == before + 1

@@ -47,7 +47,7 @@ def world() -> World:
 # -- settings ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_settings_are_locked_and_read_back(world: World) -> None:
+def test_settings_are_locked_and_read_back(world: World) -> None:
     settings = CameraSettings(exposure_us=8000, gain=3, white_balance_k=4200, focus=100)
     camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings, name="desk camera")
     assert camera.rejected_settings == ()
@@ -60,7 +60,7 @@ def test_the_settings_are_locked_and_read_back(world: World) -> None:
     assert camera.read_locks() == locks
 
 
-def test_what_is_left_to_the_camera_stays_automatic(world: World) -> None:
+def test_unset_settings_stay_automatic(world: World) -> None:
     settings = CameraSettings(exposure_us=None, gain=None, white_balance_k=None)
     camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings)
     before = camera.read_locks()
@@ -70,7 +70,7 @@ def test_what_is_left_to_the_camera_stays_automatic(world: World) -> None:
     assert camera.read_locks().exposure_us != before.exposure_us
 
 
-def test_a_setting_that_the_camera_does_not_take_is_reported(world: World) -> None:
+def test_rejected_setting_is_reported(world: World) -> None:
     settings = CameraSettings(width=1920, exposure_us=90_000, gain=99)
     camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings)
     assert {(n.setting, n.asked, n.reported) for n in camera.rejected_settings} == {
@@ -82,7 +82,7 @@ def test_a_setting_that_the_camera_does_not_take_is_reported(world: World) -> No
     assert camera.read_locks().gain == 24
 
 
-def test_a_drifting_lock_shows(world: World) -> None:
+def test_changed_lock_is_visible(world: World) -> None:
     capture = SimCapture(world)
     camera = OpenCvCamera(capture, clock=world.clock)
     capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 3)  # another program, a camera that was plugged in again
@@ -90,7 +90,7 @@ def test_a_drifting_lock_shows(world: World) -> None:
 
 
 @pytest.mark.parametrize("field", ["width", "height", "fps", "exposure_us", "white_balance_k"])
-def test_impossible_settings_are_refused(field: str) -> None:
+def test_impossible_settings_are_rejected(field: str) -> None:
     for value in (0, -1, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=field):
             CameraSettings(**{field: value})
@@ -99,7 +99,7 @@ def test_impossible_settings_are_refused(field: str) -> None:
 # -- which frame ------------------------------------------------------------------------------------------------------
 
 
-def test_stale_frames_are_dropped_by_their_stamps(world: World) -> None:
+def test_old_frames_are_dropped_by_their_stamps(world: World) -> None:
     camera = OpenCvCamera(SimCapture(world), clock=world.clock)
     assert camera.time_base is TimeBase.STAMPED
     for pause_s in (0.0, 0.01, 0.1, 3.0):
@@ -109,7 +109,7 @@ def test_stale_frames_are_dropped_by_their_stamps(world: World) -> None:
         assert after_ns <= frame.exposed_ns < after_ns + PERIOD_NS + 2000  # the first one, not just any new one
 
 
-def test_a_frame_of_the_future_is_waited_for(world: World) -> None:
+def test_capture_waits_for_a_future_frame(world: World) -> None:
     camera = OpenCvCamera(SimCapture(world), clock=world.clock)
     after_ns = world.clock.now_ns() + 700_000_000
     assert after_ns <= camera.capture(after_ns).exposed_ns < after_ns + PERIOD_NS + 2000
@@ -120,9 +120,7 @@ def test_a_frame_of_the_future_is_waited_for(world: World) -> None:
     [(1.7e12, 1.0), (-100_000.0, 1.0), (0.0, 0.0), (0.0, 1000.0)],
     ids=["time of day", "since the stream began", "no stamps", "microseconds"],
 )
-def test_without_stamps_only_frames_that_had_to_be_waited_for_count(
-    world: World, offset_ms: float, factor: float
-) -> None:
+def test_paced_source_uses_only_frames_after_a_wait(world: World, offset_ms: float, factor: float) -> None:
     capture = ForeignStamps(world, offset_ms, factor)
     camera = OpenCvCamera(capture, clock=world.clock)
     assert camera.time_base is TimeBase.PACED
@@ -135,7 +133,7 @@ def test_without_stamps_only_frames_that_had_to_be_waited_for_count(
         assert frame.exposed_ns < after_ns + 6 * PERIOD_NS
 
 
-def test_the_image_is_the_one_of_the_stamp(world: World) -> None:
+def test_image_matches_its_stamp(world: World) -> None:
     camera = OpenCvCamera(SimCapture(world), clock=world.clock)
     teapot = camera.capture(world.clock.now_ns()).image_bgr
     world.put(shelf()["dice"])
@@ -147,7 +145,7 @@ def test_the_image_is_the_one_of_the_stamp(world: World) -> None:
 # -- failures ---------------------------------------------------------------------------------------------------------
 
 
-def test_an_unplugged_camera_is_silent(world: World) -> None:
+def test_unplugged_camera_raises_device_silent(world: World) -> None:
     capture = SimCapture(world)
     camera = OpenCvCamera(capture, clock=world.clock, name="desk camera")
     capture.unplug()
@@ -170,7 +168,7 @@ class Lagging(SimCapture):
         return super().get(prop)
 
 
-def test_a_camera_that_shows_only_the_past_times_out(world: World) -> None:
+def test_camera_with_only_old_frames_times_out(world: World) -> None:
     capture = Lagging(world)
     camera = OpenCvCamera(capture, clock=world.clock, timeout_s=1.5)
     capture.stuck_at_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
@@ -181,7 +179,7 @@ def test_a_camera_that_shows_only_the_past_times_out(world: World) -> None:
     assert world.clock.now_ns() - asked_ns == pytest.approx(1.5e9, abs=2 * PERIOD_NS)
 
 
-def test_stamps_that_fall_back_are_trusted_no_more(world: World) -> None:
+def test_decreasing_stamps_are_not_trusted(world: World) -> None:
     capture = ForeignStamps(world, 0.0)
     camera = OpenCvCamera(capture, clock=world.clock)
     assert camera.time_base is TimeBase.STAMPED
@@ -191,7 +189,7 @@ def test_stamps_that_fall_back_are_trusted_no_more(world: World) -> None:
     assert camera.time_base is TimeBase.PACED
 
 
-def test_a_picture_that_is_not_colour_is_refused(world: World) -> None:
+def test_image_without_colour_is_rejected(world: World) -> None:
     class Raw(SimCapture):
         def retrieve(self) -> tuple[bool, np.ndarray | None]:
             ok, image = super().retrieve()
@@ -201,7 +199,7 @@ def test_a_picture_that_is_not_colour_is_refused(world: World) -> None:
         OpenCvCamera(Raw(world), clock=world.clock).capture(0)
 
 
-def test_a_frame_that_cannot_be_decoded_is_reported(world: World) -> None:
+def test_undecodable_frame_is_reported(world: World) -> None:
     class Torn(SimCapture):
         def retrieve(self) -> tuple[bool, None]:
             return False, None
@@ -210,7 +208,7 @@ def test_a_frame_that_cannot_be_decoded_is_reported(world: World) -> None:
         OpenCvCamera(Torn(world), clock=world.clock).capture(0)
 
 
-def test_opening_says_what_is_wrong(tmp_path: Path) -> None:
+def test_opening_errors_name_the_cause(tmp_path: Path) -> None:
     with pytest.raises(DeviceNotFound, match="camera /dev/video97 does not exist") as error:
         open_capture(97)
     assert "Connect" in error.value.next_step
@@ -219,7 +217,7 @@ def test_opening_says_what_is_wrong(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/null").exists(), reason="no device files on this system")
-def test_a_device_that_is_no_camera_cannot_be_opened() -> None:
+def test_device_that_is_not_a_camera_is_rejected() -> None:
     with pytest.raises(DeviceNotFound, match="Cannot open /dev/null"):
         open_capture("/dev/null")
 
@@ -227,7 +225,7 @@ def test_a_device_that_is_no_camera_cannot_be_opened() -> None:
 # -- recordings and streams -------------------------------------------------------------------------------------------
 
 
-def test_a_recording_is_read_frame_by_frame_to_its_end(tmp_path: Path, world: World) -> None:
+def test_recording_is_read_frame_by_frame(tmp_path: Path, world: World) -> None:
     levels = (10, 90, 170)
     for k, level in enumerate(levels):
         cv2.imwrite(str(tmp_path / f"img_{k:02d}.png"), np.full((48, 64, 3), level, np.uint8))
@@ -275,7 +273,7 @@ def stream() -> Iterator[tuple[str, list[float]]]:
     server.server_close()
 
 
-def test_a_network_stream_shows_the_present_after_a_pause(stream: tuple[str, list[float]]) -> None:
+def test_network_stream_is_current_after_a_pause(stream: tuple[str, list[float]]) -> None:
     url, level = stream
     clock = SystemClock()
     settings = CameraSettings(None, None, None, None, None, None)
@@ -295,7 +293,7 @@ def test_a_network_stream_shows_the_present_after_a_pause(stream: tuple[str, lis
 # -- focus, a pulled cable, and a slow camera --------------------------------------------------------------------------
 
 
-def test_focus_is_held_where_it_is_and_told(world: World) -> None:
+def test_focus_is_locked_and_reported(world: World) -> None:
     """Autofocus would make another picture of the same thing at the next sitting; nobody has to ask for its end."""
     capture = SimCapture(world)
     capture.drift(autofocus=True)
@@ -308,7 +306,7 @@ def test_focus_is_held_where_it_is_and_told(world: World) -> None:
     assert camera.read_locks() != locks
 
 
-def test_a_fixed_lens_has_no_focus_to_complain_about(world: World) -> None:
+def test_fixed_lens_needs_no_focus(world: World) -> None:
     class Fixed(SimCapture):
         def get(self, prop: int) -> float:
             return 0.0 if prop in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) else super().get(prop)
@@ -336,7 +334,7 @@ def returning(world: World, capture: SimCapture, away_s: float) -> OpenCvCamera:
 
 
 @pytest.mark.parametrize("away_s", [0.0, 0.5, 2.0])
-def test_a_camera_that_was_unplugged_goes_on_as_it_was(world: World, away_s: float) -> None:
+def test_replugged_camera_continues_with_its_settings(world: World, away_s: float) -> None:
     capture = SimCapture(world)
     camera = returning(world, capture, away_s)
     locks, after_ns = OpenCvCamera.read_locks(camera), world.clock.now_ns()
@@ -347,7 +345,7 @@ def test_a_camera_that_was_unplugged_goes_on_as_it_was(world: World, away_s: flo
     assert camera.returns == 1
 
 
-def test_a_camera_that_stays_away_is_silent_in_bounded_time(world: World) -> None:
+def test_missing_camera_raises_device_silent_in_bounded_time(world: World) -> None:
     capture = SimCapture(world)
     camera = returning(world, capture, 3600.0)
     begun_ns = world.clock.now_ns()
@@ -357,7 +355,7 @@ def test_a_camera_that_stays_away_is_silent_in_bounded_time(world: World) -> Non
     assert world.clock.now_ns() - begun_ns < 4e9
 
 
-def test_another_camera_in_its_place_is_refused(world: World) -> None:
+def test_different_camera_after_replugging_is_rejected(world: World) -> None:
     capture = SimCapture(world)
 
     class Small(SimCapture):
@@ -375,7 +373,7 @@ def test_another_camera_in_its_place_is_refused(world: World) -> None:
 
 
 @pytest.mark.parametrize("seconds_a_frame", [1.0, 1.5, 2.5])
-def test_while_a_slow_camera_is_waited_for_other_things_get_done(world: World, seconds_a_frame: float) -> None:
+def test_meanwhile_is_called_while_waiting_for_a_slow_camera(world: World, seconds_a_frame: float) -> None:
     capture = SimCapture(world)
     camera = OpenCvCamera(capture, clock=world.clock)
     capture.every = round(FPS * seconds_a_frame)
@@ -389,7 +387,7 @@ def test_while_a_slow_camera_is_waited_for_other_things_get_done(world: World, s
     assert gaps_s.max() < 0.8  # the gyro's FIFO lasts for 0.85 s
 
 
-def test_a_fast_camera_is_not_slowed_down_by_other_things(world: World) -> None:
+def test_meanwhile_does_not_slow_down_a_fast_camera(world: World) -> None:
     camera = OpenCvCamera(SimCapture(world), clock=world.clock)
     calls: list[int] = []
     begun_ns = world.clock.now_ns()
@@ -399,7 +397,7 @@ def test_a_fast_camera_is_not_slowed_down_by_other_things(world: World) -> None:
     assert world.clock.now_ns() - begun_ns < 10 * 2.1 * PERIOD_NS + 1e8
 
 
-def test_an_enrollment_with_a_slow_camera_loses_no_sample_of_the_gyro(simulated, tmp_path: Path) -> None:
+def test_enrollment_with_a_slow_camera_loses_no_gyro_samples(simulated, tmp_path: Path) -> None:
     s = simulated()
     s.operator.devices.camera.every = round(1.2 * FPS)  # 1.2 s a frame; the FIFO lasts for 0.85 s
     s.operator.next_object = "lamp"

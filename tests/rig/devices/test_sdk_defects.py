@@ -38,7 +38,7 @@ tricky = st.lists(st.sampled_from([0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x55]), m
 # -- what the SDK takes for an answer ----------------------------------------------------------------------------------
 
 
-def test_a_lost_reply_is_no_zero() -> None:
+def test_lost_reply_is_not_read_as_zero() -> None:
     wires = servo_wires()
     wires.bus.filters.append(lambda _: None)
     port = ClockedPort(wires.serial, wires.world.clock)
@@ -55,7 +55,7 @@ def test_a_lost_reply_is_no_zero() -> None:
     which=st.integers(1, 6),
     fifo=st.booleans(),
 )
-def test_a_late_reply_answers_no_other_question(late_ms: float, pauses_ms: list[float], which: int, fifo: bool) -> None:
+def test_late_reply_answers_no_other_read(late_ms: float, pauses_ms: list[float], which: int, fifo: bool) -> None:
     """However late, whether it overtakes or holds up those behind it: every value is the one that was asked for."""
     wires = servo_wires(baudrate=1_000_000)
     bus = open_bus(wires, retries=4)
@@ -81,7 +81,7 @@ def test_a_late_reply_answers_no_other_question(late_ms: float, pauses_ms: list[
 
 
 @pytest.mark.parametrize("size", [0, 1, 3, 25])
-def test_a_reply_of_another_length_is_none(size: int) -> None:
+def test_reply_of_another_length_is_ignored(size: int) -> None:
     """The SDK slices the bytes it wants out of it, and takes the CRC for the value where there are too few."""
     bus, _ = scripted_bus(status_packet(1, Status(0, bytes(range(size)))))
     with pytest.raises(DeviceSilent):
@@ -89,13 +89,13 @@ def test_a_reply_of_another_length_is_none(size: int) -> None:
     assert bus.statistics.late == 1
 
 
-def test_a_reply_of_another_servo_is_none() -> None:
+def test_reply_of_another_servo_is_ignored() -> None:
     bus, _ = scripted_bus(status_packet(2, Status(0, b"\x78\0")) + status_packet(1, Status(0, b"\x77\0")))
     assert bus.read(1, TABLE["Present Input Voltage"]) == 0x77
     assert bus.statistics.foreign == 1
 
 
-def test_a_refusal_without_parameters_is_no_index_error() -> None:
+def test_rejection_without_parameters_raises_no_index_error() -> None:
     """Model and firmware of a ping that is answered by an error alone: the SDK looks at bytes that are not there."""
     bus, _ = scripted_bus(status_packet(1, Status(0x07)))
     with pytest.raises(RequestRejected, match="access error"):
@@ -104,12 +104,12 @@ def test_a_refusal_without_parameters_is_no_index_error() -> None:
 
 @fuzz_settings(0.3)
 @given(data=tricky.filter(lambda data: len(data) >= 2))
-def test_the_byte_that_its_unstuffing_eats_is_kept(data: bytes) -> None:
+def test_unstuffing_keeps_all_bytes(data: bytes) -> None:
     bus, _ = scripted_bus(status_packet(1, Status(0, data)))
     assert bus.read_block(1, 0, len(data)) == data
 
 
-def test_the_byte_that_its_unstuffing_eats() -> None:
+def test_sdk_unstuffing_loses_a_byte() -> None:
     data = b"\xff\xff\xfd\xff\xfd\xfd"
     bus, _ = scripted_bus(status_packet(1, Status(0, data)))
     sdk_data, result, _ = Protocol2PacketHandler().readTxRx(bus.port, 1, 0, len(data))
@@ -124,7 +124,7 @@ def test_values_are_signed() -> None:
     assert bus.read(1, TABLE["Present Position"]) == -5000
 
 
-def test_the_alert_bit_comes_with_good_data() -> None:
+def test_alert_bit_does_not_invalidate_data() -> None:
     bus, _ = scripted_bus(status_packet(1, Status(0x80, b"\x78\0")))
     assert bus.read(1, TABLE["Present Input Voltage"]) == 120
     assert bus.alert(1)
@@ -135,7 +135,7 @@ def test_the_alert_bit_comes_with_good_data() -> None:
 
 @fuzz_settings(0.3)
 @given(data=tricky)
-def test_what_looks_like_a_header_is_stuffed_on_its_way_out(data: bytes) -> None:
+def test_header_in_data_is_stuffed(data: bytes) -> None:
     bus, wire = scripted_bus()
     Packets2().send(bus.port, 1, WRITE, b"\x54\0" + data)
     (packet,) = PacketParser().feed(wire.written[0])
@@ -144,7 +144,7 @@ def test_what_looks_like_a_header_is_stuffed_on_its_way_out(data: bytes) -> None
     assert b"\xff\xff\xfd" not in wire.written[0][3:].replace(b"\xff\xff\xfd\xfd", b"")
 
 
-def test_the_sdk_itself_does_not_stuff() -> None:
+def test_sdk_does_not_stuff() -> None:
     bus, wire = scripted_bus()
     Protocol2PacketHandler().writeTxOnly(bus.port, 1, 84, 4, [0xFF, 0xFF, 0xFD, 0x00])
     assert b"\xff\xff\xfd\x00" in wire.written[0][4:]  # a header in the middle of a packet
@@ -153,7 +153,7 @@ def test_the_sdk_itself_does_not_stuff() -> None:
 # -- how long the SDK waits --------------------------------------------------------------------------------------------
 
 
-def test_endless_noise_ends() -> None:
+def test_reading_ends_despite_endless_noise() -> None:
     wires = servo_wires()
     bus = open_bus(wires, retries=1)
     rng = np.random.default_rng(1)
@@ -171,7 +171,7 @@ def test_endless_noise_ends() -> None:
     assert wires.world.clock.now_ns() < 2e9
 
 
-def test_the_time_of_day_may_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timeouts_ignore_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> None:
     """The SDK's own time-outs look at time.time(): set back by an hour, it waits for an hour."""
 
     def asked() -> float:
@@ -185,7 +185,7 @@ def test_the_time_of_day_may_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
         bus.read(9, TABLE["Model Number"])
 
 
-def test_waiting_costs_no_cpu() -> None:
+def test_waiting_uses_no_cpu() -> None:
     """On a real (pseudo) terminal: the SDK spins through its time-out."""
     far, near = os.openpty()
     wire = open_serial(os.ttyname(near), 57_600)
@@ -201,7 +201,7 @@ def test_waiting_costs_no_cpu() -> None:
     assert cpu_s < 0.35 * wall_s
 
 
-def test_nothing_of_the_sdk_that_always_blocks_or_breaks_is_called() -> None:
+def test_defective_sdk_functions_are_not_called() -> None:
     """`broadcastPing` waits 0.8 s at 1 MBd and 1.4 s at 57,600 whoever answers (only a scan may take so long);
     `fastSyncRead` raises IndexError.
     """
@@ -213,7 +213,7 @@ def test_nothing_of_the_sdk_that_always_blocks_or_breaks_is_called() -> None:
 # -- the port ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_port_that_failed_is_not_in_use_for_ever() -> None:
+def test_failed_port_is_released() -> None:
     wires = servo_wires()
     bus = open_bus(wires, retries=0)
     wires.serial.unplug()
@@ -226,7 +226,7 @@ def test_a_port_that_failed_is_not_in_use_for_ever() -> None:
     assert bus.ping(1) == 1060
 
 
-def test_threads_wait_for_each_other() -> None:
+def test_threads_take_turns_on_the_bus() -> None:
     """The SDK tells a second thread that the port is busy, or mixes up their packets."""
     wires = servo_wires()
     bus = open_bus(wires, retries=0)
@@ -247,7 +247,7 @@ def test_threads_wait_for_each_other() -> None:
 
 
 @pytest.mark.parametrize("baud", [9_600, 57_600, 250_000, 1_000_000, 4_500_000])
-def test_any_baud_rate_is_taken(baud: int) -> None:
+def test_any_baud_rate_is_accepted(baud: int) -> None:
     assert PortHandler("").getCFlagBaud(250_000) == -1  # the defect: a list of known ones
     far, near = os.openpty()
     wire = open_serial(os.ttyname(near), baud)
@@ -261,7 +261,7 @@ def test_any_baud_rate_is_taken(baud: int) -> None:
     os.close(far)
 
 
-def test_a_port_that_another_program_holds_is_told_as_busy() -> None:
+def test_port_in_use_is_reported_as_busy() -> None:
     far, near = os.openpty()
     first = open_serial(os.ttyname(near), 57_600)
     serial.Serial(os.ttyname(near), 57_600).close()  # the defect: opened so, two programs talk at once
@@ -273,7 +273,7 @@ def test_a_port_that_another_program_holds_is_told_as_busy() -> None:
     os.close(far)
 
 
-def test_a_servo_that_is_gone_fails_at_once_or_in_bounded_time() -> None:
+def test_missing_servo_fails_in_bounded_time() -> None:
     wires = servo_wires()
     bus = open_bus(wires, retries=3)
     wires.bus.detach(wires.device)

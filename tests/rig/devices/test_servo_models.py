@@ -50,7 +50,7 @@ def go(devices: SimDevices, servo: RegisterServo, angle_deg: float) -> float:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_each_model_turns_beyond_a_revolution_and_reads_its_state(model: str) -> None:
+def test_each_model_rotates_beyond_a_revolution_and_reads_its_state(model: str) -> None:
     chosen = f"servo.model={model}"
     devices = parts_of(chosen)
     servo = servo_of(devices, chosen)
@@ -67,7 +67,7 @@ def test_each_model_turns_beyond_a_revolution_and_reads_its_state(model: str) ->
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_load_is_a_percentage_whatever_the_model_measures(model: str) -> None:
+def test_load_is_a_percentage_for_each_model(model: str) -> None:
     chosen = f"servo.model={model}"
     devices = parts_of(chosen)
     servo = servo_of(devices, chosen)
@@ -90,7 +90,7 @@ AX = (
 )
 
 
-def test_an_ax12_is_no_turntable_and_says_why() -> None:
+def test_ax12_is_rejected_as_a_turntable() -> None:
     with pytest.raises(ConfigError, match="300°") as caught:
         servo_of(parts_of(*AX[:2]), *AX[:2])
     assert 'In [table] set mode = "pan"' in caught.value.next_step
@@ -98,7 +98,7 @@ def test_an_ax12_is_no_turntable_and_says_why() -> None:
 
 @settings(max_examples=20)
 @given(goal_deg=st.floats(0.0, 300.0))
-def test_an_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
+def test_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
     devices = parts_of(*AX)
     servo = servo_of(devices, *AX)
     start_deg = servo.read_state().position_deg
@@ -112,7 +112,7 @@ def test_an_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
     assert state.trajectory_deg is None  # it does not tell
 
 
-def test_what_an_ax12_lacks_is_told() -> None:
+def test_missing_features_of_the_ax12_are_reported() -> None:
     servo = servo_of(parts_of(*AX), *AX)
     assert any("watchdog" in remark for remark in servo.remarks)
     with pytest.raises(UsageError, match="restarted") as caught:
@@ -120,7 +120,7 @@ def test_what_an_ax12_lacks_is_told() -> None:
     assert "supply" in caught.value.next_step
 
 
-def test_an_ax12_holds_where_it_is_when_its_torque_comes_on() -> None:
+def test_ax12_holds_its_position_when_torque_goes_on() -> None:
     devices = parts_of(*AX)
     servo = servo_of(devices, *AX)
     devices.servo.turn_by_hand(40.0)
@@ -133,7 +133,7 @@ def test_an_ax12_holds_where_it_is_when_its_torque_comes_on() -> None:
     assert not servo.read_condition().torque
 
 
-def test_an_overloaded_ax12_is_told_by_its_error_byte() -> None:
+def test_ax12_overload_is_read_from_its_error_byte() -> None:
     devices = parts_of(*AX)
     servo = servo_of(devices, *AX)
     servo.torque_on()
@@ -145,7 +145,7 @@ def test_an_overloaded_ax12_is_told_by_its_error_byte() -> None:
         servo.torque_on()
 
 
-def test_an_echoing_adapter_deceives_no_reader_of_protocol_1() -> None:
+def test_echo_is_not_taken_for_a_protocol_1_reply() -> None:
     """An echoed instruction that reads two bytes is a valid status packet: address and length for a value."""
     devices = parts_of(*AX)
     devices.servo_bus.echo = True
@@ -157,13 +157,13 @@ def test_an_echoing_adapter_deceives_no_reader_of_protocol_1() -> None:
     assert devices.servo.memory["Torque Enable"] == 1
 
 
-def test_an_ax12_bench_goes_to_angles_within_its_reach(simulated) -> None:
+def test_ax12_bench_rotates_within_its_reach(simulated) -> None:
     with Turntable(simulated(*AX).bench) as table:
         for angle in (60.0, -145.0, 0.0):
             assert table.goto(angle).encoder_deg == pytest.approx(angle, abs=0.6)
 
 
-def test_limits_beyond_the_reach_are_refused_before_anything_moves(simulated) -> None:
+def test_limits_beyond_the_reach_are_rejected_before_anything_moves(simulated) -> None:
     with pytest.raises(ConfigError, match="reaches 0° to 300°") as caught:
         simulated(*AX[:-1], "table.limits_deg=[-170, 170]")
     assert "[-150, 150]" in caught.value.next_step
@@ -174,7 +174,7 @@ def test_limits_beyond_the_reach_are_refused_before_anything_moves(simulated) ->
 
 @settings(max_examples=15)
 @given(ratio=st.floats(0.3, 12.0), angle_deg=st.floats(20.0, 300.0), sign=st.sampled_from([1, -1]))
-def test_behind_a_gear_angles_and_rates_are_the_tables(ratio: float, angle_deg: float, sign: int) -> None:
+def test_gear_converts_angles_and_rates_to_the_table(ratio: float, angle_deg: float, sign: int) -> None:
     angle_deg *= sign
     chosen = f"servo.gear_ratio={ratio}"
     devices = parts_of(chosen)
@@ -192,7 +192,7 @@ def test_behind_a_gear_angles_and_rates_are_the_tables(ratio: float, angle_deg: 
     assert servo.read_state().position_deg - start_deg == pytest.approx(angle_deg, abs=1.01 * servo.resolution_deg)
 
 
-def test_a_geared_bench_agrees_with_its_gyro(simulated) -> None:
+def test_geared_bench_agrees_with_its_gyro(simulated) -> None:
     geared = simulated("servo.gear_ratio=3.0", "table.zero_deg=60")
     with Turntable(geared.bench) as table:
         for angle in (90.0, -45.0):
@@ -202,14 +202,14 @@ def test_a_geared_bench_agrees_with_its_gyro(simulated) -> None:
             assert geared.world.table_deg() == pytest.approx(angle, abs=0.6)
 
 
-def test_a_wrong_gear_ratio_shows_against_the_gyro() -> None:
+def test_wrong_gear_ratio_disagrees_with_the_gyro() -> None:
     devices = parts_of("servo.gear_ratio=3.0")
     servo = servo_of(devices, "servo.gear_ratio=2.0")
     start_deg = servo.read_state().position_deg
     assert go(devices, servo, start_deg + 30.0) == pytest.approx(20.0, abs=0.2)
 
 
-def test_a_pan_servo_stays_within_one_revolution() -> None:
+def test_pan_servo_stays_within_one_revolution() -> None:
     chosen = ("table.mode=pan", "table.limits_deg=[-170, 170]")
     devices = parts_of(*chosen)
     servo = servo_of(devices, *chosen)
@@ -229,7 +229,7 @@ def test_orientation_follows_what_the_servo_carries(carries: str, sign: int) -> 
 
 
 @pytest.mark.parametrize("dps", [30.0, -60.0])
-def test_a_constant_speed_turns_the_table_and_leaves_the_servo_as_it_was(dps: float) -> None:
+def test_spin_rotates_at_constant_speed_and_restores_the_mode(dps: float) -> None:
     devices = parts_of()
     servo = servo_of(devices)
     assert isinstance(servo, DynamixelServo)
@@ -242,7 +242,7 @@ def test_a_constant_speed_turns_the_table_and_leaves_the_servo_as_it_was(dps: fl
     assert servo.setting_differences() == []
 
 
-def test_a_spin_that_nobody_listens_to_ends_by_itself() -> None:
+def test_abandoned_spin_is_stopped_by_the_watchdog() -> None:
     devices = parts_of()
     servo = servo_of(devices)
     assert isinstance(servo, DynamixelServo)
@@ -256,7 +256,7 @@ def test_a_spin_that_nobody_listens_to_ends_by_itself() -> None:
     assert devices.servo.memory["Operating Mode"] == 4
 
 
-def test_an_impossible_speed_is_refused_with_the_possible_ones() -> None:
+def test_impossible_speed_is_rejected_with_the_possible_range() -> None:
     servo = servo_of(parts_of())
     assert isinstance(servo, DynamixelServo)
     with pytest.raises(UsageError) as caught:
@@ -277,7 +277,7 @@ WRONG = {
 }
 
 
-def test_every_setting_in_the_way_is_found_told_with_its_reason_written_and_verified() -> None:
+def test_wrong_settings_are_found_explained_written_and_verified() -> None:
     devices = parts_of()
     servo = servo_of(devices, write=False)
     for name, value in WRONG.items():
@@ -303,7 +303,7 @@ def test_settings_are_written_with_torque_off() -> None:
     assert servo.setting_differences() == []
 
 
-def test_a_servo_that_answers_no_writes_is_told_to_first() -> None:
+def test_servo_without_write_replies_is_configured_first() -> None:
     devices = parts_of()
     servo = servo_of(devices, write=False)
     devices.servo.memory["Status Return Level"] = 1
@@ -312,7 +312,7 @@ def test_a_servo_that_answers_no_writes_is_told_to_first() -> None:
     assert servo.setting_differences() == []
 
 
-def test_a_servo_that_answers_only_pings_is_told_so() -> None:
+def test_servo_that_answers_only_pings_is_reported() -> None:
     devices = parts_of()
     devices.servo.memory["Status Return Level"] = 0
     with pytest.raises(DeviceSilent) as caught:
@@ -320,7 +320,7 @@ def test_a_servo_that_answers_only_pings_is_told_so() -> None:
     assert "Status Return Level" in caught.value.__notes__[0]
 
 
-def test_a_setting_that_does_not_stay_is_an_error_that_names_it() -> None:
+def test_setting_that_is_not_stored_is_reported() -> None:
     devices = parts_of()
     servo = servo_of(devices, write=False)
     devices.servo._on_write["Homing Offset"] = lambda: devices.servo.memory.__setitem__("Homing Offset", 5)
@@ -329,7 +329,7 @@ def test_a_setting_that_does_not_stay_is_an_error_that_names_it() -> None:
     assert caught.value.evidence == {"register": "Homing Offset", "wrote": 0, "read_back": 5}
 
 
-def test_a_pan_servo_wants_the_position_mode() -> None:
+def test_pan_servo_needs_the_position_mode() -> None:
     devices = parts_of()
     servo = servo_of(devices, write=False)
     found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, ServoMode.PAN)}

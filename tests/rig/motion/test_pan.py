@@ -32,7 +32,7 @@ def enrolled(simulated, catalog: Catalog, name: str, *overrides: str, views: int
     return [event for event in events if isinstance(event, Accepted)]
 
 
-def test_orientations_mean_the_same_whether_object_or_camera_turns(simulated, tmp_path: Path) -> None:
+def test_azimuths_agree_whether_object_or_camera_rotates(simulated, tmp_path: Path) -> None:
     """At one azimuth both kinds of bench see the same side of a mug, its handle to the same hand."""
     views = []
     for overrides in ((), ARM):
@@ -48,7 +48,7 @@ def test_orientations_mean_the_same_whether_object_or_camera_turns(simulated, tm
         assert min(unlike, key=lambda side: unlike[side]) == azimuth
 
 
-def test_an_ax12_enrolls_the_sides_that_it_reaches_and_finds_by_them(simulated, tmp_path: Path) -> None:
+def test_ax12_enrolls_and_identifies_within_its_reach(simulated, tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=simulated().bench.clock, create=True) as catalog:
         assert len(enrolled(simulated, catalog, "toy-car", *AX, views=12)) == 11  # the 300° that it reaches
         s = simulated(*AX)
@@ -58,7 +58,7 @@ def test_an_ax12_enrolls_the_sides_that_it_reaches_and_finds_by_them(simulated, 
     assert found.name == "toy-car"
 
 
-def test_a_pan_servo_goes_as_far_as_it_can(simulated) -> None:
+def test_pan_servo_goes_to_its_nearest_limit(simulated) -> None:
     with Turntable(simulated(*AX).bench) as table:
         assert table.within_reach(200.0) == -150.0
         assert table.within_reach(-170.0) == -150.0
@@ -72,9 +72,7 @@ def test_a_pan_servo_goes_as_far_as_it_can(simulated) -> None:
     high=st.floats(0.0, 200.0),
     sign=st.sampled_from([1, -1]),
 )
-def test_planned_views_lie_within_the_limits_and_none_is_left_out(
-    views: int, low: float, high: float, sign: int
-) -> None:
+def test_planned_views_are_complete_and_within_the_limits(views: int, low: float, high: float, sign: int) -> None:
     azimuths = even_azimuths(views, (low, high), sign)
     angles = table_angles(azimuths, (low, high), sign)
     assert all(low - 1e-5 <= angle <= high + 1e-5 for angle in angles)

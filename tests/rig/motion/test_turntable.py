@@ -17,7 +17,7 @@ from sim.servo import Frame
 from tests.rig.bench_parts import motion_bench
 
 
-def test_it_goes_where_it_is_told_and_the_platter_agrees():
+def test_table_reaches_its_goal_and_the_platter_agrees():
     with motion_bench(seed=1) as (bench, wires), Turntable(bench) as table:
         for target in (5.0, 90.0, -45.0, 0.0, 180.0):
             move = table.goto(target)
@@ -28,7 +28,7 @@ def test_it_goes_where_it_is_told_and_the_platter_agrees():
             assert move.agrees
 
 
-def test_the_play_is_taken_up_on_the_same_side_from_above_and_below():
+def test_backlash_is_taken_up_on_the_same_side_in_both_directions():
     noise = NoiseModel(backlash_deg=2.0)
     with motion_bench(noise=noise) as (bench, wires), Turntable(bench) as table:
         table.goto(50.0)
@@ -39,7 +39,7 @@ def test_the_play_is_taken_up_on_the_same_side_from_above_and_below():
         assert from_above == pytest.approx(from_below, abs=0.15)
 
 
-def test_without_an_approach_the_play_shows():
+def test_backlash_is_visible_without_approach():
     """The test above proves something: the play is there."""
     noise = NoiseModel(backlash_deg=2.0)
     with (
@@ -53,7 +53,7 @@ def test_without_an_approach_the_play_shows():
         assert abs(wires.world.table_deg() - from_below) > 1.5
 
 
-def test_entering_moves_nothing_and_leaving_takes_the_torque_off():
+def test_entering_moves_nothing_and_leaving_switches_torque_off():
     with motion_bench() as (bench, wires):
         with Turntable(bench):
             assert wires.device.memory["Torque Enable"] == 1
@@ -61,7 +61,7 @@ def test_entering_moves_nothing_and_leaving_takes_the_torque_off():
         assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_torque_is_off_after_an_exception_in_the_middle_of_a_motion():
+def test_exception_during_a_motion_switches_torque_off():
     with motion_bench() as (bench, wires):
 
         def shout(*_: object) -> None:
@@ -76,7 +76,7 @@ def test_torque_is_off_after_an_exception_in_the_middle_of_a_motion():
         assert wires.world.shaft()[1] == 0.0
 
 
-def test_a_stop_runs_out_along_the_ramp_and_does_not_come_back():
+def test_stop_follows_the_ramp_without_overshoot():
     with motion_bench() as (bench, wires):
         speeds = []
 
@@ -99,7 +99,7 @@ def test_a_stop_runs_out_along_the_ramp_and_does_not_come_back():
         assert bench.safety.state is TableState.STOPPED
 
 
-def test_a_target_beyond_the_cable_is_refused_before_anything_moves():
+def test_target_beyond_the_limits_is_rejected_before_anything_moves():
     with motion_bench() as (bench, wires), Turntable(bench) as table:
         before = len(wires.instructions)
         with pytest.raises(LimitExceeded) as caught:
@@ -110,7 +110,7 @@ def test_a_target_beyond_the_cable_is_refused_before_anything_moves():
 
 @settings(max_examples=60, deadline=None)
 @given(target=st.floats(-3000, 3000), low=st.floats(-800, 0), span=st.floats(360, 1500))
-def test_within_reach_is_the_same_view_inside_the_limits(target, low, span):
+def test_within_reach_returns_an_equivalent_angle(target, low, span):
     high = low + span
     if high < 0:
         return
@@ -129,7 +129,7 @@ def test_motion_needs_torque():
         Turntable(bench).goto(5.0)
 
 
-def test_a_jammed_table_is_found_long_before_the_servo_shuts_down_and_is_left_without_torque():
+def test_jam_is_detected_before_the_servo_shuts_down():
     with motion_bench() as (bench, wires):
         with pytest.raises(Stalled) as caught, Turntable(bench) as table:
             table.goto(10.0)
@@ -144,7 +144,7 @@ def test_a_jammed_table_is_found_long_before_the_servo_shuts_down_and_is_left_wi
         assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_a_platter_that_slips_is_seen_by_the_gyro():
+def test_gyro_detects_a_slipping_platter():
     with motion_bench(seed=2) as (bench, wires), Turntable(bench) as table:
         table.goto(5.0)
         wires.world.clock.call_at(wires.world.clock.now_ns() + 300_000_000, lambda: wires.world.slip(-3.0, seconds=0.1))
@@ -154,7 +154,7 @@ def test_a_platter_that_slips_is_seen_by_the_gyro():
         assert move.rotation_deg == pytest.approx(2.0, abs=0.2)
 
 
-def test_a_pulled_cable_is_told_at_once_and_the_servos_watchdog_stops_the_motion():
+def test_unplugged_cable_is_reported_and_the_watchdog_stops_the_table():
     with motion_bench() as (bench, wires):
         with pytest.raises(DeviceSilent), Turntable(bench) as table:
             wires.world.clock.call_at(wires.world.clock.now_ns() + 1_200_000_000, wires.serial.unplug)
@@ -165,14 +165,14 @@ def test_a_pulled_cable_is_told_at_once_and_the_servos_watchdog_stops_the_motion
         assert wires.world.shaft()[0] < 300.0
 
 
-def test_a_shaking_bench_is_not_at_rest():
+def test_shaking_bench_is_not_at_rest():
     noise = NoiseModel(structure_hz=8.0, structure_damping=0.001)  # rings for minutes
     with motion_bench(noise=noise) as (bench, _), pytest.raises(MotionTimeout) as caught, Turntable(bench) as table:
         table.goto(30.0)
     assert caught.value.evidence["peak_rate_dps"] > bench.config.table.quiet_dps
 
 
-def test_still_sees_a_push_after_settling():
+def test_check_still_detects_a_push_after_settling():
     with motion_bench() as (bench, wires), Turntable(bench) as table:
         table.goto(20.0)
         wires.world.clock.sleep(0.2)
@@ -183,7 +183,7 @@ def test_still_sees_a_push_after_settling():
         assert not table.check_still().still
 
 
-def test_direction_and_zero_are_the_tables_own():
+def test_direction_and_zero_belong_to_the_table():
     with (
         motion_bench("table.direction=-1", "imu.sign=-1", "table.zero_deg=170.0") as (bench, wires),
         Turntable(bench) as table,
@@ -194,14 +194,14 @@ def test_direction_and_zero_are_the_tables_own():
 
 
 @given(distance=st.floats(-400, 400), v=st.floats(1, 300), a=st.floats(10, 2000))
-def test_the_expected_duration_is_the_trapezoids(distance, v, a):
+def test_motion_seconds_follows_the_trapezoid(distance, v, a):
     from sim.motion import to_position
 
     expected = to_position(0.0, 0.0, 0.0, distance, v, a).end_s
     assert motion_seconds(distance, MotionProfile(v, a)) == pytest.approx(expected, abs=1e-9)
 
 
-def test_ctrl_c_while_the_torque_goes_on_takes_it_off_again():
+def test_ctrl_c_during_torque_on_switches_it_off():
     with motion_bench() as (bench, wires):
 
         def interrupt() -> None:
@@ -220,7 +220,7 @@ def test_ctrl_c_while_the_torque_goes_on_takes_it_off_again():
         assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_a_watchdog_that_a_killed_host_left_armed_does_not_stop_the_next_run():
+def test_armed_watchdog_of_a_killed_program_does_not_stop_the_next_run():
     with motion_bench() as (bench, wires):
         bench.servo.torque_on()
         bench.servo.arm_watchdog(0.2)  # and the host is killed: no torque off
@@ -230,14 +230,14 @@ def test_a_watchdog_that_a_killed_host_left_armed_does_not_stop_the_next_run():
             assert table.goto(20.0).encoder_deg == pytest.approx(20.0, abs=0.3)
 
 
-def test_somebody_who_walks_past_at_rest_costs_no_move():
+def test_short_disturbance_at_rest_does_not_fail_the_move():
     with motion_bench() as (bench, wires), Turntable(bench) as table:
         table.goto(20.0)
         wires.world.slip(0.06, 0.05)
         assert table.goto(40.0).agrees
 
 
-def test_a_platter_pushed_while_it_stands_shows_in_the_next_move():
+def test_platter_pushed_at_rest_shows_in_the_next_move():
     with motion_bench() as (bench, wires), Turntable(bench) as table:
         table.goto(20.0)
         wires.world.slip(5.0, 0.2)
@@ -247,7 +247,7 @@ def test_a_platter_pushed_while_it_stands_shows_in_the_next_move():
         assert move.rotation_deg == pytest.approx(25.0, abs=0.6)
 
 
-def test_a_shake_in_the_beginning_of_a_long_exposure_is_seen():
+def test_shake_at_the_start_of_a_long_exposure_is_detected():
     with motion_bench() as (bench, wires), Turntable(bench) as table:
         settled_ns = table.goto(20.0).settled_ns
         wires.world.slip(0.06, 0.05)
@@ -256,7 +256,7 @@ def test_a_shake_in_the_beginning_of_a_long_exposure_is_seen():
         assert not table.check_still(settled_ns).still
 
 
-def test_a_push_of_the_platter_stays_visible_after_it_stands_again():
+def test_push_of_the_platter_stays_visible_at_rest():
     with motion_bench() as (bench, wires), Turntable(bench) as table:
         table.goto(20.0)
         wires.world.slip(2.0, 0.1)
@@ -266,7 +266,7 @@ def test_a_push_of_the_platter_stays_visible_after_it_stands_again():
         assert stillness.platter_change_deg == pytest.approx(2.0, abs=0.2)
 
 
-def test_a_time_out_can_be_told_in_json_although_the_gyro_knows_nothing():
+def test_timeout_without_gyro_data_is_valid_json():
     with motion_bench() as (bench, wires), pytest.raises(MotionTimeout) as caught:
         wires.device.jam()
         wires.device.memory["Shutdown"] = 0
@@ -277,7 +277,7 @@ def test_a_time_out_can_be_told_in_json_although_the_gyro_knows_nothing():
     assert told["evidence"]["peak_rate_dps"] is None
 
 
-def test_no_motion_follows_one_that_was_broken_off_until_its_fault_is_acknowledged():
+def test_interrupted_motion_must_be_acknowledged():
     with motion_bench() as (bench, wires):
         table = Turntable(bench)
         with table:

@@ -23,7 +23,7 @@ def catalog(tmp_path, simulated):
 
 
 @pytest.mark.parametrize("limits", ["[-400, 400]", "[-300, 60]", "[0, 360]"])
-def test_an_enrollment_stays_within_any_budget_and_ends_with_the_cable_unwound(simulated, catalog, limits):
+def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, catalog, limits):
     s = simulated(*SMALL, f"table.limits_deg={limits}")
     low, high = s.bench.config.table.limits_deg
     events = list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
@@ -45,7 +45,7 @@ def test_an_enrollment_stays_within_any_budget_and_ends_with_the_cable_unwound(s
     ("start_deg", "step_deg", "turns_to"),
     [(390.0, -90, [120.0]), (-395.0, 90, [-125.0]), (250.0, 5, [-115.0]), (30.0, 90, [])],
 )
-def test_a_search_unwinds_when_it_must_and_at_its_end_and_says_so(simulated, catalog, start_deg, step_deg, turns_to):
+def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_deg, step_deg, turns_to):
     s = simulated(*SMALL, "identify.max_views=2", f"identify.first_step_deg={step_deg}", seed=3)
     list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
     with Turntable(s.bench) as table:
@@ -59,7 +59,7 @@ def test_a_search_unwinds_when_it_must_and_at_its_end_and_says_so(simulated, cat
     assert all(low <= e.commanded_deg <= high for e in events if isinstance(e, Moved))
 
 
-def test_the_answer_is_given_although_the_cable_cannot_be_unwound(simulated, catalog):
+def test_answer_is_reported_although_the_cable_cannot_be_unwound(simulated, catalog):
     s = simulated(*SMALL, "identify.max_views=2", seed=3)
     list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
     with Turntable(s.bench) as table:
@@ -76,7 +76,7 @@ def test_the_answer_is_given_although_the_cable_cannot_be_unwound(simulated, cat
     assert s.bench.safety.fault.code == Stalled.code
 
 
-def test_a_target_beyond_the_budget_is_refused_with_from_to_and_limits(simulated):
+def test_target_beyond_the_budget_is_rejected_with_limits(simulated):
     s = simulated(*SMALL)
     with Turntable(s.bench) as table:
         table.goto(20.0)

@@ -65,7 +65,7 @@ def bench() -> Iterator[Bench]:
 # -- the bias at rest ---------------------------------------------------------------------------------------------
 
 
-def test_the_bias_is_within_its_uncertainty() -> None:
+def test_bias_is_within_its_uncertainty() -> None:
     pulls = []
     for seed in range(60):
         with Bench(seed=seed) as bench:
@@ -76,7 +76,7 @@ def test_the_bias_is_within_its_uncertainty() -> None:
     assert 0.75 < np.std(pulls) < 1.35  # 60 draws: ±20 % at two sigma
 
 
-def test_a_longer_rest_knows_the_bias_better_without_waiting_again(bench: Bench) -> None:
+def test_longer_rest_reduces_the_bias_uncertainty(bench: Bench) -> None:
     first = bench.heading.rest()
     bench.clock.sleep(0.5)
     before_ns = bench.clock.now_ns()
@@ -87,7 +87,7 @@ def test_a_longer_rest_knows_the_bias_better_without_waiting_again(bench: Bench)
 
 
 @pytest.mark.parametrize("when_s", [0.1, 0.5, 1.2])
-def test_no_bias_is_taken_while_the_table_accelerates_or_turns(bench: Bench, when_s: float) -> None:
+def test_bias_is_rejected_while_the_table_moves(bench: Bench, when_s: float) -> None:
     known = bench.heading.rest()
     bench.drive(90.0)
     bench.clock.sleep(when_s)
@@ -96,7 +96,7 @@ def test_no_bias_is_taken_while_the_table_accelerates_or_turns(bench: Bench, whe
     assert bench.heading.bias is known
 
 
-def test_no_bias_is_taken_from_a_steady_rotation_beyond_any_bias(bench: Bench) -> None:
+def test_bias_is_rejected_during_a_steady_rotation(bench: Bench) -> None:
     now_s = bench.clock.now_ns() * 1e-9
     bench.world.drive(to_velocity(now_s, 0.0, 60.0, 60.0, 1.0))
     bench.clock.sleep(1.0)
@@ -105,7 +105,7 @@ def test_no_bias_is_taken_from_a_steady_rotation_beyond_any_bias(bench: Bench) -
         bench.heading.rest()
 
 
-def test_after_a_refusal_the_next_rest_is_judged_afresh(bench: Bench) -> None:
+def test_rest_after_a_rejected_bias_starts_again(bench: Bench) -> None:
     bench.drive(20.0)
     bench.clock.sleep(0.8)
     with pytest.raises(NotReady):
@@ -113,18 +113,18 @@ def test_after_a_refusal_the_next_rest_is_judged_afresh(bench: Bench) -> None:
     bench.heading.rest()
 
 
-def test_a_noisy_sensor_has_a_wider_bias() -> None:
+def test_noisy_sensor_has_a_larger_bias_uncertainty() -> None:
     with Bench(NoiseModel().with_values(gyro_noise_dps_rthz=0.02)) as noisy, Bench() as normal:
         assert noisy.heading.rest().sigma_dps > 2 * normal.heading.rest().sigma_dps
 
 
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, 1.01, inf])
-def test_a_rest_that_cannot_be_judged_is_refused(bench: Bench, duration_s: float) -> None:
+def test_invalid_rest_duration_is_rejected(bench: Bench, duration_s: float) -> None:
     with pytest.raises(UsageError):
         bench.heading.rest(duration_s)
 
 
-def test_a_sensor_without_samples_is_not_at_rest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensor_without_samples_is_not_at_rest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.heading.rest()
     assert bench.heading.peak_dps() < 1
     empty = ImuSamples(np.empty(0, np.int64), np.empty((0, 3)))
@@ -140,7 +140,7 @@ def test_a_sensor_without_samples_is_not_at_rest(bench: Bench, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("by_deg", [90.0, -35.0, 5.0, -180.0])
-def test_without_errors_the_rotation_is_exact(by_deg: float) -> None:
+def test_rotation_without_errors_is_exact(by_deg: float) -> None:
     with Bench(NoiseModel.none()) as bench:
         bench.heading.rest()
         rotation = bench.move(by_deg)
@@ -149,7 +149,7 @@ def test_without_errors_the_rotation_is_exact(by_deg: float) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [50, 100, 500, 1000])
-def test_no_rate_outruns_the_fifo(rate_hz: float) -> None:
+def test_fifo_is_read_in_time_at_each_rate(rate_hz: float) -> None:
     with Bench(NoiseModel.none(), rate_hz=rate_hz) as bench:
         bench.heading.rest()
         rotation = bench.move(60.0)
@@ -165,7 +165,7 @@ def test_no_rate_outruns_the_fifo(rate_hz: float) -> None:
         pytest.param(NoiseModel().with_values(gyro_scale_error=0, imu_tilt_deg=0), 0.0, id="scale-calibrated"),
     ],
 )
-def test_the_error_is_what_the_uncertainty_says(noise: NoiseModel, scale_sigma: float) -> None:
+def test_errors_match_the_stated_uncertainty(noise: NoiseModel, scale_sigma: float) -> None:
     """|error|/σ over parts and moves: neither too proud nor too shy."""
     pulls = []
     for seed in range(80):
@@ -181,7 +181,7 @@ def test_the_error_is_what_the_uncertainty_says(noise: NoiseModel, scale_sigma: 
     assert np.max(np.abs(pulls)) < 4
 
 
-def test_uncertainty_grows_with_time_angle_and_the_biass_own() -> None:
+def test_uncertainty_grows_with_time_angle_and_bias_uncertainty() -> None:
     noise = NoiseModel.none().with_values(gyro_noise_dps_rthz=0.005)
     with Bench(noise, scale_sigma=0.02) as bench:
         bias = bench.heading.rest()
@@ -202,7 +202,7 @@ def test_mounting_upside_down_and_scale() -> None:
         assert bench.move(40.0).angle_deg == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_platter_that_slips_on_its_shaft_disagrees_with_the_encoder() -> None:
+def test_slipping_platter_disagrees_with_the_encoder() -> None:
     noise = NoiseModel().with_values(gyro_scale_error=0, imu_tilt_deg=0)
     with Bench(noise, scale_sigma=0.001) as bench:
         bench.heading.rest()
@@ -216,7 +216,7 @@ def test_a_platter_that_slips_on_its_shaft_disagrees_with_the_encoder() -> None:
         assert slipped.difference_deg == pytest.approx(0.9, abs=0.1)
 
 
-def test_a_blow_beyond_the_gyros_range_is_not_integrated(bench: Bench) -> None:
+def test_shock_beyond_the_range_is_not_valid(bench: Bench) -> None:
     bench.heading.rest()
     bench.clock.call_at(bench.clock.now_ns() + 300_000_000, lambda: bench.world.slip(-10.0))
     rotation = bench.move(30.0)
@@ -224,7 +224,7 @@ def test_a_blow_beyond_the_gyros_range_is_not_integrated(bench: Bench) -> None:
     assert rotation.issue is GyroIssue.OUT_OF_RANGE
 
 
-def test_an_integral_with_a_hole_is_not_valid(bench: Bench) -> None:
+def test_rotation_with_lost_samples_is_not_valid(bench: Bench) -> None:
     bench.heading.rest()
     bench.heading.begin()
     bench.drive(90.0)
@@ -238,7 +238,7 @@ def test_an_integral_with_a_hole_is_not_valid(bench: Bench) -> None:
     assert bench.move(20.0).valid
 
 
-def test_a_rate_beyond_the_range_is_not_valid(bench: Bench) -> None:
+def test_rate_beyond_the_range_is_not_valid(bench: Bench) -> None:
     bench.heading.rest()
     bench.heading.begin()
     bench.world.drive(to_velocity(bench.clock.now_ns() * 1e-9, 0.0, 0.0, 400.0, 2000.0))
@@ -250,7 +250,7 @@ def test_a_rate_beyond_the_range_is_not_valid(bench: Bench) -> None:
     assert rotation.issue is GyroIssue.OUT_OF_RANGE
 
 
-def test_idle_overflow_between_moves_does_no_harm(bench: Bench) -> None:
+def test_overflow_between_moves_is_harmless(bench: Bench) -> None:
     bench.heading.rest()
     bench.clock.sleep(20.0)
     bench.heading.rest()
@@ -270,7 +270,7 @@ def test_update_leaves_the_bus_alone_while_the_fifo_is_nearly_empty(bench: Bench
 # -- at rest or not -----------------------------------------------------------------------------------------------
 
 
-def test_the_peak_rate_tells_moving_ringing_and_standing_apart(bench: Bench) -> None:
+def test_peak_rate_distinguishes_moving_ringing_and_rest(bench: Bench) -> None:
     assert bench.heading.peak_dps() == inf  # nothing is known yet
     bench.heading.rest()
     assert bench.heading.peak_dps() < 0.3
@@ -288,7 +288,7 @@ def test_the_peak_rate_tells_moving_ringing_and_standing_apart(bench: Bench) -> 
     assert bench.heading.peak_dps() < 0.3
 
 
-def test_the_window_must_be_filled(bench: Bench) -> None:
+def test_peak_rate_needs_a_full_window(bench: Bench) -> None:
     bench.heading.rest(0.2)
     assert bench.heading.peak_dps(0.15) < inf
     assert bench.heading.peak_dps(0.5) == inf
@@ -297,7 +297,7 @@ def test_the_window_must_be_filled(bench: Bench) -> None:
 # -- misuse -------------------------------------------------------------------------------------------------------
 
 
-def test_the_order_of_calls_is_kept(bench: Bench) -> None:
+def test_wrong_order_of_calls_is_rejected(bench: Bench) -> None:
     with pytest.raises(NotReady, match="bias"):
         bench.heading.begin()
     with pytest.raises(NotReady, match="begun"):
@@ -309,7 +309,7 @@ def test_the_order_of_calls_is_kept(bench: Bench) -> None:
         bench.heading.end()
 
 
-def test_a_rest_drops_the_rotation_of_a_move_that_was_broken_off(bench: Bench) -> None:
+def test_rest_drops_the_rotation_of_an_interrupted_move(bench: Bench) -> None:
     bench.heading.rest()
     bench.heading.begin()
     bench.drive(20.0)
@@ -322,7 +322,7 @@ def test_a_rest_drops_the_rotation_of_a_move_that_was_broken_off(bench: Bench) -
 
 
 @pytest.mark.parametrize("wrong", [{"axis": "w"}, {"sign": 0}, {"scale": 0.0}, {"scale": -1.0}, {"scale_sigma": -0.1}])
-def test_an_impossible_mounting_is_refused(bench: Bench, wrong: dict[str, Any]) -> None:
+def test_impossible_mounting_is_rejected(bench: Bench, wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         GyroRotationMeter(bench.imu, bench.clock, **wrong)
 
@@ -354,9 +354,7 @@ def test_agreement_is_symmetric_and_bounded(encoder: float, gyro: float, sigma: 
     ],
 )
 @pytest.mark.parametrize("moving", [True, False])
-def test_a_gyro_that_repeats_one_sample_is_refused_within_a_drain(
-    bench: Bench, hung: Any, words: str, moving: bool
-) -> None:
+def test_gyro_that_repeats_one_sample_is_detected(bench: Bench, hung: Any, words: str, moving: bool) -> None:
     bench.heading.rest()
     bench.sensor.distortions.append(lambda w: hung(w).astype(">i2"))
     broken_ns = bench.clock.now_ns()
@@ -368,7 +366,7 @@ def test_a_gyro_that_repeats_one_sample_is_refused_within_a_drain(
     assert bench.clock.now_ns() - broken_ns < 0.5e9
 
 
-def test_a_perfect_gyro_that_stands_still_does_not_hang() -> None:
+def test_noise_free_gyro_at_rest_is_not_taken_for_hanging() -> None:
     with Bench(noise=NoiseModel.none()) as bench:
         bench.heading.rest(1.0)
         assert bench.move(30.0).angle_deg == pytest.approx(30.0, abs=0.1)

@@ -43,7 +43,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_in_a_motion_is_found_in_time_and_leaves_the_table_stopped_and_latched(name):
+def test_fault_in_a_motion_stops_the_table_and_latches(name):
     cause, error, within_s = FAULTS[name]
     with motion_bench() as (bench, wires):
         clock = wires.world.clock
@@ -72,7 +72,7 @@ def test_a_fault_in_a_motion_is_found_in_time_and_leaves_the_table_stopped_and_l
         assert wires.world.shaft()[1] == 0
 
 
-def test_a_table_that_is_hard_to_turn_is_an_overload(monkeypatch):
+def test_high_friction_is_an_overload(monkeypatch):
     with motion_bench() as (bench, wires):
         with pytest.raises(Overloaded) as caught, Turntable(bench) as table:
             monkeypatch.setattr(motor, "FRICTION_LOAD", 0.85)
@@ -82,7 +82,7 @@ def test_a_table_that_is_hard_to_turn_is_an_overload(monkeypatch):
         assert bench.safety.state is TableState.FAULT
 
 
-def test_a_servo_whose_torque_is_gone_makes_no_progress():
+def test_servo_without_torque_makes_no_progress():
     with motion_bench() as (bench, wires):
         with pytest.raises(NoProgress), Turntable(bench) as table:
             table.goto(10.0)
@@ -95,7 +95,7 @@ def test_a_servo_whose_torque_is_gone_makes_no_progress():
             assert table.goto(60.0).agrees
 
 
-def test_a_servo_whose_readings_stand_still_is_never_sent_back_to_where_they_stopped():
+def test_frozen_readings_never_become_a_goal():
     with motion_bench() as (bench, wires):
         kept, speeds = [], []
 
@@ -119,7 +119,7 @@ def test_a_servo_whose_readings_stand_still_is_never_sent_back_to_where_they_sto
         assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_heat_at_rest_is_found_before_anything_moves_and_is_forgiven_when_it_has_cooled_down():
+def test_hot_servo_at_rest_is_a_fault_until_it_cooled_down():
     with motion_bench() as (bench, wires):
         wires.device.set_temperature(70.0)
         driven = []
@@ -136,7 +136,7 @@ def test_heat_at_rest_is_found_before_anything_moves_and_is_forgiven_when_it_has
         assert bench.safety.acknowledge() is TableState.READY
 
 
-def test_heat_and_a_request_to_stop_are_heeded_between_two_motions_too():
+def test_heat_and_stop_requests_are_checked_between_motions():
     with motion_bench() as (bench, wires):
         with pytest.raises(MotionStopped), Turntable(bench) as table:
             table.goto(20.0)
@@ -152,7 +152,7 @@ def test_heat_and_a_request_to_stop_are_heeded_between_two_motions_too():
 
 
 @pytest.mark.parametrize("volts", [6.1, 13.95])
-def test_a_supply_out_of_range_is_told_with_the_range(volts):
+def test_supply_out_of_range_is_reported_with_the_range(volts):
     with motion_bench() as (bench, wires):
         wires.device.set_voltage(volts)
         with pytest.raises(SupplyOutOfRange, match=r"6\.2 V to 13\.8 V") as caught, Turntable(bench):
@@ -160,13 +160,13 @@ def test_a_supply_out_of_range_is_told_with_the_range(volts):
         assert caught.value.evidence["voltage_v"] == pytest.approx(volts, abs=0.1)
 
 
-def test_a_dip_of_the_voltage_while_a_motor_starts_is_no_fault():
+def test_short_voltage_dip_is_not_a_fault():
     watch = a_watch()
     for k in range(30):
         watch.check(at(k, voltage_v=6.1 if k % 3 == 0 else 12.0), 3.6 * k, 0.0)
 
 
-def test_a_platter_that_slips_less_than_the_bound_is_left_to_the_end_of_the_move():
+def test_slip_below_the_bound_does_not_stop_the_move():
     with motion_bench(seed=3) as (bench, wires), Turntable(bench) as table:
         clock = wires.world.clock
         clock.call_at(clock.now_ns() + 1_000_000_000, lambda: wires.world.slip(-6.0, 0.2))
@@ -175,7 +175,7 @@ def test_a_platter_that_slips_less_than_the_bound_is_left_to_the_end_of_the_move
         assert bench.safety.state is TableState.READY
 
 
-def test_a_calibration_of_the_gyro_does_not_trust_it():
+def test_calibration_of_the_gyro_ignores_slip():
     with motion_bench("imu.sign=-1") as (bench, _), Turntable(bench, trust_gyro=False) as table:
         assert not table.goto(120.0).agrees
     with (
@@ -189,7 +189,7 @@ def test_a_calibration_of_the_gyro_does_not_trust_it():
 
 @pytest.mark.parametrize("velocity", [5.0, 90.0, 180.0])
 @pytest.mark.parametrize("target", [0.5, 40.0])
-def test_no_honest_motion_is_broken_off(velocity, target):
+def test_normal_motion_is_never_stopped(velocity, target):
     fast = (f"table.velocity_dps={velocity}", "table.acceleration_dps2=900")
     with motion_bench(*fast) as (bench, _), Turntable(bench) as table:
         for goal in (target, -target, 0.0):
@@ -226,7 +226,7 @@ def standing(_: int) -> float:
 
 
 @pytest.mark.parametrize("load", [75.0, -100.0])
-def test_each_limit_has_its_time(load):
+def test_each_limit_has_its_duration(load):
     push = {"load_percent": load}
     assert readings_until(Stalled, a_watch(), push | {"velocity_dps": 0.0}, standing, 0.0) == pytest.approx(
         0.28, abs=0.05
@@ -237,17 +237,17 @@ def test_each_limit_has_its_time(load):
     assert readings_until(FollowingError, a_watch(60.0), {}, turning, 0.0) == pytest.approx(0.8, abs=0.05)
 
 
-def test_a_table_that_stands_at_its_goal_makes_no_progress_and_need_not():
+def test_table_at_its_goal_needs_no_progress():
     assert readings_until(NoProgress, a_watch(20.3), {"velocity_dps": 0.0}, standing, None) == float("inf")
 
 
-def test_a_push_that_ends_is_forgotten():
+def test_short_push_is_not_a_fault():
     watch = a_watch()
     for k in range(70):
         watch.check(at(k, load_percent=90.0 if k % 18 else 5.0), turning(k), 0.0)
 
 
-def test_hardware_errors_come_first_and_a_servo_that_was_hot_must_be_cool():
+def test_hardware_errors_come_first_and_a_hot_servo_must_cool_down():
     assert isinstance(
         find_servo_fault(replace(WELL, hardware_errors=("overload",), temperature_c=90.0), CONFIG, LIMITS), DeviceFault
     )
@@ -256,7 +256,7 @@ def test_hardware_errors_come_first_and_a_servo_that_was_hot_must_be_cool():
     assert isinstance(find_servo_fault(warm, CONFIG, LIMITS, again=True), Overheated)
 
 
-def test_a_slip_is_judged_at_the_same_moment_and_by_what_the_gyro_is_sure_of():
+def test_slip_is_compared_at_the_same_time_within_the_uncertainty():
     slip = SlipMonitor(CONFIG, start_deg=5.0)
     for k in range(10):
         slip.add_reading(k * 40, 5.0 + k)

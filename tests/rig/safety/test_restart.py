@@ -74,7 +74,7 @@ def killed_in_motion(bench: Bench, wires: Wires, target_deg: float, after_s: flo
     kill(wires, plan)
 
 
-def test_after_sigkill_the_servo_stops_by_itself_and_the_next_program_says_so_before_anything_moves(bench_of):
+def test_servo_stops_after_sigkill_and_the_next_program_reports_it(bench_of):
     start, wires = bench_of
     with start() as bench:
         killed_in_motion(bench, wires, 300.0, after_s=1.2)
@@ -100,7 +100,7 @@ def test_after_sigkill_the_servo_stops_by_itself_and_the_next_program_says_so_be
     assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_after_sigkill_and_a_power_cut_the_turns_are_in_doubt_and_a_person_tells(bench_of):
+def test_sigkill_and_power_cut_need_a_new_reference(bench_of):
     start, wires = bench_of
     with start() as bench:
         killed_in_motion(bench, wires, 380.0, after_s=4.0)
@@ -122,7 +122,7 @@ def test_after_sigkill_and_a_power_cut_the_turns_are_in_doubt_and_a_person_tells
         assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
 
 
-def test_a_power_cut_between_programs_costs_no_turn(bench_of):
+def test_power_cut_between_programs_loses_no_revolution(bench_of):
     start, wires = bench_of
     with start() as bench, Turntable(bench) as table:
         table.goto(-370.0)
@@ -140,7 +140,7 @@ def test_a_power_cut_between_programs_costs_no_turn(bench_of):
         assert bench.safety.state is TableState.READY
 
 
-def test_turns_that_were_restored_survive_a_program_that_is_killed_at_rest(bench_of):
+def test_restored_revolutions_survive_a_kill_at_rest(bench_of):
     start, wires = bench_of
     with start() as bench, Turntable(bench) as table:
         table.goto(-370.0)
@@ -157,7 +157,7 @@ def test_turns_that_were_restored_survive_a_program_that_is_killed_at_rest(bench
         )
 
 
-def test_a_table_that_was_turned_while_the_supply_was_off_is_in_doubt(bench_of):
+def test_rotation_without_supply_needs_a_new_reference(bench_of):
     start, wires = bench_of
     with start() as bench, Turntable(bench) as table:
         table.goto(90.0)
@@ -168,7 +168,7 @@ def test_a_table_that_was_turned_while_the_supply_was_off_is_in_doubt(bench_of):
         pass
 
 
-def test_a_table_that_was_turned_by_hand_with_the_supply_on_is_where_it_was_turned_to(bench_of):
+def test_rotation_by_hand_with_supply_is_counted(bench_of):
     start, wires = bench_of
     with start() as bench, Turntable(bench) as table:
         table.goto(90.0)
@@ -179,7 +179,7 @@ def test_a_table_that_was_turned_by_hand_with_the_supply_on_is_where_it_was_turn
             assert table.rest_deg == pytest.approx(60.0, abs=0.3)
 
 
-def test_a_supply_that_dips_in_the_middle_of_a_motion_ends_it_and_the_turns_are_in_doubt(bench_of):
+def test_supply_loss_in_a_motion_needs_a_new_reference(bench_of):
     start, wires = bench_of
     with start() as bench:
         with pytest.raises((SupplyLost, DeviceSilent)), Turntable(bench) as table:
@@ -194,7 +194,7 @@ def test_a_supply_that_dips_in_the_middle_of_a_motion_ends_it_and_the_turns_are_
         assert bench.safety.state is TableState.UNREFERENCED
 
 
-def test_a_pulled_cable_ends_the_motion_and_on_its_return_nothing_moves_by_itself(bench_of):
+def test_unplugged_cable_ends_the_motion_and_nothing_moves_afterwards(bench_of):
     start, wires = bench_of
     with start() as bench:
         with pytest.raises(DeviceSilent), Turntable(bench) as table:
@@ -215,7 +215,7 @@ def test_a_pulled_cable_ends_the_motion_and_on_its_return_nothing_moves_by_itsel
 
 
 @pytest.mark.parametrize("other", [{"model": "xm430_w350"}, {"firmware": 44}])
-def test_another_servo_on_the_cable_is_refused(bench_of, other):
+def test_different_servo_is_rejected(bench_of, other):
     start, wires = bench_of
     with start() as bench:
         with pytest.raises(DeviceSilent), Turntable(bench) as table:
@@ -227,7 +227,7 @@ def test_another_servo_on_the_cable_is_refused(bench_of, other):
         assert bench.safety.state is TableState.DISCONNECTED
 
 
-def test_a_watchdog_that_trips_under_a_live_program_is_told_as_such_and_leaves_no_fault(bench_of):
+def test_watchdog_of_a_running_program_leaves_no_fault(bench_of):
     start, wires = bench_of
     with start() as bench:
         with pytest.raises(WatchdogTripped) as caught, Turntable(bench) as table:
@@ -240,7 +240,7 @@ def test_a_watchdog_that_trips_under_a_live_program_is_told_as_such_and_leaves_n
             assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
 
 
-def test_a_fault_outlives_the_program_and_is_acknowledged_when_its_cause_is_gone(bench_of):
+def test_fault_survives_the_program_until_it_is_acknowledged(bench_of):
     start, wires = bench_of
     with start() as bench, pytest.raises(Stalled), Turntable(bench) as table:
         table.goto(10.0)
@@ -258,7 +258,7 @@ def test_a_fault_outlives_the_program_and_is_acknowledged_when_its_cause_is_gone
         assert table.goto(60.0).agrees
 
 
-def test_a_hardware_error_needs_a_reboot_after_which_all_is_verified_and_no_turn_lost(bench_of):
+def test_hardware_error_needs_a_reboot_that_loses_no_revolution(bench_of):
     start, wires = bench_of
     with start() as bench:
         with pytest.raises(DeviceFault), Turntable(bench) as table:
@@ -280,7 +280,7 @@ def test_a_hardware_error_needs_a_reboot_after_which_all_is_verified_and_no_turn
         assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
 
 
-def test_a_reboot_that_shows_other_settings_leaves_the_fault(bench_of):
+def test_reboot_with_changed_settings_keeps_the_fault(bench_of):
     start, wires = bench_of
     with start() as bench:
         with pytest.raises(Stalled), Turntable(bench) as table:
@@ -293,7 +293,7 @@ def test_a_reboot_that_shows_other_settings_leaves_the_fault(bench_of):
         assert bench.safety.state is TableState.FAULT
 
 
-def test_an_old_goal_does_not_go_on_when_the_torque_that_a_killed_program_left_is_taken_over(bench_of):
+def test_old_goal_of_a_killed_program_is_not_continued(bench_of):
     start, wires = bench_of
     with start() as bench:
         killed_in_motion(bench, wires, 300.0, after_s=1.0)
@@ -307,7 +307,7 @@ def test_an_old_goal_does_not_go_on_when_the_torque_that_a_killed_program_left_i
             assert wires.world.shaft()[1] == 0
 
 
-def test_a_bench_whose_state_was_damaged_says_so_and_is_in_doubt(bench_of, tmp_path):
+def test_damaged_state_is_reported_and_needs_a_new_reference(bench_of, tmp_path):
     start, _wires = bench_of
     (tmp_path / "state" / "state.json").write_bytes(b'{"version": 1, "tab')
     with start() as bench:
@@ -315,7 +315,7 @@ def test_a_bench_whose_state_was_damaged_says_so_and_is_in_doubt(bench_of, tmp_p
         assert bench.safety.state is TableState.UNREFERENCED
 
 
-def test_a_stop_that_was_asked_for_ends_the_motion_with_torque_off(bench_of, tmp_path):
+def test_stop_request_ends_the_motion_with_torque_off(bench_of, tmp_path):
     start, wires = bench_of
     with start() as bench:
         with pytest.raises(RigError, match="rig stop") as stopped, Turntable(bench) as table:
@@ -331,7 +331,7 @@ def test_a_stop_that_was_asked_for_ends_the_motion_with_torque_off(bench_of, tmp
 
 
 @pytest.mark.parametrize("when", ["in a motion", "between two"])
-def test_an_adapter_that_is_plugged_in_again_is_opened_anew_and_who_answers_is_looked_at(simulated, when):
+def test_replugged_adapter_is_opened_again_and_checked(simulated, when):
     s = simulated()
     adapter = s.operator.devices.adapter
     with pytest.raises(DeviceSilent) as caught, Turntable(s.bench) as table:
@@ -356,7 +356,7 @@ def test_an_adapter_that_is_plugged_in_again_is_opened_anew_and_who_answers_is_l
         assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
 
 
-def test_another_servo_behind_the_adapter_that_came_back_is_refused(simulated):
+def test_different_servo_after_replugging_is_rejected(simulated):
     s = simulated()
     parts = s.operator.devices
     with pytest.raises(DeviceSilent), Turntable(s.bench) as table:

@@ -98,12 +98,12 @@ class Bench(RuleBasedStateMachine):
         self.connected = False
         self.zombies: list[object] = []
         self.latched = 0
-        self.everything_is_mended()
+        self.everything_is_fixed()
 
     def process(self) -> Safety:
         return Safety(self.shaft, RigConfig(), VirtualClock(), self.store)
 
-    def keeps_its_promise(self) -> None:
+    def check_ready_angle(self) -> None:
         """What is READY knows its turns."""
         if self.safety.state is TableState.READY:
             told_deg = self.safety.angle_reference.to_table(self.shaft.read_state().position_deg)
@@ -117,7 +117,7 @@ class Bench(RuleBasedStateMachine):
         if self.shaft.there and not self.shaft.other:
             self.safety.connect()
             self.connected = True
-            self.keeps_its_promise()
+            self.check_ready_angle()
 
     @precondition(lambda self: self.connected)
     @rule(
@@ -135,7 +135,7 @@ class Bench(RuleBasedStateMachine):
             return
         if not shaft.there:
             return
-        self.keeps_its_promise()
+        self.check_ready_angle()
         shaft.set_up = True
         start_deg = shaft.cable_deg
         motion = safety.motion((start_deg, to_deg), lambda: shaft.there)
@@ -194,20 +194,20 @@ class Bench(RuleBasedStateMachine):
         assert self.safety.state is TableState.FAULT
 
     @rule()
-    def everything_is_mended(self) -> None:
+    def everything_is_fixed(self) -> None:
         """What a technician does in the morning; without it, most days would be spent in the first fault."""
         self.shaft.there, self.shaft.other, self.shaft.errors = True, False, ()
         self.a_program_starts()
         if self.safety.fault:
             self.acknowledged(reboot=False)
         if self.safety.doubt:
-            self.somebody_looks_at_the_cable(zero_here=False)
+            self.operator_checks_the_cable(zero_here=False)
 
     # -- people -------------------------------------------------------------------------------------------------------
 
     @precondition(lambda self: self.connected and self.shaft.there and not self.shaft.other)
     @rule(zero_here=st.booleans())
-    def somebody_looks_at_the_cable(self, zero_here: bool) -> None:
+    def operator_checks_the_cable(self, zero_here: bool) -> None:
         with suppress(NotReady):
             if zero_here:
                 self.safety.set_angle(0.0)
@@ -262,7 +262,7 @@ TestBench = Bench.TestCase
 TestBench.settings = settings(fuzz_settings(0.2), stateful_step_count=30)
 
 
-def test_the_table_of_transitions_lets_nothing_out_of_a_fault_but_an_acknowledgement():
+def test_only_an_acknowledgement_leaves_a_fault():
     leaving = [(s, h, to) for s, ways in TRANSITIONS.items() for h, to in ways.items() if s is not to]
     assert {h for s, h, _ in leaving if s is TableState.FAULT} == {StateEvent.ACKNOWLEDGE}
     assert {(s, h) for s, h, to in leaving if to is TableState.MOVING} == {(TableState.READY, StateEvent.START)}
@@ -278,7 +278,7 @@ def test_the_table_of_transitions_lets_nothing_out_of_a_fault_but_an_acknowledge
         Safety(Shaft(), RigConfig(), VirtualClock()).state = TableState.READY
 
 
-def test_a_state_that_cannot_be_written_down_lets_nothing_move():
+def test_nothing_moves_if_the_state_cannot_be_stored():
     class Full(MemoryStore):
         full = False
 
@@ -301,7 +301,7 @@ def test_a_state_that_cannot_be_written_down_lets_nothing_move():
     assert "in this program only" in stalled.__notes__[0]
 
 
-def test_a_motion_that_nobody_said_to_have_arrived_was_broken_off():
+def test_motion_without_arrival_counts_as_interrupted():
     safety = Safety(Shaft(), RigConfig(), VirtualClock())
     safety.connect()
     safety.set_angle(0.0)
@@ -312,7 +312,7 @@ def test_a_motion_that_nobody_said_to_have_arrived_was_broken_off():
     assert safety.state is TableState.STOPPED
 
 
-def test_evidence_that_json_does_not_know_is_kept_in_words():
+def test_evidence_without_json_type_is_stored_as_text():
     safety = Safety(Shaft(), RigConfig(), VirtualClock())
     safety.latch(Stalled("Blocked.", next_step="Free it.", evidence={"seen": {1, 2}, "at": 3.5, "rate": float("nan")}))
     assert safety.fault.evidence["at"] == 3.5
@@ -320,7 +320,7 @@ def test_evidence_that_json_does_not_know_is_kept_in_words():
     assert BenchState.model_validate_json(BenchState(fault=safety.fault).model_dump_json()).fault.code == 505
 
 
-def test_the_first_fault_stays_until_it_is_acknowledged():
+def test_first_fault_stays_until_it_is_acknowledged():
     safety = Safety(Shaft(), RigConfig(), VirtualClock())
     safety.connect()
     safety.latch(Stalled("The first.", next_step="Free it."))
@@ -328,7 +328,7 @@ def test_the_first_fault_stays_until_it_is_acknowledged():
     assert safety.fault.what == "The first."
 
 
-def test_an_acknowledgement_asks_every_device_that_has_a_say():
+def test_acknowledgement_checks_all_devices():
     safety = Safety(Shaft(), RigConfig(), VirtualClock())
     safety.connect()
     safety.latch(Stalled("Blocked.", next_step="Free it."))

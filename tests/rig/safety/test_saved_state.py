@@ -53,7 +53,7 @@ def somebody(tmp_path):
     ),
     what=st.text(),
 )
-def test_what_was_written_is_read(tmp_path_factory, table, what):
+def test_state_round_trips(tmp_path_factory, table, what):
     fault = LatchedFault.of(Stalled(what, next_step="Free it.", evidence={"load_percent": 99.0}), "2026-01-02T03:04:05")
     state = BenchState(table=table, fault=fault)
     folder = tmp_path_factory.getbasetemp() / "state"
@@ -62,9 +62,23 @@ def test_what_was_written_is_read(tmp_path_factory, table, what):
     assert not list(folder.glob("*.part"))
 
 
+def test_state_of_the_first_version_is_read(tmp_path):
+    (tmp_path / "state.json").write_text(
+        """{"version": 1, "table": {"model_number": 1060, "bus_id": 1, "firmware": 46, "position_deg": -190.25,
+        "shift_deg": 360.0, "path_deg": null}, "fault": {"code": 505, "title": "stalled", "what": "The table is blocked.",
+        "next_step": "Remove it.", "evidence": {"load_percent": 99.0}, "utc": "2026-01-02T03:04:05+00:00"}}"""
+    )
+    state = FileStore(tmp_path).load()
+    assert state.table == TABLE
+    assert state.fault == LatchedFault.of(
+        Stalled("The table is blocked.", next_step="Remove it.", evidence={"load_percent": 99.0}),
+        "2026-01-02T03:04:05+00:00",
+    )
+
+
 @fuzz_settings(0.1)
 @given(st.binary(max_size=300))
-def test_what_is_damaged_is_told_and_never_believed(tmp_path_factory, damage):
+def test_damaged_state_is_reported_and_not_used(tmp_path_factory, damage):
     folder = tmp_path_factory.getbasetemp() / "damaged"
     folder.mkdir(exist_ok=True)
     (folder / "state.json").write_bytes(damage)
@@ -78,12 +92,12 @@ def test_what_is_damaged_is_told_and_never_believed(tmp_path_factory, damage):
 @pytest.mark.parametrize(
     "text", ['{"version": 2}', '{"version": 1, "table": {"position_deg": 3}}', '{"version": 1, "colour": "red"}']
 )
-def test_another_version_or_shape_is_not_guessed_at(tmp_path, text):
+def test_unknown_version_or_shape_is_not_used(tmp_path, text):
     (tmp_path / "state.json").write_text(text)
     assert FileStore(tmp_path).load().damage
 
 
-def test_a_folder_that_cannot_be_written_to_is_told_with_what_to_do(tmp_path):
+def test_unwritable_folder_is_reported_with_a_next_step(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StateNotStored, match="may not move without it") as caught:
         FileStore(tmp_path / "file" / "bench").save(BenchState(table=TABLE))
@@ -92,7 +106,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_with_what_to_do(tmp_path):
         BenchLock(tmp_path / "file" / "bench", SystemClock())
 
 
-def test_a_half_written_state_leaves_the_old_one(tmp_path, monkeypatch):
+def test_interrupted_write_keeps_the_old_state(tmp_path, monkeypatch):
     store = FileStore(tmp_path)
     store.save(BenchState(table=TABLE))
 
@@ -106,7 +120,7 @@ def test_a_half_written_state_leaves_the_old_one(tmp_path, monkeypatch):
     assert store.load().table == TABLE
 
 
-def test_a_bench_is_held_by_one_program_and_the_second_is_told_by_whom(tmp_path, somebody):
+def test_second_program_is_told_which_one_uses_the_bench(tmp_path, somebody):
     who = holder(tmp_path)
     assert who.pid == somebody.pid
     assert "teapot" in who.command
@@ -117,7 +131,7 @@ def test_a_bench_is_held_by_one_program_and_the_second_is_told_by_whom(tmp_path,
     assert "rig stop" in caught.value.next_step
 
 
-def test_a_killed_program_holds_nothing_although_its_name_is_still_there(tmp_path, somebody):
+def test_killed_program_releases_the_bench(tmp_path, somebody):
     somebody.send_signal(signal.SIGKILL)
     somebody.wait()
     assert str(somebody.pid) in (tmp_path / "lock").read_text()
@@ -126,18 +140,18 @@ def test_a_killed_program_holds_nothing_although_its_name_is_still_there(tmp_pat
     assert holder(tmp_path) is None
 
 
-def test_a_holder_without_a_readable_name_is_still_a_holder(tmp_path, somebody):
+def test_holder_without_readable_name_still_counts(tmp_path, somebody):
     (tmp_path / "lock").write_text("{")
     assert holder(tmp_path) == Holder(pid=0, command="", since_utc="")
     with pytest.raises(BenchBusy, match="another process"):
         BenchLock(tmp_path, SystemClock())
 
 
-def test_nobody_holds_a_bench_that_was_never_used(tmp_path):
+def test_unused_bench_has_no_holder(tmp_path):
     assert holder(tmp_path / "never") is None
 
 
-def test_a_request_to_stop_from_before_does_not_stop_the_next_program(tmp_path):
+def test_old_stop_request_does_not_stop_the_next_program(tmp_path):
     store = FileStore(tmp_path)
     store.request_stop()
     assert store.stop_requested()
@@ -146,7 +160,7 @@ def test_a_request_to_stop_from_before_does_not_stop_the_next_program(tmp_path):
     lock.close()
 
 
-def test_each_bench_has_a_folder_of_its_own(tmp_path, monkeypatch):
+def test_each_bench_has_its_own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "states"))
     assert load_config().state_path("hardware") == tmp_path / "states" / "hbr-rig" / "hardware"
