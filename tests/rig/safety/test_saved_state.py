@@ -65,7 +65,8 @@ def test_state_round_trips(tmp_path_factory, table, what):
 def test_state_of_the_first_version_is_read(tmp_path):
     (tmp_path / "state.json").write_text(
         """{"version": 1, "table": {"model_number": 1060, "bus_id": 1, "firmware": 46, "position_deg": -190.25,
-        "shift_deg": 360.0, "path_deg": null}, "fault": {"code": 505, "title": "stalled", "what": "The table is blocked.",
+        "shift_deg": 360.0, "path_deg": null}, "fault": {"code": 505, "title": "stalled",
+        "what": "The table is blocked.",
         "next_step": "Remove it.", "evidence": {"load_percent": 99.0}, "utc": "2026-01-02T03:04:05+00:00"}}"""
     )
     state = FileStore(tmp_path).load()
