@@ -317,9 +317,9 @@ class TestVerify:
     def test_orphaned_rows_are_recorded_in_the_log(self, catalog: Catalog) -> None:
         sql(catalog, "DELETE FROM enrollments WHERE id = 2")
         assert set(problems(finished(verify(catalog)))) == {Problem.ORPHANED_ROW}
-        mended = finished(verify(catalog, repair=True))
-        assert set(problems(mended)) == {Problem.ORPHANED_ROW, Problem.ORPHANED_FILE}
-        assert mended.unrepaired == ()
+        repaired = finished(verify(catalog, repair=True))
+        assert set(problems(repaired)) == {Problem.ORPHANED_ROW, Problem.ORPHANED_FILE}
+        assert repaired.unrepaired == ()
         assert finished(verify(catalog)).findings == ()
         kept = [e.details["row"] for e in catalog.log() if e.action == "orphaned row removed"]
         assert {row["azimuth_deg"] for row in kept if "azimuth_deg" in row} == {0.0, 5.0, 10.0}
