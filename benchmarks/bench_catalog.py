@@ -1,4 +1,4 @@
-"""Catalogs: what they take on disk, how long a large one takes to answer, how fast photographs come in."""
+"""Catalogs: size on disk, response times of a large catalog, and the speed of an import of photographs."""
 
 import argparse
 import json
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def sizes(folder: Path) -> None:
-    """What the paper's 100 objects take without the records."""
+    """Print the size of the paper's 100 objects without records."""
     views = model(100)
     path = folder / "models.npz"
     np.savez(
@@ -53,7 +53,7 @@ def sizes(folder: Path) -> None:
 
 
 def answers(folder: Path, objects: int) -> None:
-    """The real commands on a large catalog, each in a process of its own."""
+    """Print the times of commands on a large catalog, each in a new process."""
     home = folder / "large"
     home.mkdir()
     views = build(home / "catalog", objects)
@@ -74,7 +74,7 @@ def answers(folder: Path, objects: int) -> None:
 
 
 def run(home: Path, words: list[str], *, first_ranking: bool) -> tuple[float, float]:
-    """Wall and CPU seconds of a command; the wall's clock stops at the first ranking where that is wanted."""
+    """Return wall and CPU seconds of a command; the wall time ends at the first ranking if ``first_ranking``."""
     before_s = cpu_s()
     begin_ns = _CLOCK.now_ns()
     with subprocess.Popen([*RIG, *words], cwd=home, stdout=subprocess.PIPE, text=True) as process:
@@ -87,13 +87,13 @@ def run(home: Path, words: list[str], *, first_ranking: bool) -> tuple[float, fl
 
 
 def cpu_s() -> float:
-    """CPU seconds of this process and of those that it has seen end."""
+    """Return the CPU seconds of this process and of its finished children."""
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
 
 
 def imports(folder: Path, photographs: Path) -> None:
-    """Import everything, between two halves of the bare loop: whatever else the computer does falls on both."""
+    """Import everything between two halves of the bare loop, so that other programs disturb both equally."""
     files = sorted(photographs.glob("*.png"))
     half = len(files) // 2
     bare_s, bare_cpu_s = bare_loop(files[:half])
@@ -113,7 +113,7 @@ def imports(folder: Path, photographs: Path) -> None:
 
 
 def bare_loop(files: list[Path]) -> tuple[float, float]:
-    """Wall and CPU seconds to decode and describe the files, one after the other."""
+    """Return wall and CPU seconds to decode and describe the files, one after the other."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     begin_ns, before_s = _CLOCK.now_ns(), cpu_s()

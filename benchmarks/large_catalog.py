@@ -1,4 +1,4 @@
-"""A catalog of 1,000 objects of 72 views, as large as a bench would make it but for its images, which are tiny.
+"""Builds a catalog of 1,000 objects with 72 views, with the records of a real bench and tiny images.
 
 python -m benchmarks.large_catalog FOLDER [OBJECTS]
 """
@@ -23,7 +23,7 @@ from rig.views.description import BENCH_DESCRIPTOR
 
 OBJECTS = 1_000
 _NOW = datetime(2026, 1, 1, tzinfo=UTC)
-#: What a bench keeps with a view, in the same keys.
+#: The evidence that a bench stores with a view.
 _EVIDENCE: dict[str, Any] = {
     "settled_ns": 5916728816,
     "exposed_ns": 5933333000,
@@ -119,7 +119,7 @@ def _objects(views: Views) -> Iterator[Object]:
 
 
 def _turning(size: int, views: int, seed: int) -> list[str]:
-    """Packed levels of an object's views, as hexadecimal: a third of them changes slowly as it turns."""
+    """Return packed levels of an object's views, as hexadecimal: a third of them changes slowly with the azimuth."""
     rng = np.random.default_rng(seed)
     base, other = rng.integers(0, 256, (2, size), np.uint8)
     begins = np.where(rng.random(size) < 1 / 3, rng.random(size), 2.0)

@@ -12,49 +12,67 @@ Rows = NDArray[np.float32]
 
 #: Products are added up in blocks of this many columns.
 _BLOCK: Final = 64
+#: Rows that are converted to float at once.
+_CHUNK: Final = 256
 #: Cosines that are computed at once, so that they stay in the processor's cache between blocks.
-_AT_ONCE: Final = 16384
+_AT_ONCE: Final = 65536
 
 
 class Cosine:
-    """A `Comparison` of rows of unit length, float32 (n, length); ``to_unit`` makes such rows of levels."""
+    """A `Comparison` of rows of unit length, to 1e-6.
 
-    def __init__(self, unit: Rows, to_unit: Callable[[LevelArray], Rows]) -> None:
-        self._unit, self._to_unit = unit, to_unit
+    A matrix product adds up float32 in one accumulator for each result. Levels take few values, so that equal products
+    are rounded in the same direction many times: over 512 columns the error is up to 5e-6. Therefore the rows are
+    stored in blocks of columns, float32 (blocks, n, 64), whose products are added up separately.
+
+    Parameters
+    ----------
+    to_unit : callable
+        Makes rows of unit length, float32 (n, length), of levels.
+    blocks : float32 array (blocks, n, 64)
+        The rows.
+    """
+
+    def __init__(self, to_unit: Callable[[LevelArray], Rows], blocks: Rows) -> None:
+        self._to_unit, self._blocks = to_unit, blocks
+
+    @classmethod
+    def of(cls, rows: LevelArray, to_unit: Callable[[LevelArray], Rows]) -> "Cosine":
+        """Prepare rows of levels, uint8 (n, length)."""
+        return cls(to_unit, _blocks(rows, to_unit))
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
-        return _cosine(self._to_unit(queries), self._unit)
+        own = _blocks(queries, self._to_unit)
+        count = self._blocks.shape[1]
+        cosine = np.empty((len(queries), count))
+        step = max(_BLOCK, _AT_ONCE // max(1, len(queries)))
+        for start in range(0, count, step):
+            part = slice(start, start + step)
+            total = own[0] @ self._blocks[0, part].T
+            for query, rows in zip(own[1:], self._blocks[1:, part], strict=True):
+                total += query @ rows.T
+            np.clip(total, 0, 1, out=cosine[:, part])
+        return cosine
 
     def only(self, rows: IndexArray, /) -> "Cosine":
-        return Cosine(self._unit[rows], self._to_unit)
+        return Cosine(self._to_unit, np.take(self._blocks, rows, axis=1))
 
     def among(self, rows: IndexArray, /) -> FloatArray:
-        part = self._unit[rows]
-        return _positive(part @ part.transpose(0, 2, 1))
+        total = np.zeros((*rows.shape, rows.shape[-1]), np.float32)
+        for block in self._blocks:
+            part = block[rows]
+            total += part @ part.transpose(0, 2, 1)
+        similar: FloatArray = np.clip(total, 0, 1, dtype=np.float64)
+        return similar
 
 
-def _cosine(a: Rows, b: Rows) -> FloatArray:
-    """Return the cosines of rows of unit length to 1e-6, float64 (n, m); 0 for obtuse angles.
-
-    Matrix products add up float32 in one accumulator for each result. Levels take few values, so that the same product
-    is rounded in the same direction many times: over 512 columns the error is up to 5e-6. Blocks of columns, each with
-    an accumulator of its own, keep it below 1e-6. The product with one vector uses several accumulators anyway.
-    """
-    if len(a) == 1:
-        return _positive(a @ b.T)
-    cosine = np.empty((len(a), len(b)))
-    blocks = [slice(start, start + _BLOCK) for start in range(0, a.shape[1], _BLOCK)]
-    queries = [np.ascontiguousarray(a[:, columns]) for columns in blocks]
-    step = max(_BLOCK, _AT_ONCE // max(1, len(a)))
-    for start in range(0, len(b), step):
-        rows = b[start : start + step]
-        total = queries[0] @ rows[:, blocks[0]].T
-        for query, columns in zip(queries[1:], blocks[1:], strict=True):
-            total += query @ rows[:, columns].T
-        np.clip(total, 0, 1, out=cosine[:, start : start + step])
-    return cosine
-
-
-def _positive(cosine: Rows) -> FloatArray:
-    similar: FloatArray = np.clip(cosine, 0, 1, dtype=np.float64)
-    return similar
+def _blocks(rows: LevelArray, to_unit: Callable[[LevelArray], Rows]) -> Rows:
+    """Return rows of unit length in blocks of columns; the last one is filled with zeros."""
+    length = rows.shape[1]
+    blocks = np.zeros((-(-length // _BLOCK), len(rows), _BLOCK), np.float32)
+    for start in range(0, len(rows), _CHUNK):
+        unit = to_unit(rows[start : start + _CHUNK])
+        for block, column in zip(blocks, range(0, length, _BLOCK), strict=True):
+            part = unit[:, column : column + _BLOCK]
+            block[start : start + _CHUNK, : part.shape[1]] = part
+    return blocks

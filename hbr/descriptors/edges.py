@@ -59,7 +59,7 @@ class Edges(Descriptor):
 
     def prepared(self, rows: LevelArray, /) -> Cosine:
         self.check_rows(rows)
-        return Cosine(_unit(rows), _unit)
+        return Cosine.of(rows, _unit)
 
     def pack(self, levels: LevelArray) -> bytes:
         """Pack four levels into each byte, the first one in the highest bits."""

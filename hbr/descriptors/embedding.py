@@ -81,7 +81,7 @@ class Embedding(Descriptor):
 
     def prepared(self, rows: LevelArray, /) -> Cosine:
         self.check_rows(rows)
-        return Cosine(_unit(rows), _unit)
+        return Cosine.of(rows, _unit)
 
     def _run(self, image: ImageArray) -> NDArray[np.float32]:
         blob = cv2.dnn.blobFromImage(image, 1 / 255, (_SIDE_PX, _SIDE_PX), _MEAN, swapRB=True)

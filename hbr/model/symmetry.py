@@ -45,7 +45,7 @@ class Symmetry:
 
 @dataclass(frozen=True, slots=True)
 class SimilarObject:
-    """Another object that cannot be told from one, seen from some sides.
+    """An object that another one can be confused with, seen from some sides.
 
     Attributes
     ----------
