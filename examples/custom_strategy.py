@@ -1,6 +1,6 @@
-"""A search with a strategy of its own, beside those that come with the rig.
+"""Search with a strategy of your own, beside those that come with the rig.
 
-To have `rig identify --strategy golden` find it, a package names it in the entry-point group `rig.strategies`:
+For `rig identify --strategy golden`, a package names the strategy in the entry-point group `rig.strategies`:
 
     [project.entry-points."rig.strategies"]
     golden = "my_package:Golden"
@@ -8,33 +8,42 @@ To have `rig identify --strategy golden` find it, a package names it in the entr
 
 import tempfile
 
+import hbr
 from rig import Catalog, enroll, identify, load_model, open_bench
 from rig.events.events import Identified
-from rig.search.strategies import AnyStrategy, DenseSearchState, Finish, Rotate, SearchState, descriptor_for, enough
+from rig.search.strategies import (
+    AnyStrategy,
+    DenseSearchState,
+    Finish,
+    Rotate,
+    SearchState,
+    descriptor_for,
+    end_by_margin,
+)
 from sim.bench import ShelfOperator
 
 OBJECTS = ("toy-house", "toy-car", "book-night")
 
 
 class Golden:
-    """Turn by the golden angle: wherever it stops, the views so far lie well apart."""
+    """Rotate by the golden angle: at any time, the views so far lie well apart."""
 
     name = "golden"
 
-    def next(self, look: SearchState) -> Rotate | Finish:
-        return enough(look) or Rotate(137.508, "the golden angle leads far from all views so far")
+    def next(self, state: SearchState) -> Rotate | Finish:
+        return end_by_margin(state) or Rotate(137.508, note="the golden angle leads far from all views so far")
 
 
 class FarSide:
-    """The same on the rig's own search: its rules say when to stop, and views are described by its descriptor."""
+    """The far side of the object, on the dense search: the stopping rule says when the search ends."""
 
     name = "far-side"
     descriptor = "edges+colours"
 
-    def next(self, look: DenseSearchState) -> Rotate | Finish:
-        if look.verdict.kind != "look":
-            return Finish(look.verdict.words)
-        return Rotate(135.0, "nearly the far side")
+    def next(self, state: DenseSearchState) -> Rotate | Finish:
+        if state.decision.outcome is not hbr.Outcome.CONTINUE:
+            return Finish(state.decision.reason)
+        return Rotate(135.0, note="nearly the far side")
 
 
 def main() -> None:
@@ -47,12 +56,12 @@ def main() -> None:
         for name in OBJECTS:
             for _ in enroll(bench, catalog, name, views=12):
                 pass
-        hands = bench.operator
-        assert isinstance(hands, ShelfOperator)  # simulated; on a real bench somebody puts the object there
+        operator = bench.operator
+        assert isinstance(operator, ShelfOperator)  # simulated; on a real bench the operator places the object
         for strategy in (None, *strategies):
             model = load_model(catalog, descriptor=None if strategy is None else descriptor_for(strategy))
             for name in OBJECTS:
-                hands.next_object = name
+                operator.next_object = name
                 for event in identify(bench, model, strategy=strategy):
                     if isinstance(event, Identified):
                         found = f"{event.name or 'unknown':12} {event.views} views, {event.travelled_deg:.0f}°"

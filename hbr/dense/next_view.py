@@ -1,4 +1,4 @@
-"""Where to look next, by what is believed: the turn after which the strongest hypotheses are least alike."""
+"""Where to look next, by what is believed: the turn after which the strongest hypotheses are least similar."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -33,8 +33,8 @@ class NextBestView:
     rotations_deg, confusion, cost : float64 arrays (a,)
         All turns that were weighed; logarithm of the probability of still confusing two objects after each; what the
         motion costs, in the same unit.
-    alike : float64 array (a,), or None
-        How alike the pair looks after each turn; None where there is no pair.
+    similarity : float64 array (a,), or None
+        How similar the pair looks after each turn; None where there is no pair.
     """
 
     rotation_deg: float
@@ -43,7 +43,7 @@ class NextBestView:
     rotations_deg: FloatArray
     confusion: FloatArray
     cost: FloatArray
-    alike: FloatArray | None
+    similarity: FloatArray | None
 
 
 def next_best_view(
@@ -106,16 +106,16 @@ def next_best_view(
         confusion = -sharpness * novelty
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
-    alike: FloatArray | None = None
+    similarity: FloatArray | None = None
     if rivals.any():
         gained = rivals - remaining[chosen]
         first, second = np.unravel_index(int(gained.argmax()), gained.shape)
         objects = belief.index.object_index
         ordered = sorted((first, second), key=lambda i: -probability[i])
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
-        alike = similar[:, first, second]
+        similarity = similar[:, first, second]
     turn = float(turns_deg[chosen])
-    return NextBestView(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, alike)
+    return NextBestView(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, similarity)
 
 
 def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:

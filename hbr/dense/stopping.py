@@ -1,235 +1,180 @@
-"""When a search by the dense filter ends, and when an object is unknown: at error rates that were measured.
+"""The stopping rule of the dense search: when a search ends, and when an object is unknown, at measured error rates.
 
-The catalog itself is the sample: its views are looked for as if they had been taken a little aside, and once more as if
-their whole object were not enrolled.
+`leave_one_out` searches for every object of a catalog, `fit_stopping_rule` sets the thresholds from these searches, and
+`StoppingRule.decide` applies them after each view of a search.
 """
 
-from dataclasses import dataclass
-from math import ceil, floor, inf
-from typing import Final, Literal
+from dataclasses import dataclass, field
+from enum import StrEnum
+from math import ceil, floor, inf, nan
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.filter import BETA, BINS, Belief, DenseIndex
+from hbr.core.arrays import FloatArray
+from hbr.dense.filter import BETA, Belief, DenseIndex, update_belief
+from hbr.dense.leave_one_out import Leaders, LeaveOneOut, leader, leave_one_out, usual_scores
 
-#: What the lead over the second object counts beside the score, and what its leader's usual score.
-_LEAD: Final = 0.5
-_USUAL: Final = 1.0
-#: No search ends at a smaller probability, however well the rehearsed ones went: what stands there may be less clear.
-LEAST_CERTAINTY: Final = 0.9
-#: Rehearsed views lie aside by shares of a step that are spread over 0..1 as multiples of this.
-_GOLDEN: Final = 0.618034
-#: The views of a rehearsed search are this far apart.
-_STEP_DEG: Final = 90.0
+#: No search ends at a smaller confidence, however well the leave-one-out searches went: real views may be less clear.
+SMALLEST_MIN_CONFIDENCE: Final = 0.9
+#: Confidence that ends a search if the catalog has too little data for the error rate that was asked for.
+UNCALIBRATED_MIN_CONFIDENCE: Final = 0.98
+#: With fewer objects, leaving one out leaves no second candidate.
+FEWEST_OBJECTS: Final = 3
+#: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
+CALIBRATED_VIEWS: Final = 4
+MOST_SEARCHES: Final = 400
 
 
-@dataclass(frozen=True, eq=False)
-class Leaders:
-    """Who led after each view of each search, arrays (searches, views).
+class Outcome(StrEnum):
+    """What to do after a view."""
+
+    CONTINUE = "continue"
+    FOUND = "found"
+    UNKNOWN = "unknown"
+
+
+class StopReason(StrEnum):
+    """Why a search continues or ends."""
+
+    CONFIDENT = "confident"
+    NOT_CONFIDENT = "not-confident"
+    BELOW_OPEN_SET_THRESHOLD = "below-open-set-threshold"
+    MARGIN = "margin"
+    MAX_VIEWS = "max-views"
+    NO_ROTATION_LEFT = "no-rotation-left"
+    CUSTOM = "custom"
+    EARLIER_VERSION = "earlier-version"
+
+
+@dataclass(frozen=True, slots=True)
+class StopDecision:
+    """What the stopping rule decided after a view, and the numbers it compared.
 
     Attributes
     ----------
-    object_index : integer array
-        The best object.
-    score, lead : float64 array
-        Its score a view, and by how much that is above the second's.
+    outcome, reason
+        What to do, and why.
+    object_index : int
+        The leading candidate, whatever the outcome.
+    confidence, min_confidence : float
+        Its probability among the enrolled objects, and the one that ends a search.
+    open_set_score, open_set_threshold : float
+        How closely the views resemble an enrolled object, and below what score an object is unknown; a threshold of
+        -inf calls no object unknown.
     """
 
-    object_index: IndexArray
-    score: FloatArray
-    lead: FloatArray
-
-    def familiarity(self, usual: FloatArray) -> FloatArray:
-        """Return how much each search looks like one for an enrolled object, (searches, views).
-
-        The score and half of the lead: a stranger is a little like several objects, a known object much like one. Less
-        what its leader usually scores above others: what looks the same from all sides must be met better.
-
-        Parameters
-        ----------
-        usual : float64 array (objects, views)
-            As `usual_scores` returns it.
-        """
-        views = np.arange(self.score.shape[1])
-        typical = np.median(usual, axis=0)
-        return self.score + _LEAD * self.lead - _USUAL * (usual[self.object_index, views] - typical)
+    outcome: Outcome
+    reason: StopReason
+    object_index: int
+    confidence: float
+    min_confidence: float
+    open_set_score: float
+    open_set_threshold: float
 
 
-@dataclass(frozen=True, eq=False)
-class Rehearsal:
-    """Searches for every object, by its own enrolled views; arrays of (searches, views).
+class LimitationCode(StrEnum):
+    """What a stopping rule does not guarantee."""
+
+    SAMPLED = "sampled"
+    FALSE_REJECT_RATE = "false-reject-rate"
+    ERROR_RATE = "error-rate"
+    SIMILAR_OBJECTS = "similar-objects"
+    UNKNOWN_NOT_MEASURED = "unknown-not-measured"
+    ONE_OBJECT = "one-object"
+    SINGLE_VIEWS = "single-views"
+    EARLIER_VERSION = "earlier-version"
+
+
+@dataclass(frozen=True, slots=True)
+class Limitation:
+    """A rate that a stopping rule does not guarantee, with the numbers that say why.
 
     Attributes
     ----------
-    objects : int
-        Names in the model set.
-    known : Leaders
-        Among all enrolled objects.
-    stranger : Leaders
-        Had the object that was looked for not been enrolled.
-    posterior : float64 array
-        Probability of the best of all objects.
-    correct : bool array
-        Whether that is the one that was looked for.
-    beta : float
-        As for `Belief.posterior`.
+    code
+        What is not guaranteed.
+    values
+        ``sampled``: ``searched`` of ``objects``. ``false-reject-rate``: ``rate`` asked for, ``searches`` done and
+        ``needed``, ``reached`` rate. ``error-rate`` and ``similar-objects``: ``rate``, ``searches``, ``needed``,
+        ``min_confidence``, and ``wrong`` of ``ended`` searches. ``earlier-version``: ``text``.
     """
 
-    objects: int
-    known: Leaders
-    stranger: Leaders
-    posterior: FloatArray
-    correct: NDArray[np.bool_]
-    beta: float
+    code: LimitationCode
+    values: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
-class Rules:
-    """When to stop and what to call unknown.
+class StoppingRule:
+    """When a search ends, and which objects are unknown.
 
     Attributes
     ----------
     beta : float
         As for `Belief.posterior`.
-    certainty : float
-        Probability of the best object that ends a search; above 1 where no search may end early.
-    usual : float64 array (objects, views)
-        What each object scores when it is looked for, after 1, 2, ... views.
-    familiar : tuple of float
-        Familiarity (`Leaders.familiarity`) after 1, 2, ... views below which the object is unknown; the last holds for
-        all further views. -inf where nothing may be called unknown.
+    min_confidence : float
+        Confidence that ends a search.
+    usual_scores : float64 array (objects, views)
+        What each object scores when it is searched for, after 1, 2, ... views.
+    open_set_thresholds : tuple of float
+        Open-set scores after 1, 2, ... views below which an object is unknown; the last one is for all further views.
+        -inf calls no object unknown.
     error_rate, false_reject : float
-        What was asked for: wrong objects among those named, and enrolled objects called unknown.
+        The rates asked for: wrong objects among those named, and enrolled objects called unknown.
     false_accept : float
-        Strangers that were not called unknown after the last of these numbers of views, when objects were left out.
+        Measured share of left-out objects that were not called unknown after all views; nan if not measured.
     searches : int
-        Rehearsed searches that these come from.
-    promises : tuple of str
-        What cannot be promised, and how much more data it takes; empty where all can.
+        Leave-one-out searches that the rule comes from.
+    limitations : tuple of Limitation
+        What the rule does not guarantee; empty if it guarantees both rates.
     """
 
     beta: float
-    certainty: float
-    usual: FloatArray
-    familiar: tuple[float, ...]
+    min_confidence: float
+    usual_scores: FloatArray
+    open_set_thresholds: tuple[float, ...]
     error_rate: float
     false_reject: float
     false_accept: float
     searches: int
-    promises: tuple[str, ...] = ()
+    limitations: tuple[Limitation, ...] = ()
 
+    def decide(self, belief: Belief, *, max_views: int = 8) -> StopDecision:
+        """Decide whether a search ends after these views.
 
-@dataclass(frozen=True)
-class Verdict:
-    """What to do after a view.
-
-    Attributes
-    ----------
-    kind : {"look", "found", "unknown"}
-        Look on, or end.
-    object_index : int
-        The best object, whatever the kind.
-    probability, familiarity : float
-        Its probability among the enrolled objects, and how much it looks like one of them.
-    words : str
-        The reason, for people.
-    """
-
-    kind: Literal["look", "found", "unknown"]
-    object_index: int
-    probability: float
-    familiarity: float
-    words: str
-
-
-def rehearse(
-    index: DenseIndex, *, beta: float = BETA, views: int = 4, seen: LevelArray | None = None, searches: int = 4
-) -> Rehearsal:
-    """Look for every object by its own enrolled views, a quarter of a turn apart, as if they had been taken aside.
-
-    A view at the share u of a step from where it was enrolled would look less like itself by u times what its neighbour
-    does. Real queries are half a step away at most; here u is spread over 0..1, for light and noise make views differ,
-    too.
-
-    Parameters
-    ----------
-    index : DenseIndex
-        Of at least two objects. Objects with fewer than ``views`` views, or with a single one, are not looked for.
-    beta : float
-        As for `Belief.posterior`.
-    views : int
-        Views of a search.
-    seen : uint8 array (n, length), optional
-        Each enrolled view as a search would see it: from a second sitting, or described once more under the bench's
-        noise and blur. The enrolled views themselves otherwise.
-    searches : int
-        Of each object, from first views spread around it.
-
-    Raises
-    ------
-    ValueError
-        There are fewer than two objects, or none with enough views.
-    """
-    if len(index) < 2:
-        raise ValueError(f"{len(index)} object; at least two are needed to learn what a stranger looks like")
-    levels = index.views.descriptors if seen is None else seen
-    if levels.shape != index.views.descriptors.shape:
-        raise ValueError(f"seen has shape {levels.shape}; the catalog's views have {index.views.descriptors.shape}")
-    known, stranger, posterior, correct = [], [], [], []
-    aside = 0.0
-    for place, object_index in enumerate(index.object_index.tolist()):
-        rows = index.views.of(object_index)
-        if len(rows) < max(views, 2):
-            continue
-        rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
-        azimuth_deg = index.views.azimuth_deg[rows]
-        similar = index.compared.similarity(levels[rows])
-        for start in np.unique(np.arange(searches) * len(rows) // searches).tolist():
-            queries = _spread(azimuth_deg, start, views)
-            support = np.zeros((len(index), BINS), np.float32)
-            for n, i in enumerate(queries):
-                aside = (aside + _GOLDEN) % 1
-                neighbour = rows[(i + (1 if n % 2 else -1)) % len(rows)]
-                seen_so = similar[i].copy()
-                seen_so[rows[i]] -= aside * (seen_so[rows[i]] - seen_so[neighbour])
-                support += index.support(seen_so, float(azimuth_deg[i] - azimuth_deg[start]))
-                belief = Belief(index, support, azimuth_deg[queries[: n + 1]])
-                scores, odds = belief.scores(), belief.posterior(beta).sum(axis=1)
-                known.append(_leader(index.object_index, scores))
-                others = np.delete(index.object_index, place)
-                stranger.append(_leader(others, np.delete(scores, place)))
-                posterior.append(odds.max())
-                correct.append(odds.argmax() == place)
-    if not known:
-        raise ValueError(f"no object has {max(views, 2)} views; enroll more of each, or rehearse fewer views")
-    shape = -1, views
-    return Rehearsal(
-        len(index.views.object_names),
-        _leaders(known, shape),
-        _leaders(stranger, shape),
-        np.reshape(posterior, shape),
-        np.reshape(correct, shape),
-        beta,
-    )
-
-
-def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> FloatArray:
-    """Return the median score of each object in searches that found it, (objects, views); of others the typical one."""
-    usual = np.full((objects, leaders.score.shape[1]), np.nan)
-    for n in range(usual.shape[1]):
-        for j in np.unique(leaders.object_index[correct[:, n], n]).tolist():
-            usual[j, n] = np.median(leaders.score[correct[:, n] & (leaders.object_index[:, n] == j), n])
-        found = usual[~np.isnan(usual[:, n]), n]
-        usual[np.isnan(usual[:, n]), n] = np.median(found) if len(found) else 0.0
-    return usual
+        An object is found if it is confident and reaches the open-set threshold. Before the last calibrated view the
+        highest of all thresholds counts: an unknown object that passes the first threshold gets another view, which
+        costs an enrolled object little. From the last calibrated view on, an object below the threshold is unknown,
+        however many views are left: no false-reject rate was measured for those. After ``max_views`` the leading
+        candidate is found even if it is not confident.
+        """
+        probability = belief.posterior(self.beta).sum(axis=1)
+        best = int(probability.argmax())
+        calibrated = len(self.open_set_thresholds)
+        n = min(belief.queries, calibrated) - 1
+        leaders = Leaders.of([leader(belief.index.object_index, belief.scores())], (1, 1))
+        score = float(leaders.open_set_score(self.usual_scores[:, n : n + 1])[0, 0])
+        early = belief.queries < min(calibrated, max_views)
+        threshold = max(self.open_set_thresholds) if early else self.open_set_thresholds[n]
+        confidence = float(probability[best])
+        if score < threshold:
+            outcome = Outcome.CONTINUE if early else Outcome.UNKNOWN
+            reason = StopReason.BELOW_OPEN_SET_THRESHOLD
+        elif confidence >= self.min_confidence:
+            outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
+        elif belief.queries < max_views:
+            outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
+        else:
+            outcome, reason = Outcome.FOUND, StopReason.MAX_VIEWS
+        object_index = int(belief.index.object_index[best])
+        return StopDecision(outcome, reason, object_index, confidence, self.min_confidence, score, threshold)
 
 
 def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
     """Return the score below which no more than this share of further scores of the same kind fall.
 
-    The ⌊α(n + 1)⌋-th smallest of n scores; -inf where n is too small for any: fewer than 1/α - 1. The promise holds on
+    The ⌊α(n + 1)⌋-th smallest of n scores; -inf if n is too small, that is, below 1/α - 1. The guarantee holds on
     average for scores that are exchangeable with these, whatever their distribution.
 
     Source: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World", Springer 2005.
@@ -248,87 +193,206 @@ def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
     return float(ordered[place - 1]) if place else -inf
 
 
-def certainty_for(posterior: FloatArray, correct: NDArray[np.bool_], error_rate: float) -> float:
-    """Return the smallest probability that ends searches with no more than this share of wrong ones.
+def min_confidence_for(confidence: FloatArray, correct: NDArray[np.bool_], error_rate: float) -> float:
+    """Return the smallest confidence that ends searches with no more than this share of wrong ones.
 
-    A search, a row, ends at the first view whose best object has at least this probability; those that never reach it
-    end at the last view and do not count. Counted with one error more than there were, so that few searches promise
-    little: below ``1 / error_rate`` of them the result is above 1, and no search ends early.
+    A search, a row, ends at the first view whose leading candidate has at least this confidence; searches that never
+    reach it do not count. One more error is counted than there was, so that few searches guarantee little: with fewer
+    than ``1 / error_rate`` searches the result is inf.
     """
-    for certainty in np.unique(np.concatenate([[0.5], posterior[posterior > 0.5]])).tolist():
-        ends = posterior >= certainty
+    for least in np.unique(np.concatenate([[0.5], confidence[confidence > 0.5]])).tolist():
+        ends = confidence >= least
         at = np.flatnonzero(ends.any(axis=1))
         wrong = int((~correct[at, ends[at].argmax(axis=1)]).sum())
         if len(at) and (wrong + 1) / (len(at) + 1) <= error_rate:
-            return float(certainty)
+            return float(least)
     return inf
 
 
-def rules(rehearsal: Rehearsal, *, error_rate: float = 0.01, false_reject: float = 0.02) -> Rules:
-    """Find the rules that keep the stated error rates in the rehearsed searches."""
-    searches, views = rehearsal.posterior.shape
-    usual = usual_scores(rehearsal.known, rehearsal.correct, rehearsal.objects)
-    known, stranger = rehearsal.known.familiarity(usual), rehearsal.stranger.familiarity(usual)
-    familiar = tuple(conformal_threshold(known[:, n], false_reject) for n in range(views))
-    certainty = max(LEAST_CERTAINTY, certainty_for(rehearsal.posterior, rehearsal.correct, error_rate))
-    promises = []
-    if familiar[-1] == -inf:
-        promises.append(
-            f"{searches} rehearsed searches are too few for a false-reject rate of {false_reject:.1%}: nothing will be "
-            f"called unknown; {ceil(1 / false_reject) - 1} are needed"
-        )
-    if certainty > 1:
-        promises.append(
-            f"{searches} rehearsed searches cannot show an error rate of {error_rate:.2%}: no search ends early; at "
-            f"least {ceil(1 / error_rate)} are needed, and objects that can be told apart"
-        )
-    accepted = float((stranger[:, -1] >= familiar[-1]).mean())
-    return Rules(
-        rehearsal.beta, certainty, usual, familiar, error_rate, false_reject, accepted, searches, tuple(promises)
+def fit_stopping_rule(
+    searches: LeaveOneOut, *, error_rate: float = 0.01, false_reject: float = 0.02, objects: int | None = None
+) -> StoppingRule:
+    """Fit the rule that keeps the error rates in leave-one-out searches.
+
+    If there is too little data for a rate, the rule does what the data allows and states a limitation: a search ends at
+    `UNCALIBRATED_MIN_CONFIDENCE`, and objects that score less than every search did are unknown.
+
+    Parameters
+    ----------
+    searches : LeaveOneOut
+        As `leave_one_out` returns it.
+    error_rate, false_reject : float
+        Share of wrong objects among those named, and of enrolled objects called unknown.
+    objects : int, optional
+        How many objects were searched for, if that was only a sample of those in the model set.
+    """
+    count, views = searches.confidence.shape
+    objects = searches.objects if objects is None else objects
+    usual = usual_scores(searches.known, searches.correct, searches.objects)
+    known, unknown = searches.known.open_set_score(usual), searches.unknown.open_set_score(usual)
+    limitations = []
+    if objects < searches.objects:
+        limitations.append(Limitation(LimitationCode.SAMPLED, {"searched": objects, "objects": searches.objects}))
+
+    # Thresholds for unknown objects; with too few searches, the smallest score of all.
+    thresholds = tuple(conformal_threshold(known[:, n], false_reject) for n in range(views))
+    if thresholds[-1] == -inf:
+        reached = 1 / (count + 1)
+        thresholds = tuple(conformal_threshold(known[:, n], reached + 1e-9) for n in range(views))
+        values = {"rate": false_reject, "searches": count, "needed": ceil(1 / false_reject) - 1, "reached": reached}
+        limitations.append(Limitation(LimitationCode.FALSE_REJECT_RATE, values))
+
+    # Confidence that ends a search.
+    min_confidence = max(SMALLEST_MIN_CONFIDENCE, min_confidence_for(searches.confidence, searches.correct, error_rate))
+    if min_confidence > 1:
+        min_confidence, needed = UNCALIBRATED_MIN_CONFIDENCE, ceil(1 / error_rate)
+        ended, wrong = _ended(searches, min_confidence)
+        values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": min_confidence}
+        code = LimitationCode.ERROR_RATE if count < needed else LimitationCode.SIMILAR_OBJECTS
+        limitations.append(Limitation(code, {**values, "wrong": wrong, "ended": len(ended)}))
+    if objects < FEWEST_OBJECTS:
+        limitations.append(Limitation(LimitationCode.UNKNOWN_NOT_MEASURED))
+    return StoppingRule(
+        beta=searches.beta,
+        min_confidence=min_confidence,
+        usual_scores=usual,
+        open_set_thresholds=thresholds,
+        error_rate=error_rate,
+        false_reject=false_reject,
+        false_accept=float((unknown[:, -1] >= thresholds[-1]).mean()) if objects >= FEWEST_OBJECTS else nan,
+        searches=count,
+        limitations=tuple(limitations),
     )
 
 
-def judge(belief: Belief, by: Rules, *, max_views: int = 8) -> Verdict:
-    """Say whether the search may end, and with what.
+@dataclass(frozen=True, eq=False)
+class CalibratedRule:
+    """A stopping rule, and what it does in the leave-one-out searches that it comes from.
 
-    An object is found when its probability reaches the rules' certainty and it is familiar; after the last view the
-    best object is found if it is familiar, and otherwise unknown.
+    Attributes
+    ----------
+    rule : StoppingRule
+        Its ``limitations`` say what it does not guarantee.
+    views
+        Views of each search.
+    ended, wrong
+        Searches that ended by their confidence, and how many of them with a wrong object.
+    mean_views
+        Views that the ended searches took; nan if none ended.
+    rejected
+        Searches for enrolled objects that ended as unknown after the last view.
+    accepted
+        Searches for left-out objects that did not; None if there are too few objects to measure that.
+    confused : tuple of (str, str)
+        Left-out objects and the objects they were taken for, the most frequent pairs first.
     """
-    odds = belief.posterior(by.beta).sum(axis=1)
-    best = int(odds.argmax())
-    n = min(belief.queries, len(by.familiar)) - 1
-    leaders = _leaders([_leader(belief.index.object_index, belief.scores())], (1, 1))
-    probability, known = float(odds[best]), float(leaders.familiarity(by.usual[:, n : n + 1])[0, 0])
-    object_index = int(belief.index.object_index[best])
-    name = belief.index.views.object_names[object_index]
-    least = by.familiar[n]
-    says = f"{name} with a probability of {probability:.3f} and a familiarity of {known:.3f}"
-    if known >= least and probability >= by.certainty:
-        return Verdict("found", object_index, probability, known, f"{says}: sure enough")
-    if belief.queries < max_views:
-        reason = "not sure yet" if known >= least else f"below {least:.3f}, which enrolled objects reach"
-        return Verdict("look", object_index, probability, known, f"{says}: {reason}")
-    if known >= least:
-        return Verdict("found", object_index, probability, known, f"{says}: the best after {max_views} views")
-    return Verdict("unknown", object_index, probability, known, f"{says}: below {least:.3f}, so none of those enrolled")
+
+    rule: StoppingRule
+    views: int = 1
+    ended: int = 0
+    wrong: int = 0
+    mean_views: float = nan
+    rejected: int = 0
+    accepted: int | None = None
+    confused: tuple[tuple[str, str], ...] = ()
 
 
-def _leader(object_index: IndexArray, scores: FloatArray) -> tuple[int, float, float]:
-    best = int(scores.argmax())
-    lead = scores[best] - np.partition(scores, -2)[-2] if len(scores) > 1 else scores[best]
-    return int(object_index[best]), float(scores[best]), float(lead)
+def calibrate_stopping_rule(
+    index: DenseIndex,
+    *,
+    error_rate: float = 0.01,
+    false_reject: float = 0.02,
+    most_searches: int = MOST_SEARCHES,
+    sample: int | None = None,
+) -> CalibratedRule:
+    """Search for the enrolled objects among each other, and return the rule that follows.
+
+    Parameters
+    ----------
+    index : DenseIndex
+        Of at least one object.
+    error_rate, false_reject
+        As for `fit_stopping_rule`.
+    most_searches
+        Searches in all, from different first views; each object is searched for at least once.
+    sample
+        Search only for so many objects, among each other.
+    """
+    searches = calibration_searches(index, most_searches=most_searches, sample=sample)
+    if searches is None:
+        return CalibratedRule(_rule_without_candidates(index, error_rate, false_reject))
+    objects = len(index) if sample is None else min(len(index), max(2, sample))
+    rule = fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
+    known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
+    ended, wrong = _ended(searches, rule.min_confidence)
+    accepted = unknown >= rule.open_set_thresholds[-1]
+    # If the object was found, the leader among all is the one that was left out.
+    certain = accepted & searches.correct[:, -1]
+    pairs = np.stack([part.object_index[certain, -1] for part in (searches.known, searches.unknown)], axis=1)
+    confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+    names = index.views.object_names
+    return CalibratedRule(
+        rule,
+        views=searches.confidence.shape[1],
+        ended=len(ended),
+        wrong=wrong,
+        mean_views=float(ended.mean() + 1) if len(ended) else nan,
+        rejected=int((known < rule.open_set_thresholds[-1]).sum()),
+        accepted=int(accepted.sum()) if objects >= FEWEST_OBJECTS else None,
+        confused=tuple((names[a], names[b]) for a, b in confused[np.lexsort((first, -times))].tolist()),
+    )
 
 
-def _leaders(found: list[tuple[int, float, float]], shape: tuple[int, int]) -> Leaders:
-    objects, scores, leads = zip(*found, strict=True)
-    return Leaders(np.reshape(objects, shape), np.reshape(scores, shape), np.reshape(leads, shape))
+def calibration_searches(
+    index: DenseIndex, *, most_searches: int = MOST_SEARCHES, sample: int | None = None
+) -> LeaveOneOut | None:
+    """Return the leave-one-out searches of a calibration; None if objects cannot be compared with each other."""
+    usual_views = int(np.median((~index.left_out).sum(axis=1)))
+    if len(index) < 2 or usual_views < 2:
+        return None
+    places = np.arange(len(index))
+    if sample is not None:
+        places = np.unique(np.linspace(0, len(index) - 1, max(2, sample)).astype(int))
+    return leave_one_out(
+        index.only(places),
+        views=min(CALIBRATED_VIEWS, usual_views),
+        searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
+    )
 
 
-def _spread(azimuth_deg: FloatArray, start: int, count: int) -> list[int]:
-    """Indices of so many different views, a step apart, the first at `start`."""
-    chosen = [start]
-    for n in range(1, count):
-        away = np.abs((azimuth_deg - azimuth_deg[start] - n * _STEP_DEG + 180) % 360 - 180)
-        away[chosen] = np.inf
-        chosen.append(int(away.argmin()))
-    return chosen
+def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject: float) -> StoppingRule:
+    """Return the rule of a catalog in which objects cannot be compared: one object, or single views.
+
+    One object is found if it scores at least what its own views score when they are left out one by one. With single
+    views no object is called unknown.
+    """
+    threshold, searches, code = -inf, 0, LimitationCode.SINGLE_VIEWS
+    usual = np.zeros((len(index.views.object_names), 1))
+    if len(index) == 1 and len(index.views) > 1:
+        code, searches = LimitationCode.ONE_OBJECT, len(index.views)
+        levels, azimuth_deg = index.views.descriptors, index.views.azimuth_deg
+        left_out = [
+            update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()
+            for row in range(searches)
+        ]
+        leaders = Leaders.of([leader(index.object_index, scores) for scores in left_out], (searches, 1))
+        threshold = float(leaders.open_set_score(usual).min())
+    return StoppingRule(
+        beta=BETA,
+        min_confidence=UNCALIBRATED_MIN_CONFIDENCE,
+        usual_scores=usual,
+        open_set_thresholds=(threshold,),
+        error_rate=error_rate,
+        false_reject=false_reject,
+        false_accept=nan,
+        searches=searches,
+        limitations=(Limitation(code),),
+    )
+
+
+def _ended(searches: LeaveOneOut, min_confidence: float) -> tuple[NDArray[np.intp], int]:
+    """Return after which view (from 0) each ended search ends at this confidence, and how many of them are wrong."""
+    ends = searches.confidence >= min_confidence
+    at = np.flatnonzero(ends.any(axis=1))
+    view = ends[at].argmax(axis=1)
+    return view, int((~searches.correct[at, view]).sum())

@@ -1,4 +1,4 @@
-"""The methods that are compared: how views are chosen, and how they are judged."""
+"""The methods that are compared: how views are chosen, and how objects are ranked."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,7 +6,18 @@ from typing import Final, Literal
 
 from hbr.paper.hough import Extension
 
-Walk = Literal["random", "sweep-45", "sweep-90", "ahbr", "ahbr-90", "coin", "look", "look-coin", "mutual", "oracle"]
+Strategy = Literal[
+    "random",
+    "sweep-45",
+    "sweep-90",
+    "ahbr",
+    "ahbr-90",
+    "coin",
+    "next-best-view",
+    "next-best-view-coin",
+    "mutual",
+    "oracle",
+]
 
 
 @dataclass(frozen=True)
@@ -16,26 +27,26 @@ class Method:
     Attributes
     ----------
     name : str
-        By which it is asked for.
+        The name that selects it.
     label : str
         For tables and figures.
-    walk : str
+    strategy : str
         How the next view is chosen. ``random``; ``sweep-45`` and ``sweep-90``: at fixed steps; ``ahbr``: by Eq. 5-7;
-        ``coin``: by a coin with the step of Eq. 5-7. These two need two views: the second is a random one, or, of
-        ``ahbr-90``, 90 degrees to the left as on the rig. Of the dense filter alone: ``look``, by `hbr.next_best_view`;
-        ``look-coin``: its turn to a side by a coin; ``mutual``: by mutual information; ``oracle``: the photograph after
-        which the true object, which it is told, leads most.
+        ``coin``: to a random side, with the step of Eq. 5-7. The last two need two views: the second is a random one,
+        or, with ``ahbr-90``, 90° to the left as on the rig. Only with the dense filter: ``next-best-view``, by
+        `hbr.next_best_view`; ``next-best-view-coin``, its rotation to a random side; ``mutual``, by mutual information;
+        ``oracle``, the photograph after which the true object, which it knows, leads most.
     omega, list_length, extension
         As for `hbr.retrieve`, or for `hbr.DenseIndex`.
     views : int or None
-        So many are looked at, whatever is allowed; None for no limit of its own.
+        Largest number of views of this method; None for the protocol's.
     dense : bool
-        Judged by the dense filter instead of the paper's voting.
+        Ranked by the dense filter instead of the paper's voting.
     """
 
     name: str
     label: str
-    walk: Walk = "random"
+    strategy: Strategy = "random"
     omega: float = 0.5
     list_length: int = 10
     extension: Extension = "orient_all"
@@ -44,7 +55,7 @@ class Method:
 
     @property
     def active(self) -> bool:
-        return self.walk in ("ahbr", "ahbr-90", "coin")
+        return self.strategy in ("ahbr", "ahbr-90", "coin")
 
 
 _LISTED: Final = (
@@ -54,17 +65,17 @@ _LISTED: Final = (
     Method("hbr-0-orient", "HBR ω = 0 (orient)", omega=0.0, extension="orient"),
     Method("hbr", "HBR ω = 0.5"),
     Method("hbr-orient", "HBR ω = 0.5 (orient)", extension="orient"),
-    Method("ahbr", "AHBR ω = 0.5", walk="ahbr"),
-    Method("ahbr-orient", "AHBR ω = 0.5 (orient)", walk="ahbr", extension="orient"),
-    Method("ahbr-90", "AHBR, first turn 90°", walk="ahbr-90"),
-    Method("coin", "coin flip", walk="coin"),
-    Method("sweep-45", "sweep 45°", walk="sweep-45"),
-    Method("sweep-90", "sweep 90°", walk="sweep-90"),
+    Method("ahbr", "AHBR ω = 0.5", strategy="ahbr"),
+    Method("ahbr-orient", "AHBR ω = 0.5 (orient)", strategy="ahbr", extension="orient"),
+    Method("ahbr-90", "AHBR, first turn 90°", strategy="ahbr-90"),
+    Method("coin", "coin flip", strategy="coin"),
+    Method("sweep-45", "sweep 45°", strategy="sweep-45"),
+    Method("sweep-90", "sweep 90°", strategy="sweep-90"),
 )
 _OMEGA: Final = 2.0
 _DENSE: Final = (
-    Method("dense", "dense filter, next look", "look", _OMEGA, dense=True),
-    Method("dense-coin", "dense filter, coin flip", "look-coin", _OMEGA, dense=True),
+    Method("dense", "dense filter, next best view", "next-best-view", _OMEGA, dense=True),
+    Method("dense-coin", "dense filter, coin flip", "next-best-view-coin", _OMEGA, dense=True),
     Method("dense-random", "dense filter, random", "random", _OMEGA, dense=True),
     Method("dense-45", "dense filter, sweep 45°", "sweep-45", _OMEGA, dense=True),
     Method("dense-90", "dense filter, sweep 90°", "sweep-90", _OMEGA, dense=True),
@@ -79,14 +90,14 @@ _LIST_SWEEP: Final = tuple(Method(f"list-{n}", f"HBR lists of {n}", list_length=
 METHODS: Final = {method.name: method for method in (*_LISTED, *_DENSE, *_OMEGA_SWEEP, *_LIST_SWEEP)}
 GROUPS: Final[dict[str, tuple[Method, ...]]] = {
     "all": _LISTED,
-    "beyond": _DENSE[:-1],  # the oracle tries every view, which takes its time
+    "beyond": _DENSE[:-1],  # the oracle tries every view, which is slow
     "omega-sweep": _OMEGA_SWEEP,
     "list-sweep": _LIST_SWEEP,
 }
 
 
 def choose_methods(names: Iterable[str]) -> tuple[Method, ...]:
-    """The methods of these names and of the groups among them, each once.
+    """Return the methods of these names and groups, each once.
 
     Raises
     ------
@@ -103,5 +114,5 @@ def choose_methods(names: Iterable[str]) -> tuple[Method, ...]:
             listed = ", ".join([*GROUPS, *(method.name for method in (*_LISTED, *_DENSE))])
             raise ValueError(f"method {name!r} is unknown; use some of {listed}")
     if not chosen:
-        raise ValueError("no method was asked for; use all for the whole comparison")
+        raise ValueError("no method is given; use all for the whole comparison")
     return tuple(chosen.values())

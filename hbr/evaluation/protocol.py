@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import Belief, DenseIndex, update_belief
-from hbr.dense.next_view import most_informative_rotation, next_best_view
+from hbr.dense.next_view import most_informative_rotation
+from hbr.dense.session import DenseSession
+from hbr.dense.stopping import Outcome, StoppingRule, calibrate_stopping_rule
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
@@ -25,8 +27,8 @@ from hbr.paper.index import ViewIndex
 from hbr.paper.next_view import Side, next_view
 
 Removal = Literal["near", "paper79", "queries"]
-#: Probability of the best object that ends a search by the dense filter.
-CERTAINTY: Final = 0.98
+#: Codes of `Runs.outcome`.
+OUTCOMES: Final = (Outcome.CONTINUE, Outcome.FOUND, Outcome.UNKNOWN)
 _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
 
@@ -55,7 +57,7 @@ class Protocol:
         Of each object so many views stay enrolled, at equal distances, and queries are taken from the others; None for
         all views, queries among them.
     absent : tuple of str
-        Names of objects that are not enrolled at all: what comes of looking for strangers. By the dense filter alone.
+        Names of objects that are not enrolled, to measure unknown objects; only with the dense filter.
     """
 
     trials: int = 10
@@ -99,14 +101,15 @@ class Runs:
     period_deg : float64
         Symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not symmetric;
         nan if it has too few views.
-    lead : float64
+    margin : float64
         `hbr.score_margin` of the best object, a view; by the dense filter, its score above the second's.
     best : int32
         The best object, by its index in the views' names.
     score : float64
         Its score, a view.
-    posterior : float64
-        Probability of the best object by the dense filter; nan of the paper's voting.
+    outcome : int8
+        What the stopping rule decided after each view by the dense filter, as a place in `OUTCOMES`; -1 of the paper's
+        voting.
     travelled_deg : float64
         Degrees turned since the first view, to either side.
     step_ns : int64
@@ -117,10 +120,10 @@ class Runs:
     pose_error_deg: FloatArray
     alike_error_deg: FloatArray
     period_deg: FloatArray
-    lead: FloatArray
+    margin: FloatArray
     best: NDArray[np.int32]
     score: FloatArray
-    posterior: FloatArray
+    outcome: NDArray[np.int8]
     travelled_deg: FloatArray
     step_ns: NDArray[np.int64]
 
@@ -128,16 +131,16 @@ class Runs:
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
         """Nothing looked at yet."""
         shape = (methods, objects, trials, views)
-        errors, alike, period, lead, score, posterior, travelled = np.full((7, *shape), np.nan)
+        errors, alike, period, margin, score, travelled = np.full((6, *shape), np.nan)
         return cls(
             np.full(shape, -1, np.int32),
             errors,
             alike,
             period,
-            lead,
+            margin,
             np.full(shape, -1, np.int32),
             score,
-            posterior,
+            np.full(shape, -1, np.int8),
             travelled,
             np.zeros(shape, np.int64),
         )
@@ -168,6 +171,7 @@ def run_object(
     methods: Sequence[Method],
     protocol: Protocol,
     *,
+    rule: StoppingRule | None = None,
     now_ns: Callable[[], int] = lambda: 0,
 ) -> Runs:
     """Search for one object by all methods, in all trials.
@@ -184,6 +188,8 @@ def run_object(
         What to search by.
     protocol : Protocol
         The trials.
+    rule : StoppingRule, optional
+        For methods of the dense filter; by default `rule_of_trial`.
     now_ns : callable
         Monotonic time, for `Runs.step_ns`.
 
@@ -197,7 +203,9 @@ def run_object(
     ValueError
         The object has too few views, or other than there are queries.
     """
-    trial = _Trials(object_index, queries, views, protocol, now_ns)
+    if rule is None and any(method.dense for method in methods):
+        rule = rule_of_trial(views, protocol)
+    trial = _Trials(object_index, queries, views, protocol, rule, now_ns)
     runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
     for t in range(protocol.trials):
         draws = trial.draw(t)
@@ -209,15 +217,21 @@ def run_object(
 
 class _Trials:
     def __init__(
-        self, object_index: int, queries: LevelArray, views: Views, protocol: Protocol, now_ns: Callable[[], int]
+        self,
+        object_index: int,
+        queries: LevelArray,
+        views: Views,
+        protocol: Protocol,
+        rule: StoppingRule | None,
+        now_ns: Callable[[], int],
     ) -> None:
         self._object, self._queries, self._views = object_index, queries, views
-        self._protocol, self._now_ns = protocol, now_ns
+        self._protocol, self._rule, self._now_ns = protocol, rule, now_ns
         self._rows = views.of(object_index)
         self._azimuth_deg = views.azimuth_deg[self._rows]
         name = views.object_names[object_index]
         self._enrolled = views_of_trial(views, protocol)
-        self._is_stranger = name in protocol.absent
+        self._is_unknown = name in protocol.absent
         self._free = np.flatnonzero(~self._enrolled[self._rows]) if protocol.enrolled else np.arange(len(self._rows))
         self._index: DenseIndex | None = None
         if len(queries) != len(self._rows):
@@ -255,7 +269,7 @@ class _Trials:
             self._run_dense(method, draws, runs, at)
             return
         if self._protocol.absent:
-            raise ValueError(f"{method.label} cannot look for strangers here; use methods of the dense filter")
+            raise ValueError(f"{method.label} cannot search for unknown objects; use methods of the dense filter")
         seen = [int(draws.order[0])]
         travelled_deg = 0.0
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
@@ -278,64 +292,67 @@ class _Trials:
             )
             following = self._next(method, draws, seen, ranking) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
-            self._judge(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
-            self._judge_lead(ranking, seen, keep, runs, (*at, n))
+            self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            self._record_margin(ranking, seen, keep, runs, (*at, n))
             runs.travelled_deg[*at, n] = travelled_deg
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
 
     def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
+        assert self._rule is not None
         if self._index is None or self._index.omega != method.omega:
             self._index = DenseIndex(self._views.select(self._enrolled), omega=method.omega)
         seen = [int(draws.order[0])]
         travelled_deg = 0.0
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
-        so_far: DenseIndex | Belief = self._index
+        session = DenseSession(self._index, self._rule, max_views=last)
         for n in range(last):
+            # Views near the newest query leave the model for the earlier queries, too.
             gone = self._rows[~self._keep(np.array(seen)) & self._enrolled[self._rows]]
             measured_deg = (self._azimuth_deg[seen] + draws.error_deg[: n + 1]).tolist()
-            if len(gone):  # the views near to the newest query left the model for the queries before, too
-                so_far = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
+            if len(gone):
+                fewer = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
+                session = DenseSession(fewer, self._rule, max_views=last)
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
-                    so_far = update_belief(self._queries[i], angle_deg, so_far)
+                    session.add(self._queries[i], angle_deg)
             start_ns = self._now_ns()
-            so_far = belief = update_belief(self._queries[seen[-1]], measured_deg[-1], so_far)
-            following = self._next_dense(method, draws, seen, belief) if n + 1 < last else seen[-1]
+            decision = session.add(self._queries[seen[-1]], measured_deg[-1])
+            following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
-            ranking = belief.ranking()
-            self._judge(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            ranking = session.belief.ranking()
+            self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
             runs.score[*at, n] = ranking.scores[0]
-            runs.lead[*at, n] = ranking.scores[0] - ranking.scores[1] if len(ranking.scores) > 1 else ranking.scores[0]
-            runs.posterior[*at, n] = belief.posterior().sum(axis=1).max()
+            runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
+            runs.outcome[*at, n] = OUTCOMES.index(decision.outcome)
             runs.travelled_deg[*at, n] = travelled_deg
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
 
-    def _next_dense(self, method: Method, draws: _Draws, seen: list[int], belief: Belief) -> int:
-        match method.walk:
-            case "look":
-                return self._nearest(seen, next_best_view(belief).rotation_deg)
-            case "look-coin":
-                turn_deg = abs(next_best_view(belief).rotation_deg)
-                return self._nearest(seen, turn_deg if draws.coins[len(seen)] else -turn_deg)
+    def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
+        match method.strategy:
+            case "next-best-view":
+                return self._nearest(seen, session.next_best_view().rotation_deg)
+            case "next-best-view-coin":
+                rotation_deg = abs(session.next_best_view().rotation_deg)
+                return self._nearest(seen, rotation_deg if draws.coins[len(seen)] else -rotation_deg)
             case "mutual":
-                return self._nearest(seen, most_informative_rotation(belief))
+                return self._nearest(seen, most_informative_rotation(session.belief))
             case "oracle":
-                return self._told(seen, belief)
+                return self._oracle(seen, session.belief)
             case _:
-                if method.walk in _STEP_DEG:
-                    return self._nearest(seen, _STEP_DEG[method.walk])
+                if method.strategy in _STEP_DEG:
+                    return self._nearest(seen, _STEP_DEG[method.strategy])
                 return int(draws.order[len(seen)])
 
-    def _told(self, seen: list[int], belief: Belief) -> int:
-        """The photograph after which the true object leads most, of every third."""
+    def _oracle(self, seen: list[int], belief: Belief) -> int:
+        """Return the photograph after which the true object leads most, of every third."""
         left = np.setdiff1d(self._free, seen)[::3]
-        leads = []
+        margins = []
         for i in left.tolist():
             scores = update_belief(self._queries[i], float(self._azimuth_deg[i]), belief).scores()
             own = belief.index.object_index == self._object
-            leads.append(scores[own].max(initial=-np.inf) - scores[~own].max(initial=-np.inf))
-        return int(left[int(np.argmax(leads))])
+            margins.append(scores[own].max(initial=-np.inf) - scores[~own].max(initial=-np.inf))
+        return int(left[int(np.argmax(margins))])
 
     def _keep(self, seen: IndexArray) -> NDArray[np.bool_]:
         """Which of the object's views stay enrolled after these queries."""
@@ -350,7 +367,7 @@ class _Trials:
                 keep[self._ring[(place[seen] + 1) % len(self._ring)]] = False
             case "queries":
                 pass
-        if not keep.any() and not self._is_stranger:
+        if not keep.any() and not self._is_unknown:
             name = self._views.object_names[self._object]
             raise ValueError(
                 f"after {len(seen)} queries no view of {name} is left; use fewer views or removal 'queries'"
@@ -366,9 +383,9 @@ class _Trials:
         """The photograph to look at next, of those not yet looked at."""
         if method.active and len(seen) > 1:
             coin: Side = "left" if draws.coins[len(seen)] else "right"
-            turn_deg = next_view(ranking, side=coin if method.walk == "coin" else None).rotation_deg
-        elif method.walk in _STEP_DEG:
-            turn_deg = _STEP_DEG[method.walk]
+            turn_deg = next_view(ranking, side=coin if method.strategy == "coin" else None).rotation_deg
+        elif method.strategy in _STEP_DEG:
+            turn_deg = _STEP_DEG[method.strategy]
         else:
             return int(draws.order[len(seen)])
         return self._nearest(seen, turn_deg)
@@ -380,7 +397,7 @@ class _Trials:
         away_deg[seen] = np.inf
         return int(away_deg.argmin())
 
-    def _judge(
+    def _record(
         self, objects: IndexArray, pose_deg: FloatArray, seen: list[int], runs: Runs, at: tuple[int, int, int, int]
     ) -> None:
         place = np.flatnonzero(objects == self._object)
@@ -392,7 +409,7 @@ class _Trials:
             runs.pose_error_deg[at] = away_deg[seen[-1]]
             runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
 
-    def _judge_lead(
+    def _record_margin(
         self,
         ranking: Ranking,
         seen: list[int],
@@ -405,7 +422,12 @@ class _Trials:
         reach = self._reach[:, seen].sum(axis=1)
         reach[self._object] = self._own_similar[seen][:, keep].max(axis=1).sum()
         reach[ranking.object_index[0]] = -np.inf
-        runs.lead[at] = (ranking.scores[0] - reach.max()) / len(seen)
+        runs.margin[at] = (ranking.scores[0] - reach.max()) / len(seen)
+
+
+def rule_of_trial(views: Views, protocol: Protocol) -> StoppingRule:
+    """Return the stopping rule that a bench would calibrate on the views that are enrolled in all trials."""
+    return calibrate_stopping_rule(DenseIndex(views.select(views_of_trial(views, protocol)))).rule
 
 
 def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray
+from hbr.dense.stopping import Outcome
 from hbr.evaluation.methods import Method
-from hbr.evaluation.protocol import CERTAINTY, Runs
+from hbr.evaluation.protocol import OUTCOMES, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
 _BEST: int = 10
@@ -42,9 +43,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Stopping:
-    """The search that ends as soon as the lead a view reaches the margin, or when all views are taken.
+    """Searches that end by themselves, or when all views are taken.
 
-    By the dense filter it ends as soon as the best object has the probability `CERTAINTY`.
+    The paper's methods end when the margin per view reaches ``margin``; the dense filter ends by the stopping rule that
+    was calibrated on the enrolled views. A hit is a search that named the right object. ``unknown_rate`` is the share
+    of searches that called it unknown, ``ended_early`` of those that did not need all views.
     """
 
     margin: float
@@ -53,8 +56,9 @@ class Stopping:
     hit_rate: float
     hit_rate_low: float
     hit_rate_high: float
+    unknown_rate: float
     travelled_mean_deg: float
-    by_margin: float
+    ended_early: float
 
 
 @dataclass(frozen=True)
@@ -211,25 +215,27 @@ def _point(runs: Runs, method: int, n: int) -> Point:
     )
 
 
-def _stopping(runs: Runs, method: int, margin: float, min_views: int) -> Stopping:
-    looked = _looked(runs, method)
-    lead, posterior, rank, travelled_deg = (
-        part[method][..., looked].reshape(-1, len(looked))
-        for part in (runs.lead, runs.posterior, runs.rank, runs.travelled_deg)
+def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> Stopping:
+    seen = _looked(runs, method)
+    margin, outcome, rank, travelled_deg = (
+        part[method][..., seen].reshape(-1, len(seen))
+        for part in (runs.margin, runs.outcome, runs.rank, runs.travelled_deg)
     )
-    by_filter = not np.isnan(posterior).any()
-    leads = posterior >= CERTAINTY if by_filter else (lead >= margin) & (looked + 1 >= min_views)
-    stops = np.where(leads.any(axis=1), leads.argmax(axis=1), len(looked) - 1)
-    trial = np.arange(len(stops))
-    hits = int((rank[trial, stops] == 1).sum())
+    dense = bool((outcome >= 0).all())
+    ends = outcome != OUTCOMES.index(Outcome.CONTINUE) if dense else (margin >= least_margin) & (seen + 1 >= min_views)
+    end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(seen) - 1)
+    trial = np.arange(len(end))
+    unknown = outcome[trial, end] == OUTCOMES.index(Outcome.UNKNOWN)
+    hits = int(((rank[trial, end] == 1) & ~unknown).sum())
     return Stopping(
-        margin,
-        float(stops.mean()) + 1,
-        float(np.quantile(stops + 1, 0.95, method="higher")),
+        least_margin,
+        float(end.mean()) + 1,
+        float(np.quantile(end + 1, 0.95, method="higher")),
         hits / len(trial),
         *wilson(hits, len(trial)),
-        float(travelled_deg[trial, stops].mean()),
-        float(leads.any(axis=1).mean()),
+        float(unknown.mean()),
+        float(travelled_deg[trial, end].mean()),
+        float(ends[:, :-1].any(axis=1).mean()),
     )
 
 

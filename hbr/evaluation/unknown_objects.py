@@ -1,4 +1,4 @@
-"""Objects that were never enrolled: how often they are taken for one that was, and what that costs the others."""
+"""Objects that were never enrolled: how often they are accepted, and how many enrolled objects are rejected."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,25 +6,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hbr.core.arrays import BoolArray
-from hbr.dense.stopping import Leaders, Rehearsal, conformal_threshold, usual_scores
+from hbr.dense.leave_one_out import Leaders, usual_scores
+from hbr.dense.stopping import StoppingRule, conformal_threshold
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Protocol, Runs
 
 
 @dataclass(frozen=True)
-class Stranger:
-    """After so many views, over all draws of objects that were left out.
+class UnknownObjects:
+    """Results after so many views, over all draws of objects that were left out.
 
-    False rejects are of the last third of the known objects' trials: what each object usually scores comes from the
-    first third, thresholds from the second. Or, where the catalog was rehearsed, of all against its thresholds.
+    If ``calibrated``, all trials are compared with the thresholds of the stopping rule that a bench calibrates on the
+    enrolled views. Otherwise thresholds come from trials: the usual scores from the first third of the enrolled
+    objects' trials, thresholds from the second, false rejects from the last.
     """
 
-    rehearsed: bool
+    calibrated: bool
     views: int
     nominal: float
     known_trials: int
     false_rejects: int
-    stranger_trials: int
+    unknown_trials: int
     false_accepts: int
 
 
@@ -46,44 +48,46 @@ def left_out(protocol: Protocol, names: tuple[str, ...], count: int, draws: int)
     return tuple(drawn)
 
 
-def strangers(
-    parts: Sequence[tuple[Runs, BoolArray]], false_reject: float, rehearsals: Sequence[Rehearsal] = ()
-) -> tuple[Stranger, ...]:
-    """Judge the draws at a nominal false-reject rate.
+def unknown_objects(
+    parts: Sequence[tuple[Runs, BoolArray]], false_reject: float, rules: Sequence[StoppingRule] = ()
+) -> tuple[UnknownObjects, ...]:
+    """Count false rejects and false accepts at a nominal false-reject rate.
 
     Parameters
     ----------
     parts : sequence of (Runs, bool array (objects,))
-        Of each draw the runs of all objects by one method of the dense filter, and which were absent.
+        For each draw, the runs of all objects by one method of the dense filter, and which objects were absent.
     false_reject : float
-        Share of known objects' searches that may be called unknown.
-    rehearsals : sequence of Rehearsal, optional
-        Of each draw's catalog: thresholds come from them instead of from trials.
+        Share of enrolled objects that may be called unknown.
+    rules : sequence of StoppingRule, optional
+        For each draw, the rule that was fitted for this rate; without rules, thresholds come from trials.
     """
     views = parts[0][0].score.shape[-1]
     counts = np.zeros((views, 4), int)
     for d, (runs, absent) in enumerate(parts):
-        third = runs.score.shape[2] // 3
-        strange = _leaders(runs, absent, slice(None))
-        if rehearsals:
-            known, sample = _leaders(runs, ~absent, slice(None)), rehearsals[d].known
-            usual = usual_scores(sample, rehearsals[d].correct, len(absent))
+        unknown = _leaders(runs, absent, slice(None))
+        if rules:
+            known = _leaders(runs, ~absent, slice(None))
+            last = np.minimum(np.arange(views), len(rules[d].open_set_thresholds) - 1)
+            usual, thresholds = rules[d].usual_scores[:, last], np.array(rules[d].open_set_thresholds)[last]
         else:
-            first = _leaders(runs, ~absent, slice(third))
-            sample, known = (
-                _leaders(runs, ~absent, part) for part in (slice(third, 2 * third), slice(2 * third, None))
+            third = runs.score.shape[2] // 3
+            first, second, known = (
+                _leaders(runs, ~absent, slice(start, end))
+                for start, end in ((0, third), (third, 2 * third), (2 * third, None))
             )
             correct = first.object_index == np.repeat(np.flatnonzero(~absent), third)[:, None]
             usual = usual_scores(first, correct, len(absent))
-        measured = sample.familiarity(usual)
-        for n in range(views):
-            threshold = conformal_threshold(measured[:, n], false_reject)
-            familiar, odd = known.familiarity(usual)[:, n], strange.familiarity(usual)[:, n]
-            counts[n] += len(familiar), (familiar < threshold).sum(), len(odd), (odd >= threshold).sum()
-    return tuple(Stranger(bool(rehearsals), n + 1, false_reject, *row) for n, row in enumerate(counts.tolist()))
+            measured = second.open_set_score(usual)
+            thresholds = np.array([conformal_threshold(measured[:, n], false_reject) for n in range(views)])
+        rejected, accepted = known.open_set_score(usual) < thresholds, unknown.open_set_score(usual) >= thresholds
+        for column, counted in enumerate((rejected, accepted)):
+            counts[:, 2 * column] += len(counted)
+            counts[:, 2 * column + 1] += counted.sum(axis=0)
+    return tuple(UnknownObjects(bool(rules), n + 1, false_reject, *row) for n, row in enumerate(counts.tolist()))
 
 
 def _leaders(runs: Runs, objects: BoolArray, trials: slice) -> Leaders:
-    """Of these objects' trials, (objects * trials, views)."""
-    parts = (part[0, objects][:, trials] for part in (runs.best, runs.score, runs.lead))
+    """Return the leaders of these objects' trials, (objects * trials, views)."""
+    parts = (part[0, objects][:, trials] for part in (runs.best, runs.score, runs.margin))
     return Leaders(*(part.reshape(-1, part.shape[-1]) for part in parts))

@@ -60,9 +60,9 @@ def decision_chart(
     for i in around:
         ends = polar(_BARS[0], azimuth_deg[i]), polar(_BARS[0] + bars[i], azimuth_deg[i])
         parts.append(svg.line(*ends, "cost", svg.title(_words(weighed, i, azimuth_deg[i]))))
-    if weighed.alike is not None:
-        dashed = _radii(weighed.alike)
-        parts.append(svg.path([polar(dashed[i], azimuth_deg[i]) for i in around], "alike", close=True))
+    if weighed.similarity is not None:
+        dashed = _radii(weighed.similarity)
+        parts.append(svg.path([polar(dashed[i], azimuth_deg[i]) for i in around], "similarity", close=True))
     outline = [polar(curve[i], azimuth_deg[i]) for i in around]
     parts.append(svg.path(outline, "confusion", close=len(around) > 2))
     chosen = min(range(len(azimuth_deg)), key=lambda i: abs(weighed.rotations_deg[i] - rotation_deg))
@@ -91,10 +91,10 @@ def decision_chart(
 
 
 def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> list[tuple[str, str]]:
-    if len(candidates) < 2 or weighed.alike is None:
+    if len(candidates) < 2 or weighed.similarity is None:
         reason = [("only one object is likely:", "small"), ("a new side improves its pose", "small")]
         return [*reason, *_cost(weighed, chosen)]
-    least, most = min(weighed.alike), max(weighed.alike)
+    least, most = min(weighed.similarity), max(weighed.similarity)
     left, worst = (percent_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
     return [
         ("", "small"),
@@ -102,7 +102,7 @@ def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> list[t
         (short(candidates[0], _LETTERS), "step-name"),
         ("and", "small"),
         (short(candidates[1], _LETTERS), "step-name"),
-        (f"alike there {weighed.alike[chosen]:.2f}", "small"),
+        (f"similarity there {weighed.similarity[chosen]:.2f}", "small"),
         (f"({least:.2f} to {most:.2f} all around)", "small"),
         ("", "small"),
         ("chance of confusion left", "small"),
@@ -120,9 +120,9 @@ def _cost(weighed: Weighed, chosen: int) -> list[tuple[str, str]]:
 
 
 def _words(weighed: Weighed, i: int, azimuth_deg: float) -> str:
-    alike = "" if weighed.alike is None else f"; similarity of the candidates {weighed.alike[i]:.2f}"
+    similarity = "" if weighed.similarity is None else f"; similarity of the candidates {weighed.similarity[i]:.2f}"
     confusion, cost = f"{weighed.confusion[i]:.2f}", f"{weighed.cost[i]:.2f}"
-    return f"to {azimuth_words(azimuth_deg)}°: log confusion {confusion}, motion {cost}{alike}"
+    return f"to {azimuth_words(azimuth_deg)}°: log confusion {confusion}, motion {cost}{similarity}"
 
 
 def _radii(values: Sequence[float]) -> list[float]:

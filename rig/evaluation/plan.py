@@ -12,7 +12,7 @@ from hbr.evaluation.protocol import Protocol
 from rig.catalog import Catalog
 
 #: Changes when the same settings would give other numbers.
-FORMAT: Final = 3
+FORMAT: Final = 4
 
 
 @dataclass(frozen=True)

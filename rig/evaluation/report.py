@@ -115,12 +115,26 @@ def decision_rows(results: dict[str, Any]) -> Rows:
                 f"{stopping['views_mean']:.2f}",
                 f"{stopping['views_p95']:.0f}",
                 f"{100 * stopping['hit_rate']:.2f}",
+                f"{100 * stopping['unknown_rate']:.2f}",
                 f"{stopping['travelled_mean_deg']:.0f}",
                 *("–" if error is None else f"{error:.1f}" for error in poses),
                 f"{results['wall_clock']['step_median_ms'][method['name']][-1]:.1f}",
             ]
         )
-    heads = ["decision", "views", "p95", "hits %", "turned°", "pose°", "RMSE°", "alike°", "RMSE°", "asym.°", "ms"]
+    heads = [
+        "decision",
+        "views",
+        "p95",
+        "hits %",
+        "unknown %",
+        "rotated°",
+        "pose°",
+        "RMSE°",
+        "alike°",
+        "RMSE°",
+        "asym.°",
+        "ms",
+    ]
     return Rows(heads, rows)
 
 
@@ -134,16 +148,16 @@ def _sentence(contest: Contest, labels: dict[str, str]) -> str:
     first = f"{labels[contest.first]} at N = {contest.first_views}"
     second = f"{labels[contest.second]} at N = {contest.second_views}"
     if contest.difference_low > 0 and contest.p_value < 0.05:
-        verdict = "better"
+        result = "better"
     elif contest.difference_high < 0 and contest.p_value < 0.05:
-        verdict = "worse"
+        result = "worse"
     else:
-        verdict = "no difference shown"
+        result = "no difference shown"
     return (
         f"{first} ({100 * contest.first_rate:.1f} %) against {second} ({100 * contest.second_rate:.1f} %): "
         f"{100 * contest.difference:+.1f} points "
         f"[{100 * contest.difference_low:+.1f}, {100 * contest.difference_high:+.1f}], "
-        f"McNemar p = {contest.p_value:.2g} ({contest.only_first} trials to {contest.only_second}); {verdict}"
+        f"McNemar p = {contest.p_value:.2g} ({contest.only_first} trials to {contest.only_second}); {result}"
     )
 
 

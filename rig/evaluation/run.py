@@ -4,8 +4,9 @@ from collections.abc import Callable
 from functools import partial
 
 from hbr.core.arrays import LevelArray
+from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.descriptors import enrolled_levels, query_levels
-from hbr.evaluation.protocol import Runs, run_object
+from hbr.evaluation.protocol import Runs, rule_of_trial, run_object
 from hbr.model.views import Views
 from rig.core.clock import SystemClock
 from rig.core.processes import map_in_processes
@@ -52,7 +53,9 @@ def run_plan(plan: Plan, views: Views, store: Store, jobs: int, advance: Callabl
             done[j] = runs
             advance(name)
     missing = [j for j in range(len(names)) if j not in done]
-    for j, runs in map_in_processes(partial(_search, plan, views), missing, jobs):
+    dense = any(method.dense for method in plan.methods)
+    rule = rule_of_trial(views, plan.protocol) if missing and dense else None
+    for j, runs in map_in_processes(partial(_search, plan, views, rule), missing, jobs):
         store.save(names[j], runs)
         done[j] = runs
         advance(names[j])
@@ -63,6 +66,6 @@ def _enroll(plan: Plan, j: int) -> LevelArray:
     return enrolled_levels(plan.dataset, j, plan.condition, plan.size)
 
 
-def _search(plan: Plan, views: Views, j: int) -> Runs:
+def _search(plan: Plan, views: Views, rule: StoppingRule | None, j: int) -> Runs:
     queries = query_levels(plan.dataset, j, plan.condition, plan.size, plan.protocol.seed)
-    return run_object(j, queries, views, plan.methods, plan.protocol, now_ns=SystemClock().now_ns)
+    return run_object(j, queries, views, plan.methods, plan.protocol, rule=rule, now_ns=SystemClock().now_ns)

@@ -8,7 +8,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from hbr.evaluation.protocol import CERTAINTY, Runs
+from hbr.evaluation.protocol import Runs
 from rig.charts.evaluation_figures import figures
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError
@@ -109,11 +109,11 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Chart]) -> str:
             ("Hit-rates", "Percent, with Wilson's 95 % interval; best 10 after all views.", *curves),
             (
                 "Decisions and poses",
-                f"A search ends when the best object leads by {stopping['margin']:g} a view (by the dense "
-                f"filter: has a probability of {CERTAINTY:g}), or after all views: views "
-                "taken (mean, 95th percentile), hit-rate then, mean of the degrees turned. Pose error after all views, "
-                "of the trials that found the object: median and RMSE, plain, then symmetry-aware, and the median of "
-                "objects that are not rotation-symmetric. Median time of the last step.",
+                f"A search of the paper ends when the best object leads by {stopping['margin']:g} per view, one of the "
+                "dense filter by the stopping rule calibrated on the enrolled views, or after all views: views "
+                "taken (mean, 95th percentile), hit-rate and share of unknown then, mean of the degrees rotated. Pose "
+                "error after all views, of the trials that found the object: median and RMSE, plain, then "
+                "symmetry-aware, and the median of objects without symmetry. Median time of the last step.",
                 *decisions,
             ),
         ],

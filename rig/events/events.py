@@ -1,29 +1,75 @@
-"""What a plan tells while it runs: small frozen events, the one stream that people, files and tests see."""
+"""The events of a running plan: small frozen dataclasses, the same for the terminal, for files and for tests."""
 
 import re
 from dataclasses import dataclass, field, fields, is_dataclass
-from enum import StrEnum
+from enum import Enum, StrEnum
 from math import isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hbr import StopDecision, StopReason
 from rig.views.capture import ViewEvidence
 
-SCHEMA = 1
-"""Version of the JSON form (docs/events.md): raised when a field goes or changes its meaning, not when one comes."""
+SCHEMA = 2
+"""Version of the JSON form (docs/events.md): it rises when a field is removed or changes its meaning."""
 
 _OUTSIDE = {"json": False}
 
 
+class NoteCode(StrEnum):
+    """What a note is about; `rig.events.wording.note_words` puts it into words."""
+
+    PAPER_SEARCH = "paper-search"
+    MIXED_EMPTY_TABLE = "mixed-empty-table"
+    ENROLLED_WITHOUT_EMPTY_TABLE = "enrolled-without-empty-table"
+    EMPTY_TABLE_DOUBTED = "empty-table-doubted"
+    EMPTY_TABLE_MISSING = "empty-table-missing"
+    EMPTY_TABLE_OF_ENROLLMENT = "empty-table-of-enrollment"
+    EMPTY_TABLE_CHANGED = "empty-table-changed"
+    TABLE_DIFFERS = "table-differs"
+    STOPPING_RULE_UNREADABLE = "stopping-rule-unreadable"
+    STOPPING_RULE_OUTDATED = "stopping-rule-outdated"
+    RATES_NOT_GUARANTEED = "rates-not-guaranteed"
+    EARLIER_VERSION = "earlier-version"
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something that the operator should know: a code, and the numbers and names that its words need."""
+
+    code: NoteCode
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+class RotationReason(StrEnum):
+    """Why a strategy chose a rotation."""
+
+    FIRST_STEP = "first-step"
+    LESS_SIMILAR_SIDE = "less-similar-side"
+    ONE_CANDIDATE = "one-candidate"
+    SEPARATES_CANDIDATES = "separates-candidates"
+    NEW_SIDE = "new-side"
+    EVEN_STEPS = "even-steps"
+    RANDOM = "random"
+    CUSTOM = "custom"
+    EARLIER_VERSION = "earlier-version"
+
+
+class WaitReason(StrEnum):
+    """What `rig identify --watch` waits for."""
+
+    FIRST_OBJECT = "first-object"
+    NEXT_OBJECT = "next-object"
+
+
 @dataclass(frozen=True, slots=True)
 class Started:
-    """A plan begins: ``plan`` is "enroll" or "identify", ``views`` how many views it takes at most.
+    """A plan starts: ``plan`` is "enroll" or "identify", ``views`` the largest number of views.
 
-    ``angles_deg`` are the table angles that an enrollment goes to; ``strategy`` and ``seed`` decide where an
-    identification looks, ``descriptor`` is what it compares views by, and ``notes`` say, for people, what its answer
-    will be worth.
+    ``angles_deg`` are the table angles of an enrollment. An identification has a ``strategy`` with its ``seed``, the
+    ``descriptor`` that views are compared by, and ``notes`` on what its answer is worth.
     """
 
     plan: str
@@ -35,7 +81,7 @@ class Started:
     angles_deg: tuple[float, ...] = ()
     schema: int = SCHEMA
     descriptor: str | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,15 +105,15 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Unwinding:
-    """The table is about to go the long way round, because its cable reaches no further: ``turns`` whole turns back.
+    """The table rotates back by whole ``revolutions`` to free its cable.
 
-    Angles of the table in degrees, unwrapped; ``limits_deg`` is how far the cable reaches.
+    Angles of the table in degrees, unwrapped; ``limits_deg`` are the limits of the cable.
     """
 
     index: int
     from_deg: float
     to_deg: float
-    turns: int
+    revolutions: int
     limits_deg: tuple[float, float]
 
 
@@ -110,40 +156,40 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """What is thought after a view; ``margin`` is how far, in score per view, the first candidate surely leads.
+    """The candidates after a view, the best first.
 
-    It leads any other enrolled object by at least that (`hbr.score_margin`); it may be negative. ``verdict`` is the
-    stopping rule's decision, in words.
+    ``margin`` is how far, in score per view, the first one leads every other enrolled object at least; it may be
+    negative. ``decision`` is the stopping rule's, of the dense search.
     """
 
     index: int
     candidates: tuple[Candidate, ...]
     margin: float
-    verdict: str = ""
+    decision: StopDecision | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """All turns that were weighed before one was decided on.
+    """All rotations that the dense search weighed before it chose one.
 
-    ``rotations_deg`` are the camera's, positive to the left; ``confusion`` is the logarithm of the probability of still
-    taking one object for another after each, ``cost`` what its motion costs, in the same unit: the lowest sum was
-    chosen. ``alike`` is how alike the two rivals look there; None where no second object is likely.
+    ``rotations_deg`` are the camera's, positive to the left. ``confusion`` is the logarithm of the probability of still
+    confusing two objects after each rotation, ``cost`` what its motion costs, in the same unit: the lowest sum was
+    chosen. ``similarity`` is how similar the two candidates look there; None if no second object is likely.
     """
 
     rotations_deg: tuple[float, ...]
     confusion: tuple[float, ...]
     cost: tuple[float, ...]
-    alike: tuple[float, ...] | None = None
+    similarity: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """Where to look next, and ``why`` in words: of AHBR, the side on which the ``rivals`` look less alike (Eq. 6-7).
+    """The rotation to the next view, and the ``reason`` for it.
 
-    ``rotation_deg`` is the camera's around the object, positive to the left; the table turns the other way, to
-    ``target_deg``. ``s_left`` and ``s_right`` are None where the sides were not compared, ``weighed`` where not all
-    turns were.
+    ``rotation_deg`` is the camera's around the object, positive to the left; the table rotates the other way, to
+    ``target_deg``. ``s_left`` and ``s_right`` are how similar the ``candidates`` look from each side (Eq. 6), if AHBR
+    compared the sides. ``note`` is the explanation of a strategy of your own, or of an earlier version.
     """
 
     index: int
@@ -152,8 +198,9 @@ class Decided:
     target_deg: float
     s_left: float | None
     s_right: float | None
-    rivals: tuple[str, ...]
-    why: str = ""
+    candidates: tuple[str, ...]
+    reason: RotationReason
+    note: str = ""
     weighed: Weighed | None = None
 
 
@@ -195,8 +242,8 @@ class Item:
 class SimilarObject:
     """An enrolled object that looks the same from some sides.
 
-    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise; ``share`` of the views; ``similarity`` is the
-    largest of any two views.
+    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise; ``share`` is their share of the views;
+    ``similarity`` is the largest of any two views.
     """
 
     name: str
@@ -207,17 +254,18 @@ class SimilarObject:
 
 @dataclass(frozen=True, slots=True)
 class SimilarObjects:
-    """What a new object will be taken for: itself, turned by ``period_deg``, and other objects.
+    """What a new object can be confused with: itself, rotated by ``period_deg``, and other objects.
 
-    ``period_deg`` is 360 where no turn makes it look the same, 0 where it looks alike from everywhere, None where there
-    are too few views to tell. ``neighbours`` is how alike neighbouring views are, ``alike`` those a period apart.
+    ``period_deg`` is 360 if the object has no symmetry, 0 if it looks the same from everywhere, None if it has too few
+    views to tell. ``neighbour_similarity`` is the mean of neighbouring views, ``period_similarity`` of views a period
+    apart.
     """
 
     name: str
     period_deg: float | None
-    neighbours: float | None
-    alike: float | None
-    lookalikes: tuple[SimilarObject, ...]
+    neighbour_similarity: float | None
+    period_similarity: float | None
+    objects: tuple[SimilarObject, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,18 +289,17 @@ class EmptyTableImage:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """Something that a person should see to; the plan goes on meanwhile. ``index`` is the view that it was seen at."""
+    """Something that the operator should attend to while the plan continues; ``index`` is the view it was seen at."""
 
     index: int | None
-    what: str
-    next_step: str
+    note: Note
 
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """Nothing happens until somebody does something: ``why`` says what."""
+    """The plan waits for the operator."""
 
-    why: str
+    reason: WaitReason
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,29 +315,32 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """The answer: an object's name, or None for "unknown".
+    """The answer: an object's name, or None for an unknown object.
 
-    ``score``, ``margin`` and ``min_score`` (below which an object counts as unknown) are per view; ``pose_deg`` the
-    azimuth the camera sees last, in the catalog's frame, ``yaw_deg`` how far the object stands turned counter-clockwise
-    against its enrollment; ``reason`` why the search ended. Of the dense search ``probability`` is the first
-    candidate's, ``familiarity`` how much this looks like an enrolled object, and ``min_familiarity`` the least that
-    those have; None where nothing may be called unknown.
+    ``score`` and ``margin`` are per view. ``pose_deg`` is the azimuth the camera sees last, in the catalog's frame, and
+    ``yaw_deg`` how far the object is rotated counter-clockwise against its enrollment. ``reason`` says why the search
+    ended; ``note`` is the explanation of a strategy of your own, or of an earlier version. The paper's search compares
+    the score with ``min_score`` and the margin with ``min_margin``; the dense search compares the confidence with
+    ``min_confidence`` and the open-set score with ``open_set_threshold``, None if no object is called unknown.
     """
 
     name: str | None
     candidates: tuple[Candidate, ...]
     score: float
     margin: float
-    min_score: float
     pose_deg: float
     yaw_deg: float
     views: int
     travelled_deg: float
     seconds: float
-    reason: str
-    probability: float | None = None
-    familiarity: float | None = None
-    min_familiarity: float | None = None
+    reason: StopReason
+    note: str = ""
+    min_score: float | None = None
+    min_margin: float | None = None
+    confidence: float | None = None
+    min_confidence: float | None = None
+    open_set_score: float | None = None
+    open_set_threshold: float | None = None
 
 
 Event = (
@@ -329,6 +379,8 @@ def plain(value: Any) -> Any:
     """
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value) if f.metadata.get("json", True)}
+    if isinstance(value, Enum):
+        return value.value
     if isinstance(value, tuple | list):
         return [plain(v) for v in value]
     if isinstance(value, dict):

@@ -1,77 +1,235 @@
 """What happened, in words: the same on the terminal and in the report."""
 
 from collections.abc import Iterable, Sequence
-from math import isfinite
+from math import isfinite, nan
+from typing import Any
 
-from hbr import Verdict
-from rig.events.events import Decided, Identified, Moved, SimilarObject, SimilarObjects, Unwinding
+from hbr import Outcome, StopDecision, StopReason
+from hbr.dense.stopping import Limitation, LimitationCode
+from rig.events.events import (
+    Decided,
+    Identified,
+    Moved,
+    Note,
+    NoteCode,
+    RotationReason,
+    SimilarObject,
+    SimilarObjects,
+    Unwinding,
+    WaitReason,
+)
+from rig.views.table_problems import problem_text
+
+_NEXT_IMAGE = "to take one: rig empty-table"
+
+
+def note_words(note: Note) -> str:
+    """Return a note as a sentence without its full stop."""
+    v = note.values
+    match note.code:
+        case NoteCode.PAPER_SEARCH:
+            missing = (
+                f"{counted(v['objects'], 'object')} without it" if v.get("objects") else "the catalog is without it"
+            )
+            return (
+                f"the search compares whole images by {v['used']} because {v['missing']} is missing ({missing}); to "
+                f"add it from the stored images: rig catalog redescribe --descriptor {v['missing']}"
+            )
+        case NoteCode.MIXED_EMPTY_TABLE:
+            names, one = v["objects"], len(v["objects"]) == 1
+            shown = joined(names[:3]) if len(names) <= 3 else f"{', '.join(names[:3])} and {len(names) - 3} more"
+            return (
+                f"{shown} {'was' if one else 'were'} enrolled {'with' if v['with_image'] else 'without'} an "
+                "empty-table image, unlike the other objects, and such views compare badly; to repeat the enrollment: "
+                "rig enroll --replace"
+            )
+        case NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE:
+            return (
+                "most objects were enrolled without an empty-table image, so the search does not use it; to repeat the "
+                "enrollment: rig enroll --replace"
+            )
+        case NoteCode.EMPTY_TABLE_DOUBTED:
+            return f"the empty-table image may be outdated ({_problems(v)}); {_NEXT_IMAGE}"
+        case NoteCode.EMPTY_TABLE_MISSING:
+            return f"the search has no empty-table image ({_problems(v)}); {_NEXT_IMAGE}"
+        case NoteCode.EMPTY_TABLE_OF_ENROLLMENT:
+            return f"the empty-table image of the enrollment is used ({_problems(v)}); {_NEXT_IMAGE}"
+        case NoteCode.EMPTY_TABLE_CHANGED:
+            return f"the bench no longer looks like its empty-table image: {problem_text(v['problem'])}"
+        case NoteCode.TABLE_DIFFERS:
+            return f"the table does not look as it did at {v['taken_utc']}; an object that is round may be on it"
+        case NoteCode.STOPPING_RULE_UNREADABLE:
+            return f"the stored stopping rule cannot be read ({v['reason']}); to renew it: rig catalog calibrate"
+        case NoteCode.STOPPING_RULE_OUTDATED:
+            changes = [f"{counted(v[key], 'object')} {key}" for key in ("added", "removed") if v[key]]
+            changed = ", ".join(changes) or "other views, or another version of this program"
+            return (
+                f"the stopping rule is from {v['made']}, and the catalog has changed since ({changed}), so it "
+                "guarantees no error rate; to renew it: rig catalog calibrate"
+            )
+        case NoteCode.RATES_NOT_GUARANTEED:
+            return (
+                f"{v['searches']} leave-one-out searches cannot guarantee at most {percent(v['error_rate'])} wrong "
+                f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown; for the reasons: "
+                "rig catalog calibrate"
+            )
+        case NoteCode.EARLIER_VERSION:
+            return str(v["text"])
+
+
+def _problems(values: dict[str, Any]) -> str:
+    return "; ".join(problem_text(problem) for problem in values["problems"])
+
+
+def next_step_words(note: Note) -> str:
+    """Return what the operator should do about a warning."""
+    match note.code:
+        case NoteCode.EMPTY_TABLE_CHANGED:
+            return "Continue; these views do not use the image. Then take a new one: rig empty-table"
+        case NoteCode.TABLE_DIFFERS:
+            return "Check that the table is empty. If it is not, remove the object and repeat: rig empty-table"
+        case _:
+            return str(note.values.get("next_step", ""))
+
+
+def wait_words(reason: WaitReason) -> str:
+    """Return what a plan waits for."""
+    return "the next object" if reason is WaitReason.NEXT_OBJECT else "the first object, on the empty table"
+
+
+def limitation_words(limitation: Limitation) -> str:
+    """Return what a stopping rule does not guarantee, as a sentence without its full stop."""
+    v = limitation.values
+    match limitation.code:
+        case LimitationCode.SAMPLED:
+            return (
+                f"only {v['searched']} of {counted(v['objects'], 'object')} were searched for, so no rate is "
+                "guaranteed; to search for all: rig catalog calibrate"
+            )
+        case LimitationCode.FALSE_REJECT_RATE:
+            return (
+                f"a false-reject rate of {percent(v['rate'])} needs {v['needed']} leave-one-out searches, and there "
+                f"are {v['searches']}: objects that score less than every search did are unknown, a rate of "
+                f"{percent(v['reached'])}"
+            )
+        case LimitationCode.ERROR_RATE | LimitationCode.SIMILAR_OBJECTS:
+            why = (
+                f"needs {v['needed']} leave-one-out searches, and there are {v['searches']}"
+                if limitation.code is LimitationCode.ERROR_RATE
+                else "cannot be reached, because enrolled objects are too similar"
+            )
+            return (
+                f"an error rate of {percent(v['rate'])} {why}: a search ends at a confidence of "
+                f"{percent(v['min_confidence'], 0)}, at which {v['wrong']} of {v['ended']} were wrong"
+            )
+        case LimitationCode.UNKNOWN_NOT_MEASURED:
+            return "unknown objects cannot be measured with fewer than three objects; enroll more"
+        case LimitationCode.ONE_OBJECT:
+            return (
+                "with one object there is no other candidate: it is found by the similarity to its own views alone, "
+                "and no rate is guaranteed; enroll more"
+            )
+        case LimitationCode.SINGLE_VIEWS:
+            return (
+                "objects with a single view cannot be calibrated: no object is called unknown, and no rate is "
+                "guaranteed; enroll more"
+            )
+        case LimitationCode.EARLIER_VERSION:
+            return str(v["text"])
 
 
 def decision_words(decided: Decided) -> str:
-    """Return why the camera goes to a side, and how far: "left: the rivals look less alike there …; turning 47.3°."."""
-    turning = f"turning {abs(decided.rotation_deg):.1f}°"
-    # A step of AHBR is at most 90°; what exceeds it leads past views that were taken before (`hbr.next_view`).
-    compared = decided.s_left is not None
-    past = " past what was seen already" if compared and round(abs(decided.rotation_deg), 1) > 90 else ""
-    return f"{decided.side}: {decided.why}; {turning}{past}."
+    """Return which way the camera goes, and why: "left 47.3°: the leading candidates look less similar there …."."""
+    # A rotation of AHBR is at most 90°; a larger one leads past views that were taken before (`hbr.next_view`).
+    past = decided.s_left is not None and round(abs(decided.rotation_deg), 1) > 90
+    rotation = f"{decided.side} {abs(decided.rotation_deg):.1f}°{', past earlier views' if past else ''}"
+    return f"{rotation}: {rotation_words(decided)}."
 
 
-def side_words(side: str, s_left: float, s_right: float, rivals: Sequence[str]) -> str:
-    """Return why a side was chosen: how alike the rivals look from the left and from the right (Eq. 6)."""
-    if len(rivals) < 2:
-        return "no second candidate is in sight to be told apart"
+def rotation_words(decided: Decided) -> str:
+    """Return why a rotation was chosen."""
+    match decided.reason:
+        case RotationReason.FIRST_STEP:
+            return "the first rotation is fixed"
+        case RotationReason.LESS_SIMILAR_SIDE if decided.s_left is not None and decided.s_right is not None:
+            return _side_words(decided.side, decided.s_left, decided.s_right, len(decided.candidates))
+        case RotationReason.SEPARATES_CANDIDATES if decided.weighed is not None and decided.weighed.similarity:
+            similarity = decided.weighed.similarity
+            here = similarity[decided.weighed.rotations_deg.index(decided.rotation_deg)]
+            first, second = decided.candidates[:2]
+            return (
+                f"distinguishes {first} from {second}, similarity {here:.2f} there "
+                f"({min(similarity):.2f}–{max(similarity):.2f} all around)"
+            )
+        case RotationReason.ONE_CANDIDATE | RotationReason.NEW_SIDE:
+            return "no second object is likely, so a new side is viewed"
+        case RotationReason.EVEN_STEPS:
+            return "the views are taken in even steps"
+        case RotationReason.RANDOM:
+            return "the rotation is random"
+        case _:
+            return decided.note
+
+
+def _side_words(side: str, s_left: float, s_right: float, candidates: int) -> str:
     left, right = distinct(s_left, s_right)
-    leading = "the two leading candidates" if len(rivals) == 2 else "the leading candidates"
+    leading = "the two leading candidates" if candidates == 2 else "the leading candidates"
     if s_left == s_right:
-        return f"{leading} look as much alike on both sides: S_left {left} = S_right {right}"
-    if side == "left":
-        return f"{leading} look less alike there: S_left {left} < S_right {right}"
-    return f"{leading} look less alike there: S_right {right} < S_left {left}"
+        return f"{leading} look equally similar on both sides: S_left {left} = S_right {right}"
+    smaller, larger = (
+        (f"S_left {left}", f"S_right {right}") if side == "left" else (f"S_right {right}", f"S_left {left}")
+    )
+    return f"{leading} look less similar there: {smaller} < {larger}"
 
 
-def separation_words(rivals: Sequence[str], alike: Sequence[float] | None, chosen: int) -> str:
-    """Return what a turn of the dense search is to show: which two objects it separates, and how well."""
-    if len(rivals) < 2 or alike is None:
-        return "no second object is likely, and that side is new"
-    here = alike[chosen]
-    least, most = min(alike), max(alike)
-    return f"to tell {rivals[0]} from {rivals[1]}, {here:.2f} alike there ({least:.2f} to {most:.2f} all around)"
+def stop_words(decision: StopDecision, views: int) -> str:
+    """Return what the stopping rule decided after ``views`` views, and why."""
+    confidence, least = percent_words(decision.confidence), percent_words(decision.min_confidence)
+    score, threshold = f"{decision.open_set_score:.3f}", f"{decision.open_set_threshold:.3f}"
+    match decision.reason:
+        case StopReason.CONFIDENT:
+            known = f", and the open-set score {score} the {threshold} of enrolled objects"
+            return (
+                f"the confidence {confidence} reaches {least}{known if isfinite(decision.open_set_threshold) else ''}"
+            )
+        case StopReason.NOT_CONFIDENT:
+            return f"not confident yet: {confidence}, and {least} ends the search"
+        case StopReason.BELOW_OPEN_SET_THRESHOLD if decision.outcome is Outcome.CONTINUE:
+            return f"the open-set score {score} is still below the {threshold} of enrolled objects"
+        case StopReason.BELOW_OPEN_SET_THRESHOLD:
+            return f"the open-set score {score} is below the {threshold} of enrolled objects"
+        case _:
+            return f"the best candidate after {counted(views, 'view')}, with a confidence of {confidence} below {least}"
 
 
-def verdict_words(verdict: Verdict, *, certainty: float, least: float, views: int) -> str:
-    """Return what the rules of the dense search say after ``views`` views, and why.
-
-    Parameters
-    ----------
-    verdict
-        Theirs.
-    certainty
-        Probability that ends a search.
-    least
-        Familiarity that enrolled objects reach; not finite where nothing may be called unknown.
-    views
-        That were taken.
-    """
-    probability, familiarity = percent_words(verdict.probability), f"{verdict.familiarity:.3f}"
-    familiar = not isfinite(least) or verdict.familiarity >= least
-    known = f" and a familiarity of {familiarity} the {least:.3f} of enrolled objects" if isfinite(least) else ""
-    if verdict.kind == "unknown":
-        return f"a familiarity of {familiarity} stays below the {least:.3f} that enrolled objects reach"
-    if verdict.kind == "look" and not familiar:
-        return f"not familiar yet: {familiarity}, and enrolled objects reach {least:.3f}"
-    if verdict.kind == "look":
-        return f"not sure yet: a probability of {probability}, and {percent_words(certainty)} ends the search"
-    if verdict.probability >= certainty:
-        return f"a probability of {probability} reaches {percent_words(certainty)}{known}"
-    views_words = counted(views, "view")
-    return f"the best after {views_words}, with a probability of {probability}; {percent_words(certainty)} is sure"
+def reason_words(answer: Identified) -> str:
+    """Return why a search ended."""
+    match answer.reason:
+        case StopReason.MARGIN:
+            return f"the margin {answer.margin:.3f} per view reaches {answer.min_margin:g}"
+        case StopReason.NO_ROTATION_LEFT:
+            return "the cable allows no other view"
+        case StopReason.CUSTOM | StopReason.EARLIER_VERSION:
+            return answer.note
+        case StopReason.MAX_VIEWS if answer.confidence is None:
+            return f"the search took all {counted(answer.views, 'view')} that are allowed"
+    unknown = answer.reason is StopReason.BELOW_OPEN_SET_THRESHOLD
+    numbers = (answer.confidence, answer.min_confidence, answer.open_set_score, answer.open_set_threshold)
+    confidence, least, score, threshold = (nan if number is None else number for number in numbers)
+    outcome = Outcome.UNKNOWN if unknown else Outcome.FOUND
+    return stop_words(StopDecision(outcome, answer.reason, 0, confidence, least, score, threshold), answer.views)
 
 
 def percent_words(probability: float) -> str:
-    """Return a probability in percent; what is nearly none or nearly all as such."""
+    """Return a probability in percent; below 0.1 % and above 99.9 % only that."""
     if probability > 0.999:
-        return ">99.9%"
-    return "<0.1%" if probability < 0.001 else f"{probability:.1%}"
+        return ">99.9 %"
+    return "<0.1 %" if probability < 0.001 else percent(probability)
+
+
+def percent(share: float, decimals: int = 1) -> str:
+    """Return a share in percent: "2.0 %"."""
+    return f"{100 * share:.{decimals}f} %"
 
 
 def move_words(moved: Moved) -> str:
@@ -90,7 +248,7 @@ def move_words(moved: Moved) -> str:
 def unwinding_words(unwinding: Unwinding) -> str:
     """Return that the table frees its cable by a long rotation, and why."""
     low, high = (f"{angle:g}°".replace("-", "−") for angle in unwinding.limits_deg)
-    back = counted(unwinding.turns, "revolution")
+    back = counted(unwinding.revolutions, "revolution")
     return (
         f"Unwinding the cable: the table rotates from {angle_words(unwinding.from_deg)} to "
         f"{angle_words(unwinding.to_deg)} ({back} back; the cable allows {low} to {high})"
@@ -107,8 +265,8 @@ def result_words(answer: Identified) -> str:
         verb = "objects are" if len(similar) > 1 else "object is"
         return f"Unknown object. The most similar enrolled {verb} {joined(similar)}."
     words = f"{answer.name}, rotated {round(answer.yaw_deg) % 360}°"
-    if answer.probability is not None:
-        percent = ">99.9" if answer.probability > 0.999 else min(round(answer.probability * 100), 99)
+    if answer.confidence is not None:
+        percent = ">99.9" if answer.confidence > 0.999 else min(round(answer.confidence * 100), 99)
         words += f", {percent} % confident"
     return f"{words} ({counted(answer.views, 'view')})"
 
@@ -118,7 +276,7 @@ def answer_lines(answer: Identified) -> list[str]:
     lines = [result_words(answer)]
     if answer.name is not None and answer.margin <= 0 and len(answer.candidates) > 1:
         lines.append(f"Not certain: {answer.candidates[1].name} is similarly likely.")
-    return [*lines, sentence(answer.reason)]
+    return [*lines, sentence(reason_words(answer))]
 
 
 def answer_words(answer: Identified) -> str:
@@ -128,14 +286,14 @@ def answer_words(answer: Identified) -> str:
 
 
 def symmetry_words(similar: SimilarObjects) -> str:
-    """Return what an object's views say about its pose; nothing where they say nothing."""
-    if similar.period_deg is None or similar.neighbours is None or similar.alike is None:
+    """Return what an object's views say about its pose; empty if they say nothing."""
+    if similar.period_deg is None or similar.neighbour_similarity is None or similar.period_similarity is None:
         return ""
-    numbers = f"similarity {similar.alike:.3f}, of neighbouring views {similar.neighbours:.3f}"
+    numbers = f"similarity {similar.period_similarity:.3f}, of neighbouring views {similar.neighbour_similarity:.3f}"
     if similar.period_deg == 0:
-        return f"looks alike from everywhere (least {numbers}): its pose will not be known"
+        return f"looks the same from everywhere (smallest {numbers}): its pose cannot be determined"
     if similar.period_deg < 360:
-        return f"looks the same every {similar.period_deg:g}° ({numbers}): its pose will be known up to that"
+        return f"looks the same every {similar.period_deg:g}° ({numbers}): its pose is known up to that angle"
     return ""
 
 
@@ -144,15 +302,14 @@ def similar_object_words(one: SimilarObject) -> str:
     if one.arcs_deg == ((0.0, 360.0),):
         return f"looks like {one.name} from all sides"
     arcs = [f"{a:.0f}°" if a == b else f"{a:.0f}–{b:.0f}°" for a, b in one.arcs_deg]
-    several = f"{', '.join(arcs[:-1])} and {arcs[-1]}" if len(arcs) > 1 else arcs[0]
-    return f"looks like {one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {several}"
+    return f"looks like {one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {joined(arcs)}"
 
 
 def similar_objects_words(similar: SimilarObjects) -> list[str]:
-    """Return what an object will be taken for, a line for each finding."""
+    """Return what an object can be confused with, a line for each finding."""
     lines = [words] if (words := symmetry_words(similar)) else []
-    lines += [f"{similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.lookalikes]
-    return lines if similar.lookalikes else [*lines, "looks like no other enrolled object"]
+    lines += [f"{similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects]
+    return lines if similar.objects else [*lines, "looks like no other enrolled object"]
 
 
 def duration_words(seconds: float) -> str:

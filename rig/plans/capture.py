@@ -4,13 +4,13 @@ from collections.abc import Generator
 
 from rig.bench import Bench
 from rig.core.errors import ViewRejected
-from rig.events.events import Event, Moved, Rejected, Unwinding, Warned
+from rig.events.events import Event, Moved, Note, NoteCode, Rejected, Unwinding, Warned
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
 from rig.safety.gyro_rotation import finite
 from rig.views.capture import Attempt, Viewer, rejection_text
 from rig.views.description import DescribedView
-from rig.views.empty_table import COMMAND, store_table_problem
+from rig.views.empty_table import store_table_problem
 
 
 def moved(index: int, move: Move) -> Moved:
@@ -53,15 +53,11 @@ def unwind(index: int, table: Turntable) -> Generator[Event, None, None]:
         yield from announced(index, table, target_deg)
 
 
-def warn_of_table(bench: Bench, index: int, view: DescribedView, consequence: str) -> Generator[Event, None, None]:
+def warn_of_table(bench: Bench, index: int, view: DescribedView) -> Generator[Event, None, None]:
     """Store and report that the bench no longer looks like its empty-table image, if this view has shown it."""
     if view.table_problem is not None:
         store_table_problem(bench, view.table_problem)
-        yield Warned(
-            index,
-            f"the bench no longer looks like its empty-table image: {view.table_problem.text}",
-            f"{consequence}; then take a new image: {COMMAND}",
-        )
+        yield Warned(index, Note(NoteCode.EMPTY_TABLE_CHANGED, {"problem": view.table_problem.as_json()}))
 
 
 def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Generator[Event, None, Attempt]:

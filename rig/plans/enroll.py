@@ -150,7 +150,7 @@ def _take_views(
             )
             enrollment.add(record, attempt.image_bgr)
             yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
-            yield from warn_of_table(bench, index, described, "Continue: these views do not use the image")
+            yield from warn_of_table(bench, index, described)
             first = first or (index, angle_deg, attempt.image_bgr)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
         # supply the servo forgets whole revolutions, and a cable that stays wound up is wound further the next time.

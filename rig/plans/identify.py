@@ -1,4 +1,4 @@
-"""The plan that finds out what stands on the table: look, vote, decide, turn, until the answer is clear.
+"""The plan that identifies the object on the table: view, rank, decide, rotate, until the search ends.
 
 Decision: docs/decisions/0002.
 """
@@ -32,31 +32,30 @@ def identify(
     top: int = SHOWN,
     empty_table: NDArray[np.uint8] | None = None,
 ) -> Generator[Event, None, Identified]:
-    """Identify the object on the table against the enrolled views; yields events and returns the answer.
+    """Identify the object on the table; yields events and returns the answer.
 
-    After each view the strategy chooses the next view or ends the search (`rig.search.strategies`).
-    ``dense`` is the bench's own: it turns to where the likeliest objects differ most, until one is
-    probable enough, or unknown, by rules that were rehearsed on the catalog. ``ahbr`` is the paper's: the first two
-    views are a fixed step apart, every later one lies where the rivals look less alike (Eq. 5-7), until a known object
-    leads all others by ``identify.margin`` a view, or ``identify.max_views`` were taken. Its object is unknown when its
-    score a view stays below ``identify.min_score``; where that is not given, below what the enrolled views let expect
-    (`hbr.open_set_threshold`). Closing the generator takes the torque off.
+    After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). ``dense`` is the
+    bench's own: it takes the next best view until the stopping rule, which was calibrated on the catalog, finds an
+    object or calls it unknown. ``ahbr`` is the paper's: the first rotation is fixed, and each further one leads to the
+    side on which the candidates look less similar (Eq. 5-7), until an enrolled object leads all others by
+    ``identify.margin`` per view, or after ``identify.max_views``. Its object is unknown if its score per view is below
+    ``identify.min_score``; the default is what the enrolled views score among each other (`hbr.open_set_threshold`).
+    Closing the generator turns the torque off.
 
     Parameters
     ----------
     bench
         An open bench.
     model : Model or hbr.ViewIndex
-        What is enrolled, as `rig.search.model.load_model` has it; a ViewIndex is for the paper's strategies.
+        The enrolled views, from `rig.search.model.load_model`; a ViewIndex is for the paper's strategies.
     strategy
-        Its name, or a strategy of your own; None takes the one that the model is for.
+        Its name, or a strategy of your own. The default is the one that the model is for.
     seed
-        For strategies that draw.
+        For strategies that draw random numbers.
     top
-        How many candidates the events name.
+        The number of candidates that the events name.
     empty_table : uint8 array (H, W, 3), optional
-        The bench without an object: the object is found by what differs from it. Where none is given, the one that
-        `rig.search.model.empty_table_for` has.
+        The empty-table image for the segmentation; by default the one from `rig.search.model.empty_table_for`.
 
     Raises
     ------
@@ -72,8 +71,8 @@ def identify(
     viewer = Viewer(bench.camera, bench.config.view)
     notes = model.notes if isinstance(model, Model) else ()
     if empty_table is None and isinstance(model, Model):
-        empty_table, told = empty_table_for(bench, model)
-        notes += told
+        empty_table, more = empty_table_for(bench, model)
+        notes += more
     describe = ViewDescriber(bench.config.view, (search.descriptor,), empty_table)
     yield Started(
         "identify",
@@ -88,23 +87,26 @@ def identify(
     bench.operator.place(None)
     started_ns = bench.clock.now_ns()
     travelled_deg = 0.0
-    sign = bench.config.table.orientation_sign  # as the table turns, the camera goes around the object backwards
+    sign = bench.config.table.orientation_sign  # the camera goes around the object against the table
     number = 0
-    trouble: RigError | None = None
+    failed: RigError | None = None
     with Turntable(bench) as table:
         move = table.hold()
         orientation_deg = sign * move.encoder_deg
         while True:
+            # View: at rest, an acceptable frame, described.
             yield moved(number, move)
             shot = yield from capture(number, viewer, table, move.settled_ns)
             azimuth_deg = float(wrap360(orientation_deg))
-            seen = describe(shot.image_bgr)
-            yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr, seen.segmentation)
-            yield from warn_of_table(bench, number, seen, "The search continues without the image")
-            ranked, step = search.look(seen.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
+            described = describe(shot.image_bgr)
+            yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr, described.segmentation)
+            yield from warn_of_table(bench, number, described)
+            # Decide: rank the candidates, then rotate or finish.
+            ranked, step = search.add(described.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
             yield ranked
             if isinstance(step, Finish):
                 break
+            # Rotate: within the cable budget, and count what the table really did.
             asked_deg = table.rest_deg + sign * step.rotation_deg
             decided = _decided(number, step, table.within_reach(asked_deg), top)
             yield decided
@@ -116,23 +118,24 @@ def identify(
         try:
             yield from unwind(number, table)
         except RigError as error:
-            trouble = error  # the answer is known, and must not be lost
-    answer = search.answer(ranked, step.why, travelled_deg=travelled_deg, seconds=seconds)
+            failed = error  # report the answer first
+    answer = search.answer(ranked, step, travelled_deg=travelled_deg, seconds=seconds)
     yield answer
-    if trouble:
-        raise trouble
+    if failed:
+        raise failed
     return answer
 
 
-def _decided(number: int, turn: Rotate, target_deg: float, top: int) -> Decided:
+def _decided(number: int, step: Rotate, target_deg: float, top: int) -> Decided:
     return Decided(
         index=number,
-        side="left" if turn.rotation_deg >= 0 else "right",
-        rotation_deg=turn.rotation_deg,
+        side="left" if step.rotation_deg >= 0 else "right",
+        rotation_deg=step.rotation_deg,
         target_deg=target_deg,
-        s_left=turn.s_left,
-        s_right=turn.s_right,
-        rivals=turn.rivals[:top],
-        why=turn.why,
-        weighed=turn.weighed,
+        s_left=step.s_left,
+        s_right=step.s_right,
+        candidates=step.candidates[:top],
+        reason=step.reason,
+        note=step.note,
+        weighed=step.weighed,
     )

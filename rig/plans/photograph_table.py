@@ -8,7 +8,7 @@ from hbr.segmentation import MIN_AGREEMENT
 from rig.bench import Bench, TableClearer
 from rig.core.clock import seconds_between
 from rig.core.errors import TableNotEmpty, UsageError
-from rig.events.events import EmptyTableImage, Event, Warned, plain
+from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned, plain
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture
 from rig.plans.enroll import SAME_SIMILARITY
@@ -85,12 +85,8 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
     # A round object does not change with the rotation, but the image differs from the previous one.
     before = empty_table_status(bench)
     if before.table is not None and image_similarity(before.table.image_bgr, first.image_bgr, config) < SAME_SIMILARITY:
-        yield Warned(
-            None,
-            f"The table does not look as it did at {before.table.taken_utc:%Y-%m-%d %H:%M} UTC. A round object would "
-            "not be noticed by the rotation.",
-            f"Check that the table is empty. If it is not, clear it and run `{COMMAND}` again.",
-        )
+        taken_utc = f"{before.table.taken_utc:%Y-%m-%d %H:%M} UTC"
+        yield Warned(None, Note(NoteCode.TABLE_DIFFERS, {"taken_utc": taken_utc}))
     evidence = first.evidence
     taken = EmptyTable(
         image_bgr=first.image_bgr,

@@ -1,16 +1,16 @@
-"""Symmetry of a new object, and the objects that it can be confused with."""
+"""What an enrolled object can be confused with."""
 
 from hbr.model import symmetry
 from hbr.model.views import Views
 from rig.core.errors import ObjectNotFound
 from rig.events.events import SimilarObject, SimilarObjects
 
-REPORTED = 3
-"""Largest number of similar objects in a report."""
+SHOWN = 3
+"""The number of similar objects that are named."""
 
 
 def similar_objects(views: Views, name: str) -> SimilarObjects:
-    """Compare the views of an enrolled object with each other and with those of the other objects.
+    """Measure how similar an enrolled object is to itself from other sides, and to the other objects.
 
     Raises
     ------
@@ -26,10 +26,10 @@ def similar_objects(views: Views, name: str) -> SimilarObjects:
     return SimilarObjects(
         name=name,
         period_deg=own.period_deg if own else None,
-        neighbours=own.neighbours if own else None,
-        alike=own.similarity if own else None,
-        lookalikes=tuple(
+        neighbour_similarity=own.neighbours if own else None,
+        period_similarity=own.similarity if own else None,
+        objects=tuple(
             SimilarObject(views.object_names[one.object_index], one.arcs_deg, one.share, one.similarity)
-            for one in symmetry.similar_objects(views, number)[:REPORTED]
+            for one in symmetry.similar_objects(views, number)[:SHOWN]
         ),
     )

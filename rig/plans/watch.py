@@ -1,4 +1,4 @@
-"""The plan that never ends: whatever is put on the table is identified, one object after the other."""
+"""The plan that identifies one object after the other, until it is stopped."""
 
 from collections.abc import Callable, Generator
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 import hbr
 from rig.bench import Bench
 from rig.core.errors import ViewRejected
-from rig.events.events import Event, Failed, Waiting
+from rig.events.events import Event, Failed, Waiting, WaitReason
 from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
 from rig.plans.identify import identify
@@ -26,32 +26,32 @@ def watch(
     top: int = SHOWN,
     empty_table: NDArray[np.uint8] | None = None,
 ) -> Generator[Event, None, None]:
-    """Identify one object after the other, endlessly; yields a `Waiting` before the events of each.
+    """Identify one object after the other, until closed; yields a `Waiting` before the events of each.
 
-    The bench's operator brings the objects, or waits for them (`rig.views.object_presence.TableWatcher`). After each
+    The operator brings the objects, or the plan waits for them (`rig.views.object_presence.TableWatcher`). After each
     answer the table returns to its start angle and unwinds its cable. If no view of an object is acceptable, the plan
     yields `Failed` and waits for the next object; any other error ends the plan.
 
     Parameters
     ----------
     bench
-        An open one.
+        An open bench.
     model
-        Gives what is enrolled, before each search: what was enrolled meanwhile is found.
+        Returns the model before each search, so that objects enrolled meanwhile are found.
     strategy, seed, top, empty_table
         As for `identify`.
 
     Raises
     ------
     RigError
-        As `identify`, but for `ViewRejected`.
+        As `identify`, except for `ViewRejected`.
     """
     with Turntable(bench) as table:
         home_deg = table.rest_deg
-    begun = False
+    started = False
     while True:
-        yield Waiting("the next object" if begun else "the first object, on the empty table")
-        begun = True
+        yield Waiting(WaitReason.NEXT_OBJECT if started else WaitReason.FIRST_OBJECT)
+        started = True
         try:
             answer = yield from identify(bench, model(), strategy=strategy, seed=seed, top=top, empty_table=empty_table)
             views = answer.views

@@ -18,7 +18,7 @@ from rig.charts.decision_chart import decision_chart
 from rig.charts.polar_path import polar_path
 from rig.charts.score_chart import score_chart
 from rig.core.errors import UsageError
-from rig.events.events import Candidate
+from rig.events.events import Candidate, Ranked
 from rig.events.wording import (
     answer_words,
     azimuth_words,
@@ -26,9 +26,11 @@ from rig.events.wording import (
     decision_words,
     listed,
     move_words,
+    note_words,
     percent_words,
     sentence,
     signed,
+    stop_words,
 )
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
@@ -206,7 +208,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         path=path,
         compared=any(event.s_left is not None for event in record.decided),
         scores=scores,
-        notes=[sentence(note) for note in record.notes],
+        notes=[sentence(note_words(note)) for note in record.notes],
         decisions=_decisions(record),
         frames=_frames(record),
         unfold=unfold or record.correct is False,
@@ -230,6 +232,11 @@ def _leading(one: Candidate) -> tuple[str, str, str]:
     return one.name, f"{one.score:.3f}", "" if one.probability is None else percent_words(one.probability)
 
 
+def _decision(ranked: Ranked | None) -> str:
+    decision = None if ranked is None else ranked.decision
+    return "" if ranked is None or decision is None else sentence(stop_words(decision, ranked.index + 1))
+
+
 def _decisions(record: IdentificationRecord) -> list[Markup]:
     """Return a chart for each decision that compared all possible rotations."""
     seen_deg = {view.index: _report_azimuth_deg(record, view.azimuth_deg) for view in record.views}
@@ -239,7 +246,7 @@ def _decisions(record: IdentificationRecord) -> list[Markup]:
                 seen_deg[event.index],
                 event.weighed,
                 event.rotation_deg,
-                candidates=event.rivals,
+                candidates=event.candidates,
                 seen_deg=[azimuth_deg for index, azimuth_deg in seen_deg.items() if index <= event.index],
                 number=event.index + 1,
             )
@@ -263,7 +270,7 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
                 where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
                 rejected=listed(view.rejected),
                 leading=[_leading(c) for c in thought.candidates[:3]] if thought else [],
-                decided=sentence(thought.verdict) if thought and thought.verdict else "",
+                decided=_decision(thought),
                 margin=signed(thought.margin, 3) if thought else "",
                 moved=sentence(move_words(view.move)) if view.move and view.index else "",
                 decision=decision_words(decision) if decision else "",

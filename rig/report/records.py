@@ -17,6 +17,7 @@ from rig.events.events import (
     Event,
     Identified,
     Moved,
+    Note,
     Ranked,
     Rejected,
     SimilarObjects,
@@ -159,7 +160,7 @@ class IdentificationRecord:
     def __init__(self, *, truth: Truth | None = None, region: Region | None = None) -> None:
         self.truth = truth
         self.conditions: Mapping[str, Any] = {}
-        self.notes: tuple[str, ...] = ()
+        self.notes: tuple[Note, ...] = ()
         self.ranked: list[Ranked] = []
         self.decided: list[Decided] = []
         self.answer: Identified | None = None
@@ -223,5 +224,5 @@ class IdentificationRecord:
             if after.move is not None:
                 rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
             decided = self.decided[k - 1]  # every view but the last is followed by a decision
-            steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.rivals[:2]))
+            steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.candidates[:2]))
         return steps

@@ -92,7 +92,7 @@ def enrollment_items(record: EnrollmentRecord) -> list[SummaryItem]:
         )
     if record.similar:
         items.append(_symmetry(record.similar))
-        similar = [similar_object_words(one).removeprefix("looks like ") for one in record.similar.lookalikes]
+        similar = [similar_object_words(one).removeprefix("looks like ") for one in record.similar.objects]
         items.append(SummaryItem("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
     if record.result:
         items.append(SummaryItem("bench time", f"{record.result.seconds:.0f} s"))
@@ -100,13 +100,13 @@ def enrollment_items(record: EnrollmentRecord) -> list[SummaryItem]:
 
 
 def _symmetry(similar: SimilarObjects) -> SummaryItem:
-    if similar.period_deg is None or similar.neighbours is None or similar.alike is None:
+    if similar.period_deg is None or similar.neighbour_similarity is None or similar.period_similarity is None:
         return SummaryItem("symmetry", "–", "too few views to tell")
-    note = f"similarity {similar.alike:.3f}, of neighbouring views {similar.neighbours:.3f}"
+    note = f"similarity {similar.period_similarity:.3f}, of neighbouring views {similar.neighbour_similarity:.3f}"
     if similar.period_deg == 360:
         return SummaryItem("symmetry", "none", note)
     return SummaryItem(
-        "symmetry", f"every {similar.period_deg:g}°" if similar.period_deg else "alike from everywhere", note
+        "symmetry", f"every {similar.period_deg:g}°" if similar.period_deg else "the same from everywhere", note
     )
 
 
@@ -116,8 +116,8 @@ def _answer_items(record: IdentificationRecord) -> list[SummaryItem]:
         return []
     return [
         SummaryItem("answer", answer.name or "unknown"),
-        *([SummaryItem("probability", percent_words(answer.probability))] if answer.probability is not None else []),
-        SummaryItem("score", f"{answer.score:.3f}", f"per view; leads by {answer.margin:.3f}"),
+        *([SummaryItem("confidence", percent_words(answer.confidence))] if answer.confidence is not None else []),
+        SummaryItem("score", f"{answer.score:.3f}", f"per view; margin {answer.margin:.3f}"),
         SummaryItem("views", f"{answer.views}"),
         SummaryItem("travelled", f"{answer.travelled_deg:.0f}°"),
         SummaryItem("bench time", f"{answer.seconds:.1f} s"),

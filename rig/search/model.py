@@ -1,6 +1,5 @@
-"""What a search compares views with: the enrolled views by one descriptor, and the rules of the dense search."""
+"""What a search compares views with: the enrolled views by one descriptor, and the stopping rule."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -12,38 +11,41 @@ from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.descriptions import empty_tables, has_descriptor, read_empty_table
 from rig.core.errors import CatalogError, DescriptorOutdated
-from rig.search.stopping_rules import rules_of
+from rig.events.events import Note, NoteCode
+from rig.search.stopping_rules import stopping_rule_of
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
-from rig.views.empty_table import COMMAND, empty_table_status
+from rig.views.empty_table import empty_table_status
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Enrolled views, made ready for searches.
+    """Enrolled views, prepared for searches.
 
     Attributes
     ----------
     index : hbr.ViewIndex or hbr.DenseIndex
-        For the paper's searches, or for the dense one.
-    rules : hbr.Rules, optional
-        When the dense search ends, and what it calls unknown.
+        For the paper's searches, or for the dense search.
+    rule : hbr.StoppingRule, optional
+        When the dense search ends, and which objects are unknown.
     notes
-        What a person should know of an answer by this model.
-    pictured
-        Whether the objects were enrolled with a picture of the empty table, most of them; None where nobody knows.
+        What the operator should know about an answer by this model.
+    with_empty_table
+        Whether most objects were enrolled with an empty-table image; None if that is not known.
     empty_table : uint8 array (H, W, 3), optional
-        The newest picture that they were enrolled with.
+        The newest empty-table image of the enrollments.
     """
 
     index: hbr.ViewIndex | hbr.DenseIndex
-    rules: hbr.Rules | None = None
-    notes: tuple[str, ...] = ()
-    pictured: bool | None = None
+    rule: hbr.StoppingRule | None = None
+    notes: tuple[Note, ...] = ()
+    with_empty_table: bool | None = None
     empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.index, hbr.DenseIndex) and self.rules is None:
-            raise ValueError("a dense search needs rules; take load_model, or hbr.rules(hbr.rehearse(index, ...))")
+        if isinstance(self.index, hbr.DenseIndex) and self.rule is None:
+            raise ValueError(
+                "a dense search needs a stopping rule; use load_model, or hbr.calibrate_stopping_rule(index).rule"
+            )
 
     @property
     def views(self) -> hbr.Views:
@@ -52,27 +54,27 @@ class Model:
 
     @property
     def descriptor(self) -> str:
-        """What they are described by, and queries must be."""
+        """The descriptor of the enrolled views, and of queries."""
         return self.views.descriptor
 
 
-def model_of(views: hbr.Views, *, rules: hbr.Rules | None = None, notes: tuple[str, ...] = ()) -> Model:
-    """Make a model of views: for the dense search where there are rules, else for the paper's."""
-    return Model(hbr.ViewIndex(views)) if rules is None else Model(hbr.DenseIndex(views), rules, notes)
+def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:
+    """Return a model of views: for the dense search if there is a stopping rule, else for the paper's."""
+    return Model(hbr.ViewIndex(views)) if rule is None else Model(hbr.DenseIndex(views), rule)
 
 
 def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
-    """Load what is enrolled: by the bench's own descriptor where every object has it, else by the paper's.
+    """Load the enrolled views: by the bench's own descriptor if every object has it, else by the paper's.
 
-    The rules of the dense search are those that `rig catalog calibrate` has stored, where they are of this catalog;
-    else they are rehearsed, on a sample that does not keep anybody waiting (`rig.search.stopping_rules.rules_of`).
+    The stopping rule of the dense search is the one that `rig catalog calibrate` stored, if it is of this catalog.
+    Otherwise a quick calibration makes one (`rig.search.stopping_rules.stopping_rule_of`).
 
     Parameters
     ----------
     catalog
         An open one.
     descriptor
-        To have this and no other.
+        Load views by this descriptor and no other.
 
     Raises
     ------
@@ -81,17 +83,18 @@ def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
     CatalogError, CatalogBusy
         The catalog cannot be read.
     """
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
+    if descriptor == BENCH_DESCRIPTOR:
+        return _dense(catalog)
     if descriptor is None:
+        objects = 0
         if has_descriptor(catalog, BENCH_DESCRIPTOR):
             try:
                 return _dense(catalog)
             except DescriptorOutdated as error:
-                notes = (_fallback(error.what),)
-        else:
-            notes = (_fallback(f"the catalog has no {BENCH_DESCRIPTOR}"),)
-    elif descriptor == BENCH_DESCRIPTOR:
-        return _dense(catalog)
+                objects = int(error.evidence["objects"])
+        values = {"used": PAPER_DESCRIPTOR, "missing": BENCH_DESCRIPTOR, "objects": objects}
+        notes = (Note(NoteCode.PAPER_SEARCH, values),)
     views = catalog.views(PAPER_DESCRIPTOR).views
     return Model(hbr.ViewIndex(views), notes=notes if len(views) else ())
 
@@ -99,55 +102,35 @@ def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
 def _dense(catalog: Catalog) -> Model:
     views = catalog.views(BENCH_DESCRIPTOR).views
     if not len(views):
-        return Model(hbr.ViewIndex(hbr.Views.empty()))  # the search says so
+        return Model(hbr.ViewIndex(hbr.Views.empty()))  # the search reports that the catalog is empty
     index = hbr.DenseIndex(views)
-    rules, notes = rules_of(catalog.path, index)
+    rule, notes = stopping_rule_of(catalog.path, index)
     before = empty_tables(catalog)
-    pictured = len(before.with_image) >= len(before.without_image)
-    others = before.without_image if pictured else before.with_image
+    with_image = len(before.with_image) >= len(before.without_image)
+    others = before.without_image if with_image else before.with_image
     if others:
-        notes += (
-            f"{_few(others)} {'was' if len(others) == 1 else 'were'} enrolled {'without' if pictured else 'with'} a "
-            "picture of the empty table, unlike the others: such views compare badly; rig enroll --replace takes them "
-            "anew",
-        )
+        notes += (Note(NoteCode.MIXED_EMPTY_TABLE, {"objects": list(others), "with_image": not with_image}),)
     table = None
-    if pictured and before.newest is not None:
-        with suppress(CatalogError):  # rig catalog verify tells of it; the bench has a picture of its own
+    if with_image and before.newest is not None:
+        with suppress(CatalogError):  # rig catalog verify reports it; the bench has an image of its own
             table = read_empty_table(catalog, before.newest)
-    return Model(index, rules, notes, pictured, table)
+    return Model(index, rule, notes, with_image, table)
 
 
-def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[str, ...]]:
-    """Return the picture of the empty table that a search goes by, and what a person should know of that.
+def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:
+    """Return the empty-table image that a search uses, and what the operator should know about it.
 
-    The bench's own of today; where it has none, the one that the objects were enrolled with. None where they were
-    enrolled without: views are compared with views that were described alike.
+    It is the bench's own of today, else the one of the enrollment. None if the objects were enrolled without an image:
+    views are compared with views that were described in the same way.
     """
     if not isinstance(model.index, hbr.DenseIndex):
         return None, ()
     status = empty_table_status(bench)
-    if model.pictured is False:
-        if status.table is None:
-            return None, ()
-        return None, (
-            "most objects were enrolled without a picture of the empty table, and are searched without; "
-            "rig enroll --replace takes them anew with it",
-        )
+    problems = {"problems": [problem.as_json() for problem in status.problems]}
+    if model.with_empty_table is False:
+        return None, () if status.table is None else (Note(NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE),)
     if status.table is not None:
-        return status.table.image_bgr, (f"{status.text}; {COMMAND} takes a new one",) if status.problems else ()
+        return status.table.image_bgr, (Note(NoteCode.EMPTY_TABLE_DOUBTED, problems),) if status.problems else ()
     if model.empty_table is None:
-        return None, (f"{status.text}; {COMMAND} takes one",)
-    return model.empty_table, (f"{status.text}: the image of the enrollment is used; {COMMAND} takes a new one",)
-
-
-def _few(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
-
-
-def _fallback(reason: str) -> str:
-    return (
-        f"the search goes by {PAPER_DESCRIPTOR}, of the whole picture: {reason}; "
-        f"rig catalog redescribe --descriptor {BENCH_DESCRIPTOR} adds it from the stored images"
-    )
+        return None, (Note(NoteCode.EMPTY_TABLE_MISSING, problems),)
+    return model.empty_table, (Note(NoteCode.EMPTY_TABLE_OF_ENROLLMENT, problems),)

@@ -1,23 +1,23 @@
-"""Compute a saved run again, from its frames: the same program must decide the same."""
+"""Compute a saved run again from its frames: the same program must decide the same."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
-from rig.events.events import Accepted, Decided, Identified, Moved, Ranked, plain
+from rig.events.events import Accepted, Decided, Identified, Moved, Ranked, RotationReason, plain
 from rig.search.saved_run import SavedRun
 from rig.search.session import Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.description import ViewDescriber
 
-TOLERANCE = 1e-9
+TOLERANCE: Final = 1e-9
 """Numbers that differ less are equal: another machine may sum in another order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Something that came out otherwise; ``view`` counts from 1."""
+    """Something that was computed differently; ``view`` counts from 1."""
 
     view: int
     what: str
@@ -30,7 +30,7 @@ class Difference:
 
 @dataclass(slots=True)
 class Check:
-    """What the check of a run found."""
+    """The result of checking a run."""
 
     views: int = 0
     decisions: int = 0
@@ -38,14 +38,14 @@ class Check:
 
 
 def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
-    """Describe every frame again, vote again and decide again, and compare with what was saved.
+    """Describe every frame, search and decide again, and compare with what was saved.
 
     Parameters
     ----------
     run
         The run.
     by
-        The strategy, where it has no name that this program knows.
+        The strategy, if it has no name that this program knows.
 
     Raises
     ------
@@ -60,87 +60,60 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     step: Rotate | Finish | None = None
     table_deg = 0.0
     for event in run.events():
+        computed: Any = None
         match event:
             case Moved():
                 table_deg = event.encoder_deg
             case Accepted():
-                seen = describe(event.image_bgr)
+                view = describe(event.image_bgr)
                 if search is None:
+                    top = len(run.views.object_names)
                     search, _ = begin_search(
-                        run.model,
-                        run.config,
-                        by or started.strategy,
-                        seed=started.seed or 0,
-                        top=len(run.views.object_names),
+                        run.model, run.config, by or started.strategy, seed=started.seed or 0, top=top
                     )
-                levels = seen.levels[search.descriptor]
-                ranked, step = search.look(levels, event.azimuth_deg, table_deg=table_deg)
+                levels = view.levels[search.descriptor]
+                ranked, step = search.add(levels, event.azimuth_deg, table_deg=table_deg)
                 found.views += 1
                 if event.segmentation is not None:
                     found.differences += _compare(
-                        found.views, "segmentation", event.segmentation, plain(seen.segmentation)
+                        found.views, "segmentation", event.segmentation, plain(view.segmentation)
                     )
             case Ranked() if ranked is not None:
-                # As many candidates as the run was asked to name.
-                top = len(event.candidates)
-                again = replace(ranked, candidates=ranked.candidates[:top])
-                found.differences += _compare(found.views, "", plain(event), plain(again))
+                # A run names as many candidates as it was asked for.
+                computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
             case Decided():
                 found.decisions += 1
-                found.differences += _compare(found.views, "", _saved_step(event), _computed_step(step, event))
+                computed = _decided(step, event)
             case Identified() if ranked is not None and search is not None:
                 found.decisions += 1
-                found.differences += _compare(
-                    found.views, "", _saved_answer(event), _computed_answer(search, ranked, step)
-                )
+                end = step if isinstance(step, Finish) else Finish()
+                answer = search.answer(ranked, end, travelled_deg=event.travelled_deg, seconds=event.seconds)
+                computed = replace(answer, candidates=answer.candidates[: len(event.candidates)])
             case _:
                 pass
+        if computed is not None:
+            saved, again = plain(event), plain(computed) if not isinstance(computed, dict) else computed
+            for name in run.not_saved(event):
+                saved.pop(name, None)
+                again.pop(name, None)
+            found.differences += _compare(found.views, "", saved, again)
     return found
 
 
-def _saved_step(event: Decided) -> dict[str, Any]:
-    return {
-        "what": "turn",
-        "rotation_deg": event.rotation_deg,
-        "s_left": event.s_left,
-        "s_right": event.s_right,
-        "rivals": list(event.rivals),
-        "why": event.why,
-        "weighed": plain(event.weighed),
-    }
-
-
-def _computed_step(step: Rotate | Finish | None, saved: Decided) -> dict[str, Any]:
+def _decided(step: Rotate | Finish | None, saved: Decided) -> Decided | dict[str, Any]:
+    """Return the event of the computed step; the target angle is the turntable's, not the search's."""
     if not isinstance(step, Rotate):
-        return {"what": "stop", "why": step.why if step else "no view was taken"}
-    rivals = list(step.rivals[: len(saved.rivals)])
-    return {"what": "turn", **plain(step), "rivals": rivals}
-
-
-_ANSWER: Final = (
-    "name",
-    "score",
-    "margin",
-    "min_score",
-    "pose_deg",
-    "yaw_deg",
-    "reason",
-    "probability",
-    "familiarity",
-    "min_familiarity",
-)
-
-
-def _saved_answer(event: Identified) -> dict[str, Any]:
-    return {"what": "stop", **{key: getattr(event, key) for key in _ANSWER}}
-
-
-def _computed_answer(search: Search, ranked: Ranked, step: Rotate | Finish | None) -> dict[str, Any]:
-    answer = search.answer(ranked, step.why if step else "")
-    return {
-        "what": "stop" if isinstance(step, Finish) else "turn",
-        **{key: getattr(answer, key) for key in _ANSWER},
-    }
+        return {"reason": None if step is None else plain(step.reason)}
+    return replace(
+        saved,
+        rotation_deg=step.rotation_deg,
+        s_left=step.s_left,
+        s_right=step.s_right,
+        candidates=step.candidates[: len(saved.candidates)],
+        reason=RotationReason(step.reason),
+        note=step.note,
+        weighed=step.weighed,
+    )
 
 
 def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[Difference]:

@@ -8,6 +8,7 @@ what happened, an event a line, and ``frames/000.png``, ... the accepted frames,
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
 from importlib.metadata import version
 from math import nan
 from pathlib import Path
@@ -26,15 +27,15 @@ from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError
 from rig.core.files import write
 from rig.events.events import Accepted, Event, Started, event_dict, event_kind
+from rig.search.earlier_runs import NOT_SAVED, upgraded
 from rig.search.model import Model, empty_table_for, model_of
-from rig.search.stopping_rules import FILE as RULES
-from rig.search.stopping_rules import read_rules, write_rules
+from rig.search.stopping_rules import FILE as STOPPING_RULE
+from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
-from rig.views.segmentation_evidence import upgrade_evidence
 
 FORMAT: Final = "hbr-rig run"
-VERSION: Final = 2
-"""Raised when a program that knows less could not compute a run again; version 1 knew no dense search."""
+VERSION: Final = 3
+"""Version 2 brought the dense search; version 3 stores codes instead of sentences, and terms of the glossary."""
 EMPTY_TABLE: Final = "empty_table.png"
 
 _KINDS: Final[dict[str, type]] = {event_kind(kind): kind for kind in get_args(Event)}
@@ -80,8 +81,8 @@ class RunWriter:
                     f"The folder {folder} is not empty.", next_step="Give a new folder for each run with --save-run."
                 )
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
-            if model.rules is not None and isinstance(model.index, hbr.DenseIndex):
-                write_rules(folder / RULES, model.rules, model.index, made_utc=started_utc)
+            if model.rule is not None and isinstance(model.index, hbr.DenseIndex):
+                write_stopping_rule(folder / STOPPING_RULE, model.rule, model.index, made_utc=started_utc)
             if empty_table is None:
                 empty_table, _ = empty_table_for(bench, model)
             if empty_table is not None:
@@ -179,7 +180,7 @@ class SavedRun:
         """
         for number, line in enumerate(self._lines, 1):
             try:
-                yield event_of(line, self._frame)
+                yield event_of(line if self._current else upgraded(line), self._frame)
             except (KeyError, TypeError, ValueError) as error:
                 raise _damaged(self.folder, f"events.jsonl, line {number}: {error}") from error
 
@@ -196,6 +197,14 @@ class SavedRun:
         if not isinstance(first, Started):
             raise _damaged(self.folder, "events.jsonl does not begin with the event started")
         return first
+
+    def not_saved(self, event: Event) -> tuple[str, ...]:
+        """Return the fields of an event that the run's format does not have."""
+        return () if self._current else NOT_SAVED.get(type(event), ())
+
+    @property
+    def _current(self) -> bool:
+        return bool(self.about["version"] == VERSION)
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
         return _image(frame_path(self.folder, index))
@@ -223,8 +232,8 @@ def load_run(folder: Path) -> SavedRun:
             raise ValueError(f"it was described by {used['name']} {used['version']}, which this program has not")
         config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
         views = _views(_json_lines(_bytes(folder / "model.jsonl")), used["name"])
-        stored = read_rules(folder)
-        model = model_of(views, rules=None if stored is None else stored.adapted(views))
+        stored = read_stopping_rule(folder)
+        model = model_of(views, rule=None if stored is None else stored.adapted(views))
         empty_table = _image(folder / EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
         lines = _json_lines(_bytes(folder / "events.jsonl"), cut=True)
     except CatalogError as error:
@@ -256,10 +265,6 @@ def event_of(values: dict[str, Any], frame: Any) -> Event:
         raise ValueError(f"there is no event {name!r}")
     if name == "accepted":
         values["image_bgr"] = frame(values["index"])
-        if "front_end" in values:  # its name in runs of version 2 and before
-            values["segmentation"] = values.pop("front_end")
-        if values.get("segmentation") is not None:
-            values["segmentation"] = upgrade_evidence(values["segmentation"])
     event: Event = built(_KINDS[name], values)
     return event
 
@@ -278,6 +283,8 @@ def built(kind: Any, value: Any) -> Any:
     if origin is tuple:
         items = get_args(kind)
         return tuple(built(items[0] if items[-1] is Ellipsis else items[i], item) for i, item in enumerate(value))
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return kind(value)
     if kind is float:
         return nan if value is None else float(value)
     if kind in (str, bool, int) and type(value) is not kind:

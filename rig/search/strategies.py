@@ -1,8 +1,8 @@
-"""What to do next in a search: turn on, and how far, or stop; each time in words.
+"""Strategies: after each view, rotate to the next view or finish.
 
-`identify` asks one strategy after every view. Five come with the rig; others plug in by an object of their own, or by
-name through the entry-point group `rig.strategies`. Which views a strategy is shown it says by its attribute
-``descriptor``: the paper's where it has none (`Strategy`, `SearchState`), the bench's own for the dense search
+`identify` asks one strategy after every view. Five come with the rig; others are passed as an object, or plug in by
+name through the entry-point group `rig.strategies`. The attribute ``descriptor`` of a strategy says which views it is
+shown: without it, the paper's (`Strategy`, `SearchState`); with the bench's own descriptor, those of the dense search
 (`DenseStrategy`, `DenseSearchState`).
 """
 
@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
+from hbr import Outcome, StopReason
 from hbr.core.angles import wrap180
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
-from rig.events.events import Weighed
-from rig.events.wording import separation_words, side_words
+from rig.events.events import RotationReason, Weighed
 from rig.motion.motion_model import MotionModel
 from rig.motion.move import equivalent_within
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 
 GROUP: Final = "rig.strategies"
 
-TURN_STEP_DEG: Final = 5.0
-"""Turns that the dense search weighs are so far apart."""
+ROTATION_STEP_DEG: Final = 5.0
+"""Step between the rotations that the dense search weighs."""
 
 _REVISIT_DEG: Final = 10.0
 _DRAWS: Final = 20
@@ -36,7 +36,7 @@ _DRAWS: Final = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchState:
-    """What is known after a view.
+    """What the paper's search knows after a view.
 
     Attributes
     ----------
@@ -45,17 +45,17 @@ class SearchState:
     queries : uint8 array (N, 144)
         Descriptors of the views so far, in their order.
     ranking : hbr.Ranking
-        What they say; `ranking.orientation_deg` is where each was taken.
+        The objects by their scores; `ranking.orientation_deg` has the orientation of each view.
     score, margin
-        Of the leading candidate, per view: its Hough score, and how far it surely leads (`hbr.score_margin`).
+        Of the leading candidate, per view: its Hough score, and its margin (`hbr.score_margin`).
     min_score
-        Below this score a view the object counts as unknown.
+        Below this score per view the object is unknown.
     table_deg, limits_deg
-        Where the table stands, unwrapped, and how far its cable reaches.
+        The table angle, unwrapped, and the limits of the cable.
     config
         The settings of a search.
     rng
-        For strategies that draw: seeded, so that a saved run can be computed again.
+        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
     """
 
     index: hbr.ViewIndex
@@ -71,7 +71,7 @@ class SearchState:
 
     @property
     def views(self) -> int:
-        """How many views there are."""
+        """The number of views so far."""
         return len(self.queries)
 
 
@@ -81,25 +81,23 @@ class DenseSearchState:
 
     Attributes
     ----------
-    belief : hbr.Belief
-        How much every object, from every azimuth, is supported.
-    verdict : hbr.Verdict
-        What the rules say of it.
-    rules : hbr.Rules
-        When to stop and what to call unknown.
+    session : hbr.DenseSession
+        With its ``belief``, its stopping ``rule`` and its method ``next_best_view``.
+    decision : hbr.StopDecision
+        The stopping rule's decision.
     rotations_deg, seconds : float64 arrays (a,)
-        Turns of the camera around the object that the cable allows, every 5°, and how long each takes on this bench.
+        Rotations of the camera around the object that the cable allows, every 5°, and how long each takes on this
+        bench.
     table_deg
-        Where the table stands, unwrapped.
+        The table angle, unwrapped.
     config
         The settings of a search.
     rng
-        For strategies that draw: seeded, so that a saved run can be computed again.
+        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
     """
 
-    belief: hbr.Belief
-    verdict: hbr.Verdict
-    rules: hbr.Rules
+    session: hbr.DenseSession
+    decision: hbr.StopDecision
     rotations_deg: NDArray[np.float64]
     seconds: NDArray[np.float64]
     table_deg: float
@@ -108,61 +106,63 @@ class DenseSearchState:
 
     @property
     def views(self) -> int:
-        """How many views there are."""
-        return self.belief.queries
+        """The number of views so far."""
+        return self.session.belief.queries
 
 
 @dataclass(frozen=True, slots=True)
 class Rotate:
-    """Look again, ``rotation_deg`` further around the object, positive to the left; ``why`` in words.
+    """Take the next view after a rotation of the camera around the object, positive to the left.
 
-    ``s_left`` and ``s_right`` say how alike the ``rivals`` (names) look from either side, where that was asked;
-    ``weighed`` has all turns that were, where they were.
+    A strategy of your own explains itself in ``note``. ``s_left`` and ``s_right`` are how similar the ``candidates``
+    (names) look from each side, if the strategy compared the sides; ``weighed`` has all rotations that it weighed.
     """
 
     rotation_deg: float
-    why: str
+    reason: RotationReason = RotationReason.CUSTOM
+    note: str = ""
     s_left: float | None = None
     s_right: float | None = None
-    rivals: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()
     weighed: Weighed | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """Look no further; ``why`` in words."""
+    """End the search. A strategy of your own explains itself in ``note``."""
 
-    why: str
+    reason: StopReason = StopReason.CUSTOM
+    note: str = ""
 
 
 class Strategy(Protocol):
-    """Decides after each view."""
+    """Decides after each view of the paper's search."""
 
     @property
     def name(self) -> str:
-        """By which it is asked for, and which is kept with a run."""
+        """The name that selects it, and that a saved run stores."""
         ...
 
-    def next(self, look: SearchState) -> Rotate | Finish:
-        """Return where to look next, or that it is enough. The same look and draws give the same answer."""
+    def next(self, state: SearchState) -> Rotate | Finish:
+        """Return the rotation to the next view, or the end. The same state and draws give the same answer."""
         ...
 
 
 class DenseStrategy(Protocol):
-    """Decides after each view, by what the dense search believes."""
+    """Decides after each view of the dense search."""
 
     @property
     def name(self) -> str:
-        """By which it is asked for, and which is kept with a run."""
+        """The name that selects it, and that a saved run stores."""
         ...
 
     @property
     def descriptor(self) -> str:
-        """By which views are described for it: ``edges+colours``, the bench's own."""
+        """The descriptor of its views: ``edges+colours``, the bench's own."""
         ...
 
-    def next(self, look: DenseSearchState) -> Rotate | Finish:
-        """Return where to look next, or that it is enough. The same look and draws give the same answer."""
+    def next(self, state: DenseSearchState) -> Rotate | Finish:
+        """Return the rotation to the next view, or the end. The same state and draws give the same answer."""
         ...
 
 
@@ -170,28 +170,28 @@ AnyStrategy = Strategy | DenseStrategy
 
 
 def descriptor_for(strategy: AnyStrategy) -> str:
-    """Return what views are described by for a strategy; the paper's where it does not say."""
+    """Return the descriptor of a strategy's views; the paper's if the strategy names none."""
     return str(getattr(strategy, "descriptor", PAPER_DESCRIPTOR))
 
 
 def is_dense(strategy: AnyStrategy) -> TypeGuard[DenseStrategy]:
-    """Whether a strategy is shown what the dense search believes."""
+    """Whether a strategy decides on the dense search."""
     return descriptor_for(strategy) != PAPER_DESCRIPTOR
 
 
 def strategy_for(descriptor: str) -> AnyStrategy:
-    """Return the strategy that is taken for views by a descriptor where nobody asks for one."""
+    """Return the default strategy for views by a descriptor."""
     return Active() if descriptor == PAPER_DESCRIPTOR else Dense()
 
 
-def reachable_turns(config: RigConfig, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the turns of the camera that the cable allows, and how long each takes by the bench's motion model.
+def reachable_rotations(config: RigConfig, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rotations of the camera that the cable allows, and how long each takes by the bench's motion model.
 
-    Where the short way exceeds the cable, the table goes the long way round, which takes its time.
+    If the short way exceeds the cable budget, the table rotates the long way round, which takes longer.
     """
     model = MotionModel(config)
     rotations_deg, seconds = [], []
-    for rotation_deg in (np.arange(TURN_STEP_DEG - 180, 180 + TURN_STEP_DEG, TURN_STEP_DEG)).tolist():
+    for rotation_deg in (np.arange(ROTATION_STEP_DEG - 180, 180 + ROTATION_STEP_DEG, ROTATION_STEP_DEG)).tolist():
         asked_deg = table_deg + config.table.orientation_sign * rotation_deg
         target_deg = equivalent_within(asked_deg, table_deg, config.table.limits_deg)
         if rotation_deg and target_deg is not None:
@@ -200,92 +200,96 @@ def reachable_turns(config: RigConfig, table_deg: float) -> tuple[NDArray[np.flo
     return np.array(rotations_deg), np.array(seconds)
 
 
-def enough(look: SearchState) -> Finish | None:
-    """Return the reason to stop that most strategies share, or None.
+def end_by_margin(state: SearchState) -> Finish | None:
+    """Return the end that most strategies of the paper's search share, or None.
 
-    A search is over when a known object leads all others by ``identify.margin`` a view, or ``identify.max_views`` were
-    taken; nobody is called unknown at a first glance.
+    A search ends when an enrolled object leads all others by ``identify.margin`` per view, or after
+    ``identify.max_views``. A low score ends no search early.
     """
-    config = look.config
-    if look.views >= config.min_views and look.score >= look.min_score and look.margin >= config.margin:
-        return Finish(f"the lead of {look.margin:.3f} a view passes {config.margin:g}")
-    return spent(look)
+    config = state.config
+    if state.views >= config.min_views and state.score >= state.min_score and state.margin >= config.margin:
+        return Finish(StopReason.MARGIN)
+    return end_by_views(state)
 
 
-def spent(look: SearchState) -> Finish | None:
-    """Return the reason to stop when all views that are allowed were taken, or None."""
-    if look.views >= look.config.max_views:
-        return Finish(f"{look.config.max_views} views were taken")
-    return None
+def end_by_views(state: SearchState) -> Finish | None:
+    """Return the end if all allowed views were taken, or None."""
+    return Finish(StopReason.MAX_VIEWS) if state.views >= state.config.max_views else None
 
 
 class Active:
-    """AHBR: turn to the side where the candidates look less alike (Eq. 5-7); the first turn is fixed."""
+    """AHBR: rotate to the side on which the candidates look less similar (Eq. 5-7); the first rotation is fixed."""
 
     name = "ahbr"
 
-    def next(self, look: SearchState) -> Rotate | Finish:
-        if stop := enough(look):
-            return stop
-        if look.views == 1:
-            return Rotate(look.config.first_step_deg, "the first turn is fixed")
-        decision = hbr.next_view(look.ranking)
-        names = look.ranking.views.object_names
-        rivals = tuple(names[i] for i in decision.candidates)
-        why = side_words(decision.side, decision.s_left, decision.s_right, rivals)
-        return Rotate(decision.rotation_deg, why, decision.s_left, decision.s_right, rivals)
+    def next(self, state: SearchState) -> Rotate | Finish:
+        if end := end_by_margin(state):
+            return end
+        if state.views == 1:
+            return Rotate(state.config.first_step_deg, RotationReason.FIRST_STEP)
+        decision = hbr.next_view(state.ranking)
+        names = state.ranking.views.object_names
+        several = len(decision.candidates) > 1
+        return Rotate(
+            decision.rotation_deg,
+            RotationReason.LESS_SIMILAR_SIDE if several else RotationReason.ONE_CANDIDATE,
+            s_left=decision.s_left,
+            s_right=decision.s_right,
+            candidates=tuple(names[i] for i in decision.candidates),
+        )
 
 
 class Sweep:
-    """All around in even steps, one for each view that is allowed, until the answer is clear."""
+    """All around in even steps, one for each allowed view, until the margin is large enough."""
 
     name = "sweep"
 
-    def next(self, look: SearchState) -> Rotate | Finish:
-        views = look.config.max_views
-        return enough(look) or Rotate(360.0 / views, f"the sweep goes around in {views} even steps")
+    def next(self, state: SearchState) -> Rotate | Finish:
+        return end_by_margin(state) or Rotate(360.0 / state.config.max_views, RotationReason.EVEN_STEPS)
 
 
 class Random:
-    """Anywhere that was not seen yet, until the answer is clear."""
+    """Random views that were not taken before, until the margin is large enough."""
 
     name = "random"
 
-    def next(self, look: SearchState) -> Rotate | Finish:
-        return enough(look) or Rotate(_draw(look), "a turn drawn at random")
+    def next(self, state: SearchState) -> Rotate | Finish:
+        return end_by_margin(state) or Rotate(_draw(state), RotationReason.RANDOM)
 
 
 class Passive:
-    """HBR as the paper measures it: views at random, all that are allowed, and only then an answer."""
+    """HBR as the paper measures it: all allowed views at random, then an answer."""
 
     name = "hbr"
 
-    def next(self, look: SearchState) -> Rotate | Finish:
-        return spent(look) or Rotate(_draw(look), f"view {look.views + 1} of {look.config.max_views}, drawn at random")
+    def next(self, state: SearchState) -> Rotate | Finish:
+        return end_by_views(state) or Rotate(_draw(state), RotationReason.RANDOM)
 
 
 class Dense:
-    """The bench's own: turn to where the likeliest objects differ most, the motion counted, until the rules end it."""
+    """The bench's own: rotate to the next best view, motion time included, until the stopping rule ends the search."""
 
     name = "dense"
     descriptor = BENCH_DESCRIPTOR
 
-    def next(self, look: DenseSearchState) -> Rotate | Finish:
-        if look.verdict.kind != "look":
-            return Finish(look.verdict.words)
-        if not len(look.rotations_deg):
-            return Finish("the cable leaves no other view")
-        ahead = hbr.next_best_view(
-            look.belief, beta=look.rules.beta, rotations_deg=look.rotations_deg, seconds=look.seconds
+    def next(self, state: DenseSearchState) -> Rotate | Finish:
+        if state.decision.outcome is not Outcome.CONTINUE:
+            return Finish(state.decision.reason)
+        if not len(state.rotations_deg):
+            return Finish(StopReason.NO_ROTATION_LEFT)
+        best = state.session.next_best_view(state.rotations_deg, state.seconds)
+        names = state.session.belief.index.views.object_names
+        return Rotate(
+            best.rotation_deg,
+            RotationReason.NEW_SIDE if best.pair is None else RotationReason.SEPARATES_CANDIDATES,
+            candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
+            weighed=Weighed(
+                tuple(best.rotations_deg.tolist()),
+                tuple(best.confusion.tolist()),
+                tuple(best.cost.tolist()),
+                None if best.similarity is None else tuple(best.similarity.tolist()),
+            ),
         )
-        names = look.belief.index.views.object_names
-        rivals = () if ahead.pair is None else tuple(names[i] for i in ahead.pair)
-        alike = None if ahead.alike is None else tuple(ahead.alike.tolist())
-        chosen = ahead.rotations_deg.tolist().index(ahead.rotation_deg)
-        weighed = Weighed(
-            tuple(ahead.rotations_deg.tolist()), tuple(ahead.confusion.tolist()), tuple(ahead.cost.tolist()), alike
-        )
-        return Rotate(ahead.rotation_deg, separation_words(rivals, alike, chosen), rivals=rivals, weighed=weighed)
 
 
 BUILT_IN: Final[dict[str, Callable[[], AnyStrategy]]] = {
@@ -294,7 +298,7 @@ BUILT_IN: Final[dict[str, Callable[[], AnyStrategy]]] = {
 
 
 def names() -> list[str]:
-    """Return the names of all strategies that can be asked for, the plugged-in ones behind the rig's own."""
+    """Return the names of all strategies: the rig's own, then the plug-ins."""
     return [*BUILT_IN, *sorted({point.name for point in entry_points(group=GROUP)} - set(BUILT_IN))]
 
 
@@ -304,7 +308,7 @@ def strategy(name: str) -> AnyStrategy:
     Raises
     ------
     UsageError
-        There is none, or the plug-in that should bring it cannot be loaded.
+        There is none, or its plug-in cannot be loaded.
     """
     if name in BUILT_IN:
         return BUILT_IN[name]()
@@ -315,7 +319,7 @@ def strategy(name: str) -> AnyStrategy:
             except (ImportError, AttributeError, TypeError) as error:
                 raise UsageError(
                     f"The strategy {name!r} of {point.value} cannot be loaded.",
-                    next_step="Mend or uninstall the package that brings it, or choose another strategy.",
+                    next_step="Fix or uninstall the package that provides it, or choose another strategy.",
                     evidence={"reason": str(error)},
                 ) from error
             return plugged
@@ -327,11 +331,11 @@ def strategy(name: str) -> AnyStrategy:
     )
 
 
-def _draw(look: SearchState) -> float:
-    """A rotation that leads to where no view was taken yet; the last one drawn where everything has been seen."""
-    seen_deg = look.ranking.orientation_deg
+def _draw(state: SearchState) -> float:
+    """Return a random rotation to where no view was taken; the last one drawn if views were taken everywhere."""
+    seen_deg = state.ranking.orientation_deg
     for _ in range(_DRAWS):
-        rotation_deg = float(look.rng.uniform(-180.0, 180.0))
+        rotation_deg = float(state.rng.uniform(-180.0, 180.0))
         if np.all(np.abs(wrap180(seen_deg[-1] + rotation_deg - seen_deg)) > _REVISIT_DEG):
             break
     return rotation_deg

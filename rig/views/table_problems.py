@@ -44,10 +44,11 @@ class TableProblem:
     @property
     def text(self) -> str:
         """The problem in words."""
-        return _text(self.as_json())
+        return problem_text(self.as_json())
 
 
-def _text(problem: Mapping[str, Any]) -> str:
+def problem_text(problem: Mapping[str, Any]) -> str:
+    """Return a problem in words, from its JSON values."""
     match problem:
         case {"code": "camera-moves"}:
             return "the camera moves around the object, so that every view has another background"

@@ -60,10 +60,10 @@ class MoveLines:
         if decided and decided.s_left is not None and decided.s_right is not None:
             left, right = distinct(decided.s_left, decided.s_right, decimals=3)
             similarity = f"{left:>12}{right:>9}  "
-        if decided and decided.weighed is not None and decided.weighed.alike is not None:
-            alike = decided.weighed.alike
-            there = alike[decided.weighed.rotations_deg.index(decided.rotation_deg)]
-            similarity = f"{there:>11.2f}{f'{min(alike):.2f}–{max(alike):.2f}':>11} "
+        if decided and decided.weighed is not None and decided.weighed.similarity is not None:
+            weighed = decided.weighed.similarity
+            there = weighed[decided.weighed.rotations_deg.index(decided.rotation_deg)]
+            similarity = f"{there:>11.2f}{f'{min(weighed):.2f}–{max(weighed):.2f}':>11} "
         goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
         leading = ", ".join(
             f"{c.name} {f'{c.score:.3f}' if c.probability is None else percent_words(c.probability)}"

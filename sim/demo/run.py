@@ -291,7 +291,7 @@ def _identify(
         if say and (text := moves.add(event)):
             print(text, flush=True)
         if say and isinstance(event, Started):
-            print(MoveLines.HEADING if model.rules is None else MoveLines.DENSE_HEADING)
+            print(MoveLines.HEADING if model.rule is None else MoveLines.DENSE_HEADING)
     return record
 
 

@@ -1,4 +1,4 @@
-"""`rig catalog calibrate`: when a search ends and what it calls unknown, rehearsed on the catalog."""
+"""`rig catalog calibrate`: fit the stopping rule of the dense search to the catalog."""
 
 import sys
 from typing import TYPE_CHECKING, Annotated
@@ -9,32 +9,32 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
-    from rig.search.stopping_rules import Rehearsed
+    from hbr import CalibratedRule
 
 
 @command
 def calibrate(
     settings: Settings,
     error_rate: Annotated[
-        float, typer.Option(min=0.0001, max=0.5, help="Wrong objects among those named, at most.")
+        float, typer.Option(min=0.0001, max=0.5, help="Largest share of wrong objects among those named.")
     ] = 0.01,
     false_reject: Annotated[
-        float, typer.Option(min=0.0001, max=0.5, help="Enrolled objects called unknown, at most.")
+        float, typer.Option(min=0.0001, max=0.5, help="Largest share of enrolled objects called unknown.")
     ] = 0.02,
 ) -> None:
-    """Rehearse searches for every enrolled object, and keep the rules by which rig identify ends.
+    """Calibrate the stopping rule, which decides when rig identify ends a search.
 
-    Each object is looked for by its own views, as if taken a little aside, and once more with the whole object left
-    out, as a stranger. What cannot be promised is said, and how much more data it takes. Do it again when the catalog
-    has changed; rig identify notices.
+    Search for each enrolled object with its own views, as if the camera had stood beside them, and again with the whole
+    object left out, as an unknown object. The command reports what the rule cannot guarantee, and how much more data
+    that needs. Repeat it when the catalog has changed; rig identify reports that.
 
     Example: rig catalog calibrate --bench sim --error-rate 0.005
     """
-    from hbr import DenseIndex
+    from hbr import DenseIndex, calibrate_stopping_rule
     from rig.core.clock import SystemClock, seconds_between
     from rig.core.errors import CatalogError
     from rig.events.events import plain
-    from rig.search.stopping_rules import FILE, rehearse, rules_values, write_rules
+    from rig.search.stopping_rules import FILE, stopping_rule_values, write_stopping_rule
     from rig.views.description import BENCH_DESCRIPTOR
 
     clock = SystemClock()
@@ -44,50 +44,51 @@ def calibrate(
             raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
         path = catalog.path / FILE
     begun_ns = clock.now_ns()
-    print(f"Looking for {len(views.object_names)} objects among each other ...", file=sys.stderr)
+    print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
     index = DenseIndex(views)
-    found = rehearse(index, error_rate=error_rate, false_reject=false_reject)
+    found = calibrate_stopping_rule(index, error_rate=error_rate, false_reject=false_reject)
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
-    write_rules(path, found.rules, index, made_utc=made_utc)
+    write_stopping_rule(path, found.rule, index, made_utc=made_utc)
     if settings.json:
-        values = rules_values(found.rules, index, made_utc=made_utc)
-        outcome = {key: value for key, value in plain(found).items() if key != "rules"}
-        settings.print_json({"file": str(path), "rehearsed": outcome, **values})
+        outcome = {key: value for key, value in plain(found).items() if key != "rule"}
+        values = stopping_rule_values(found.rule, index, made_utc=made_utc)
+        settings.print_json({"file": str(path), "calibration": outcome, **values})
         return
     for words in _lines(found, len(views.object_names), seconds_between(begun_ns, clock.now_ns())):
         print(words)
-    print(f"Kept: {path}")
+    print(f"Stored: {path}")
 
 
-def _lines(found: "Rehearsed", objects: int, seconds: float) -> list[str]:
+def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:
     from math import isfinite
 
-    from rig.events.wording import counted, percent_words, sentence
+    from rig.events.wording import counted, limitation_words, percent, percent_words, sentence
 
-    rules = found.rules
+    rule = found.rule
     lines = [
-        f"{rules.searches} rehearsed searches of {counted(found.views, 'view')} for {counted(objects, 'object')}, "
+        f"{rule.searches} leave-one-out searches of {counted(found.views, 'view')} for {counted(objects, 'object')} "
         f"in {seconds:.1f} s"
     ]
     if found.ended:
         lines.append(
-            f"  answers  a search ends at a probability of {percent_words(rules.certainty)}: {found.ended} did, after "
-            f"{found.mean_views:.2f} views, {found.wrong} of them with a wrong object ({found.wrong / found.ended:.1%})"
+            f"  answers  {found.ended} searches ended at a confidence of {percent_words(rule.min_confidence)}, after "
+            f"{found.mean_views:.2f} views on average, {found.wrong} of them with a wrong object "
+            f"({percent(found.wrong / found.ended)})"
         )
-    if isfinite(rules.familiar[-1]):
-        least = ", ".join(f"{one:.3f}" for one in rules.familiar)
-        so = f": {found.rejected} of {rules.searches} searches for enrolled objects ended so"
-        share = f"{so} ({found.rejected / rules.searches:.1%})" if found.ended else ""
-        lines.append(f"  unknown  below a familiarity of {least} after 1, 2, ... views{share}")
+    if isfinite(rule.open_set_thresholds[-1]):
+        thresholds = ", ".join(f"{one:.3f}" for one in rule.open_set_thresholds)
+        share = f": {found.rejected} of {rule.searches} searches for enrolled objects" if found.ended else ""
+        share += f" ({percent(found.rejected / rule.searches)})" if found.ended else ""
+        lines.append(f"  unknown  below an open-set score of {thresholds} after 1, 2, ... views{share}")
     if found.accepted is not None:
-        pairs = ", ".join(f"{one} for {other}" for one, other in found.taken_for)
+        pairs = ", ".join(f"{one} for {other}" for one, other in found.confused[:3])
         lines.append(
-            f"  strangers  {found.accepted} of {rules.searches} left out were taken for another object "
-            f"({found.accepted / rules.searches:.1%}){f': {pairs}' if pairs else ''}"
+            f"  left out  {found.accepted} of {rule.searches} left-out objects were taken for another object "
+            f"({percent(found.accepted / rule.searches)}){f': {pairs}' if pairs else ''}"
         )
-    if not rules.promises:
+    if not rule.limitations:
         lines.append(
-            f"Promised, for searches like these: at most {rules.error_rate:.1%} wrong answers, and "
-            f"{rules.false_reject:.1%} of the enrolled objects called unknown."
+            f"Guaranteed for searches like these: at most {percent(rule.error_rate)} wrong answers, and "
+            f"{percent(rule.false_reject)} of the enrolled objects called unknown."
         )
-    return [*lines, *(f"Not promised: {sentence(words)}" for words in rules.promises)]
+    return [*lines, *(f"Not guaranteed: {sentence(limitation_words(one))}" for one in rule.limitations)]

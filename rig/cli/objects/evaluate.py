@@ -169,7 +169,7 @@ def evaluate(
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
         if leave_out is not None:
-            _strangers(settings, plan, leave_out, jobs, out)
+            _unknown_objects(settings, plan, leave_out, jobs, out)
             return
         if matrix:
             _matrix(settings, plan, jobs, out)
@@ -241,12 +241,12 @@ def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
     print(f"Written: {out / 'matrix.json'}, with Wilson's intervals.", file=sys.stderr)
 
 
-def _strangers(settings: Settings, plan: "Plan", count: int, jobs: int, out: Path) -> None:
+def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: int, out: Path) -> None:
     from rich.console import Console
 
     from rig.cli.ui.present import Progress
     from rig.evaluation.run import enrolled_views
-    from rig.evaluation.unknown_objects import run_strangers, stranger_rows
+    from rig.evaluation.unknown_objects import run_unknown_objects, unknown_object_rows
     from rig.evaluation.write import write_json
 
     with Progress("enrolling, searching") as progress:
@@ -255,13 +255,13 @@ def _strangers(settings: Settings, plan: "Plan", count: int, jobs: int, out: Pat
         def advance(_name: str) -> None:
             progress.advance()
 
-        results = run_strangers(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
-    write_json(results, out / "strangers.json")
+        results = run_unknown_objects(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
+    write_json(results, out / "unknown_objects.json")
     if settings.json:
         settings.print_json({"event": "finished", **results})
         return
-    Console().print(stranger_rows(results).terminal())
-    print(f"Written: {out / 'strangers.json'}, with Wilson's intervals.", file=sys.stderr)
+    Console().print(unknown_object_rows(results).terminal())
+    print(f"Written: {out / 'unknown_objects.json'}, with Wilson's intervals.", file=sys.stderr)
 
 
 def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "Dataset":

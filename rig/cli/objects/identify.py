@@ -84,7 +84,7 @@ def identify(
             seed = settings.seed or 0
             if watch and isinstance(bench.operator, ObjectAlreadyPlaced):
                 bench.operator = TableWatcher(bench)  # the camera sees when the operator has put an object there
-            uses_image = known.descriptor != PAPER_DESCRIPTOR and known.pictured is not False
+            uses_image = known.descriptor != PAPER_DESCRIPTOR and known.with_empty_table is not False
             if uses_image and isinstance(bench.operator, TableClearer):
                 ensure_empty_table_image(settings, bench, ask=False)
             # Search, and show and save each event.

@@ -23,6 +23,7 @@ from rig.events.events import (
     Event,
     Identified,
     Moved,
+    Note,
     Ranked,
     Rejected,
     SimilarObjects,
@@ -38,6 +39,7 @@ from rig.events.wording import (
     percent_words,
     signed,
     similar_objects_words,
+    stop_words,
 )
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
@@ -250,7 +252,7 @@ class IdentifyView(LiveView):
 
     def __init__(self, console: Console) -> None:
         super().__init__(console)
-        self._notes: tuple[str, ...] = ()
+        self._notes: tuple[Note, ...] = ()
         self._ranked: Ranked | None = None
         self._taken = 0
         self._of = 0
@@ -281,11 +283,11 @@ class IdentifyView(LiveView):
                 if plain:
                     self.note(line(event))
             case Decided() if plain:
-                self.note(f"  {self._verdict}" if self._verdict else "")
+                self.note(f"  {self._decision}" if self._decision else "")
                 self.note(line(event))
             case Decided():
-                verdict = f"{self._verdict}; " if self._verdict else ""
-                self.note(f"view {self._taken}  {self._leading}  {verdict}{decision_words(event)}")
+                decision = f"{self._decision}; " if self._decision else ""
+                self.note(f"view {self._taken}  {self._leading}  {decision}{decision_words(event)}")
             case Identified():
                 self._ended = True
                 self._stop()
@@ -299,11 +301,13 @@ class IdentifyView(LiveView):
         if self._ranked is None:
             return ""
         best = self._ranked.candidates[0]
-        return f"{best.name} {_odds(best) or signed(self._ranked.margin, 3)}"
+        return f"{best.name} {_percent(best) or signed(self._ranked.margin, 3)}"
 
     @property
-    def _verdict(self) -> str:
-        return "" if self._ranked is None else self._ranked.verdict
+    def _decision(self) -> str:
+        if self._ranked is None or self._ranked.decision is None:
+            return ""
+        return stop_words(self._ranked.decision, self._ranked.index + 1)
 
     def render(self) -> RenderableType:
         table = Table(box=None, pad_edge=False, expand=False)
@@ -326,7 +330,7 @@ class IdentifyView(LiveView):
                 f"{one.score:.3f}",
                 behind,
                 f"{azimuth_words(one.pose_deg)}°",
-                *([_odds(one)] if likely else []),
+                *([_percent(one)] if likely else []),
             ]
             if wide:
                 share = one.score if one.probability is None else one.probability
@@ -340,9 +344,9 @@ class IdentifyView(LiveView):
         lead = f", margin {signed(self._ranked.margin, 3)}" if self._ranked else ""
         status = Text(f"view {self._taken} of {self._of} at most{where}{lead}", style="bold")
         status.append(f"   {self._hint}", style="dim")
-        verdict = [Text(self._verdict)] if self._verdict else []
-        return Group(table, *verdict, status) if candidates else Group(status)
+        decision = [Text(self._decision)] if self._decision else []
+        return Group(table, *decision, status) if candidates else Group(status)
 
 
-def _odds(one: Candidate) -> str:
+def _percent(one: Candidate) -> str:
     return "" if one.probability is None else percent_words(one.probability)

@@ -37,10 +37,13 @@ from rig.events.wording import (
     decision_words,
     duration_words,
     move_words,
+    next_step_words,
+    note_words,
     percent_words,
     signed,
     similar_objects_words,
     unwinding_words,
+    wait_words,
 )
 from rig.plans.estimate import DryRun, Obstacle
 from rig.views.capture import rejection_text
@@ -65,7 +68,7 @@ def line(event: Event) -> str:
     """Return the text of an event for the operator; empty if it has none."""
     match event:
         case Started():
-            return "\n".join(f"Note: {note}." for note in event.notes)
+            return "\n".join(f"Note: {note_words(note)}." for note in event.notes)
         case Moved():
             encoder, asked = (angle_words(angle, 2) for angle in (event.encoder_deg, event.commanded_deg))
             return f"  table at {encoder} (asked {asked}): {move_words(event)}"
@@ -86,8 +89,9 @@ def line(event: Event) -> str:
             took = duration_words(event.seconds)
             return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
         case Identified():
+            least = "" if event.min_score is None else f" (unknown below {event.min_score:.3f})"
             numbers = (
-                f"Score {event.score:.3f} per view (unknown below {event.min_score:.3f}), "
+                f"Score {event.score:.3f} per view{least}, "
                 f"margin {signed(event.margin, 3)}, {event.travelled_deg:.0f}° of rotation, "
                 f"{duration_words(event.seconds)}."
             )
@@ -102,16 +106,16 @@ def line(event: Event) -> str:
             share = "" if event.turning_share is None else f", {event.turning_share * 100:.1f} % rotates with the table"
             return f"Empty-table image: {event.width} × {event.height} pixels{share}"
         case Warned():
-            return f"Warning: {event.what}.\nNext step: {event.next_step}"
+            return f"Warning: {note_words(event.note)}.\nNext step: {next_step_words(event.note)}"
         case Waiting():
-            return f"Waiting for {event.why}; Ctrl+C ends."
+            return f"Waiting for {wait_words(event.reason)}; Ctrl+C ends."
         case Failed():
             return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
 
 
 def _leader(one: Candidate) -> str:
-    odds = "" if one.probability is None else f" ({percent_words(one.probability)})"
-    return f"{one.name} {one.score:.3f}{odds} at {azimuth_words(one.pose_deg)}°"
+    probability = "" if one.probability is None else f" ({percent_words(one.probability)})"
+    return f"{one.name} {one.score:.3f}{probability} at {azimuth_words(one.pose_deg)}°"
 
 
 def _skip_words(item: Item) -> str:

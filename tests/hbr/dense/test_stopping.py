@@ -1,4 +1,4 @@
-"""Stated error rates, kept; and nothing promised of too little data."""
+"""The stopping rule keeps the stated error rates, and states what too little data does not allow."""
 
 from math import inf
 
@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hbr import Belief, DenseIndex, Views, tanimoto, update_belief
+from hbr import Belief, DenseIndex, DenseSession, Outcome, StopReason, Views, leave_one_out, tanimoto, update_belief
+from hbr.dense.leave_one_out import Leaders, usual_scores
 from hbr.dense.stopping import (
-    Leaders,
-    Rules,
-    certainty_for,
+    UNCALIBRATED_MIN_CONFIDENCE,
+    LimitationCode,
+    StoppingRule,
+    calibrate_stopping_rule,
     conformal_threshold,
-    judge,
-    rehearse,
-    rules,
-    usual_scores,
+    fit_stopping_rule,
+    min_confidence_for,
 )
 
 BETA = 60.0
@@ -38,7 +38,7 @@ def catalog(objects: int = 8, noise: float = 0.15, seed: int = 0) -> Views:
 
 @settings(max_examples=25)
 @given(st.integers(0, 10**6), st.sampled_from([0.01, 0.02, 0.05, 0.2]), st.integers(120, 400))
-def test_a_conformal_threshold_rejects_the_stated_share_on_average(seed: int, share: float, count: int) -> None:
+def test_conformal_threshold_rejects_the_stated_share_on_average(seed: int, share: float, count: int) -> None:
     rng = np.random.default_rng(seed)
     rejected = []
     for _ in range(300):
@@ -49,7 +49,7 @@ def test_a_conformal_threshold_rejects_the_stated_share_on_average(seed: int, sh
     assert abs(np.mean(rejected) - exact) <= 4 * np.sqrt(share * (1 - share) / 300) + 1 / count
 
 
-def test_too_few_scores_reject_nothing() -> None:
+def test_conformal_threshold_rejects_nothing_with_too_few_scores() -> None:
     assert conformal_threshold(np.linspace(0, 1, 48), 0.02) == -inf
     assert conformal_threshold(np.linspace(0, 1, 49), 0.02) == 0.0
     with pytest.raises(ValueError, match="between 0 and 1"):
@@ -58,104 +58,130 @@ def test_too_few_scores_reject_nothing() -> None:
         conformal_threshold([np.nan], 0.1)
 
 
-def test_certainty_is_the_least_that_keeps_the_error_rate() -> None:
+def test_min_confidence_is_the_smallest_that_keeps_the_error_rate() -> None:
     rng = np.random.default_rng(0)
-    posterior = rng.uniform(0.3, 1, (2000, 1))
-    correct = rng.random((2000, 1)) < posterior  # as probable as it says
-    certainty = certainty_for(posterior, correct, 0.05)
-    stops = posterior >= certainty
-    assert (~correct[stops]).mean() <= 0.05
-    assert 0.85 < certainty < 0.95  # the mean above it is 0.95
-    assert certainty_for(posterior[:15], np.ones((15, 1), bool), 0.05) == inf
-    assert certainty_for(posterior[:40], np.ones((40, 1), bool), 0.05) < 1
+    confidence = rng.uniform(0.3, 1, (2000, 1))
+    correct = rng.random((2000, 1)) < confidence  # as probable as it says
+    least = min_confidence_for(confidence, correct, 0.05)
+    assert (~correct[confidence >= least]).mean() <= 0.05
+    assert 0.85 < least < 0.95  # the mean above it is 0.95
+    assert min_confidence_for(confidence[:15], np.ones((15, 1), bool), 0.05) == inf
+    assert min_confidence_for(confidence[:40], np.ones((40, 1), bool), 0.05) < 1
 
 
-def test_a_rehearsal_looks_for_each_object_by_its_own_views_as_if_taken_aside() -> None:
+def test_leave_one_out_searches_for_each_object_beside_its_own_views() -> None:
     views = catalog()
     index = DenseIndex(views)
-    rehearsal = rehearse(index, beta=BETA, views=3, searches=2)
-    assert rehearsal.known.score.shape == rehearsal.stranger.score.shape == rehearsal.correct.shape == (16, 3)
-    np.testing.assert_array_equal(rehearsal.known.object_index, np.repeat(np.arange(8), 2)[:, None] * [1, 1, 1])
-    assert (rehearsal.stranger.object_index != rehearsal.known.object_index).all()
-    assert (rehearsal.stranger.score < rehearsal.known.score).all()
-    assert rehearsal.correct.mean() == 1
-    # the first view of the first search once more: 0.618 of a step aside, to the right
+    found = leave_one_out(index, beta=BETA, views=3, searches=2)
+    assert found.known.score.shape == found.unknown.score.shape == found.correct.shape == (16, 3)
+    np.testing.assert_array_equal(found.known.object_index, np.repeat(np.arange(8), 2)[:, None] * [1, 1, 1])
+    assert (found.unknown.object_index != found.known.object_index).all()
+    assert (found.unknown.score < found.known.score).all()
+    assert found.correct.mean() == 1
+    # The first view of the first search by hand: 0.618 of a step aside, to the right.
     rows = views.of(0)
     similar = tanimoto(views.descriptors[rows[0]], views.descriptors)[0]
     similar[rows[0]] = 1 - 0.618034 * (1 - similar[rows[17]])
-    belief = Belief(index, index.support(similar, 0.0), np.zeros(1))
-    scores = belief.scores()
-    ordered = np.sort(scores)
-    assert rehearsal.known.score[0, 0] == pytest.approx(ordered[-1])
-    assert rehearsal.known.lead[0, 0] == pytest.approx(ordered[-1] - ordered[-2])
-    others = np.sort(scores[1:])
-    assert rehearsal.stranger.score[0, 0] == pytest.approx(others[-1])
-    assert rehearsal.stranger.lead[0, 0] == pytest.approx(others[-1] - others[-2])
-    # views of a second sitting that are less like the enrolled ones are met less well
+    scores = Belief(index, index.support(similar, 0.0), np.zeros(1)).scores()
+    ordered, others = np.sort(scores), np.sort(scores[1:])
+    assert found.known.score[0, 0] == pytest.approx(ordered[-1])
+    assert found.known.margin[0, 0] == pytest.approx(ordered[-1] - ordered[-2])
+    assert found.unknown.score[0, 0] == pytest.approx(others[-1])
+    assert found.unknown.margin[0, 0] == pytest.approx(others[-1] - others[-2])
+    # Views of a second session that are less similar to the enrolled ones score less.
     other = np.maximum(views.descriptors, 1) - (views.descriptors > 0)
-    again = rehearse(index, beta=BETA, views=3, searches=2, seen=other.astype(np.uint8))
-    assert again.known.score.mean() < rehearsal.known.score.mean()
+    again = leave_one_out(index, beta=BETA, views=3, searches=2, seen=other.astype(np.uint8))
+    assert again.known.score.mean() < found.known.score.mean()
 
 
-def test_familiarity_is_relative_to_what_the_leader_usually_scores() -> None:
+def test_open_set_score_is_relative_to_the_usual_score_of_the_leader() -> None:
     known = Leaders(np.array([[0], [0], [1], [1]]), np.array([[0.9], [0.8], [0.7], [0.2]]), np.full((4, 1), 0.1))
     usual = usual_scores(known, np.array([[True], [True], [True], [False]]), 3)
-    np.testing.assert_allclose(usual[:, 0], [0.85, 0.7, 0.775])  # of the third nothing is known
+    np.testing.assert_allclose(usual[:, 0], [0.85, 0.7, 0.775])  # the third object was never found
     np.testing.assert_allclose(
-        known.familiarity(usual)[:, 0],
+        known.open_set_score(usual)[:, 0],
         [0.9 + 0.05 - 0.075, 0.8 + 0.05 - 0.075, 0.7 + 0.05 + 0.075, 0.2 + 0.05 + 0.075],
     )
 
 
-def test_rules_of_a_catalog_find_its_objects_and_not_others() -> None:
+def test_a_fitted_rule_finds_enrolled_objects_and_calls_others_unknown() -> None:
     everything = catalog(40, seed=3)
-    enrolled = everything.object_index < 30
-    index = DenseIndex(everything.select(enrolled))
-    made = rules(rehearse(index, beta=BETA), error_rate=0.05, false_reject=0.05)
-    assert made.promises == ()
-    assert made.false_accept < 0.1
-    kinds = []
+    index = DenseIndex(everything.select(everything.object_index < 30))
+    rule = fit_stopping_rule(leave_one_out(index, beta=BETA), error_rate=0.05, false_reject=0.05)
+    assert rule.limitations == ()
+    assert rule.false_accept < 0.1
+    ends = []
     for j in range(40):
-        rows = everything.of(j)
-        so_far: DenseIndex | Belief = index
-        for i in rows[[2, 7, 11, 16]]:
-            so_far = belief = update_belief(everything.descriptors[i], float(everything.azimuth_deg[i]), so_far)
-            verdict = judge(belief, made, max_views=4)
-            if verdict.kind != "look":
+        session = DenseSession(index, rule, max_views=4)
+        for i in everything.of(j)[[2, 7, 11, 16]]:
+            decision = session.add(everything.descriptors[i], float(everything.azimuth_deg[i]))
+            if decision.outcome is not Outcome.CONTINUE:
                 break
-        kinds.append((verdict.kind, verdict.object_index == j))
-        assert verdict.words.startswith(f"object {verdict.object_index} with a probability of")
-    assert [kind for kind, _ in kinds[:30]].count("found") >= 28
-    assert all(right for kind, right in kinds[:30] if kind == "found")
-    assert [kind for kind, _ in kinds[30:]].count("unknown") >= 9
+        ends.append((decision.outcome, decision.object_index == j))
+    assert [outcome for outcome, _ in ends[:30]].count(Outcome.FOUND) >= 28
+    assert all(right for outcome, right in ends[:30] if outcome is Outcome.FOUND)
+    assert [outcome for outcome, _ in ends[30:]].count(Outcome.UNKNOWN) >= 9
 
 
-def test_a_small_catalog_promises_nothing_and_says_how_much_it_takes() -> None:
-    made = rules(rehearse(DenseIndex(catalog(2)), beta=BETA), error_rate=0.01, false_reject=0.02)
-    assert made.familiar == (-inf,) * 4
-    assert made.certainty == inf
-    assert "49 are needed" in made.promises[0]
-    assert "no search ends early" in made.promises[1]
-    belief = update_belief(catalog(2).descriptors[0], 0.0, DenseIndex(catalog(2)))
-    assert judge(belief, made, max_views=4).kind == "look"
-    assert judge(belief, made, max_views=1).kind == "found"
+def test_a_small_catalog_guarantees_nothing_and_says_how_much_data_is_needed() -> None:
+    index = DenseIndex(catalog(2))
+    rule = fit_stopping_rule(leave_one_out(index, beta=BETA), error_rate=0.01, false_reject=0.02)
+    assert rule.min_confidence == UNCALIBRATED_MIN_CONFIDENCE
+    assert np.isfinite(rule.open_set_thresholds).all()
+    limits = {one.code: one.values for one in rule.limitations}
+    assert limits[LimitationCode.FALSE_REJECT_RATE] == {"rate": 0.02, "searches": 8, "needed": 49, "reached": 1 / 9}
+    assert limits[LimitationCode.ERROR_RATE]["needed"] == 100
+    assert LimitationCode.UNKNOWN_NOT_MEASURED in limits
+    assert np.isnan(rule.false_accept)
 
 
-def test_a_score_that_no_enrolled_object_has_ends_as_unknown_and_never_early() -> None:
-    by = Rules(BETA, 0.9, np.full((4, 2), 0.9), (1.4, 1.4), 0.01, 0.02, 0.0, 100)
-    index = DenseIndex(catalog(4))
-    stranger = catalog(1, seed=99).descriptors[0]
-    belief = update_belief(stranger, 0.0, index)
-    assert judge(belief, by, max_views=2).kind == "look"
-    verdict = judge(update_belief(stranger, 90.0, belief), by, max_views=2)
-    assert verdict.kind == "unknown"
-    assert "none of those enrolled" in verdict.words
+@pytest.mark.parametrize(
+    ("thresholds", "min_confidence", "views", "max_views", "outcome", "reason"),
+    [
+        ((0.0, 0.0, 0.0), 0.5, 1, 8, Outcome.FOUND, StopReason.CONFIDENT),
+        # Before the last calibrated view, the highest threshold counts.
+        ((0.0, 9.0, 9.0), 0.5, 1, 8, Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD),
+        ((0.0, 9.0, 9.0), 0.5, 1, 1, Outcome.FOUND, StopReason.CONFIDENT),
+        ((0.0, 9.0, 9.0), 0.5, 2, 8, Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD),
+        # From then on, an object below it is unknown, however many views are left.
+        ((0.0, 9.0, 9.0), 0.5, 3, 8, Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD),
+        ((9.0,), 0.5, 1, 8, Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD),
+        ((0.0, 0.0, 0.0), 0.5, 3, 8, Outcome.FOUND, StopReason.CONFIDENT),
+        ((0.0, 0.0, 0.0), 1.1, 3, 8, Outcome.CONTINUE, StopReason.NOT_CONFIDENT),
+        ((0.0, 0.0, 0.0), 1.1, 3, 3, Outcome.FOUND, StopReason.MAX_VIEWS),
+        ((-inf,), 1.1, 1, 1, Outcome.FOUND, StopReason.MAX_VIEWS),
+    ],
+)
+def test_decisions(thresholds, min_confidence, views, max_views, outcome, reason) -> None:
+    everything = catalog(3)
+    usual = np.zeros((3, len(thresholds)))
+    rule = StoppingRule(BETA, min_confidence, usual, thresholds, 0.01, 0.02, 0.0, 100)
+    session = DenseSession(DenseIndex(everything), rule, max_views=max_views)
+    for i in everything.of(1)[[0, 6, 12][:views]]:
+        decision = session.add(everything.descriptors[i], float(everything.azimuth_deg[i]))
+    assert (decision.outcome, decision.reason, decision.object_index) == (outcome, reason, 1)
+    assert session.end().outcome is not Outcome.CONTINUE
 
 
-def test_what_cannot_be_rehearsed_is_refused() -> None:
+def test_one_object_is_compared_with_its_own_views() -> None:
+    views = catalog(1)
+    index = DenseIndex(views)
+    rule = calibrate_stopping_rule(index).rule
+    assert [one.code for one in rule.limitations] == [LimitationCode.ONE_OBJECT]
+    scores = [
+        update_belief(views.descriptors[i], views.azimuth_deg[i], index.without(np.array([i]))).scores()[0]
+        for i in range(len(views))
+    ]
+    assert rule.open_set_thresholds == (pytest.approx(1.5 * min(scores)),)
+    unknown = catalog(1, seed=99).descriptors[0]
+    assert DenseSession(index, rule).add(unknown, 0.0).outcome is Outcome.UNKNOWN
+    assert DenseSession(index, rule).add(views.descriptors[0], 0.0).outcome is Outcome.FOUND
+
+
+def test_leave_one_out_rejects_catalogs_without_enough_views() -> None:
     with pytest.raises(ValueError, match="at least two"):
-        rehearse(DenseIndex(catalog(1)), beta=BETA)
+        leave_one_out(DenseIndex(catalog(1)), beta=BETA)
     with pytest.raises(ValueError, match="no object has 19 views"):
-        rehearse(DenseIndex(catalog(2)), beta=BETA, views=19)
+        leave_one_out(DenseIndex(catalog(2)), beta=BETA, views=19)
     with pytest.raises(ValueError, match="seen has shape"):
-        rehearse(DenseIndex(catalog(2)), beta=BETA, seen=np.zeros((3, 144), np.uint8))
+        leave_one_out(DenseIndex(catalog(2)), beta=BETA, seen=np.zeros((3, 144), np.uint8))

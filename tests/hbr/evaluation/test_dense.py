@@ -1,14 +1,14 @@
-"""The trials of the dense filter: fewer views enrolled, strangers, and walks of its own."""
+"""Trials of the dense filter: fewer enrolled views, unknown objects, and its own strategies."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hbr import DenseIndex, next_best_view, update_belief
+from hbr import DenseIndex, Outcome, next_best_view, update_belief
 from hbr.core.angles import wrap180
 from hbr.evaluation.methods import METHODS, choose_methods
-from hbr.evaluation.protocol import Protocol, Runs, _Trials, run_object
+from hbr.evaluation.protocol import OUTCOMES, Protocol, Runs, _Trials, rule_of_trial, run_object
 from hbr.evaluation.results import contests, method_results
 from tests.hbr.dense.searches import believe_all
 from tests.hbr.evaluation.test_protocol import QUERIES, STEP, VIEWS
@@ -26,7 +26,8 @@ def test_a_trial_equals_the_protocol_written_out(name: str, protocol: Protocol) 
     j = 2
     own = VIEWS.of(j)
     runs = run(name, j, protocol)
-    trials = _Trials(j, QUERIES[own], VIEWS, protocol, lambda: 0)
+    rule = rule_of_trial(VIEWS, protocol)
+    trials = _Trials(j, QUERIES[own], VIEWS, protocol, None, lambda: 0)
     ring = np.arange(24)
     kept = ring % 3 == 0 if protocol.enrolled else ring >= 0
     for t in range(protocol.trials):
@@ -45,22 +46,22 @@ def test_a_trial_equals_the_protocol_written_out(name: str, protocol: Protocol) 
             ranking = belief.ranking()
             assert runs.rank[0, 0, t, n] == ranking.object_index.tolist().index(j) + 1
             assert runs.score[0, 0, t, n] == ranking.scores[0]
-            assert runs.posterior[0, 0, t, n] == belief.posterior().sum(axis=1).max()
+            assert OUTCOMES[runs.outcome[0, 0, t, n]] is rule.decide(belief, max_views=4).outcome
             match name:
                 case "dense":
-                    turn = next_best_view(belief).rotation_deg
+                    step = next_best_view(belief).rotation_deg
                 case "dense-coin":
-                    turn = abs(next_best_view(belief).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
+                    step = abs(next_best_view(belief).rotation_deg) * (1 if draws.coins[len(seen) % 4] else -1)
                 case "dense-90":
-                    turn = 90.0
+                    step = 90.0
                 case _:
-                    turn = wrap180(float(draws.order[(n + 1) % 4] * STEP - angles[-1]))
+                    step = wrap180(float(draws.order[(n + 1) % 4] * STEP - angles[-1]))
             left = [i for i in ring if i not in seen and not (protocol.enrolled and kept[i])]
-            seen.append(min(left, key=lambda i: abs((i * STEP - angles[-1] - turn + 180) % 360 - 180)))
+            seen.append(min(left, key=lambda i: abs((i * STEP - angles[-1] - step + 180) % 360 - 180)))
 
 
-def test_only_views_that_are_not_enrolled_are_looked_at() -> None:
-    trials = _Trials(1, QUERIES[VIEWS.of(1)], VIEWS, PROTOCOL, lambda: 0)
+def test_queries_are_views_that_are_not_enrolled() -> None:
+    trials = _Trials(1, QUERIES[VIEWS.of(1)], VIEWS, PROTOCOL, None, lambda: 0)
     for t in range(20):
         assert (trials.draw(t).order % 3 != 0).all()
     assert (np.array([trials._nearest([1], turn) for turn in np.arange(0, 360, 7.0)]) % 3 != 0).all()
@@ -68,36 +69,40 @@ def test_only_views_that_are_not_enrolled_are_looked_at() -> None:
         run("dense-90", protocol=replace(PROTOCOL, max_views=16))
 
 
-def test_strangers_are_looked_for_among_the_others() -> None:
+def test_absent_objects_are_searched_for_among_the_others() -> None:
     protocol = replace(PROTOCOL, absent=("object 2", "object 4"))
-    stranger, known = run("dense", 2, protocol), run("dense", 1, protocol)
-    assert (stranger.rank == 0).all()
-    assert np.isnan(stranger.pose_error_deg).all()
+    unknown, known = run("dense", 2, protocol), run("dense", 1, protocol)
+    assert (unknown.rank == 0).all()
+    assert np.isnan(unknown.pose_error_deg).all()
     assert (known.rank == 1).all()
-    assert stranger.score.max() < known.score.min()
-    # the same scores as a filter that never heard of them
-    trials = _Trials(2, QUERIES[VIEWS.of(2)], VIEWS, protocol, lambda: 0)
+    assert unknown.score.max() < known.score.min()
+    # the same scores as a filter of the other objects alone
+    trials = _Trials(2, QUERIES[VIEWS.of(2)], VIEWS, protocol, None, lambda: 0)
     first = int(trials.draw(0).order[0])
     others = VIEWS.select(np.isin(VIEWS.object_index, [0, 1, 3, 5]) & (VIEWS.azimuth_deg % 45 == 0))
     belief = update_belief(QUERIES[VIEWS.of(2)[first]], 0.0, DenseIndex(others, omega=METHODS["dense"].omega))
-    assert stranger.score[0, 0, 0, 0] == pytest.approx(belief.scores().max())
+    assert unknown.score[0, 0, 0, 0] == pytest.approx(belief.scores().max())
     with pytest.raises(ValueError, match="dense filter"):
         run("hbr", 1, protocol)
 
 
 def test_the_oracle_leads_at_least_as_much_as_a_fixed_step() -> None:
-    leads = {
-        name: np.mean([run(name, j).lead[0, 0, :, 1].mean() for j in range(6)]) for name in ("dense-oracle", "dense-90")
+    margins = {
+        name: np.mean([run(name, j).margin[0, 0, :, 1].mean() for j in range(6)])
+        for name in ("dense-oracle", "dense-90")
     }
-    assert leads["dense-oracle"] > leads["dense-90"]
+    assert margins["dense-oracle"] > margins["dense-90"]
 
 
-def test_a_search_by_the_filter_ends_by_its_probability_and_methods_are_compared() -> None:
+def test_dense_searches_end_by_the_stopping_rule_and_methods_are_compared() -> None:
     methods = choose_methods(["dense", "dense-90", "dense-mutual", "hbr"])
     runs = Runs.concatenate([run("dense,dense-90,dense-mutual,hbr", j) for j in range(6)])
-    runs.posterior[0] = np.linspace(0.96, 0.99, 4)
+    runs.rank[0] = 1
+    runs.outcome[0] = [OUTCOMES.index(Outcome.CONTINUE)] * 2 + [OUTCOMES.index(Outcome.FOUND)] * 2
+    runs.outcome[0, 0, :, 2:] = OUTCOMES.index(Outcome.UNKNOWN)
     stopping = method_results(runs, methods, margin=10.0)[0].stopping
-    assert stopping.views_mean == 3  # 0.96, 0.97, 0.98
+    assert (stopping.views_mean, stopping.ended_early) == (3, 1.0)
+    assert (stopping.hit_rate, stopping.unknown_rate) == (pytest.approx(5 / 6), pytest.approx(1 / 6))
     assert method_results(runs, methods, margin=10.0)[3].stopping.views_mean == 4
     asked = {(c.first, c.first_views, c.second) for c in contests(runs, methods, np.random.default_rng(0))}
     assert {("dense", 3, "dense-90"), ("dense", 2, "dense-mutual")} <= asked

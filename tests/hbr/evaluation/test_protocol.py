@@ -46,7 +46,7 @@ def test_a_trial_equals_the_protocol_written_out(name: str, removal: Removal) ->
     j = 2
     own = VIEWS.of(j)
     runs = run(j, (method,), protocol)
-    trials = _Trials(j, QUERIES[own], VIEWS, protocol, lambda: 0)
+    trials = _Trials(j, QUERIES[own], VIEWS, protocol, None, lambda: 0)
     for t in range(protocol.trials):
         draws = trials.draw(t)
         seen, travelled = [int(draws.order[0])], 0.0
@@ -68,7 +68,7 @@ def test_a_trial_equals_the_protocol_written_out(name: str, removal: Removal) ->
             )
             place = ranking.object_index.tolist().index(j) if j in ranking.object_index else -1
             assert runs.rank[0, 0, t, n] == place + 1
-            assert runs.lead[0, 0, t, n] == pytest.approx(hbr.score_margin(ranking, QUERIES[own[seen]]) / (n + 1))
+            assert runs.margin[0, 0, t, n] == pytest.approx(hbr.score_margin(ranking, QUERIES[own[seen]]) / (n + 1))
             assert runs.travelled_deg[0, 0, t, n] == travelled
             if place >= 0:
                 error = abs((ranking.pose_deg[place] - angles[-1] + 180) % 360 - 180)
@@ -103,16 +103,16 @@ def test_methods_meet_the_same_trials_whatever_else_is_run() -> None:
 def test_trials_of_an_object_do_not_depend_on_the_other_objects() -> None:
     order = np.concatenate([VIEWS.of(4), VIEWS.of(1)])
     few = Views.concatenate([VIEWS.select(VIEWS.of(j)) for j in (4, 1)])
-    trials = _Trials(4, QUERIES[VIEWS.of(4)], VIEWS, PROTOCOL, lambda: 0)
-    again = _Trials(few.object_names.index("object 4"), QUERIES[order[:24]], few, PROTOCOL, lambda: 0)
+    trials = _Trials(4, QUERIES[VIEWS.of(4)], VIEWS, PROTOCOL, None, lambda: 0)
+    again = _Trials(few.object_names.index("object 4"), QUERIES[order[:24]], few, PROTOCOL, None, lambda: 0)
     for t in range(3):
         np.testing.assert_array_equal(trials.draw(t).order, again.draw(t).order)
         np.testing.assert_array_equal(trials.draw(t).error_deg, again.draw(t).error_deg)
 
 
 def test_seeds_and_trials_differ() -> None:
-    trials = _Trials(0, QUERIES[:24], VIEWS, PROTOCOL, lambda: 0)
-    other = _Trials(0, QUERIES[:24], VIEWS, replace(PROTOCOL, seed=1), lambda: 0)
+    trials = _Trials(0, QUERIES[:24], VIEWS, PROTOCOL, None, lambda: 0)
+    other = _Trials(0, QUERIES[:24], VIEWS, replace(PROTOCOL, seed=1), None, lambda: 0)
     orders = {tuple(draw.order.tolist()) for draw in (trials.draw(0), trials.draw(1), other.draw(0))}
     assert len(orders) == 3
 
@@ -120,7 +120,7 @@ def test_seeds_and_trials_differ() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.sets(st.integers(0, 23), min_size=1, max_size=5), st.sampled_from([5.0, 15.0, 15.1, 31.0]))
 def test_near_views_are_taken_out_and_no_others(seen: set[int], near_deg: float) -> None:
-    trials = _Trials(0, QUERIES[:24], VIEWS, replace(PROTOCOL, near_deg=near_deg), lambda: 0)
+    trials = _Trials(0, QUERIES[:24], VIEWS, replace(PROTOCOL, near_deg=near_deg), None, lambda: 0)
     keep = trials._keep(np.array(sorted(seen)))
     for i in range(24):
         nearest = min(abs(i - s) if abs(i - s) <= 12 else 24 - abs(i - s) for s in seen) * STEP
@@ -130,14 +130,14 @@ def test_near_views_are_taken_out_and_no_others(seen: set[int], near_deg: float)
 def test_paper79_leaves_79_percent_of_72_views() -> None:
     azimuth = np.arange(0, 360, 5.0)
     views = Views.of_object("a", np.ones((72, 144), np.uint8), azimuth)
-    trials = _Trials(0, views.descriptors, views, Protocol(removal="paper79"), lambda: 0)
+    trials = _Trials(0, views.descriptors, views, Protocol(removal="paper79"), None, lambda: 0)
     left = [trials._keep(trials.draw(t).order).mean() for t in range(400)]
     assert np.mean(left) == pytest.approx(0.79, abs=0.005)
 
 
 def test_orientation_errors_are_normal_about_the_drift() -> None:
     protocol = replace(PROTOCOL, sigma_deg=3.0, drift_deg=10.0)
-    trials = _Trials(0, QUERIES[:24], VIEWS, protocol, lambda: 0)
+    trials = _Trials(0, QUERIES[:24], VIEWS, protocol, None, lambda: 0)
     errors = np.array([trials.draw(t).error_deg for t in range(500)]) - 10.0 * np.arange(5)
     assert errors.mean() == pytest.approx(0, abs=0.2)
     assert errors.std() == pytest.approx(3, rel=0.05)

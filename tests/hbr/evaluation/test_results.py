@@ -27,7 +27,7 @@ def test_a_curve_counts_hits_and_the_ten_best() -> None:
     assert first.hit_rate_low < 0.25 < first.hit_rate_high
 
 
-def test_pose_errors_are_of_hits_alone() -> None:
+def test_only_hits_have_pose_errors() -> None:
     runs = runs_of([[[1], [1], [3]]], pose_error_deg=[[[30], [40], [170]]], alike_error_deg=[[[0], [10], [170]]])
     ((point,),) = (result.curve for result in method_results(runs, PAIR[:1], 0.0, min_views=1))
     assert (point.pose_error_median_deg, point.alike_error_median_deg) == (35, 5)
@@ -41,25 +41,25 @@ def test_no_hit_has_no_pose_error() -> None:
     assert point.pose_error_median_deg is point.alike_error_rmse_deg is None
 
 
-def test_a_search_ends_at_the_margin_not_before_the_least_views_and_at_the_last() -> None:
+def test_a_search_ends_by_its_margin_after_min_views_or_at_the_last_view() -> None:
     runs = runs_of(
         [[[2, 2, 1], [1, 2, 2], [1, 1, 2], [2, 2, 1]]],
-        lead=[[[0.1, 0.2, 0.3], [0.9, 0.5, 0.5], [0.0, 0.49, 0.2], [0, 0.5, 0]]],
+        margin=[[[0.1, 0.2, 0.3], [0.9, 0.5, 0.5], [0.0, 0.49, 0.2], [0, 0.5, 0]]],
         travelled_deg=[[[0, 10, 20]] * 4],
     )
     (result,) = method_results(runs, PAIR[:1], 0.5, min_views=2)
     stopping = result.stopping
     assert (stopping.views_mean, stopping.views_p95) == (2.5, 3)  # after 3, 2, 3 and 2 views
     assert stopping.hit_rate == 0.25
-    assert stopping.by_margin == 0.5
+    assert stopping.ended_early == 0.5
     assert stopping.travelled_mean_deg == 15
     (early,) = method_results(runs, PAIR[:1], 0.5, min_views=1)
     assert early.stopping.views_mean == 2.25
     assert early.stopping.hit_rate == 0.5
 
 
-def test_a_method_that_looks_once_has_one_point() -> None:
-    runs = runs_of([[[1, -1], [2, -1]]], lead=[[[0.0, np.nan]] * 2], travelled_deg=[[[0.0, np.nan]] * 2])
+def test_a_method_of_one_view_has_one_point() -> None:
+    runs = runs_of([[[1, -1], [2, -1]]], margin=[[[0.0, np.nan]] * 2], travelled_deg=[[[0.0, np.nan]] * 2])
     (result,) = method_results(runs, PAIR[:1], 0.1)
     assert len(result.curve) == 1
     assert (result.stopping.views_mean, result.stopping.hit_rate) == (1, 0.5)
@@ -77,6 +77,6 @@ def test_contests_are_on_the_same_trials() -> None:
     assert 0 < contest.difference_low < 0.25 < contest.difference_high
 
 
-def test_questions_that_the_runs_cannot_answer_are_left_out() -> None:
+def test_questions_without_runs_are_left_out() -> None:
     assert contests(runs_of([[[1]], [[1]]]), PAIR, np.random.default_rng(0))[0].first_views == 1
     assert not contests(runs_of([[[1, 1]]]), PAIR[:1], np.random.default_rng(0))

@@ -273,5 +273,5 @@ class TestDecisionChart:
             even = (0.0,) * len(turns)
             svg = decision_chart(0.0, Weighed(turns, even, even), turns[0])
             assert "only one object is likely" in svg
-            assert not having(svg, "alike")
+            assert not having(svg, "similarity")
             assert "nan" not in svg

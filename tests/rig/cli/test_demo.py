@@ -46,7 +46,7 @@ def test_demo_enrolls_and_finds_objects_and_recognizes_unknown_ones(small):
     assert done.exit_code in (0, 6)  # with so few views an answer can be wrong: exit code 6
     text = done.stdout
     moves = re.findall(
-        r"^ +\d +[\d.]+° +([+-][\d.]+)° +([+-][\d.]+)° +([+-][\d.]+) ± [\d.]+°.* (\S+) [<>]?(\d+\.\d)%",
+        r"^ +\d +[\d.]+° +([+-][\d.]+)° +([+-][\d.]+)° +([+-][\d.]+) ± [\d.]+°.* (\S+) [<>]?(\d+\.\d) %",
         text.replace("−", "-"),
         re.MULTILINE,
     )

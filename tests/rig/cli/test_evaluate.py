@@ -215,7 +215,7 @@ def test_the_matrix_has_every_perturbation_at_three_strengths(photographs: Path,
     assert run(photographs, "--matrix", "--descriptor", "edges", "--out", out).exit_code == 2
 
 
-def test_other_descriptors_are_judged_by_the_dense_filter(photographs: Path, tmp_path: Path) -> None:
+def test_other_descriptors_are_evaluated_with_the_dense_filter(photographs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ("--descriptor", "edges+colours", "--perturb", "shift:1+gain:1", "--enrolled", "6", *QUICK[2:])
     done = run(photographs, "--methods", "dense,dense-90", *options, "--out", out)
@@ -225,7 +225,7 @@ def test_other_descriptors_are_judged_by_the_dense_filter(photographs: Path, tmp
     assert found["settings"]["condition"]["perturbations"] == "shift:1+gain:1"
     assert found["settings"]["protocol"]["enrolled"] == 6
     assert [method["name"] for method in found["methods"]] == ["dense", "dense-90"]
-    assert "probability of" in (out / "report.html").read_text()
+    assert "stopping rule" in (out / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_other_descriptors_are_judged_by_the_dense_filter(photographs: Path, tmp
         (("--enrolled", "12", "--methods", "dense"), "queries it needs more"),
     ],
 )
-def test_what_does_not_go_together_is_refused_in_words(
+def test_contradicting_options_are_rejected(
     photographs: Path, tmp_path: Path, options: tuple[str, ...], words: str
 ) -> None:
     done = run(photographs, *options, *QUICK[2:], "--out", tmp_path / "out")
@@ -248,16 +248,18 @@ def test_what_does_not_go_together_is_refused_in_words(
     assert words in " ".join(done.output.split())
 
 
-def test_objects_that_are_left_out_are_looked_for_too(photographs: Path, tmp_path: Path) -> None:
+def test_left_out_objects_are_searched_for(photographs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ("--descriptor", "edges+colours", "--enrolled", "6", "--leave-out", "2", "--trials", "3")
     done = run(photographs, *options, "--views", "2", "--jobs", "1", "--out", out)
     assert done.exit_code == 0, done.output
     assert "false rejects / accepts" in done.output
-    found = json.loads((out / "strangers.json").read_text())
-    assert {row["stranger_trials"] for row in found["strangers"]} == {30}
-    # rehearsed rules are judged by all trials, others by the third that they do not come from
-    assert {(row["rehearsed"], row["known_trials"]) for row in found["strangers"]} == {(False, 10), (True, 30)}
-    # two calibration trials can promise nothing: nobody is called unknown
-    assert all(row["false_rejects"] == 0 and row["false_accepts"] == 30 for row in found["strangers"])
+    found = json.loads((out / "unknown_objects.json").read_text())
+    rows = found["unknown_objects"]
+    assert {row["unknown_trials"] for row in rows} == {30}
+    # Calibrated rules are measured with all trials, others with the third that they do not come from.
+    assert {(row["calibrated"], row["known_trials"]) for row in rows} == {(False, 10), (True, 30)}
+    # With two trials for thresholds, no object is called unknown.
+    by_trials = [row for row in rows if not row["calibrated"]]
+    assert all(row["false_rejects"] == 0 and row["false_accepts"] == 30 for row in by_trials)
     assert run(photographs, *options[:4], "--leave-out", "3", "--out", out).exit_code == 2

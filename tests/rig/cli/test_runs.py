@@ -158,9 +158,9 @@ def test_dense_is_the_default_strategy(rig, enrolled):
     events, _ = searched("--top", "1", "--save-run", "runs/own")
     started, *_, answer = (event for event in events if event["event"] != "empty_table_image")
     assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
-    assert 0.9 < answer["probability"] <= 1
-    assert answer["familiarity"] >= answer["min_familiarity"]
-    assert "cannot promise" in started["notes"][0]
+    assert 0.9 < answer["confidence"] <= 1
+    assert answer["open_set_score"] >= answer["open_set_threshold"]
+    assert started["notes"][0]["code"] == "rates-not-guaranteed"
     assert rig("replay", "runs/own", "--check").exit_code == 0
     assert rig("report", "runs/own").exit_code == 0
     page = (enrolled[0] / "runs" / "own" / "report.html").read_text(encoding="utf-8")
@@ -172,18 +172,18 @@ def test_dense_is_the_default_strategy(rig, enrolled):
 def test_stopping_rule_is_calibrated_stored_and_used(rig, enrolled):
     told = rig("catalog", "calibrate", "--false-reject", "0.1")
     assert told.exit_code == 0, told.output
-    assert re.search(r"^\d+ rehearsed searches of 4 views for 2 objects", told.stdout)
-    assert "Not promised: An error rate of 1.0% takes 100 rehearsed searches" in told.stdout
+    assert re.search(r"^\d+ leave-one-out searches of 4 views for 2 objects", told.stdout)
+    assert "Not guaranteed: An error rate of 1.0 % needs 100 leave-one-out searches" in told.stdout
     kept = enrolled[0] / "catalog" / "search_rules.json"
     assert told.stdout.rstrip().endswith(str(kept))
     values = json.loads(rig("catalog", "calibrate", "--json").stdout)
     assert values["false_reject"] == 0.02
-    assert values["rehearsed"]["views"] == 4
+    assert values["calibration"]["views"] == 4
     assert json.loads(kept.read_text(encoding="utf-8"))["searches"] == values["searches"]
     kept.write_text("{", encoding="utf-8")
     done = rig("identify", "--set", "bench.sim.object=lamp")
     assert done.exit_code == 0
-    assert "cannot be read; rig catalog calibrate makes them anew" in done.stdout
+    assert "to renew it: rig catalog calibrate" in done.stdout
     kept.unlink()
 
 
@@ -344,9 +344,9 @@ def test_watch_waits_until_the_camera_sees_an_object(rig, with_operator, monkeyp
     assert done.exit_code == 130
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert [e["name"] for e in events if e["event"] == "identified"] == ["lamp"]
-    assert [e["why"] for e in events if e["event"] == "waiting"] == [
-        "the first object, on the empty table",
-        "the next object",
+    assert [e["reason"] for e in events if e["event"] == "waiting"] == [
+        "first-object",
+        "next-object",
     ]
 
 

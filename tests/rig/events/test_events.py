@@ -8,6 +8,7 @@ from typing import Any, get_args
 import pytest
 
 import hbr
+from hbr import StopDecision
 from rig.catalog import Catalog
 from rig.core.errors import ViewRejected
 from rig.devices.camera import CameraLocks
@@ -16,9 +17,12 @@ from rig.events.events import (
     Candidate,
     Event,
     Failed,
+    Note,
+    NoteCode,
     SimilarObject,
     Unwinding,
     Waiting,
+    WaitReason,
     Warned,
     Weighed,
     event_dict,
@@ -39,6 +43,8 @@ PARTS = {
     "candidate": Candidate,
     "similar_object": SimilarObject,
     "weighed": Weighed,
+    "note": Note,
+    "stop_decision": StopDecision,
     "evidence": ViewEvidence,
     "locks": CameraLocks,
     "stillness": Stillness,
@@ -125,8 +131,8 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
             for event in enroll(s.bench, catalog, "candle", views=4):
                 seen.add(check_event(event))
     error = caught.value.as_dict()
-    seen |= {check_event(Failed(**error)), check_event(Waiting("the next object"))}
-    seen.add(check_event(Warned(3, "the table is another", "Take a new picture.")))
+    seen |= {check_event(Failed(**error)), check_event(Waiting(WaitReason.NEXT_OBJECT))}
+    seen.add(check_event(Warned(3, Note(NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}))))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == {event_kind(kind) for kind in get_args(Event)}
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hbr import Outcome, StopDecision, StopReason
 from hbr.core.angles import wrap180, wrap360
 from rig.devices.camera import CameraLocks
 from rig.events.events import (
@@ -15,17 +16,22 @@ from rig.events.events import (
     Event,
     Identified,
     Moved,
+    Note,
+    NoteCode,
     Ranked,
     Rejected,
+    RotationReason,
     Started,
     Weighed,
 )
-from rig.events.wording import separation_words, side_words
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.safety.gyro_rotation import Stillness
 from rig.views.capture import ViewEvidence
 
 NAMES = ("mug-white", "mug-star", "teapot", "vase-blue", "lamp")
+
+
+NOTE = Note(NoteCode.RATES_NOT_GUARANTEED, {"searches": 24, "error_rate": 0.01, "false_reject": 0.02})
 
 
 def evidence(sharpness: float = 100.0) -> ViewEvidence:
@@ -79,21 +85,22 @@ def identifying(
             step_deg = rotations_deg[k]
             s_left, s_right = (None, None) if k == 0 else (0.41, 0.66) if step_deg >= 0 else (0.66, 0.41)
             side = "left" if step_deg >= 0 else "right"
-            why = "the first turn is fixed" if s_left is None else side_words(side, s_left, s_right, names)
-            yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names), why)
+            reason = RotationReason.LESS_SIMILAR_SIDE if k else RotationReason.FIRST_STEP
+            yield Decided(k, side, step_deg, -orientation_deg - step_deg, s_left, s_right, tuple(names), reason)
     travelled_deg = sum(map(abs, rotations_deg))
     yield Identified(
         answer,
         candidates,
         candidates[0].score,
         0.1,
-        min_score,
         pose_deg,
         yaw_deg,
         k + 1,
         travelled_deg,
         9.5,
-        "the lead passes",
+        StopReason.MARGIN,
+        min_score=min_score,
+        min_margin=0.05,
     )
 
 
@@ -102,7 +109,7 @@ def searching_densely(
 ) -> Iterator[Event]:
     """The dense search turns by ``rotations_deg``, the best of all, to tell the first two of `NAMES` apart."""
     rng = np.random.default_rng(6)
-    yield Started("identify", None, 8, {}, strategy="dense", descriptor="edges+colours", notes=("rehearse them",))
+    yield Started("identify", None, 8, {}, strategy="dense", descriptor="edges+colours", notes=(NOTE,))
     turns_deg = tuple(float(turn) for turn in range(-175, 185, 5) if turn)
     orientation_deg = 0.0
     for k in range(len(rotations_deg) + 1):
@@ -111,11 +118,12 @@ def searching_densely(
         yield moved(k, -orientation_deg, -rotation_deg)
         yield Accepted(k, float(wrap360(orientation_deg)), evidence(), noise(rng, (48, 64)), {"agreement": 0.9})
         pose_deg = float(wrap360(orientation_deg - 30))
-        odds = (0.6 + 0.2 * k, 0.4 - 0.2 * k, 0.0005, 0.0, 0.0)
+        probability = (0.6 + 0.2 * k, 0.4 - 0.2 * k, 0.0005, 0.0, 0.0)
         candidates = tuple(
-            Candidate(n, 0.9 - 0.1 * i, pose_deg, p) for i, (n, p) in enumerate(zip(NAMES, odds, strict=True))
+            Candidate(n, 0.9 - 0.1 * i, pose_deg, p) for i, (n, p) in enumerate(zip(NAMES, probability, strict=True))
         )
-        yield Ranked(k, candidates, 0.1, "not sure yet: a probability of 60.0%, and 95.0% ends the search")
+        decision = StopDecision(Outcome.CONTINUE, StopReason.NOT_CONFIDENT, 0, 0.6, 0.95, 1.02, 0.95)
+        yield Ranked(k, candidates, 0.1, decision)
         if k < len(rotations_deg):
             step_deg = rotations_deg[k]
             away = tuple(abs(float(wrap180(turn - step_deg))) for turn in turns_deg)
@@ -125,25 +133,25 @@ def searching_densely(
                 tuple(0.02 + abs(turn) / 4500 for turn in turns_deg),
                 tuple(0.5 + a / 400 for a in away) if pair else None,
             )
-            rivals = NAMES[:2] if pair else ()
-            why = separation_words(rivals, weighed.alike, turns_deg.index(step_deg))
-            side = "left" if step_deg >= 0 else "right"
-            yield Decided(k, side, step_deg, -orientation_deg - step_deg, None, None, rivals, why, weighed)
+            reason = RotationReason.SEPARATES_CANDIDATES if pair else RotationReason.NEW_SIDE
+            side, target_deg = "left" if step_deg >= 0 else "right", -orientation_deg - step_deg
+            names = NAMES[:2] if pair else ()
+            yield Decided(k, side, step_deg, target_deg, None, None, names, reason, weighed=weighed)
     yield Identified(
         answer,
         candidates,
         candidates[0].score,
         0.1,
-        0.75,
         pose_deg,
         30.0,
         k + 1,
         195.0,
         7.5,
-        "a probability of 97.0% reaches 95.0%",
-        probability=odds[0],
-        familiarity=1.02,
-        min_familiarity=0.95,
+        StopReason.CONFIDENT,
+        confidence=probability[0],
+        min_confidence=0.95,
+        open_set_score=1.02,
+        open_set_threshold=0.95,
     )
 
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.events.events import Accepted, Decided, Identified, Moved, Rejected, Started
-from rig.events.wording import answer_words, decision_words, distinct, move_words, side_words
+from rig.events.events import Accepted, Moved, Rejected, Started
 from rig.report import EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
 from rig.report.summary import enrollment_items, totals
@@ -153,59 +152,6 @@ class TestIdentification:
         found = facts(totals([], [identified(None)]))
         assert found["answer"] == "unknown"
         assert found["views"] == "4"
-
-
-def decided(side: str, rotation_deg: float, s_left: float, s_right: float, *rivals: str) -> Decided:
-    why = side_words(side, s_left, s_right, rivals)
-    return Decided(1, side, rotation_deg, -rotation_deg, s_left, s_right, rivals, why)
-
-
-class TestWords:
-    def test_decisions(self) -> None:
-        first = Decided(0, "left", 90.0, -90.0, None, None, (), "the first turn is fixed")
-        assert decision_words(first) == "left: the first turn is fixed; turning 90.0°."
-        assert decision_words(decided("left", 47.3, 0.41, 0.66, "a", "b")) == (
-            "left: the two leading candidates look less alike there: S_left 0.41 < S_right 0.66; turning 47.3°."
-        )
-        assert decision_words(decided("right", -137.3, 0.66, 0.41, "a", "b", "c")) == (
-            "right: the leading candidates look less alike there: S_right 0.41 < S_left 0.66; "
-            "turning 137.3° past what was seen already."
-        )
-        tie = decided("left", 90.0, 0.5, 0.5, "a", "b")
-        assert "as much alike on both sides: S_left 0.50 = S_right 0.50" in decision_words(tie)
-        drawn = Decided(1, "right", -170.0, 170.0, None, None, (), "a turn drawn at random")
-        assert decision_words(drawn) == "right: a turn drawn at random; turning 170.0°."
-
-    @given(a=st.floats(0, 45), b=st.floats(0, 45))
-    def test_different_numbers_have_different_text(self, a: float, b: float) -> None:
-        left, right = distinct(a, b)
-        assert (left != right) == (a != b) or abs(a - b) < 1e-5
-        assert float(left) == pytest.approx(a, abs=0.00501)
-
-    def test_moves(self) -> None:
-        move = Moved(1, -90.0, -90.1, -90.1, -89.99, 0.12, 0.6, True, 1.0)
-        assert move_words(move) == "rotation −90.10° (encoder), −89.99 ± 0.12° (gyro)"
-        slipped = replace(move, agrees=False, rotation_imu_deg=-80.0)
-        assert move_words(slipped).endswith("they differ by more than 0.60°, so the gyro value counts")
-        assert move_words(replace(move, rotation_imu_deg=None)).endswith("no gyro value")
-
-    def test_single_candidate_is_not_compared(self) -> None:
-        alone = decided("left", 90.0, 0.0, 0.0, "mug")
-        assert decision_words(alone) == "left: no second candidate is in sight to be told apart; turning 90.0°."
-
-    def test_answers(self) -> None:
-        known, unknown = identified("mug-white").answer, identified(None).answer
-        assert isinstance(known, Identified)
-        assert isinstance(unknown, Identified)
-        assert answer_words(known) == "mug-white, rotated 30° (4 views). The lead passes."
-        sure = replace(known, yaw_deg=359.7, probability=0.996, views=1)
-        assert answer_words(sure).startswith("mug-white, rotated 0°, 99 % confident (1 view). ")
-        assert ">99.9 % confident" in answer_words(replace(known, probability=0.9999))
-        assert "Not certain: mug-star is similarly likely." in answer_words(replace(known, margin=-0.01))
-        assert answer_words(unknown).startswith(
-            "Unknown object. The most similar enrolled objects are mug-white (score 0.930), mug-star (score 0.830) and "
-            "teapot (score 0.730). "
-        )
 
 
 def test_rejected_frames_belong_to_the_next_view() -> None:

@@ -1,4 +1,4 @@
-"""Saved runs: kept in open formats, walked through again, and computed again to the same decisions."""
+"""Saved runs: stored in open formats, read, and computed again to the same decisions."""
 
 import json
 import shutil
@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import hbr
+from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
 from rig.config import load_config
 from rig.core.errors import UsageError
-from rig.events.events import Accepted, Decided, Identified, Rejected, Started, event_dict
+from rig.events.events import Accepted, Decided, Identified, NoteCode, Rejected, RotationReason, Started, event_dict
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
@@ -22,6 +23,8 @@ from rig.search.saved_run import RunWriter, event_of, load_run
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
+
+DATA = Path(__file__).parent / "data"
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +63,7 @@ def saved(tmp_path_factory):
 
 
 def changed(saved, tmp_path: Path, line: int, **values: object) -> Path:
-    """Return a copy of the first run in which an event says something else."""
+    """Return a copy of the first run with a changed event."""
     folder = tmp_path / "changed"
     shutil.copytree(saved["ahbr"][0], folder)
     lines = (folder / "events.jsonl").read_text().splitlines()
@@ -75,17 +78,17 @@ def place(saved, kind: type) -> int:
 
 
 @pytest.mark.parametrize("strategy", ["ahbr", "hbr", "sweep", "random"])
-def test_a_run_computed_again_decides_the_same(saved, strategy):
+def test_a_run_is_computed_again_to_the_same_decisions(saved, strategy):
     folder, events = saved[strategy]
     found = check(load_run(folder))
     assert found.differences == []
     assert found.views == 4
-    assert found.decisions == 4  # three turns and the answer
+    assert found.decisions == 4  # three rotations and the answer
     assert isinstance(events[-1], Identified)
 
 
 @pytest.mark.parametrize("strategy", ["ahbr", "random"])
-def test_the_events_come_back_as_they_were(saved, strategy):
+def test_events_are_read_as_they_were_written(saved, strategy):
     folder, events = saved[strategy]
     again = list(load_run(folder).events())
     assert [event_dict(event) for event in again] == [event_dict(event) for event in events]
@@ -95,7 +98,7 @@ def test_the_events_come_back_as_they_were(saved, strategy):
             assert (one.image_bgr == other.image_bgr).all()
 
 
-def test_the_folder_is_open_formats(saved):
+def test_the_folder_has_open_formats(saved):
     folder, _ = saved["ahbr"]
     assert sorted(path.name for path in folder.iterdir()) == ["events.jsonl", "frames", "model.jsonl", "run.json"]
     assert [path.name for path in sorted((folder / "frames").iterdir())] == [f"{i:03d}.png" for i in range(4)]
@@ -105,14 +108,14 @@ def test_the_folder_is_open_formats(saved):
     assert json.loads((folder / "run.json").read_text())["devices"]["servo"]["model"] == "xl430_w250"
 
 
-def test_a_dense_search_is_computed_again_from_its_frames_rules_and_empty_table(saved, tmp_path):
+def test_a_dense_search_is_computed_again_from_its_folder(saved, tmp_path):
     folder, events = saved["dense"]
     run = load_run(folder)
     found = check(run)
     assert found.differences == []
     assert found.views == found.decisions == len([e for e in events if isinstance(e, Accepted)])
     assert run.views.descriptor == events[0].descriptor == "edges+colours"
-    assert run.model.rules is not None
+    assert run.model.rule is not None
     assert run.empty_table is not None
     assert all(e.segmentation["agreement"] > 0.9 for e in events if isinstance(e, Accepted))
     again = list(run.events())
@@ -128,31 +131,52 @@ def test_a_dense_search_is_computed_again_from_its_frames_rules_and_empty_table(
             assert words in {difference.what for difference in check(load_run(other)).differences}
 
 
-def test_other_rules_decide_otherwise(saved, tmp_path):
+def test_another_stopping_rule_is_noticed(saved, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(saved["dense"][0], folder)
-    rules = json.loads((folder / "search_rules.json").read_text())
-    (folder / "search_rules.json").write_text(json.dumps(rules | {"familiar": [2.0] * len(rules["familiar"])}))
-    assert {"what", "verdict"} & {difference.what for difference in check(load_run(folder)).differences}
+    rule = json.loads((folder / "search_rules.json").read_text())
+    changed = {"open_set_thresholds": [2.0] * len(rule["open_set_thresholds"])}
+    (folder / "search_rules.json").write_text(json.dumps(rule | changed))
+    assert "decision.outcome" in {difference.what for difference in check(load_run(folder)).differences}
 
 
-def test_a_run_of_the_first_format_is_read(saved, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(saved["ahbr"][0], folder)
-    about = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps(about | {"version": 1}))
-    assert check(load_run(folder)).differences == []
+@pytest.mark.parametrize("strategy", ["ahbr", "dense"])
+def test_runs_of_format_2_are_read_and_computed_again(strategy):
+    run = load_run(DATA / f"run-format-2-{strategy}")
+    found = check(run)
+    assert found.differences == []
+    assert found.views == found.decisions >= 2
+    started, *_, answer = run.events()
+    assert isinstance(started, Started)
+    assert isinstance(answer, Identified)
+    assert answer.reason is hbr.StopReason.EARLIER_VERSION
+    assert answer.note
+    decided = [event for event in run.events() if isinstance(event, Decided)]
+    assert decided[-1].candidates
+    assert all(event.reason is RotationReason.EARLIER_VERSION and event.note for event in decided)
+    if strategy == "dense":
+        assert answer.confidence is not None
+        assert run.model.rule is not None
+        assert {one.code for one in run.model.rule.limitations} <= {LimitationCode.EARLIER_VERSION}
+        assert {note.code for note in started.notes} <= {NoteCode.EARLIER_VERSION}
+        assert all(event.weighed is not None and event.weighed.similarity for event in decided)
 
 
-def test_every_decision_says_why(saved):
-    for strategy, words in (("ahbr", "S_left"), ("hbr", "at random"), ("sweep", "even steps"), ("random", "at random")):
+def test_every_decision_has_a_reason(saved):
+    reasons = {
+        "ahbr": RotationReason.LESS_SIMILAR_SIDE,
+        "hbr": RotationReason.RANDOM,
+        "sweep": RotationReason.EVEN_STEPS,
+        "random": RotationReason.RANDOM,
+    }
+    for strategy, reason in reasons.items():
         decided = [e for e in saved[strategy][1] if isinstance(e, Decided)]
         assert len(decided) == 3
-        assert all(words in e.why for e in decided[1:])
+        assert all(e.reason is reason for e in decided[1:])
     assert [e.rotation_deg for e in saved["sweep"][1] if isinstance(e, Decided)] == [90.0] * 3
 
 
-def test_a_frame_that_was_changed_is_noticed(saved, tmp_path):
+def test_a_changed_frame_is_noticed(saved, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(saved["ahbr"][0], folder)
     frame = folder / "frames" / "002.png"
@@ -164,19 +188,19 @@ def test_a_frame_that_was_changed_is_noticed(saved, tmp_path):
     assert all(d.view >= 3 for d in differences)
 
 
-def test_a_decision_that_was_changed_is_noticed(saved, tmp_path):
+def test_a_changed_decision_is_noticed(saved, tmp_path):
     folder = changed(saved, tmp_path, place(saved, Decided), rotation_deg=12.0)
     (difference,) = check(load_run(folder)).differences
     assert (difference.view, difference.what, difference.saved) == (3, "rotation_deg", 12.0)
 
 
-def test_an_answer_that_was_changed_is_noticed(saved, tmp_path):
+def test_a_changed_answer_is_noticed(saved, tmp_path):
     folder = changed(saved, tmp_path, place(saved, Identified), name="lamp")
     (difference,) = check(load_run(folder)).differences
     assert str(difference) == f"view 4, name: saved lamp, computed {saved['ahbr'][1][-1].name}"
 
 
-def test_a_run_that_was_cut_off_is_read_as_far_as_it_goes(saved, tmp_path):
+def test_an_interrupted_run_is_read_to_its_last_event(saved, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(saved["ahbr"][0], folder)
     path = folder / "events.jsonl"
@@ -203,7 +227,7 @@ def test_a_run_that_was_cut_off_is_read_as_far_as_it_goes(saved, tmp_path):
         ("frames/001.png", b"no picture", "cannot be read"),
     ],
 )
-def test_a_damaged_run_is_refused_in_words(saved, tmp_path, name, content, words):
+def test_a_damaged_run_is_rejected(saved, tmp_path, name, content, words):
     folder = tmp_path / "run"
     shutil.copytree(saved["ahbr"][0], folder)
     (folder / name).write_bytes(content)
@@ -213,7 +237,7 @@ def test_a_damaged_run_is_refused_in_words(saved, tmp_path, name, content, words
     assert caught.value.next_step
 
 
-def test_what_is_no_run_or_taken_already_is_said(saved, tmp_path, simulated):
+def test_a_folder_without_a_run_or_not_empty_is_rejected(saved, tmp_path, simulated):
     with pytest.raises(UsageError, match="no saved run"):
         load_run(tmp_path)
     folder, _ = saved["ahbr"]
@@ -224,7 +248,7 @@ def test_what_is_no_run_or_taken_already_is_said(saved, tmp_path, simulated):
         RunWriter(Path("/proc/run"), bench, hbr.ViewIndex(hbr.Views.empty()))
 
 
-def test_a_number_that_was_not_finite_comes_back_as_unknown(saved):
+def test_a_number_that_was_not_finite_is_read_as_nan(saved):
     accepted = next(e for e in saved["ahbr"][1] if isinstance(e, Accepted))
     values = event_dict(Rejected(0, 1, ("gyro",), accepted.evidence))
     values["evidence"]["stillness"]["peak_rate_dps"] = None

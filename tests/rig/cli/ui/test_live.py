@@ -21,19 +21,19 @@ from rig.cli.ui.operator_prompts import OperatorPrompts
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
-from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, SkipReason, Waiting
+from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, SkipReason, Waiting, WaitReason
 from rig.events.wording import angle_words
 from rig.plans.tray import TrayDecision, TrayItem
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-INSIGHT = SimilarObjects("mug-white", 180.0, 0.95, 0.96, (SimilarObject("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
+SIMILAR = SimilarObjects("mug-white", 180.0, 0.95, 0.96, (SimilarObject("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
 
 
-def enrolled_with_insight() -> list[Event]:
+def enrolled_with_similar_objects() -> list[Event]:
     *before, last = enrolling(views=8, retaken=(3,))
-    return [*before, INSIGHT, last]
+    return [*before, SIMILAR, last]
 
 
 def screen(width: int, *, terminal: bool = True) -> Console:
@@ -54,7 +54,7 @@ def shown(console: Console, view: LiveView, events: list[Event]) -> str:
 @pytest.mark.parametrize("width", [30, 40, 60, 72, 88, 100, 200])
 def test_the_table_of_an_enrollment_fits_the_terminal(width):
     console = screen(width)
-    text = shown(console, EnrollView(console, load_config(), "3 of 25"), enrolled_with_insight())
+    text = shown(console, EnrollView(console, load_config(), "3 of 25"), enrolled_with_similar_objects())
     assert "accepted" in text.replace("\n", "")
     assert ("asked" in text) == (width >= 60)
     assert ("saturated" in text) == (width >= 88)
@@ -64,7 +64,7 @@ def test_the_table_of_an_enrollment_fits_the_terminal(width):
 def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
     console = screen(80, terminal=False)
     view = EnrollView(console, load_config(), "3 of 25")
-    text = shown(console, view, enrolled_with_insight())
+    text = shown(console, view, enrolled_with_similar_objects())
     lines = text.splitlines()
     assert lines[0].startswith("3 of 25 mug-white: 8 views, about ")
     views = [line for line in lines if line.startswith("view ")]
@@ -77,7 +77,7 @@ def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
     assert re.search(r"accepted  \d+ s left$", views[4])
     assert lines[-2:] == [
         "  looks the same every 180° (similarity 0.960, of neighbouring views 0.950): "
-        "its pose will be known up to that",
+        "its pose is known up to that angle",
         "  looks like mug-03 from 120–200° (similarity up to 0.990)",
     ]
 
@@ -86,10 +86,10 @@ def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
 @pytest.mark.parametrize("answer", ["mug-white", None])
 def test_the_candidates_are_seen_after_each_view_and_every_decision_in_words(width, answer):
     console = screen(width)
-    text = shown(console, IdentifyView(console), [Waiting("the next object"), *identifying(answer)])
+    text = shown(console, IdentifyView(console), [Waiting(WaitReason.NEXT_OBJECT), *identifying(answer)])
     flat = " ".join(text.split())
     assert "candidate" in flat
-    assert "S_left 0.41 < S_right 0.66; turning 47.3°" in flat
+    assert "left 47.3°: the leading candidates look less similar there: S_left 0.41 < S_right 0.66" in flat
     assert ("similar enrolled objects are mug-white" if answer is None else "mug-white, rotated 30°") in flat
     assert "258° of rotation, 10 s." in flat
 
@@ -101,7 +101,7 @@ def test_a_search_in_a_pipe_reads_as_lines():
     text = shown(console, IdentifyView(console), events)
     assert f"at {angle_words(move.encoder_deg, 2)}" in text
     assert "candidates: mug-white 0.910 at 60.0°" in text
-    assert "turning 47.3°" in text
+    assert "left 47.3°" in text
     assert max(map(len, text.splitlines())) > 100  # no line is broken for a terminal that is not there
 
 
@@ -111,9 +111,9 @@ def test_a_dense_search_shows_probabilities_and_what_the_rules_say(width, answer
     console = screen(width)
     text = shown(console, IdentifyView(console), list(searching_densely(answer)))
     flat = " ".join(text.split())
-    assert "Note: rehearse them." in flat
-    assert "mug-white 60.0% not sure yet: a probability of 60.0%" in flat
-    assert "to tell mug-white from mug-star, 0.50 alike there (0.50 to 0.95 all around); turning 80.0°" in flat
+    assert "Note: 24 leave-one-out searches cannot guarantee" in flat
+    assert "mug-white 60.0 % not confident yet: 60.0 %" in flat
+    assert "left 80.0°: distinguishes mug-white from mug-star, similarity 0.50 there (0.50–0.95 all around)" in flat
     assert ("% confident (3 views)" in flat) == (answer is not None)
     assert ("Unknown object. The most similar enrolled objects are mug-white (score 0.900)" in flat) == (answer is None)
 
@@ -121,10 +121,10 @@ def test_a_dense_search_shows_probabilities_and_what_the_rules_say(width, answer
 def test_a_dense_search_in_a_pipe_reads_as_lines():
     console = screen(80, terminal=False)
     lines = shown(console, IdentifyView(console), list(searching_densely())).splitlines()
-    assert lines[0] == "Note: rehearse them."
-    assert "  candidates: mug-white 0.900 (60.0%) at 330.0°, mug-star 0.800 (40.0%) at 330.0°" in lines[3]
-    assert lines[4] == "  not sure yet: a probability of 60.0%, and 95.0% ends the search"
-    assert lines[5].startswith("  left: to tell mug-white from mug-star")
+    assert lines[0].startswith("Note: 24 leave-one-out searches")
+    assert "  candidates: mug-white 0.900 (60.0 %) at 330.0°, mug-star 0.800 (40.0 %) at 330.0°" in lines[3]
+    assert lines[4] == "  not confident yet: 60.0 %, and 95.0 % ends the search"
+    assert lines[5].startswith("  left 80.0°: distinguishes mug-white from mug-star")
 
 
 class Keyboard:

@@ -1,0 +1,189 @@
+"""Searches for every enrolled object with its own views: the sample from which a stopping rule is fitted."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.dense.filter import BETA, BINS, Belief, DenseIndex
+
+#: Weight of the margin in the open-set score, and of the leader's usual score.
+_MARGIN_WEIGHT: Final = 0.5
+_USUAL_WEIGHT: Final = 1.0
+#: Queries lie beside their enrolled views by shares of a step that are spread over 0..1 as multiples of this.
+_GOLDEN: Final = 0.618034
+#: Distance between the views of a search.
+_STEP_DEG: Final = 90.0
+
+
+@dataclass(frozen=True, eq=False)
+class Leaders:
+    """The leading candidate after each view of each search, arrays (searches, views).
+
+    Attributes
+    ----------
+    object_index : integer array
+        The leading candidate.
+    score, margin : float64 array
+        Its score per view, and how far that is above the second score.
+    """
+
+    object_index: IndexArray
+    score: FloatArray
+    margin: FloatArray
+
+    @classmethod
+    def of(cls, found: list[tuple[int, float, float]], shape: tuple[int, int]) -> "Leaders":
+        """Return what `leader` found after each view of each search."""
+        object_index, score, margin = zip(*found, strict=True)
+        return cls(np.reshape(object_index, shape), np.reshape(score, shape), np.reshape(margin, shape))
+
+    def open_set_score(self, usual_scores: FloatArray) -> FloatArray:
+        """Return the open-set score after each view of each search, (searches, views).
+
+        It is the score plus half of the margin, less what the leader usually scores above other objects. An unknown
+        object resembles several enrolled objects a little; an enrolled object resembles one of them closely. An object
+        that looks the same from all sides usually scores more, so it must match better.
+
+        Parameters
+        ----------
+        usual_scores : float64 array (objects, views)
+            As `usual_scores` returns it.
+        """
+        views = np.arange(self.score.shape[1])
+        typical = np.median(usual_scores, axis=0)
+        return (
+            self.score
+            + _MARGIN_WEIGHT * self.margin
+            - _USUAL_WEIGHT * (usual_scores[self.object_index, views] - typical)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LeaveOneOut:
+    """Searches for every object with its own enrolled views; arrays of (searches, views).
+
+    Attributes
+    ----------
+    objects : int
+        Names in the model set.
+    known : Leaders
+        Among all enrolled objects.
+    unknown : Leaders
+        The same searches as if the searched object were not enrolled.
+    confidence : float64 array
+        Probability of the leading candidate among all objects.
+    correct : bool array
+        Whether the leading candidate is the searched object.
+    beta : float
+        As for `Belief.posterior`.
+    """
+
+    objects: int
+    known: Leaders
+    unknown: Leaders
+    confidence: FloatArray
+    correct: NDArray[np.bool_]
+    beta: float
+
+
+def leave_one_out(
+    index: DenseIndex, *, beta: float = BETA, views: int = 4, seen: LevelArray | None = None, searches: int = 4
+) -> LeaveOneOut:
+    """Search for every object with its own enrolled views, 90° apart, as if the camera had stood beside them.
+
+    A query beside an enrolled view, at the share u of a step, is less similar to that view by u times the difference
+    to its neighbour. Real queries are at most half a step away; u is spread over 0..1 to allow for light and noise,
+    which make views differ, too.
+
+    Parameters
+    ----------
+    index : DenseIndex
+        Of at least two objects. Objects with fewer than ``views`` views, or with a single one, are not searched for.
+    beta : float
+        As for `Belief.posterior`.
+    views : int
+        Views of a search.
+    seen : uint8 array (n, length), optional
+        Each enrolled view as a search would see it: from a second session, or described again under the bench's noise
+        and blur. The enrolled views themselves by default.
+    searches : int
+        Searches for each object; their first views are spread around it.
+
+    Raises
+    ------
+    ValueError
+        There are fewer than two objects, or none with enough views.
+    """
+    if len(index) < 2:
+        raise ValueError(f"{len(index)} object; leave-one-out searches need at least two")
+    levels = index.views.descriptors if seen is None else seen
+    if levels.shape != index.views.descriptors.shape:
+        raise ValueError(f"seen has shape {levels.shape}; the catalog's views have {index.views.descriptors.shape}")
+    known, unknown, confidence, correct = [], [], [], []
+    aside = 0.0
+    for place, object_index in enumerate(index.object_index.tolist()):
+        rows = index.views.of(object_index)
+        if len(rows) < max(views, 2):
+            continue
+        rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
+        azimuth_deg = index.views.azimuth_deg[rows]
+        similar = index.compared.similarity(levels[rows])
+        others = np.delete(index.object_index, place)
+        for start in np.unique(np.arange(searches) * len(rows) // searches).tolist():
+            chosen = _spread(azimuth_deg, start, views)
+            support = np.zeros((len(index), BINS), np.float32)
+            for n, i in enumerate(chosen):
+                # The query lies beside its enrolled view, towards alternating neighbours.
+                aside = (aside + _GOLDEN) % 1
+                neighbour = rows[(i + (1 if n % 2 else -1)) % len(rows)]
+                moved = similar[i].copy()
+                moved[rows[i]] -= aside * (moved[rows[i]] - moved[neighbour])
+                support += index.support(moved, float(azimuth_deg[i] - azimuth_deg[start]))
+                belief = Belief(index, support, azimuth_deg[chosen[: n + 1]])
+                scores, probability = belief.scores(), belief.posterior(beta).sum(axis=1)
+                known.append(leader(index.object_index, scores))
+                unknown.append(leader(others, np.delete(scores, place)))
+                confidence.append(probability.max())
+                correct.append(probability.argmax() == place)
+    if not known:
+        raise ValueError(f"no object has {max(views, 2)} views; enroll more of each, or search with fewer views")
+    shape = -1, views
+    return LeaveOneOut(
+        len(index.views.object_names),
+        Leaders.of(known, shape),
+        Leaders.of(unknown, shape),
+        np.reshape(confidence, shape),
+        np.reshape(correct, shape),
+        beta,
+    )
+
+
+def leader(object_index: IndexArray, scores: FloatArray) -> tuple[int, float, float]:
+    """Return the leading candidate, its score and its margin; without a second candidate, that is the whole score."""
+    best = int(scores.argmax())
+    margin = scores[best] - np.partition(scores, -2)[-2] if len(scores) > 1 else scores[best]
+    return int(object_index[best]), float(scores[best]), float(margin)
+
+
+def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> FloatArray:
+    """Return each object's median score in the searches that found it, (objects, views); the typical one of others."""
+    usual = np.full((objects, leaders.score.shape[1]), np.nan)
+    for n in range(usual.shape[1]):
+        for j in np.unique(leaders.object_index[correct[:, n], n]).tolist():
+            usual[j, n] = np.median(leaders.score[correct[:, n] & (leaders.object_index[:, n] == j), n])
+        found = usual[~np.isnan(usual[:, n]), n]
+        usual[np.isnan(usual[:, n]), n] = np.median(found) if len(found) else 0.0
+    return usual
+
+
+def _spread(azimuth_deg: FloatArray, start: int, count: int) -> list[int]:
+    """Return the indices of ``count`` different views, a step apart, the first one at ``start``."""
+    chosen = [start]
+    for n in range(1, count):
+        away = np.abs((azimuth_deg - azimuth_deg[start] - n * _STEP_DEG + 180) % 360 - 180)
+        away[chosen] = np.inf
+        chosen.append(int(away.argmin()))
+    return chosen

@@ -1,0 +1,59 @@
+"""One search by the dense filter: views in; belief, decision and next best view out."""
+
+from typing import Final
+
+from numpy.typing import ArrayLike
+
+from hbr.core.arrays import LevelArray
+from hbr.dense.filter import KEPT, Belief, DenseIndex, update_belief
+from hbr.dense.next_view import NextBestView, next_best_view
+from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
+
+_WORTH_REDUCING: Final = 2
+
+
+class DenseSession:
+    """A search for one object, the same for the bench, for replay and for evaluation.
+
+    Parameters
+    ----------
+    index : DenseIndex
+        The enrolled views.
+    rule : StoppingRule
+        When the search ends.
+    max_views : int
+        Views after which it ends in any case.
+
+    Attributes
+    ----------
+    belief : Belief
+        After at least one view.
+    decision : StopDecision
+        The rule's decision after the last view.
+    """
+
+    belief: Belief
+    decision: StopDecision
+
+    def __init__(self, index: DenseIndex, rule: StoppingRule, *, max_views: int = 8) -> None:
+        self.rule = rule
+        self.max_views = max_views
+        # Taking out a part of the views costs more than it saves if a search ends after one or two views.
+        self._kept = KEPT if len(index) > _WORTH_REDUCING * KEPT else len(index)
+        self._so_far: DenseIndex | Belief = index
+
+    def add(self, levels: LevelArray, orientation_deg: float) -> StopDecision:
+        """Add the next view, as for `update_belief`, and return the rule's decision."""
+        self._so_far = self.belief = update_belief(levels, orientation_deg, self._so_far, kept=self._kept)
+        self.decision = self.rule.decide(self.belief, max_views=self.max_views)
+        return self.decision
+
+    def next_best_view(self, rotations_deg: ArrayLike | None = None, seconds: ArrayLike | None = None) -> NextBestView:
+        """Return the rotation to the next best view, as `hbr.next_best_view` does."""
+        return next_best_view(self.belief, beta=self.rule.beta, rotations_deg=rotations_deg, seconds=seconds)
+
+    def end(self) -> StopDecision:
+        """Return the decision with which the search ends here, even if the rule would continue."""
+        if self.decision.outcome is Outcome.CONTINUE:
+            return self.rule.decide(self.belief, max_views=self.belief.queries)
+        return self.decision

@@ -1,0 +1,201 @@
+"""Codes of events in words. Other tests assert the codes."""
+
+from dataclasses import replace
+from math import inf
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hbr import Outcome, StopDecision, StopReason
+from hbr.dense.stopping import Limitation, LimitationCode
+from rig.events.events import (
+    Decided,
+    Identified,
+    Moved,
+    Note,
+    NoteCode,
+    RotationReason,
+    SimilarObject,
+    SimilarObjects,
+    WaitReason,
+    Weighed,
+)
+from rig.events.wording import (
+    answer_words,
+    decision_words,
+    distinct,
+    limitation_words,
+    move_words,
+    next_step_words,
+    note_words,
+    percent_words,
+    reason_words,
+    similar_objects_words,
+    stop_words,
+    wait_words,
+)
+from tests.rig.report.report_samples import NOTE, identified
+
+
+def decided(side: str, rotation_deg: float, s_left: float, s_right: float, *names: str) -> Decided:
+    reason = RotationReason.LESS_SIMILAR_SIDE if len(names) > 1 else RotationReason.ONE_CANDIDATE
+    return Decided(1, side, rotation_deg, -rotation_deg, s_left, s_right, names, reason)
+
+
+def test_decisions_give_the_rotation_and_its_reason() -> None:
+    first = Decided(0, "left", 90.0, -90.0, None, None, (), RotationReason.FIRST_STEP)
+    assert decision_words(first) == "left 90.0°: the first rotation is fixed."
+    assert decision_words(decided("left", 47.3, 0.41, 0.66, "a", "b")) == (
+        "left 47.3°: the two leading candidates look less similar there: S_left 0.41 < S_right 0.66."
+    )
+    assert decision_words(decided("right", -137.3, 0.66, 0.41, "a", "b", "c")) == (
+        "right 137.3°, past earlier views: the leading candidates look less similar there: S_right 0.41 < S_left 0.66."
+    )
+    tie = decided("left", 90.0, 0.5, 0.5, "a", "b")
+    assert "equally similar on both sides: S_left 0.50 = S_right 0.50" in decision_words(tie)
+    assert "no second object is likely" in decision_words(decided("left", 90.0, 0.0, 0.0, "mug"))
+    for reason, words in ((RotationReason.RANDOM, "random"), (RotationReason.EVEN_STEPS, "even steps")):
+        assert words in decision_words(replace(first, reason=reason))
+    for reason in (RotationReason.CUSTOM, RotationReason.EARLIER_VERSION):
+        assert decision_words(replace(first, reason=reason, note="the far side")) == "left 90.0°: the far side."
+
+
+def test_dense_decisions_name_the_two_candidates() -> None:
+    weighed = Weighed((-90.0, 90.0), (-8.0, -9.0), (0.1, 0.1), (0.95, 0.5))
+    reason = RotationReason.SEPARATES_CANDIDATES
+    found = Decided(0, "left", 90.0, -90.0, None, None, ("a", "b"), reason, weighed=weighed)
+    assert decision_words(found) == "left 90.0°: distinguishes a from b, similarity 0.50 there (0.50–0.95 all around)."
+    alone = replace(found, candidates=(), reason=RotationReason.NEW_SIDE)
+    assert decision_words(alone) == "left 90.0°: no second object is likely, so a new side is viewed."
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reason", "words"),
+    [
+        (Outcome.FOUND, StopReason.CONFIDENT, "the confidence 97.0 % reaches 95.0 %, and the open-set score 1.000 the"),
+        (Outcome.FOUND, StopReason.MAX_VIEWS, "the best candidate after 3 views, with a confidence of 97.0 % below 95"),
+        (Outcome.CONTINUE, StopReason.NOT_CONFIDENT, "not confident yet: 97.0 %, and 95.0 % ends the search"),
+        (Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD, "the open-set score 1.000 is still below the 0.900"),
+        (Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD, "the open-set score 1.000 is below the 0.900"),
+    ],
+)
+def test_stop_decisions_give_their_numbers(outcome: Outcome, reason: StopReason, words: str) -> None:
+    decision = StopDecision(outcome, reason, 0, 0.97, 0.95, 1.0, 0.9)
+    assert stop_words(decision, 3).startswith(words)
+    assert "inf" not in stop_words(replace(decision, reason=StopReason.CONFIDENT, open_set_threshold=-inf), 3)
+
+
+def test_answers_begin_with_the_result() -> None:
+    known, unknown = identified("mug-white").answer, identified(None).answer
+    assert isinstance(known, Identified)
+    assert isinstance(unknown, Identified)
+    assert answer_words(known) == "mug-white, rotated 30° (4 views). The margin 0.100 per view reaches 0.05."
+    sure = replace(known, yaw_deg=359.7, confidence=0.996, views=1)
+    assert answer_words(sure).startswith("mug-white, rotated 0°, 99 % confident (1 view). ")
+    assert ">99.9 % confident" in answer_words(replace(known, confidence=0.9999))
+    assert "Not certain: mug-star is similarly likely." in answer_words(replace(known, margin=-0.01))
+    assert answer_words(unknown).startswith(
+        "Unknown object. The most similar enrolled objects are mug-white (score 0.930), mug-star (score 0.830) and "
+        "teapot (score 0.730). "
+    )
+
+
+def test_the_end_of_a_search_has_a_reason() -> None:
+    known = identified("mug-white").answer
+    assert isinstance(known, Identified)
+    assert reason_words(replace(known, reason=StopReason.MAX_VIEWS)) == "the search took all 4 views that are allowed"
+    assert reason_words(replace(known, reason=StopReason.NO_ROTATION_LEFT)) == "the cable allows no other view"
+    assert reason_words(replace(known, reason=StopReason.CUSTOM, note="enough")) == "enough"
+    dense = replace(known, confidence=0.6, min_confidence=0.95, open_set_score=1.0, open_set_threshold=None)
+    assert reason_words(replace(dense, reason=StopReason.MAX_VIEWS)).startswith("the best candidate after 4 views")
+    assert reason_words(replace(dense, reason=StopReason.CONFIDENT)) == "the confidence 60.0 % reaches 95.0 %"
+
+
+@pytest.mark.parametrize(
+    ("code", "values", "words"),
+    [
+        (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 1}, "--descriptor edges"),
+        (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 0}, "the catalog is without it"),
+        (NoteCode.MIXED_EMPTY_TABLE, {"objects": ["a"], "with_image": False}, "a was enrolled without an empty-table"),
+        (NoteCode.MIXED_EMPTY_TABLE, {"objects": list("abcde"), "with_image": True}, "a, b, c and 2 more were"),
+        (NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE, {}, "most objects were enrolled without"),
+        (NoteCode.EMPTY_TABLE_DOUBTED, {"problems": [{"code": "old", "hours": 72}]}, "(it is 3 days old); to take one"),
+        (NoteCode.EMPTY_TABLE_MISSING, {"problems": [{"code": "missing"}]}, "no empty-table image (there is no"),
+        (NoteCode.EMPTY_TABLE_OF_ENROLLMENT, {"problems": [{"code": "missing"}]}, "enrollment is used (there is no"),
+        (NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "other", "text": "it moved"}}, "image: it moved"),
+        (NoteCode.TABLE_DIFFERS, {"taken_utc": "2026-01-02"}, "does not look as it did at 2026-01-02"),
+        (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON); to renew it: rig catalog calibrate"),
+        (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 1, "removed": 2}, "1 object added, 2 obj"),
+        (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 0, "removed": 0}, "(other views, or"),
+        (NoteCode.EARLIER_VERSION, {"text": "as it was"}, "as it was"),
+    ],
+)
+def test_notes(code: NoteCode, values: dict[str, object], words: str) -> None:
+    assert words in note_words(Note(code, values))
+
+
+def test_warnings_have_a_next_step() -> None:
+    assert note_words(NOTE).startswith(
+        "24 leave-one-out searches cannot guarantee at most 1.0 % wrong answers and 2.0 %"
+    )
+    for code in (NoteCode.EMPTY_TABLE_CHANGED, NoteCode.TABLE_DIFFERS):
+        assert next_step_words(Note(code)).endswith("rig empty-table")
+    assert next_step_words(Note(NoteCode.EARLIER_VERSION, {"next_step": "Wait."})) == "Wait."
+    assert wait_words(WaitReason.NEXT_OBJECT) != wait_words(WaitReason.FIRST_OBJECT)
+
+
+NUMBERS = {"rate": 0.01, "searches": 24, "needed": 100, "min_confidence": 0.98, "wrong": 1, "ended": 20}
+
+
+@pytest.mark.parametrize(
+    ("code", "values", "words"),
+    [
+        (LimitationCode.SAMPLED, {"searched": 20, "objects": 400}, "only 20 of 400 objects were searched for"),
+        (LimitationCode.FALSE_REJECT_RATE, {**NUMBERS, "reached": 0.04}, "1.0 % needs 100 leave-one-out searches, and"),
+        (LimitationCode.ERROR_RATE, NUMBERS, "a confidence of 98 %, at which 1 of 20 were wrong"),
+        (LimitationCode.SIMILAR_OBJECTS, NUMBERS, "because enrolled objects are too similar"),
+        (LimitationCode.UNKNOWN_NOT_MEASURED, {}, "fewer than three objects"),
+        (LimitationCode.ONE_OBJECT, {}, "with one object there is no other candidate"),
+        (LimitationCode.SINGLE_VIEWS, {}, "a single view"),
+        (LimitationCode.EARLIER_VERSION, {"text": "as it was"}, "as it was"),
+    ],
+)
+def test_limitations(code: LimitationCode, values: dict[str, object], words: str) -> None:
+    assert words in limitation_words(Limitation(code, values))
+
+
+def test_similar_objects() -> None:
+    mug = SimilarObjects("mug", 180.0, 0.95, 0.96, (SimilarObject("cup", ((120.0, 200.0), (300.0, 300.0)), 0.2, 0.99),))
+    assert similar_objects_words(mug) == [
+        "looks the same every 180° (similarity 0.960, of neighbouring views 0.950): its pose is known up to that angle",
+        "looks like cup from 120–200° and 300° (similarity up to 0.990)",
+    ]
+    vase = replace(mug, period_deg=0.0, objects=())
+    assert similar_objects_words(vase)[0].startswith("looks the same from everywhere")
+    assert similar_objects_words(replace(vase, period_deg=None)) == ["looks like no other enrolled object"]
+
+
+def test_moves() -> None:
+    move = Moved(1, -90.0, -90.1, -90.1, -89.99, 0.12, 0.6, True, 1.0)
+    assert move_words(move) == "rotation −90.10° (encoder), −89.99 ± 0.12° (gyro)"
+    slipped = replace(move, agrees=False, rotation_imu_deg=-80.0)
+    assert move_words(slipped).endswith("they differ by more than 0.60°, so the gyro value counts")
+    assert move_words(replace(move, rotation_imu_deg=None)).endswith("no gyro value")
+
+
+@given(a=st.floats(0, 45), b=st.floats(0, 45))
+def test_different_numbers_read_differently(a: float, b: float) -> None:
+    left, right = distinct(a, b)
+    assert (left != right) == (a != b) or abs(a - b) < 1e-5
+    assert float(left) == pytest.approx(a, abs=0.00501)
+
+
+def test_percentages_near_0_and_100() -> None:
+    assert [percent_words(p) for p in (0.0, 0.0005, 0.5, 0.9995, 1.0)] == [
+        "<0.1 %",
+        "<0.1 %",
+        "50.0 %",
+        ">99.9 %",
+        ">99.9 %",
+    ]
