@@ -22,14 +22,14 @@ Floats = NDArray[np.float64]
 EXPECTED_ID = 0xA0
 NOISE_DPS_RTHZ = 0.014
 RATE_HZ, RANGE_DPS = 100.0, 2000.0
-LSB_PER_DPS, LSB_PER_MS2, LSB_PER_HEADING_DEG, LSB_PER_QUATERNION = 16.0, 100.0, 16.0, 16384.0
+LSB_PER_DPS, LSB_PER_MS2, LSB_PER_QUATERNION = 16.0, 100.0, 16384.0
 OTHERS = {
     0x00: "no device: SDA is held low, or ground is missing",
     0xFF: "no device: SDA is not connected",
     0xFB: "a BNO055 whose registers are read at a wrong position: the bus loses clock pulses",
 }
 
-_CHIP_ID, _PAGE_ID, _ACC_DATA, _FIRST, _EUL_DATA, _TEMP = 0x00, 0x07, 0x08, 0x14, 0x1A, 0x34
+_CHIP_ID, _PAGE_ID, _ACC_DATA, _FIRST, _TEMP = 0x00, 0x07, 0x08, 0x14, 0x34
 _UNIT_SEL, _OPR_MODE, _LAST = 0x3B, 0x3D, 0x3E
 _CONFIG_MODE, _IMU_MODE, _FUSION_RUNNING = 0x00, 0x08, 5
 _TO_CONFIG_S, _FROM_CONFIG_S = 0.02, 0.01
@@ -162,12 +162,6 @@ class Bno055:
         """Return the temperature of the sensor's die; raises as `read_samples` does."""
         self._read()
         return float(int.from_bytes(self._registers.read(_TEMP, 1), "little", signed=True))
-
-    def heading_deg(self) -> float:
-        """Return the fusion's heading in [0, 360), counter-clockwise, relative to power-up."""
-        self._read()
-        clockwise = int.from_bytes(self._registers.read(_EUL_DATA, 2), "little", signed=True) / LSB_PER_HEADING_DEG
-        return -clockwise % 360.0
 
     def calibration(self) -> Bno055Calibration:
         """Return the calibration status; the gyro's reaches 3 after a few seconds at rest."""

@@ -14,11 +14,9 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceSilent, RequestRejected, UsageError
 from rig.devices.dynamixel.packets import (
-    BROADCAST_ID,
     PING,
     READ,
     REBOOT,
-    SYNC_READ,
     WRITE,
     Packets,
     Packets1,
@@ -51,7 +49,7 @@ class BusStatistics:
     corrupt: int = 0
     late: int = 0
     foreign: int = 0
-    refused: int = 0
+    rejected: int = 0
 
     def as_dict(self) -> dict[str, int]:
         return asdict(self)
@@ -114,23 +112,6 @@ class DynamixelBus:
 
         reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
         return reply.data[skipped : skipped + size]
-
-    def sync_read(self, device_ids: Sequence[int], address: int, size: int) -> dict[int, bytes]:
-        """Return ``size`` bytes from ``address`` of several devices, by id, in one transaction (Protocol 2.0 only)."""
-        if self.protocol == 1:
-            return {device_id: self.read_block(device_id, address, size) for device_id in device_ids}
-
-        skipped = 0
-
-        def attempt() -> Answers:
-            nonlocal skipped
-            start, asked = self._unambiguous(address, size)
-            skipped = address - start
-            parameters = self._packets.read_parameters(start, asked) + bytes(device_ids)
-            return self._ask(BROADCAST_ID, SYNC_READ, parameters, asked, device_ids)
-
-        replies = self._transact(f"sync read of {size} bytes at {address}", device_ids, attempt)
-        return {device_id: replies[device_id].data[skipped : skipped + size] for device_id in device_ids}
 
     def write(self, device_id: int, register: Register, value: int, *, answered: bool = True) -> None:
         """Write a register; with ``answered`` False do not wait for a reply, which the servo may be set not to send."""
@@ -197,7 +178,7 @@ class DynamixelBus:
                     self._alerts |= {reply.bus_id: reply.alert for reply in replies.values()}
                     rejected = next((reply for reply in replies.values() if reply.error), None)
                     if rejected:
-                        self.statistics.refused += 1
+                        self.statistics.rejected += 1
                         raise self._rejected(what, rejected)
                     return replies
                 self._count(result)

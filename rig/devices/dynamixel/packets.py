@@ -12,8 +12,7 @@ from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler, Protocol2PacketH
 
 from rig.devices.dynamixel.port import ClockedPort
 
-PING, READ, WRITE, REBOOT, SYNC_READ = 0x01, 0x02, 0x03, 0x08, 0x82
-BROADCAST_ID = 0xFE
+PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 
 _HEADER = b"\xff\xff\xfd"
 _STUFFED = _HEADER + b"\xfd"

@@ -116,15 +116,6 @@ def test_samples_sum_to_the_rotation_for_any_reading_pattern(angles: list[float]
             assert turned == pytest.approx(angle, abs=0.03)
 
 
-def test_heading_is_counter_clockwise_and_within_a_revolution(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
-        start = imu.heading_deg()
-        now_s = bench.clock.now_ns() * 1e-9
-        bench.world.drive(to_position(now_s, 0.0, 0.0, 90.0, 90.0, 300.0))
-        bench.clock.sleep(3.0)
-        assert (imu.heading_deg() - start) % 360 == pytest.approx(90.0, abs=0.1)
-
-
 def test_long_gap_counts_as_lost_samples(bench: Bench) -> None:
     with closing(bench.open()) as imu:
         imu.read_samples()
@@ -154,7 +145,7 @@ def test_reset_while_running_is_detected(bench: Bench) -> None:
         with pytest.raises(DeviceSilent, match="acknowledge"):
             imu.read_samples()
         bench.clock.sleep(SILENT_S)
-        for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c, imu.heading_deg, imu.calibration):
+        for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c, imu.calibration):
             with pytest.raises(DeviceFault, match="supply was interrupted") as caught:
                 reading()
         assert caught.value.evidence["operating_mode"] == {"got": 0, "expected": 8}

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.config import ServoConfig, load_config
+from rig.config import load_config
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent, RequestRejected, UsageError
 from rig.devices.dynamixel import settings as permanent
 from rig.devices.dynamixel.opening import open_servo
@@ -21,7 +21,6 @@ from sim.servo.ax12 import DEG_PER_COUNT
 from sim.servo.models import MODELS
 from sim.servo.motor import OVERLOAD_S
 from sim.world import World
-from tests.rig.bench_parts import servo_wires
 
 
 def parts_of(*overrides: str, noise: NoiseModel | None = None) -> SimDevices:
@@ -336,16 +335,3 @@ def test_pan_servo_needs_the_position_mode() -> None:
     assert "Operating Mode" not in found  # the factory's
     found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, ServoMode.SPIN)}
     assert found["Operating Mode"] == 1
-
-
-def test_several_servos_are_read_in_one_transaction() -> None:
-    wires = servo_wires()
-    second = type(wires.device)(World(clock=wires.world.clock), "xl330_m288", bus_id=2)
-    wires.bus.attach(second)
-    servo = open_servo(wires.serial, ServoConfig(), wires.world.clock)
-    sent = len(wires.instructions)
-    assert servo.bus.sync_read((1, 2), 0, 2) == {1: (1060).to_bytes(2, "little"), 2: (1200).to_bytes(2, "little")}
-    assert len(wires.instructions) == sent + 1
-    wires.bus.detach(second)
-    with pytest.raises(DeviceSilent, match="Servo 2 "):
-        servo.bus.sync_read((1, 2), 0, 2)
