@@ -107,7 +107,7 @@ class SimI2cBus:
         return self._devices.pop(address)
 
     def nack(self, count: int = 1) -> None:
-        """Let nobody acknowledge the next ``count`` addresses."""
+        """Leave the next ``count`` addresses without an acknowledge."""
         self._nacks = count
 
     def cut_read(self, after_bytes: int) -> None:

@@ -95,10 +95,10 @@ class NoiseModel:
 
 
 def from_calibration(results: Iterable[CalibrationResult], base: NoiseModel | None = None) -> NoiseModel:
-    """Return the noise model of the bench on which ``results`` were calibrated, for the simulated bench beside it.
+    """Return the noise model of the bench that has these calibration results.
 
-    A value that differs from part to part becomes a spread as wide as the part's own error: worlds of other seeds are
-    other parts as good as that one. What no result tells is as in ``base``.
+    For a value that differs from part to part, the standard deviation is the measured error, so other seeds give other
+    parts of the same quality. Values without a calibration result are those of ``base``.
     """
     values: dict[str, float] = {}
     for result in results:

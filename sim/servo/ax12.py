@@ -160,7 +160,7 @@ class Ax12Servo:
     shaft
         What it turns.
     bus_id, baudrate
-        As left by whoever set the servo up.
+        Its settings before the test.
     center_counts
         What the position reads at the shaft's angle 0.
 

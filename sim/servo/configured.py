@@ -27,6 +27,6 @@ def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
     except ValueError as error:
         raise ConfigError(
             "The simulated bench has no such servo.",
-            next_step="Mend servo.model or servo.baud.",
+            next_step="Correct servo.model or servo.baud.",
             evidence={"reason": str(error)},
         ) from error

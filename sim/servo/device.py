@@ -42,7 +42,7 @@ class XSeriesServo:
     model
         A name of `sim.servo.models.MODELS`.
     bus_id, baudrate
-        As left by whoever set the servo up; Factory Reset goes back to 1 and 57,600.
+        Its settings before the test; Factory Reset restores 1 and 57,600.
     firmware
         Firmware Version; the model's usual one where not given.
     center_counts

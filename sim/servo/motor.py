@@ -177,7 +177,7 @@ class Motor:
             The shaft is driven or jammed.
         """
         if self._driven or self._jammed:
-            raise ValueError("nobody turns a shaft that is held: switch the servo's torque off and free it first")
+            raise ValueError("A held shaft cannot be rotated: switch the servo's torque off and free it first.")
         angle, speed = self._world.shaft()
         self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, v_max, a_max))
         return self.commanded.end_s - self._now_s()

@@ -1,4 +1,4 @@
-"""The built-in objects: geometry, orientation, symmetry, and what tells them apart."""
+"""The built-in objects: geometry, orientation, symmetry, and differences."""
 
 import numpy as np
 import pytest

@@ -42,7 +42,7 @@ class Head(RuleBasedStateMachine):
         self.head = SimHead(self.world)
         self.link = HeadLink(HeadSerial(self.head), self.world.clock, lambda _event: None, "head")
         self.link.start()
-        self.told: HeartbeatReply | None = None
+        self.reply: HeartbeatReply | None = None
         self.deadman_ns = 0
         self.beaten_ns: int | None = None
         self.acknowledged_ns = 0
@@ -68,7 +68,7 @@ class Head(RuleBasedStateMachine):
     @rule(deadman_ms=st.sampled_from([DEADMAN_MIN_MS, 100, 250, DEADMAN_MAX_MS]))
     def beat(self, deadman_ms):
         self.expire()
-        self.told = self.link.request(Heartbeat(deadman_ms), HeartbeatReply)
+        self.reply = self.link.request(Heartbeat(deadman_ms), HeartbeatReply)
         self.deadman_ns, self.beaten_ns = deadman_ms * MS, self.link.heard_ns
 
     @rule(level=st.integers(0, 255))
@@ -173,11 +173,11 @@ class Head(RuleBasedStateMachine):
 
     @invariant()
     def it_tells_what_it_does(self):
-        if getattr(self, "told", None) is not None:
-            told, self.told = self.told, None
-            assert HeadFault(told.faults) == self.latched
-            assert (told.state == HeadState.FAULT) == bool(self.latched)
-            assert told.state != HeadState.IDLE
+        if getattr(self, "reply", None) is not None:
+            reply, self.reply = self.reply, None
+            assert HeadFault(reply.faults) == self.latched
+            assert (reply.state == HeadState.FAULT) == bool(self.latched)
+            assert reply.state != HeadState.IDLE
 
 
 TestHead = pytest.mark.skipif(bool(missing("memory")), reason=missing("memory"))(Head.TestCase)

@@ -34,9 +34,9 @@ def test_program_with_pyserial_finds_a_head(kind, tmp_path):
     command = [sys.executable, "-c", "from rig.cli.main import main; main()", *arguments]
     program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=tmp_path)
     try:
-        told = json.loads(program.stdout.readline())
-        assert told["kind"] == kind
-        assert (tmp_path / "head").resolve() == (tmp_path / told["port"]).resolve()
+        started = json.loads(program.stdout.readline())
+        assert started["kind"] == kind
+        assert (tmp_path / "head").resolve() == (tmp_path / started["port"]).resolve()
         clock = SystemClock()
         wire = open_serial(str(tmp_path / "head"), BAUD, "head")
         head = answering(lambda: RigHead(wire, clock, mpu6050(), deadman_s=2.0), clock)

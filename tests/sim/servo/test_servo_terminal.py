@@ -32,8 +32,8 @@ def sim_servo(tmp_path: Path) -> Iterator[Callable[..., dict[str, Any]]]:
         process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
         running.append(process)
         assert process.stdout is not None
-        told: dict[str, Any] = json.loads(process.stdout.readline())
-        return told | {"process": process}
+        started: dict[str, Any] = json.loads(process.stdout.readline())
+        return started | {"process": process}
 
     yield start
     for process in running:
@@ -45,8 +45,8 @@ def sim_servo(tmp_path: Path) -> Iterator[Callable[..., dict[str, Any]]]:
 
 def test_rustypot_drives_an_xl430(sim_servo: Callable[..., dict[str, Any]]) -> None:
     rustypot = pytest.importorskip("rustypot")
-    told = sim_servo("--id", "1", "--id", "4")
-    servo = rustypot.Xl430PyController(told["port"], 1_000_000, 0.5)
+    started = sim_servo("--id", "1", "--id", "4")
+    servo = rustypot.Xl430PyController(started["port"], 1_000_000, 0.5)
     assert [servo.ping(i) for i in (1, 4)] == [True, True]
     assert servo.read_model_number(1) in (1060, [1060])
     servo.write_operating_mode(1, 4)
@@ -64,8 +64,8 @@ def test_rustypot_drives_an_xl430(sim_servo: Callable[..., dict[str, Any]]) -> N
 
 def test_rustypot_drives_an_ax12(sim_servo: Callable[..., dict[str, Any]]) -> None:
     rustypot = pytest.importorskip("rustypot")
-    told = sim_servo("--set", "servo.model=ax_12a")
-    servo = rustypot.AxPyController(told["port"], 1_000_000, 0.5)
+    started = sim_servo("--set", "servo.model=ax_12a")
+    servo = rustypot.AxPyController(started["port"], 1_000_000, 0.5)
     assert servo.ping(1)
     assert servo.read_model_number(1) in (12, [12])
     assert servo.read_raw_present_position(1) in (512, [512])
@@ -100,7 +100,7 @@ def test_sdk_and_rig_driver_find_the_servo(sim_servo: Callable[..., dict[str, An
 
 
 def test_stop_removes_the_link_and_ends_reads(sim_servo: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
-    told = sim_servo("--link", str(tmp_path / "servo"))
-    told["process"].send_signal(signal.SIGTERM)
-    assert told["process"].wait(10) == 143
+    started = sim_servo("--link", str(tmp_path / "servo"))
+    started["process"].send_signal(signal.SIGTERM)
+    assert started["process"].wait(10) == 143
     assert not os.path.lexists(tmp_path / "servo")
