@@ -242,12 +242,12 @@ class EnrollView(LiveView):
 
 
 class IdentifyView(LiveView):
-    """The candidates after each view, with scores, lead and pose, and each decision in words.
+    """The candidates after each view, and the decisions.
 
     Parameters
     ----------
     console
-        Where.
+        The terminal or the pipe to print to.
     """
 
     def __init__(self, console: Console) -> None:

@@ -1,4 +1,4 @@
-"""What a person sees while a plan runs, on terminals of all sizes and in a pipe; pausing; being asked."""
+"""The display of a running plan on terminals and in pipes; pauses; prompts for the operator."""
 
 import io
 import os
@@ -52,7 +52,7 @@ def shown(console: Console, view: LiveView, events: list[Event]) -> str:
 
 
 @pytest.mark.parametrize("width", [30, 40, 60, 72, 88, 100, 200])
-def test_the_table_of_an_enrollment_fits_the_terminal(width):
+def test_enrollment_table_fits_the_terminal(width):
     console = screen(width)
     text = shown(console, EnrollView(console, load_config(), "3 of 25"), enrolled_with_similar_objects())
     assert "accepted" in text.replace("\n", "")
@@ -61,7 +61,7 @@ def test_the_table_of_an_enrollment_fits_the_terminal(width):
     assert "8 views enrolled" in " ".join(text.split())
 
 
-def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
+def test_enrollment_in_a_pipe_has_one_line_for_each_view():
     console = screen(80, terminal=False)
     view = EnrollView(console, load_config(), "3 of 25")
     text = shown(console, view, enrolled_with_similar_objects())
@@ -84,7 +84,7 @@ def test_in_a_pipe_every_view_is_a_line_with_all_numbers():
 
 @pytest.mark.parametrize("width", [30, 60, 120])
 @pytest.mark.parametrize("answer", ["mug-white", None])
-def test_the_candidates_are_seen_after_each_view_and_every_decision_in_words(width, answer):
+def test_search_shows_candidates_and_decisions(width, answer):
     console = screen(width)
     text = shown(console, IdentifyView(console), [Waiting(WaitReason.NEXT_OBJECT), *identifying(answer)])
     flat = " ".join(text.split())
@@ -94,7 +94,7 @@ def test_the_candidates_are_seen_after_each_view_and_every_decision_in_words(wid
     assert "258° of rotation, 10 s." in flat
 
 
-def test_a_search_in_a_pipe_reads_as_lines():
+def test_search_in_a_pipe_is_printed_in_lines():
     console = screen(80, terminal=False)
     events = list(identifying())
     move = next(e for e in events if isinstance(e, Moved) and e.index == 1)
@@ -184,7 +184,7 @@ def keyboard(folder):
     keyboard.close()
 
 
-def test_a_key_pauses_and_goes_on_and_the_terminal_is_left_as_it_was(keyboard):
+def test_key_pauses_and_resumes_and_the_terminal_is_restored(keyboard):
     keyboard.type(" ")
     keyboard.until("Paused. The table holds its angle.")
     assert "24 views enrolled" not in keyboard.seen
@@ -195,7 +195,7 @@ def test_a_key_pauses_and_goes_on_and_the_terminal_is_left_as_it_was(keyboard):
     assert termios.tcgetattr(keyboard.slave) == keyboard.before
 
 
-def test_ctrl_c_during_a_pause_keeps_the_views_and_says_how_to_go_on(keyboard):
+def test_ctrl_c_during_a_pause_stores_the_views_and_prints_how_to_continue(keyboard):
     keyboard.type("p")
     keyboard.until("Paused")
     keyboard.process.send_signal(signal.SIGINT)
@@ -213,7 +213,7 @@ def wait(condition: Callable[[], bool]) -> None:
     raise AssertionError("it did not come to that")
 
 
-def test_sigtstp_stops_between_two_views_and_sigcont_goes_on(folder):
+def test_sigtstp_pauses_between_two_views_and_sigcont_resumes(folder):
     process = subprocess.Popen(
         [*RIG, "enroll", "dice", "--views", "12"], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -236,7 +236,7 @@ def asked(answers: str, kept: ObjectSummary | None = None) -> tuple[TrayDecision
     return person.request(TrayItem(2, "mug", "kitchen"), 3, 25, kept), questions.getvalue()
 
 
-def test_a_person_is_asked_for_the_next_object():
+def test_operator_is_asked_for_the_next_object():
     answer, question = asked("\n")
     assert answer is TrayDecision.PROCEED
     assert question.startswith("3 of 25: put mug (kitchen) on the table")
@@ -246,7 +246,7 @@ def test_a_person_is_asked_for_the_next_object():
     assert asked("")[0] is TrayDecision.STOP
 
 
-def test_a_person_is_asked_whether_an_interrupted_object_was_moved():
+def test_operator_is_asked_whether_an_interrupted_object_was_moved():
     clock = SystemClock()
     kept = ObjectSummary("mug", "", "", clock.utc(), None, 0, 31)
     answer, question = asked("n\n", kept)
@@ -255,7 +255,7 @@ def test_a_person_is_asked_whether_an_interrupted_object_was_moved():
     assert asked("\n", kept)[0] is TrayDecision.PROCEED
 
 
-def test_a_person_decides_what_becomes_of_an_object_that_failed():
+def test_operator_decides_about_an_object_that_failed():
     error = ViewRejected("View 3 was rejected: too dark.", next_step="Check the light.")
     for said, expected in (("\n", TrayDecision.PROCEED), ("s\n", TrayDecision.SKIP), ("q\n", TrayDecision.STOP)):
         questions = io.StringIO()
@@ -265,7 +265,7 @@ def test_a_person_decides_what_becomes_of_an_object_that_failed():
         assert "Check the light" in questions.getvalue()
 
 
-def test_where_nobody_can_be_asked_that_is_said():
+def test_unreadable_input_is_a_usage_error():
     class Closed(io.StringIO):
         def readline(self, *_: object) -> str:
             raise OSError("no input")
@@ -274,7 +274,7 @@ def test_where_nobody_can_be_asked_that_is_said():
         OperatorPrompts(questions=io.StringIO(), answers=Closed()).request(TrayItem(2, "mug"), 1, 1, None)
 
 
-def test_items_that_are_skipped_are_told():
+def test_skipped_objects_are_reported():
     console = screen(80, terminal=False)
     text = shown(console, EnrollView(console, load_config()), [Item(1, 2, "mug", "skip", SkipReason.ALREADY_ENROLLED)])
     assert text == "1 of 2  mug: skipped, it is already enrolled\n"
