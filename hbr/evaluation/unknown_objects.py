@@ -42,6 +42,7 @@ def left_out(protocol: Protocol, names: tuple[str, ...], count: int, draws: int)
         raise ValueError(f"{count} of {len(names)} objects cannot be left out; at least two must stay enrolled")
     drawn = []
     for draw in range(draws):
+        # "strangers" seeds the draws of the published figures: another word would draw other objects.
         absent = generator(protocol.seed, "strangers", "trial", draw).choice(len(names), count, replace=False)
         chosen = tuple(names[j] for j in sorted(absent.tolist()))
         drawn.append(replace(protocol, absent=chosen, seed=protocol.seed + draw))

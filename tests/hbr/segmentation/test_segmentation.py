@@ -272,12 +272,12 @@ def test_code_of_the_descriptors_page_runs(monkeypatch: pytest.MonkeyPatch) -> N
         "frame": with_object(empty),
         "views": hbr.Views.concatenate(parts),
         "orientation_deg": 0.0,
-        "turns": [-90.0, 45.0],
+        "rotations_deg": [-90.0, 45.0],
     }
     for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(code, known)
     assert known["seen"].box is not None
-    assert known["verdict"].kind == "look"
-    assert known["look"].rotation_deg in known["turns"]
+    assert known["decision"].outcome in hbr.Outcome
+    assert known["best"].rotation_deg in known["rotations_deg"]
     named = set(re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE))
     assert named == {*hbr.descriptors.names(), "onnx:FILE"}

@@ -314,7 +314,7 @@ def test_rest_drops_the_rotation_of_an_interrupted_move(bench: Bench) -> None:
     bench.heading.begin()
     bench.drive(20.0)
     bench.clock.sleep(0.8)
-    bias = bench.heading.rest()  # judges only what comes from now on
+    bias = bench.heading.rest()  # checks only the samples from now on
     assert bias.samples == pytest.approx(100, abs=3)
     with pytest.raises(NotReady, match="begun"):
         bench.heading.end()
