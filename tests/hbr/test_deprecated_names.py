@@ -32,7 +32,7 @@ def test_judge_decides_by_the_rule() -> None:
     index = hbr.DenseIndex(views)
     rule = hbr.calibrate_stopping_rule(index).rule
     belief = hbr.update_belief(views.descriptors[0], 0.0, index)
-    with pytest.warns(DeprecationWarning):
+    with pytest.warns(DeprecationWarning, match="StoppingRule.decide"):
         judge = hbr.judge
     assert judge(belief, rule, max_views=3) == rule.decide(belief, max_views=3)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):

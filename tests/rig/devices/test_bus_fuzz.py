@@ -127,7 +127,7 @@ def test_noise_is_never_a_value_or_an_acknowledgement(protocol: int, noise: list
     assert bus.port.clock.now_ns() < 2 * ANSWER_S * 1e9
 
 
-# -- I2C: no sums, so that only what the bytes say about each other can be checked --------------------------------------
+# -- I2C: no sums, so that only what the bytes say about each other can be checked
 
 
 class Spoiler:
