@@ -55,24 +55,24 @@ def test_region_follows_the_object_after_the_camera_moved(rig):
 
     note = " ".join(rig("enroll", "mug-dots", "--views", "8").stderr.split())
     assert region(rig, "mug-dots") == follows
-    assert f"described within {BEFORE}, view.roi is {follows} since the axis was calibrated" in note
+    assert f"enrolled with view.roi = {BEFORE}; now it is {follows} (axis calibration)" in note
     assert f"rig catalog redescribe --region {','.join(map(str, follows))}" in note
-    assert "with --replace" in note
+    assert "--replace" in note
     rig("catalog", "redescribe", "--region", ",".join(map(str, follows)))
     found = rig("identify", "--set", "bench.sim.object=mug-dots", "--json")
-    assert "described within" not in found.stderr
+    assert "enrolled with view.roi" not in found.stderr
     assert json.loads(found.stdout.splitlines()[-1])["name"] == "mug-dots"
 
     assert f"    sets view.roi = {follows}" in rig("calibrate", "show").stdout
     written = rig("identify", "--set", "bench.sim.object=mug-dots", "--set", f"view.roi={BEFORE}").stderr
     assert "of the configuration takes precedence over" in written
-    assert f"described within {follows}, view.roi is {BEFORE}" in " ".join(written.split())
+    assert f"enrolled with view.roi = {follows}; now it is {BEFORE}" in " ".join(written.split())
     other = rig("identify", "--set", "bench.sim.object=mug-dots", seed=3).stderr
     assert "table.axis was calibrated on another device: conditions.seed was 2, is 3" in " ".join(other.split())
 
     assert rig("enroll", "mug-star", "--views", "4", "--replace").exit_code == 0
     taller = rig("calibrate", "table", "--height-mm", "120")
     assert taller.exit_code == 0, taller.output
-    assert "described within" not in rig("identify").stderr, (
+    assert "enrolled with view.roi" not in rig("identify").stderr, (
         "regions that followed the objects then and follow them now"
     )
