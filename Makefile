@@ -45,7 +45,7 @@ wheel: $(READY)
 bench: $(READY)
 	@for file in benchmarks/bench_*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
 
-# Locked versions with their hashes, for every platform and Python that the project supports.
+# Locked versions with their hashes, for every platform and Python that the project supports (docs/decisions/0006).
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock

@@ -92,6 +92,12 @@ def test_decisions_have_consecutive_numbers_and_are_listed():
         assert re.findall(r"^## (.*)$", text, re.MULTILINE) == ["Decision", "Reasons", "Consequences"]
 
 
+def test_every_decision_is_named_where_it_applies():
+    sources = [ROOT / "Makefile", *(path for package in generate.PACKAGES for path in (ROOT / package).rglob("*.py"))]
+    named = {n for path in sources for n in re.findall(r"docs/decisions/(\d{4})", path.read_text(encoding="utf-8"))}
+    assert named == {path.name[:4] for path in DOCS.glob("decisions/0*.md")}
+
+
 def test_architecture_picture_shows_every_room():
     svg = architecture.picture()
     for package in ("rig", "hbr"):
