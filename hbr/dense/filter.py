@@ -8,6 +8,8 @@ hypothesis (j, φ): object j, with azimuth φ at the first query. A query i, tur
 where k runs over all views of the object and away is how far the azimuth lies outside the arc of view k, which reaches
 half-way to its neighbours: an azimuth between two enrolled views is as good as one on a view, also where a view lacks.
 The power p lets a query that meets an enrolled view well say more than one that lies between two.
+
+Decision: docs/decisions/0025.
 """
 
 from copy import copy

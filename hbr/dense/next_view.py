@@ -1,4 +1,7 @@
-"""Where to look next, by what is believed: the turn after which the strongest hypotheses are least similar."""
+"""Where to look next, by what is believed: the turn after which the strongest hypotheses are least similar.
+
+Decision: docs/decisions/0032.
+"""
 
 from dataclasses import dataclass
 from typing import Final

@@ -2,6 +2,8 @@
 
 `leave_one_out` searches for every object of a catalog, `fit_stopping_rule` sets the thresholds from these searches, and
 `StoppingRule.decide` applies them after each view of a search.
+
+Decision: docs/decisions/0026.
 """
 
 from dataclasses import dataclass, field

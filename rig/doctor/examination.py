@@ -1,4 +1,7 @@
-"""Run the checks of a bench, each in a thread: a check that hangs or fails becomes a finding."""
+"""Run the checks of a bench, each in a thread: a check that hangs or fails becomes a finding.
+
+Decision: docs/decisions/0013.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress

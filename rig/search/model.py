@@ -1,4 +1,7 @@
-"""What a search compares views with: the enrolled views by one descriptor, and the stopping rule."""
+"""What a search compares views with: the enrolled views by one descriptor, and the stopping rule.
+
+Decision: docs/decisions/0030.
+"""
 
 from contextlib import suppress
 from dataclasses import dataclass, field

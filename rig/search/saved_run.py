@@ -3,6 +3,8 @@
 ``run.json`` has the conditions and settings, ``model.jsonl`` the enrolled views, an object a line, ``events.jsonl``
 what happened, an event a line, and ``frames/000.png``, ... the accepted frames, lossless. Of a dense search
 ``search_rules.json`` has the rules that it went by, ``empty_table.png`` the picture that the object was found with.
+
+Decision: docs/decisions/0018.
 """
 
 import json

@@ -4,6 +4,8 @@
 name through the entry-point group `rig.strategies`. The attribute ``descriptor`` of a strategy says which views it is
 shown: without it, the paper's (`Strategy`, `SearchState`); with the bench's own descriptor, those of the dense search
 (`DenseStrategy`, `DenseSearchState`).
+
+Decision: docs/decisions/0017.
 """
 
 from collections.abc import Callable

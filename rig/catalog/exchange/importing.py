@@ -1,4 +1,7 @@
-"""Import objects: check and describe their images in a staging folder, then insert all of them at once."""
+"""Import objects: check and describe their images in a staging folder, then insert all of them at once.
+
+Decision: docs/decisions/0015.
+"""
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
