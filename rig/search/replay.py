@@ -13,6 +13,8 @@ from rig.views.description import ViewDescriber
 
 TOLERANCE: Final = 1e-9
 """Numbers that differ less are equal: another machine may sum in another order."""
+EARLIER_TOLERANCE: Final = 1e-3
+"""For runs of formats 1 and 2: similarities had errors of up to 5e-6 then, which exponents in the belief multiply."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +55,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
         The run cannot be read, or its strategy is not known.
     """
     started = run.started
+    tolerance = TOLERANCE if run.is_current else EARLIER_TOLERANCE
     found = Check()
     search: Search | None = None
     describe = ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
@@ -75,9 +78,8 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 ranked, step = search.add(levels, event.azimuth_deg, table_deg=table_deg)
                 found.views += 1
                 if event.segmentation is not None:
-                    found.differences += _compare(
-                        found.views, "segmentation", event.segmentation, plain(view.segmentation)
-                    )
+                    saved, again = event.segmentation, plain(view.segmentation)
+                    found.differences += _compare(found.views, "segmentation", saved, again, tolerance)
             case Ranked() if ranked is not None:
                 # A run names as many candidates as it was asked for.
                 computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
@@ -96,7 +98,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             for name in run.not_saved(event):
                 saved.pop(name, None)
                 again.pop(name, None)
-            found.differences += _compare(found.views, "", saved, again)
+            found.differences += _compare(found.views, "", saved, again, tolerance)
     return found
 
 
@@ -116,16 +118,16 @@ def _decided(step: Rotate | Finish | None, saved: Decided) -> Decided | dict[str
     )
 
 
-def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[Difference]:
+def _compare(view: int, where: str, saved: Any, computed: Any, tolerance: float) -> Iterator[Difference]:
     """Yield what differs, field by field."""
     if isinstance(saved, dict) and isinstance(computed, dict):
         for key in {**saved, **computed}:
-            yield from _compare(view, f"{where}.{key}" if where else key, saved.get(key), computed.get(key))
+            yield from _compare(view, f"{where}.{key}" if where else key, saved.get(key), computed.get(key), tolerance)
     elif isinstance(saved, list) and isinstance(computed, list) and len(saved) == len(computed):
         for number, (a, b) in enumerate(zip(saved, computed, strict=True), 1):
-            yield from _compare(view, f"{where} {number}", a, b)
+            yield from _compare(view, f"{where} {number}", a, b, tolerance)
     elif isinstance(saved, float) and isinstance(computed, float):
-        if not isclose(saved, computed, rel_tol=TOLERANCE, abs_tol=TOLERANCE):
+        if not isclose(saved, computed, rel_tol=tolerance, abs_tol=tolerance):
             yield Difference(view, where, saved, computed)
     elif saved != computed:
         yield Difference(view, where, saved, computed)

@@ -182,7 +182,7 @@ class SavedRun:
         """
         for number, line in enumerate(self._lines, 1):
             try:
-                yield event_of(line if self._current else upgraded(line), self._frame)
+                yield event_of(line if self.is_current else upgraded(line), self._frame)
             except (KeyError, TypeError, ValueError) as error:
                 raise _damaged(self.folder, f"events.jsonl, line {number}: {error}") from error
 
@@ -202,10 +202,11 @@ class SavedRun:
 
     def not_saved(self, event: Event) -> tuple[str, ...]:
         """Return the fields of an event that the run's format does not have."""
-        return () if self._current else NOT_SAVED.get(type(event), ())
+        return () if self.is_current else NOT_SAVED.get(type(event), ())
 
     @property
-    def _current(self) -> bool:
+    def is_current(self) -> bool:
+        """Whether the run has the format of this version."""
         return bool(self.about["version"] == VERSION)
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
