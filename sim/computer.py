@@ -61,8 +61,8 @@ class ComputerFiles:
         """Connect a U2D2 (an FTDI adapter); ``by_id`` is its stable name."""
         self._usb += 1
         usb = f"sys/devices/usb1/1-{self._usb}"
-        facts = {"idVendor": "0403", "idProduct": "6014", "manufacturer": "FTDI", "product": "USB <-> Serial Converter"}
-        for key, value in {**facts, "serial": serial}.items():
+        chip = {"idVendor": "0403", "idProduct": "6014", "manufacturer": "FTDI", "product": "USB <-> Serial Converter"}
+        for key, value in {**chip, "serial": serial}.items():
             self.write(f"{usb}/{key}", f"{value}\n")
         port = self.root / usb / f"1-{self._usb}:1.0" / name
         port.mkdir(parents=True)

@@ -113,10 +113,10 @@ def to_velocity(start_s: float, position_deg: float, velocity_dps: float, goal_d
 
 
 class Platter:
-    """The platter on the shaft: free play (a play operator) and a damped structural vibration.
+    """The platter on the shaft: backlash and a damped structural vibration.
 
-    The play operator keeps the platter within ±play/2 of the shaft and otherwise leaves it where friction holds it.
-    The vibration is x'' + 2ζω x' + ω² x = −a(t), solved exactly for each piece of constant shaft acceleration a.
+    The backlash operator keeps the platter within ±backlash/2 of the shaft; otherwise friction holds the platter. The
+    vibration is x'' + 2ζω x' + ω² x = −a(t), solved exactly for each piece of constant shaft acceleration a.
     """
 
     def __init__(self, play_deg: float, structure_hz: float, damping: float) -> None:

@@ -256,7 +256,7 @@ class DenseRanking:
 def update_belief(
     query: LevelArray, orientation_deg: float, so_far: DenseIndex | Belief, *, kept: int = KEPT
 ) -> Belief:
-    """Add a query to what is believed.
+    """Add a query to the belief.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def update_belief(
     orientation_deg : float
         Orientation of the camera around the object, counter-clockwise, from any zero that all queries share.
     so_far : DenseIndex or Belief
-        The enrolled views for the first query, what was believed before for any other.
+        The enrolled views for the first query, the belief so far for any other.
     kept : int
         Objects that are considered further after the first query: those with the most similar views.
 

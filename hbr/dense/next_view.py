@@ -1,4 +1,4 @@
-"""Where to look next, by what is believed: the turn after which the strongest hypotheses are least similar.
+"""The next best view, by the belief: the rotation after which the strongest hypotheses are least similar.
 
 Decision: docs/decisions/0032.
 """
@@ -99,19 +99,19 @@ def next_best_view(
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
     probability, place, bin_of = _strongest(belief.posterior(beta))
     cost = second_costs * times_s
-    rivals = probability[:, None] * probability * (place[:, None] != place)
-    if rivals.any():
+    pairs = probability[:, None] * probability * (place[:, None] != place)
+    if pairs.any():
         similar, known = _expected(belief, place, bin_of, turns_deg)
         tells = novelty[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :])
-        remaining = rivals * np.exp(-sharpness * tells * (1 - similar))
+        remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
         confusion = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
     else:  # one object alone: what is new helps its azimuth
         confusion = -sharpness * novelty
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
     similarity: FloatArray | None = None
-    if rivals.any():
-        gained = rivals - remaining[chosen]
+    if pairs.any():
+        gained = pairs - remaining[chosen]
         first, second = np.unravel_index(int(gained.argmax()), gained.shape)
         objects = belief.index.object_index
         ordered = sorted((first, second), key=lambda i: -probability[i])
@@ -161,8 +161,8 @@ def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArra
     best = np.argpartition(-weight, count - 1)[:count]
     best = best[np.argsort(-weight[best], kind="stable")]
     place, bin_of = np.divmod(best, posterior.shape[1])
-    rival = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
-    enough = max(1 + int(np.searchsorted(np.cumsum(weight[best]), 1 - _NEGLIGIBLE)), rival + 1)
+    second = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
+    enough = max(1 + int(np.searchsorted(np.cumsum(weight[best]), 1 - _NEGLIGIBLE)), second + 1)
     best, place, bin_of = best[:enough], place[:enough], bin_of[:enough]
     return weight[best], place, bin_of
 

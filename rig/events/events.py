@@ -89,7 +89,7 @@ class Moved:
     """The table turned and is at rest.
 
     Angles of the table in degrees, unwrapped. ``agrees`` says whether encoder and gyro measured the same rotation
-    within ``bound_deg``; when they do not, the platter's gyro is believed.
+    within ``bound_deg``; when they do not, the gyro on the platter is trusted.
     """
 
     index: int

@@ -119,7 +119,7 @@ class EnrollmentRecord:
             self.similar = event
 
     def complete(self, stored: Iterable[tuple[ViewRecord, Image]]) -> None:
-        """Add the stored views that were not taken under these eyes: those of the sittings before."""
+        """Add the stored views of earlier sessions, which this report did not see."""
         seen = {view.index for view in self.views}
         for record, image_bgr in stored:
             if record.index not in seen:
@@ -135,7 +135,7 @@ class Truth:
     """The object that is really on the table.
 
     ``name`` is None for an object that was never enrolled. ``yaw_deg`` is how far it stands turned counter-clockwise
-    against its enrollment, None where nobody knows. ``symmetry_deg`` is the smallest turn after which it looks the
+    against its enrollment, None if it is not known. ``symmetry_deg`` is the smallest turn after which it looks the
     same: 360 for an object without symmetry, 0 for one that looks the same from everywhere. ``description`` is what
     people call an object that was never enrolled.
     """

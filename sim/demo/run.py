@@ -189,7 +189,7 @@ def run_demo(
             "identify": config.identify.model_dump(mode="json"),
             "noise model": asdict(world.noise),
             **({} if change is None else {"changed between enrollment and query": asdict(change)}),
-            **{f"device: {name}": facts for name, facts in devices.items()},
+            **{f"device: {name}": identity for name, identity in devices.items()},
         },
         wall_clock={"run at": f"{begun:%Y-%m-%d %H:%M} UTC", "took": f"{wall_s:.1f} s"},
     )

@@ -148,7 +148,7 @@ def platter(play_deg: float, structure_hz: float = 0.0, damping: float = 0.15) -
 
 
 def play_operator(shaft: np.ndarray, start: float, half_play: float) -> np.ndarray:
-    """Return the play operator by its definition, sample by sample."""
+    """Return the backlash operator by its definition, sample by sample."""
     angle, held = np.empty_like(shaft), start
     for i, x in enumerate(shaft):
         held = min(max(held, x - half_play), x + half_play)
@@ -158,7 +158,7 @@ def play_operator(shaft: np.ndarray, start: float, half_play: float) -> np.ndarr
 
 @quick
 @given(trajectories(), st.floats(0, 3))
-def test_backlash_is_the_play_operator_and_stays_within_its_half(path: Trajectory, play_deg: float) -> None:
+def test_backlash_follows_its_operator_and_stays_within_its_half(path: Trajectory, play_deg: float) -> None:
     follower = Platter(play_deg, 0.0, 0.0)
     follower.follow(path, None)
     times = samples(path, 2_000)
@@ -171,7 +171,7 @@ def test_backlash_is_the_play_operator_and_stays_within_its_half(path: Trajector
 @quick
 @given(st.floats(0.01, 3), st.floats(5, 100), st.floats(5, 100))
 def test_backlash_is_a_hysteresis(play_deg: float, there: float, back: float) -> None:
-    """Coming from below the platter lags by half the play, from above it leads by half."""
+    """Coming from below the platter lags by half of the backlash, from above it leads by half."""
     follower = platter(play_deg)
     for k, goal in enumerate((there, there - back)):
         x = float(follower.at(10.0 * k)[0]) if k else 0.0
@@ -195,7 +195,7 @@ def test_rate_is_the_derivative_of_the_platters_angle(
     t = np.random.default_rng(seed).uniform(path.start_s[0] + 2 * h, path.end_s + 0.5, 300)
     (before, rate_before), (after, rate_after) = follower.at(t - h), follower.at(t + h)
     slope = (after - before) / (2 * h)
-    # Nothing jumps, not even where the play engages and with it the rate.
+    # Nothing jumps, not even where the backlash engages and with it the rate.
     rate = follower.at(t)[1]
     fastest = np.maximum(np.maximum(np.abs(rate_before), np.abs(rate_after)), np.abs(rate))
     assert np.all(np.abs(slope) <= fastest + 0.5)

@@ -53,8 +53,8 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
     """See to it that the bench has an empty-table image of today before objects are put on the table.
 
     An operator that can clear the table by itself does so. Otherwise the operator is asked at the terminal if ``ask``
-    is set; ``then`` names the object to put on the table afterwards. If nobody can be asked, a note says that the work
-    continues with the old image or without one.
+    is set; ``then`` names the object to put on the table afterwards. If the operator cannot be asked, a note
+    says that the work continues with the old image or without one.
     """
     from rig.bench import ObjectAlreadyPlaced, TableClearer
     from rig.core.errors import TableNotEmpty, ViewRejected

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, tanimoto, update_belief
 from hbr.dense.filter import BINS, Belief
-from tests.hbr.dense.searches import believe_all
+from tests.hbr.dense.searches import belief_after
 
 
 def catalog(seed: int, objects: int = 4, *, ragged: bool = True) -> Views:
@@ -52,7 +52,7 @@ def test_support_is_the_formula_s_at_every_azimuth_of_every_object(
 ) -> None:
     views = catalog(seed, objects=3)
     queries = catalog(seed + 1, ragged=False).descriptors[: len(angles)]
-    belief = believe_all(queries, angles, DenseIndex(views, omega=omega, power=power))
+    belief = belief_after(queries, angles, DenseIndex(views, omega=omega, power=power))
     wanted = written_out(queries, angles, views, omega, power)
     np.testing.assert_allclose(belief.support, wanted, atol=2e-5)
     ranking = belief.ranking()
@@ -93,7 +93,7 @@ def test_a_view_that_is_left_out_counts_no_more() -> None:
 def test_turned_queries_agree_on_an_azimuth_and_its_mean_lies_between_the_bins() -> None:
     views = catalog(7, ragged=False)
     rows = views.of(2)
-    belief = believe_all(views.descriptors[rows[[1, 3, 6]]], [10.0, 100.0, 235.0], DenseIndex(views))
+    belief = belief_after(views.descriptors[rows[[1, 3, 6]]], [10.0, 100.0, 235.0], DenseIndex(views))
     ranking = belief.ranking()
     assert ranking.object_index[0] == 2
     assert abs((ranking.pose_deg[0] - views.azimuth_deg[rows[6]] + 180) % 360 - 180) < 2.5
@@ -103,8 +103,8 @@ def test_turning_the_zero_of_the_orientations_changes_nothing() -> None:
     views = catalog(9)
     queries = catalog(10, ragged=False).descriptors[:3]
     index = DenseIndex(views)
-    one = believe_all(queries, [0.0, 40.0, 170.0], index)
-    other = believe_all(queries, [-300.0, -260.0, 230.0], index)
+    one = belief_after(queries, [0.0, 40.0, 170.0], index)
+    other = belief_after(queries, [-300.0, -260.0, 230.0], index)
     np.testing.assert_allclose(one.support, other.support, atol=1e-6)
 
 

@@ -90,9 +90,9 @@ def test_the_expected_confusion_is_that_of_the_formula(start: int, sharpness: fl
         shown = [VIEWS.descriptors[VIEWS.of(j)[own.argmin()]] for j, own in zip(place.tolist(), away, strict=True)]
         known = np.exp(-0.5 * (np.array([own.min() for own in away]) / 15) ** 2)
         similar = np.array([[_tanimoto(a, b) for b in shown] for a in shown])
-        rivals = np.outer(probability, probability) * (place[:, None] != place)
+        pairs = np.outer(probability, probability) * (place[:, None] != place)
         assert confusion == pytest.approx(
-            np.log((rivals * np.exp(-sharpness * novelty * np.sqrt(np.outer(known, known)) * (1 - similar))).sum()),
+            np.log((pairs * np.exp(-sharpness * novelty * np.sqrt(np.outer(known, known)) * (1 - similar))).sum()),
             abs=1e-6,
         )
 

@@ -10,7 +10,7 @@ from hbr.core.angles import wrap180
 from hbr.evaluation.methods import METHODS, choose_methods
 from hbr.evaluation.protocol import OUTCOMES, Protocol, Runs, _Trials, rule_of_trial, run_object
 from hbr.evaluation.results import contests, method_results
-from tests.hbr.dense.searches import believe_all
+from tests.hbr.dense.searches import belief_after
 from tests.hbr.evaluation.test_protocol import QUERIES, STEP, VIEWS
 
 PROTOCOL = Protocol(trials=3, max_views=4, enrolled=8, removal="queries")
@@ -42,7 +42,7 @@ def test_a_trial_equals_the_protocol_written_out(name: str, protocol: Protocol) 
             whole = DenseIndex(VIEWS.select(mask), omega=METHODS[name].omega)
             gone = own[kept & ~mine]
             index = whole.without(np.searchsorted(np.flatnonzero(mask), gone))
-            belief = believe_all(QUERIES[own[seen]], angles + draws.error_deg[: n + 1], index)
+            belief = belief_after(QUERIES[own[seen]], angles + draws.error_deg[: n + 1], index)
             ranking = belief.ranking()
             assert runs.rank[0, 0, t, n] == ranking.object_index.tolist().index(j) + 1
             assert runs.score[0, 0, t, n] == ranking.scores[0]

@@ -31,8 +31,8 @@ def test_no_object_has_a_smaller_margin_even_off_the_lists(seed, objects, n, lis
     # With lists as long as the catalog every object is listed, with all of its views.
     everything = hbr.retrieve(queries, orientation, index, list_length=len(views))
     best = ranking.object_index[0]
-    rivals = everything.scores[everything.object_index != best]
-    assert hbr.score_margin(ranking, queries) <= ranking.scores[0] - rivals.max() + 1e-9
+    others = everything.scores[everything.object_index != best]
+    assert hbr.score_margin(ranking, queries) <= ranking.scores[0] - others.max() + 1e-9
     assert hbr.score_margin(ranking, queries) <= ranking.margin + 1e-9
 
 

@@ -88,7 +88,7 @@ def test_extension_projects_only_the_new_views(monkeypatch: pytest.MonkeyPatch) 
     grown = index.extended(views_of(rows[2000:]))
     assert projected == [1000]
     assert index.search(rows[0], 5)[0].max() < 2000  # projects the query
-    grown.extended(views_of(rows[:1001]))  # twice the views the axes were fitted to: all anew
+    grown.extended(views_of(rows[:1001]))  # twice the views the axes were fitted to: all again
     assert projected[2:] == [4001]
 
 

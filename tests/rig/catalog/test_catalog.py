@@ -212,12 +212,12 @@ def test_finish_rejects_missing_views(catalog: Catalog) -> None:
 
 def test_add_rejects_stored_view(catalog: Catalog) -> None:
     begin(catalog, "mug").add(record(0), image(0))
-    rival = catalog.resume("mug", provenance=PROVENANCE)
+    other = catalog.resume("mug", provenance=PROVENANCE)
     with pytest.raises(CatalogError, match="stored already"):
-        rival.add(record(0), image(99))
-    for index in rival.missing():
-        rival.add(record(index), image(index))
-    rival.finish()
+        other.add(record(0), image(99))
+    for index in other.missing():
+        other.add(record(index), image(index))
+    other.finish()
     assert np.array_equal(catalog.read_image(catalog.object("mug").views[0]), image(0))
 
 

@@ -71,11 +71,11 @@ def test_override_without_key_or_value_raises_config_error(text):
 
 def test_paths_are_relative_to_the_file_and_benches_do_not_share_catalogs(tmp_path):
     file = tmp_path / "rig.toml"
-    text = 'state_dir = "kept"\ncalibration_dir = "/facts"\n[catalog]\npath = "data/objects"\n'
+    text = 'state_dir = "kept"\ncalibration_dir = "/results"\n[catalog]\npath = "data/objects"\n'
     file.write_text(text, encoding="utf-8")
     assert load_config(file).catalog_path("hardware") == tmp_path / "data" / "objects"
     assert load_config(file).state_path("hardware") == tmp_path / "kept" / "hardware"
-    assert load_config(file).calibration_path("hardware") == Path("/facts/hardware")
+    assert load_config(file).calibration_path("hardware") == Path("/results/hardware")
     assert RigConfig().catalog_path("sim") != RigConfig().catalog_path("hardware")
 
 

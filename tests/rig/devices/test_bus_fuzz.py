@@ -227,6 +227,6 @@ def test_any_register_values_of_an_imu_are_handled(
     clock.sleep(1.0)
     imu.read_samples()
     clock.sleep(0.1)
-    samples = imu.read_samples()  # nothing of it was believed for good
+    samples = imu.read_samples()  # no wrong value was kept
     assert samples.lost == 0
     assert samples.gyro_dps == pytest.approx(0.0)

@@ -208,7 +208,7 @@ def test_estop_acts_within_a_millisecond_without_the_computer(opened):
     opened.head.estop_open = False
     opened.clock.sleep(0.05)
     with pytest.raises(EmergencyStop):
-        opened.imu.check()  # released, but nobody has acknowledged it
+        opened.imu.check()  # released, but not acknowledged yet
     opened.imu.acknowledge()
     opened.imu.check()
     assert not opened.head.relay_closed

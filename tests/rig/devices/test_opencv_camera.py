@@ -294,7 +294,7 @@ def test_network_stream_is_current_after_a_pause(stream: tuple[str, list[float]]
 
 
 def test_focus_is_locked_and_reported(world: World) -> None:
-    """Autofocus would make another picture of the same thing at the next sitting; nobody has to ask for its end."""
+    """Autofocus would change the image of the same object in the next session, so it is off by default."""
     capture = SimCapture(world)
     capture.drift(autofocus=True)
     camera = OpenCvCamera(capture, clock=world.clock)

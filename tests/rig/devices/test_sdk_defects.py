@@ -235,7 +235,7 @@ def test_threads_take_turns_on_the_bus() -> None:
     def read(name: str) -> None:
         try:
             wrong.extend(value for _ in range(40) if (value := bus.read(1, TABLE[name])) != WORDS[name])
-        except Exception as error:  # in a thread, nobody else would see it
+        except Exception as error:  # in a thread, no caller would see it
             wrong.append(error)
 
     threads = [threading.Thread(target=read, args=(name,)) for name in WORDS]

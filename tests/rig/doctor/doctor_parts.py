@@ -23,7 +23,7 @@ from sim.world import World
 
 @dataclass
 class Bench:
-    """A bench that nobody has opened: its computer's files, its devices, and what went over the servo's line."""
+    """A bench that is not open: the files of its computer, its devices, and the traffic on the servo's bus."""
 
     computer: ComputerFiles
     devices: SimDevices

@@ -492,7 +492,7 @@ def test_hanging_or_failing_check_stops_no_other():
         yield fine("hangs", "never told")
 
     def refused(context):
-        raise DeviceSilent("Nobody is there.", next_step="Knock.")
+        raise DeviceSilent("No answer.", next_step="Knock.")
         yield
 
     def pulled(context):

@@ -122,7 +122,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
         seen |= {check_event(similar_objects(views, name)) for name in ("dice", "lamp")}
         for event in identify(s.bench, hbr.ViewIndex(views), strategy="sweep"):
             seen.add(check_event(event))
-        s.operator.next_object = "radio"  # nobody knows it: the dense search weighs its turns, and gives up
+        s.operator.next_object = "radio"  # not enrolled: the dense search weighs its rotations, and ends
         told = [event_dict(event) for event in identify(s.bench, load_model(catalog))]
         assert {"decided", "identified"} <= {check_values(values) for values in told}
         assert any(values["weighed"] for values in told if values["event"] == "decided")

@@ -22,7 +22,7 @@ def test_table_reaches_its_goal_and_the_platter_agrees():
         for target in (5.0, 90.0, -45.0, 0.0, 180.0):
             move = table.goto(target)
             assert move.encoder_deg == pytest.approx(target, abs=0.3)
-            # The platter hangs behind by half the play, always on the same side.
+            # The platter hangs behind by half of the backlash, always on the same side.
             lag = move.encoder_deg - wires.world.table_deg()
             assert lag == pytest.approx(wires.world.noise.backlash_deg / 2, abs=0.1)
             assert move.agrees
@@ -40,7 +40,7 @@ def test_backlash_is_taken_up_on_the_same_side_in_both_directions():
 
 
 def test_backlash_is_visible_without_approach():
-    """The test above proves something: the play is there."""
+    """The test above proves something: there is backlash."""
     noise = NoiseModel(backlash_deg=2.0)
     with (
         motion_bench("table.approach_deg=0", "table.backlash_deg=3", noise=noise) as (bench, wires),

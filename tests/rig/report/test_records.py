@@ -15,8 +15,8 @@ from rig.views.capture import RejectReason
 from tests.rig.report.report_samples import enrolled, enrolling, evidence, identified, identifying, moved
 
 
-def facts(pairs: list) -> dict[str, str]:
-    return {fact.label: fact.value for fact in pairs}
+def by_label(pairs: list) -> dict[str, str]:
+    return {item.label: item.value for item in pairs}
 
 
 class TestEnrollment:
@@ -49,11 +49,11 @@ class TestEnrollment:
             record.add(event)
         assert record.result is None
         assert 0 < len(record.views) < record.planned == 8
-        assert facts(totals([record, enrolled()], []))["objects enrolled"] == "1"
+        assert by_label(totals([record, enrolled()], []))["objects enrolled"] == "1"
 
     def test_summary_numbers_come_from_the_evidence(self) -> None:
         record = enrolled(views=8, retaken=(1,))
-        found = {fact.label: (fact.value, fact.note) for fact in enrollment_items(record)}
+        found = {item.label: (item.value, item.note) for item in enrollment_items(record)}
         assert found["views"] == ("8", "of 8 planned")
         assert found["retakes"] == ("1", "blurred (sharpness 2.0 < 3)")
         assert found["sharpness"] == ("104", "median; 100 to 107")
@@ -138,7 +138,7 @@ class TestIdentification:
             identified(None, (90.0,), truth=Truth(None)),
             identified("lamp", (90.0,), truth=Truth(None)),
         ]
-        found = facts(totals([enrolled(), enrolled()], records))
+        found = by_label(totals([enrolled(), enrolled()], records))
         assert found == {
             "objects enrolled": "2",
             "found": "2/3",
@@ -149,7 +149,7 @@ class TestIdentification:
         }
 
     def test_single_answer_without_truth_shows_its_numbers(self) -> None:
-        found = facts(totals([], [identified(None)]))
+        found = by_label(totals([], [identified(None)]))
         assert found["answer"] == "unknown"
         assert found["views"] == "4"
 

@@ -79,7 +79,7 @@ def test_servo_stops_after_sigkill_and_the_next_program_reports_it(bench_of):
     with start() as bench:
         killed_in_motion(bench, wires, 300.0, after_s=1.2)
         watchdog_s = bench.config.table.watchdog_s
-    assert wires.world.shaft()[1] > 50  # it turns on, and nobody is there
+    assert wires.world.shaft()[1] > 50  # it rotates on without its program
     wires.world.clock.sleep(watchdog_s + 0.15)  # the ramp of a stop as fast as it can
     assert wires.world.shaft()[1] == 0
     assert wires.device.memory["Torque Enable"] == 1

@@ -30,7 +30,7 @@ TABLE = SavedTable(model_number=1060, bus_id=1, firmware=46, position_deg=-190.2
 
 
 @pytest.fixture
-def somebody(tmp_path):
+def other_program(tmp_path):
     """Return a process that holds the bench."""
     process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path), "teapot"], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "held\n"
@@ -121,27 +121,27 @@ def test_interrupted_write_keeps_the_old_state(tmp_path, monkeypatch):
     assert store.load().table == TABLE
 
 
-def test_second_program_is_told_which_one_uses_the_bench(tmp_path, somebody):
+def test_second_program_is_told_which_one_uses_the_bench(tmp_path, other_program):
     who = holder(tmp_path)
-    assert who.pid == somebody.pid
+    assert who.pid == other_program.pid
     assert "teapot" in who.command
     assert not who.terminates  # it has no handler: SIGTERM would leave the torque on
-    with pytest.raises(BenchBusy, match=rf"process {somebody.pid} .*teapot") as caught:
+    with pytest.raises(BenchBusy, match=rf"process {other_program.pid} .*teapot") as caught:
         BenchLock(tmp_path, SystemClock())
     assert caught.value.exit_code == 9
     assert "rig stop" in caught.value.next_step
 
 
-def test_killed_program_releases_the_bench(tmp_path, somebody):
-    somebody.send_signal(signal.SIGKILL)
-    somebody.wait()
-    assert str(somebody.pid) in (tmp_path / "lock").read_text()
+def test_killed_program_releases_the_bench(tmp_path, other_program):
+    other_program.send_signal(signal.SIGKILL)
+    other_program.wait()
+    assert str(other_program.pid) in (tmp_path / "lock").read_text()
     assert holder(tmp_path) is None
     BenchLock(tmp_path, SystemClock()).close()
     assert holder(tmp_path) is None
 
 
-def test_holder_without_readable_name_still_counts(tmp_path, somebody):
+def test_holder_without_readable_name_still_counts(tmp_path, other_program):
     (tmp_path / "lock").write_text("{")
     assert holder(tmp_path) == Holder(pid=0, command="", since_utc="")
     with pytest.raises(BenchBusy, match="another process"):

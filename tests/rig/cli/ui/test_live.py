@@ -240,7 +240,7 @@ def test_operator_is_asked_for_the_next_object():
     answer, question = asked("\n")
     assert answer is TrayDecision.PROCEED
     assert question.startswith("3 of 25: put mug (kitchen) on the table")
-    assert "\a" not in question  # in a pipe nobody hears it
+    assert "\a" not in question  # a pipe makes no sound
     assert asked("s\n")[0] is TrayDecision.SKIP
     assert asked("what?\nn\nQ\n")[0] is TrayDecision.STOP  # what is no answer is asked again
     assert asked("")[0] is TrayDecision.STOP

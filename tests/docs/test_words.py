@@ -1,0 +1,89 @@
+"""One term for each concept: no file uses a term that docs/glossary.md replaces."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = ("hbr", "rig", "sim", "calibration", "examples", "benchmarks", "tests", "docs", "firmware")
+SUFFIXES = {".py", ".md", ".j2", ".toml"}
+
+# Terms of earlier versions, as regular expressions. They match whole words, also within a name (`_` and case separate).
+RETIRED = (
+    r"strangers?",
+    r"(?:least_|min_)?familiar(?:ity)?|unfamiliar",
+    r"rehears(?:e|ed|es|al|als|ing)",
+    r"sightings?",
+    r"front[ _-]?ends?",
+    r"mend(?:s|ed|ing)?",
+    r"sittings?",
+    r"rivals?",
+    r"look-?alikes?|resemblances?",
+    r"verdicts?",
+    r"anyhow",
+    r"anew",
+    r"somebody|nobody|anybody",
+    r"table ?pictures?",
+    r"likeness(?:es)?",
+    r"believe(?:d|s)?",
+    r"next look",
+    r"facts?",
+    r"(?:the|its|their|gears'|no|without) play",
+    r"hbr\.judge",
+    r"attendants?",
+    r"remed(?:y|ies)",
+    r"certainty|sureness",
+)
+EXCEPTIONS: dict[str, tuple[str, ...]] = {
+    "docs/glossary.md": RETIRED,  # it lists them
+    "docs/style.md": (r"anew", r"anyhow"),  # examples of what not to write
+    "tests/docs/test_words.py": RETIRED,
+    # The names of earlier versions, where they are read or deprecated.
+    "docs/events.md": RETIRED,
+    "hbr/__init__.py": RETIRED,
+    "rig/catalog/exchange/batch.py": RETIRED,
+    "rig/catalog/exchange/bundle.py": RETIRED,
+    "rig/search/earlier_runs.py": RETIRED,
+    "rig/search/stopping_rules.py": (r"(?:least_|min_)?familiar(?:ity)?|unfamiliar", r"certainty|sureness"),
+    "tests/hbr/test_deprecated_names.py": RETIRED,
+    "tests/rig/catalog/test_migration.py": RETIRED,
+    "tests/rig/search/test_stopping_rules.py": (r"(?:least_|min_)?familiar(?:ity)?|unfamiliar", r"certainty|sureness"),
+    "hbr/evaluation/unknown_objects.py": (r"strangers?",),  # the name of a random stream: another draws other objects
+    "tests/rig/catalog/test_upkeep.py": (r"somebody|nobody|anybody",),  # a user of the operating system
+}
+"""Files that may use some of these terms."""
+
+
+def files() -> Iterator[Path]:
+    for folder in FOLDERS:
+        for path in sorted((ROOT / folder).rglob("*")):
+            if path.suffix in SUFFIXES and "migrations" not in path.parts and "data" not in path.parts:
+                yield path
+    yield from (ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "Makefile", "mkdocs.yml"))
+
+
+def retired_terms() -> list[str]:
+    """Return every retired term that is used: file, line and term."""
+    patterns = {term: re.compile(rf"\b(?:{term.replace('_', ' ')})\b", re.IGNORECASE) for term in RETIRED}
+    found = []
+    for path in files():
+        name = path.relative_to(ROOT).as_posix()
+        allowed = EXCEPTIONS.get(name, ())
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            text = words(line)
+            found += [
+                f"{name}:{number}: {match[0]}"
+                for term, pattern in patterns.items()
+                if term not in allowed and (match := pattern.search(text))
+            ]
+    return found
+
+
+def words(line: str) -> str:
+    """Return a line with the words of each name apart: ``minFamiliarity`` and ``min_familiarity`` alike."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", line).replace("_", " ")
+
+
+def test_no_retired_term_is_used():
+    found = retired_terms()
+    assert not found, "\n".join([f"{len(found)} retired terms; docs/glossary.md has the ones to use:", *found])
