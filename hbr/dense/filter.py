@@ -1,13 +1,13 @@
-"""The dense Hough filter: how much every object, seen from every azimuth, is supported by all views so far.
+"""The dense Hough filter: the support of all views so far for every object at every azimuth.
 
-Beside the paper's voting (`hbr.retrieve`), which follows the few views on its lists, this one keeps a score for every
-hypothesis (j, φ): object j, with azimuth φ at the first query. A query i, turned by r_i since the first, adds
+The paper's voting (`hbr.retrieve`) follows the few views on its lists. This filter has a score for every hypothesis
+(j, φ): object j with azimuth φ at the first query. A query i, rotated by r_i since the first, adds
 
     s_i(j, φ + r_i) = max_k [T(q_i, c_jk)^p - ω · away(φ + r_i, k) / 360]
 
 where k runs over all views of the object and away is how far the azimuth lies outside the arc of view k, which reaches
-half-way to its neighbours: an azimuth between two enrolled views is as good as one on a view, also where a view lacks.
-The power p lets a query that meets an enrolled view well say more than one that lies between two.
+half-way to its neighbours: an azimuth between two views is as good as one on a view, also if a view is missing.
+The power p gives a query near an enrolled view more weight than one between two views.
 
 Decision: docs/decisions/0025.
 """
@@ -26,10 +26,10 @@ from hbr.model.views import Views
 
 #: As for `Belief.posterior`: fits the similarities of the bench's own descriptor.
 BETA: Final = 30.0
-#: Azimuths at the first query that are told apart.
+#: Number of azimuths at the first query.
 BINS: Final = 72
 _BIN_DEG: Final = 360 / BINS
-#: Objects that are kept after the first view.
+#: Number of objects that are considered after the first view.
 KEPT: Final = 500
 #: How fast a bin's weight in the mean azimuth falls with its support.
 _POSE_SHARPNESS: Final = 60.0
@@ -43,14 +43,14 @@ Floats = NDArray[np.float32]
 
 
 class DenseIndex:
-    """Enrolled views, made ready for the dense filter.
+    """Enrolled views, prepared for the dense filter.
 
     Parameters
     ----------
     views : Views
         Of any descriptor. Objects without views are left out.
     omega : float
-        Weight ω of the orientation, a turn.
+        Weight ω of the orientation, per revolution.
     power : float
         p, of the similarities; 1 for the plain sum.
     """
@@ -163,7 +163,7 @@ class DenseIndex:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What all views so far say about every object from every azimuth.
+    """The support of all views so far for every object at every azimuth.
 
     Attributes
     ----------
@@ -224,9 +224,9 @@ class Belief:
         return azimuth_deg
 
     def posterior(self, beta: float = BETA) -> FloatArray:
-        """Probability of every hypothesis, (k, 72): proportional to exp(β A / √n).
+        """Return the probability of every hypothesis, (k, 72): proportional to exp(β A / √n).
 
-        The root tempers it: views of one object are not independent, and none says as much as the one before.
+        The root reduces it: views of one object are not independent, and each adds less than the one before.
         """
         exponent = self.support.astype(np.float64) * (beta / np.sqrt(self.queries))
         weights = np.exp(exponent - exponent.max())

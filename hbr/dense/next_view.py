@@ -13,31 +13,31 @@ from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
 from hbr.dense.filter import BETA, BINS, Belief
 
-#: Hypotheses that are compared at most, and the share of the belief that need not be compared.
+#: Largest number of compared hypotheses, and the share of the belief that is not compared.
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3
-#: A view this near to one that was had tells little that is new.
+#: A view this near to an earlier one adds little.
 _NEAR_DEG: Final = 15.0
 
 
 @dataclass(frozen=True, eq=False)
 class NextBestView:
-    """A turn, and what it was decided on.
+    """A rotation, and what it was decided on.
 
     Attributes
     ----------
     rotation_deg : float
-        Turn of the camera around the object, counter-clockwise.
+        Rotation of the camera around the object, counter-clockwise.
     orientation_deg : float
-        Where it leads, in the zero of the queries' orientations, in [0, 360).
+        The orientation after it, from the zero of the queries' orientations, in [0, 360).
     pair : (int, int) or None
-        The two objects that it separates most: index of each in the views' names, the likelier first. None where only
+        The two objects that it separates most: index of each in the views' names, the likelier first. None if only
         one object is left.
     rotations_deg, confusion, cost : float64 arrays (a,)
-        All turns that were weighed; logarithm of the probability of still confusing two objects after each; what the
-        motion costs, in the same unit.
+        All rotations that were weighed; logarithm of the probability of still confusing two objects after each; cost of
+        the motion, in the same unit.
     similarity : float64 array (a,), or None
-        How similar the pair looks after each turn; None where there is no pair.
+        How similar the pair looks after each rotation; None if there is no pair.
     """
 
     rotation_deg: float
@@ -58,13 +58,13 @@ def next_best_view(
     seconds: ArrayLike | None = None,
     second_costs: float = 1.0,
 ) -> NextBestView:
-    """Choose the turn with the lowest expected confusion, and what it costs.
+    """Choose the rotation with the lowest sum of expected confusion and cost.
 
-    For hypotheses p, p' of different objects, a turn a leaves the confusion
+    For hypotheses p, p' of different objects, a rotation a leaves the confusion
     Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 15°)²) discounts a view
-    at the distance d from the nearest one had, and κ(a) = exp(-½ (e / 15°)²) one at the distance e from the view that
-    is enrolled nearest to it: nothing is known of what lies between. Its logarithm and μ · time(a) are added up; equal
-    sums go to the earlier turn.
+    at the distance d from the nearest earlier one, and κ(a) = exp(-½ (e / 15°)²) one at the distance e from the nearest
+    enrolled view: nothing is known of what lies between. Its logarithm and μ · time(a) are added up; of equal sums, the
+    earlier rotation is chosen.
 
     Parameters
     ----------
@@ -73,39 +73,43 @@ def next_best_view(
     beta : float
         As for `Belief.posterior`.
     sharpness : float
-        λ: how surely a view separates two objects that look different.
+        λ: how reliably a view separates two objects that look different.
     rotations_deg : array (a,), optional
-        Turns that may be made, e.g. those that the cable allows; every 5 degrees, the shorter way round, otherwise.
+        Possible rotations, e.g. within the cable budget; by default every 5 degrees, the shorter way round.
     seconds : array (a,), optional
-        How long each takes by the bench's motion model; proportional to the angle, 90 degrees a second, otherwise.
+        Time of each by the bench's motion model; by default at 90 degrees per second.
     second_costs : float
-        μ: what a second is worth, in logarithms of the confusion.
+        μ: cost of a second, in logarithms of the confusion.
 
     Raises
     ------
     ValueError
-        No turn to choose from, or not one time for each.
+        There is no rotation to choose from, or not one time for each.
     """
-    turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
-    if turns_deg.ndim != 1 or not len(turns_deg) or not np.isfinite(turns_deg).all():
-        raise ValueError(f"rotations_deg is {turns_deg}; at least one finite turn is needed, check the cable's limits")
-    times_s = np.abs(turns_deg) / 90 if seconds is None else np.asarray(seconds, np.float64)
-    if times_s.shape != turns_deg.shape or not np.isfinite(times_s).all():
-        raise ValueError(f"{len(turns_deg)} turns and times of shape {times_s.shape}; one finite time each is needed")
+    angles_deg = _all_rotations() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    if angles_deg.ndim != 1 or not len(angles_deg) or not np.isfinite(angles_deg).all():
+        raise ValueError(
+            f"rotations_deg is {angles_deg}; at least one finite rotation is needed, check the cable's limits"
+        )
+    times_s = np.abs(angles_deg) / 90 if seconds is None else np.asarray(seconds, np.float64)
+    if times_s.shape != angles_deg.shape or not np.isfinite(times_s).all():
+        raise ValueError(
+            f"{len(angles_deg)} rotations and times of shape {times_s.shape}; one finite time each is needed"
+        )
 
     here_deg = float(belief.orientation_deg[-1])
-    landing_deg = here_deg + turns_deg
+    landing_deg = here_deg + angles_deg
     apart_deg = np.abs(wrap180(landing_deg[:, None] - belief.orientation_deg)).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
     probability, place, bin_of = _strongest(belief.posterior(beta))
     cost = second_costs * times_s
     pairs = probability[:, None] * probability * (place[:, None] != place)
     if pairs.any():
-        similar, known = _expected(belief, place, bin_of, turns_deg)
+        similar, known = _expected(belief, place, bin_of, angles_deg)
         tells = novelty[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :])
         remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
         confusion = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
-    else:  # one object alone: what is new helps its azimuth
+    else:  # one object alone: a new side helps to find its azimuth
         confusion = -sharpness * novelty
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
@@ -117,14 +121,14 @@ def next_best_view(
         ordered = sorted((first, second), key=lambda i: -probability[i])
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
         similarity = similar[:, first, second]
-    turn = float(turns_deg[chosen])
-    return NextBestView(turn, wrap360(here_deg + turn), pair, turns_deg, confusion, cost, similarity)
+    turn = float(angles_deg[chosen])
+    return NextBestView(turn, wrap360(here_deg + turn), pair, angles_deg, confusion, cost, similarity)
 
 
 def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
-    """Choose the turn whose view is expected to leave the least entropy of the object: a baseline for `next_best_view`.
+    """Choose the rotation whose view is expected to leave the least entropy: a baseline for `next_best_view`.
 
-    If hypothesis h is true, the view after a turn is the one that was enrolled there, and hypothesis h' is then as
+    If hypothesis h is true, the view after a rotation is the one that was enrolled there, and hypothesis h' is then as
     likely as exp(β T(view_h, view_h')^p) says.
 
     Parameters
@@ -132,9 +136,9 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
     belief, beta, rotations_deg
         As for `next_best_view`.
     """
-    turns_deg = _all_turns() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    angles_deg = _all_rotations() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     probability, place, bin_of = _strongest(belief.posterior(beta))
-    similar, _ = _expected(belief, place, bin_of, turns_deg)
+    similar, _ = _expected(belief, place, bin_of, angles_deg)
     weights = probability * np.exp(
         beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
     )
@@ -142,10 +146,10 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
     objects = (place[:, None] == np.unique(place)).astype(np.float64)
     shares = weights @ objects
     entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=2)
-    return float(turns_deg[int((entropy @ probability).argmin())])
+    return float(angles_deg[int((entropy @ probability).argmin())])
 
 
-def _all_turns() -> FloatArray:
+def _all_rotations() -> FloatArray:
     steps: FloatArray = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1)
     return steps * (360 / BINS)
 
@@ -168,11 +172,11 @@ def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArra
 
 
 def _expected(
-    belief: Belief, place: IndexArray, bin_of: IndexArray, turns_deg: FloatArray
+    belief: Belief, place: IndexArray, bin_of: IndexArray, angles_deg: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Similarity of what the hypotheses would show after each turn, (a, m, m), and how well that is known, (a, m)."""
     index = belief.index
-    seen_deg = bin_of * (360.0 / BINS) + belief.turned_deg + turns_deg[:, None]
+    seen_deg = bin_of * (360.0 / BINS) + belief.turned_deg + angles_deg[:, None]
     own_deg = index.azimuth_deg[place]
     away_deg = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None]))
     away_deg[:, index.left_out[place]] = np.inf

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hbr.evaluation.datasets import Dataset
     from rig.evaluation.plan import Plan
 
-#: How often other objects are left out.
+#: Draws of left-out objects.
 _DRAWS = 5
 
 
@@ -25,7 +25,7 @@ def evaluate(
     settings: Settings,
     folder: Annotated[
         Path | None,
-        typer.Argument(metavar="[FOLDER]", help="Images obj{N}__{angle}.png or .jpg; the catalog where none is named."),
+        typer.Argument(metavar="[FOLDER]", help="Images obj{N}__{angle}.png or .jpg; the catalog by default."),
     ] = None,
     noise: Annotated[
         str, typer.Option(help="Noise of the queries: none, gn, gn:VARIANCE, mb, mb:PIXELS:DEGREES, gn+mb.")
@@ -40,18 +40,19 @@ def evaluate(
     descriptor: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="What views are described by: cedd, edges+colours, ...; see hbr.descriptors."
+            metavar="NAME", help="Descriptor of the views: cedd, edges+colours, ...; see docs/descriptors.md."
         ),
     ] = "cedd",
     perturb: Annotated[
         str,
-        typer.Option(help="What else differs for queries, as KIND:STRENGTH joined by +: shift:2+gain:1, all:3."),
+        typer.Option(help="Other changes of the queries, as KIND:STRENGTH joined by +: shift:2+gain:1, all:3."),
     ] = "none",
     enrolled: Annotated[
-        int | None, typer.Option(min=1, metavar="VIEWS", help="Enroll so many views of each object, query the others.")
+        int | None,
+        typer.Option(min=1, metavar="VIEWS", help="Enroll this number of views of each object, and query the others."),
     ] = None,
-    trials: Annotated[int, typer.Option(min=1, help="Trials of each object.")] = 10,
-    views: Annotated[int, typer.Option(min=1, help="Queries of a trial.")] = 8,
+    trials: Annotated[int, typer.Option(min=1, help="Number of trials for each object.")] = 10,
+    views: Annotated[int, typer.Option(min=1, help="Number of queries in a trial.")] = 8,
     removal: Annotated[
         str | None,
         typer.Option(
@@ -64,23 +65,24 @@ def evaluate(
         float, typer.Option(min=0, metavar="DEGREES", help="Standard deviation of each measured orientation.")
     ] = 2.0,
     drift: Annotated[
-        float, typer.Option(metavar="DEGREES", help="What the measured orientation gains with each view.")
+        float, typer.Option(metavar="DEGREES", help="Drift of the measured orientation with each view.")
     ] = 0.0,
     rotate: Annotated[
-        float, typer.Option(min=0, max=180, metavar="DEGREES", help="Turn queries in their plane, by up to so much.")
+        float,
+        typer.Option(min=0, max=180, metavar="DEGREES", help="Rotate queries in the image plane, by up to this angle."),
     ] = 0.0,
     background: Annotated[
-        str, typer.Option(help="Behind a query's object: same, uniform, textured; bench, other-bench (drawn benches).")
+        str, typer.Option(help="Background of queries: same, uniform, textured; bench, other-bench (drawn benches).")
     ] = "same",
     reference: Annotated[
         str,
         typer.Option(
-            help="Picture of the empty table for queries on a bench: own, enrollment (of the bench enrolled on), none "
-            "(nor for enrolled views)."
+            help="Empty-table image for queries on a bench: own, enrollment (of the bench of the enrollment), none "
+            "(not for enrolled views either)."
         ),
     ] = "own",
     enrolled_noise: Annotated[
-        str, typer.Option(metavar="NOISE", help="Describe enrolled views under noise, too; as for --noise.")
+        str, typer.Option(metavar="NOISE", help="Describe enrolled views under noise, too; values as for --noise.")
     ] = "none",
     prefilter: Annotated[
         float, typer.Option(min=0, metavar="PIXELS", help="Blur all images by a Gaussian of this standard deviation.")
@@ -89,7 +91,7 @@ def evaluate(
         bool,
         typer.Option(
             "--matrix",
-            help="One perturbation at a time, each at three strengths, by the dense filter and a sweep of 90°; needs "
+            help="Apply one perturbation at a time, at three strengths, with the dense filter and a sweep of 90°; needs "
             "--enrolled.",
         ),
     ] = False,
@@ -98,24 +100,26 @@ def evaluate(
         typer.Option(
             min=1,
             metavar="OBJECTS",
-            help="Leave so many objects out, five times, and look for them, too: false accepts and false rejects.",
+            help="Leave this number of objects out, five times, and search for them, too: false accepts and rejects.",
         ),
     ] = None,
     objects: Annotated[
-        str | None, typer.Option(metavar="FIRST-LAST", help="These objects alone, counted from 1; e.g. 51-100.")
+        str | None, typer.Option(metavar="FIRST-LAST", help="Evaluate only these objects, counted from 1; e.g. 51-100.")
     ] = None,
     report: Annotated[
         str | None,
         typer.Option(
-            metavar="FIRST-LAST", help="Results of these objects alone, among all; with --resume of old runs."
+            metavar="FIRST-LAST",
+            help="Report only these objects, searched for among all; with --resume for earlier runs.",
         ),
     ] = None,
     margin: Annotated[
-        float | None, typer.Option(min=0, help="Lead a view that ends a search; identify.margin otherwise.")
+        float | None,
+        typer.Option(min=0, help="Margin per view that ends a search of the paper; default: identify.margin."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; one for each core otherwise.")] = None,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the results are written.")] = Path("rig-eval"),
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with what the folder has.")] = False,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one for each core.")] = None,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the results.")] = Path("rig-eval"),
+    resume: Annotated[bool, typer.Option("--resume", help="Continue with the results in the folder.")] = False,
 ) -> None:
     """Measure retrieval on a folder of photographs in the layout of COIL-100, or on the catalog.
 
@@ -165,7 +169,7 @@ def evaluate(
         dataset = plan.dataset
         reported = None if report is None else _range(report)
         if reported is not None:
-            dataset.subset(*reported)  # refuses what is not there
+            dataset.subset(*reported)  # rejects objects that do not exist
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
         if leave_out is not None:
@@ -192,11 +196,12 @@ def evaluate(
             runs = run_plan(plan, model, store, jobs, tell(progress, "searched"))
     except ValueError as error:
         raise UsageError(
-            str(error), next_step="Correct the options or the data set and go on; --resume keeps what is done."
+            str(error), next_step="Correct the options or the data set, then continue with --resume."
         ) from error
     except KeyboardInterrupt:
         print(
-            f"\nInterrupted; what is done is kept in {out}. Go on with the same command and --resume.", file=sys.stderr
+            f"\nInterrupted. The finished objects are stored in {out}. To continue, repeat the command with --resume.",
+            file=sys.stderr,
         )
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
@@ -225,7 +230,7 @@ def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
     from rig.evaluation.write import write_json
 
     if plan.protocol.enrolled is None:
-        raise ValueError("--matrix takes its queries from the views that are not enrolled; give --enrolled 18 or fewer")
+        raise ValueError("--matrix needs views that are not enrolled for its queries; give --enrolled 18 or fewer")
     with Progress("enrolling, searching") as progress:
         progress.start(2 * len(plan.dataset.objects))
 
@@ -281,5 +286,5 @@ def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "D
 def _range(text: str) -> tuple[int, int]:
     first, _, last = text.partition("-")
     if not (first.isdecimal() and last.isdecimal()):
-        raise ValueError(f"objects {text!r} is no range; give the first and the last, e.g. 51-100")
+        raise ValueError(f"objects {text!r} is not a range; give the first and the last, e.g. 51-100")
     return int(first), int(last)
