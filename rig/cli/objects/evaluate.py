@@ -91,7 +91,7 @@ def evaluate(
         bool,
         typer.Option(
             "--matrix",
-            help="Apply one perturbation at a time, at three strengths, with the dense filter and a sweep of 90°; needs "
+            help="One perturbation at a time, at three strengths, with the dense filter and a sweep of 90°; needs "
             "--enrolled.",
         ),
     ] = False,
