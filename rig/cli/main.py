@@ -1,11 +1,15 @@
 """The command line program `rig`: all commands, grouped as in its help."""
 
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from rig.cli.bench import config, doctor, find, safety, servo, setup, table
 from rig.cli.catalog import calibrate as rules
@@ -18,15 +22,52 @@ from rig.cli.ui.command import (
     NoColorOption,
     SeedOption,
     SetOption,
+    show_error,
     without_color,
 )
-from rig.cli.ui.exit_codes import EXIT_CODES
+from rig.cli.ui.exit_codes import EXIT_BY_SIGNAL, EXIT_CODES
 from rig.cli.ui.settings import Settings
+from rig.cli.ui.terminal import checked_output, discard, neutral
+from rig.core.errors import OutputFailed, UsageError
 
 GROUP = "rig.commands"
+_WANTS_JSON = "rig.wants_json"
+_TYPER_USAGE_ERROR: Any = typer.BadParameter.__base__
+"""Typer exports no name for it, and the module of the class depends on Typer's version."""
+
+
+class _Commands(TyperGroup):
+    """All commands. With ``--json`` an error in the arguments is also printed as JSON, as other errors are."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        wants_json = "--json" in args
+        with _usage_error(json=wants_json):
+            context = super().make_context(info_name, args, parent, **extra)
+        context.meta[_WANTS_JSON] = wants_json
+        return context
+
+    def invoke(self, ctx: Any) -> Any:
+        with _usage_error(json=ctx.meta[_WANTS_JSON]):
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _usage_error(*, json: bool) -> Iterator[None]:
+    """Neutralise an error in the arguments, and print it as JSON; Typer prints it as text."""
+    try:
+        yield
+    except _TYPER_USAGE_ERROR as error:
+        error.message = neutral(error.message)
+        if json and type(error).__name__ != "NoArgsIsHelpError":
+            path = error.ctx.command_path if error.ctx else "rig"
+            problem = UsageError(error.format_message(), next_step=f"For the arguments: {path} --help")
+            Settings().print_json(problem.as_dict())
+        raise
+
 
 app = typer.Typer(
     name="rig",
+    cls=_Commands,
     help="Control the turntable rig: enroll objects as views at known angles, and identify them.",
     epilog="\n".join(["Exit codes", "", *(f"{code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())]),
     no_args_is_help=True,
@@ -105,4 +146,15 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that cannot show ° or − shows ? instead of a traceback
-    app()
+    with checked_output():
+        try:
+            try:
+                app()
+            finally:
+                sys.stdout.flush()
+        except OutputFailed as error:
+            show_error(error, Settings())
+            sys.exit(error.exit_code)
+        except BrokenPipeError:
+            discard(sys.stdout)
+            sys.exit(EXIT_BY_SIGNAL + signal.SIGPIPE)

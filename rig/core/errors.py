@@ -67,6 +67,10 @@ class UsageError(RigError, code=200, title="usage"):
     """A command or function was called with arguments that are not possible."""
 
 
+class OutputFailed(RigError, code=201, title="output"):
+    """The standard output cannot be written: its disk is full or fails."""
+
+
 class ConfigError(RigError, code=300, title="configuration"):
     """The configuration has mistakes; the evidence lists all of them."""
 

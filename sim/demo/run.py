@@ -12,12 +12,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from rig.bench import Bench
 from rig.catalog import Catalog
-from rig.cli.ui.present import Progress, line
+from rig.cli.ui.present import Progress, console, line
 from rig.cli.ui.settings import Settings
 from rig.config.values import validate
 from rig.core.clock import SystemClock, seconds_between
@@ -329,7 +328,7 @@ def _print_totals(result: DemoResult) -> None:
             signed(trial["margin"], 3),
         )
     print()
-    Console(file=sys.stdout).print(table)
+    console().print(table)
     error = totals["median_pose_error_deg"]
     print(
         f"\n{totals['found']} of {totals['of']} enrolled objects found again, "

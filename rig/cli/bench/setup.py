@@ -120,12 +120,11 @@ class Dialogue:
         return self.wanted
 
     def _scan(self, scan: "DeviceScan") -> None:
-        from rich.console import Console
-
         from rig.cli.bench.findings import print_finding, show_progress
+        from rig.cli.ui.present import console
         from rig.doctor.examination import run_checks
 
-        screen = Console(file=self.out)
+        screen = console(stderr=self.out is sys.stderr)
         for finding in run_checks(self.context, scan.checks, show_progress):
             print_finding(screen, finding)
 

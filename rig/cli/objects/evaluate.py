@@ -210,22 +210,20 @@ def evaluate(
     if settings.json:
         settings.print_json({"event": "finished", **results})
         return
-    from rich.console import Console
+    from rig.cli.ui.present import console
 
-    console = Console()
-    console.print(curve_rows(results).terminal())
-    console.print()
-    console.print(decision_rows(results).terminal())
-    console.print()
+    screen = console()
+    screen.print(curve_rows(results).terminal())
+    screen.print()
+    screen.print(decision_rows(results).terminal())
+    screen.print()
     for sentence in contest_sentences(results):
-        console.print(sentence, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+        screen.print(sentence, markup=False, highlight=False, soft_wrap=not screen.is_terminal)
     print(f"Written: {out / 'report.html'}, results.json, results.csv and the figures beside it.", file=sys.stderr)
 
 
 def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
-    from rich.console import Console
-
-    from rig.cli.ui.present import Progress
+    from rig.cli.ui.present import Progress, console
     from rig.evaluation.matrix import matrix_rows, run_matrix
     from rig.evaluation.write import write_json
 
@@ -242,14 +240,12 @@ def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
     if settings.json:
         settings.print_json({"event": "finished", **results})
         return
-    Console().print(matrix_rows(results).terminal())
+    console().print(matrix_rows(results).terminal())
     print(f"Written: {out / 'matrix.json'}, with Wilson's intervals.", file=sys.stderr)
 
 
 def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: int, out: Path) -> None:
-    from rich.console import Console
-
-    from rig.cli.ui.present import Progress
+    from rig.cli.ui.present import Progress, console
     from rig.evaluation.run import enrolled_views
     from rig.evaluation.unknown_objects import run_unknown_objects, unknown_object_rows
     from rig.evaluation.write import write_json
@@ -265,7 +261,7 @@ def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: int, ou
     if settings.json:
         settings.print_json({"event": "finished", **results})
         return
-    Console().print(unknown_object_rows(results).terminal())
+    console().print(unknown_object_rows(results).terminal())
     print(f"Written: {out / 'unknown_objects.json'}, with Wilson's intervals.", file=sys.stderr)
 
 

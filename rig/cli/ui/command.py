@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,8 @@ import typer
 from rig.cli.ui.complete import bench_names
 from rig.cli.ui.exit_codes import EXIT_BY_SIGNAL, EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
-from rig.core.errors import RigError
+from rig.cli.ui.terminal import discard, guarded_output
+from rig.core.errors import OutputFailed, RigError
 
 COMMON: str = "Common options"
 """Panel of the help."""
@@ -89,12 +91,15 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             without_color()
         _handle_signals()
         try:
-            function(settings, **values)
-        except RigError as error:
-            show_error(error, settings)
-            raise typer.Exit(error.exit_code) from None
+            with guarded_output():
+                try:
+                    function(settings, **values)
+                    sys.stdout.flush()
+                except RigError as error:
+                    show_error(error, settings)
+                    raise typer.Exit(error.exit_code) from None
         except BrokenPipeError:  # the reader of a pipe, such as head, has ended
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            discard(sys.stdout)
             raise typer.Exit(EXIT_BY_SIGNAL + signal.SIGPIPE) from None
         except KeyboardInterrupt:
             print("Interrupted. If the command has moved the table, its torque is off now.", file=sys.stderr)
@@ -116,7 +121,8 @@ def without_color() -> None:
 def show_error(error: RigError, settings: Settings) -> None:
     """Print an error with its evidence and its next step, without a traceback."""
     if settings.json:
-        settings.print_json(error.as_dict())
+        with suppress(OutputFailed):
+            settings.print_json(error.as_dict())
     lines = [f"Error {error.code} ({error.title}): {error.what}"]
     for key, value in error.evidence.items():
         if isinstance(value, list | tuple):
@@ -124,7 +130,8 @@ def show_error(error: RigError, settings: Settings) -> None:
         else:
             lines.append(f"  {key}: {value}")
     lines += [f"  {note}" for note in getattr(error, "__notes__", ())]
-    print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
+    with suppress(OutputFailed):
+        print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
 
 
 def _handle_signals() -> None:

@@ -96,7 +96,11 @@ class LiveView(AbstractContextManager["LiveView"]):
     def _start(self) -> None:
         if self._console.is_terminal and self._live is None:
             self._live = Live(
-                console=self._console, get_renderable=self.render, refresh_per_second=8, redirect_stderr=False
+                console=self._console,
+                get_renderable=self.render,
+                refresh_per_second=8,
+                redirect_stdout=False,  # Rich would interpret terminal escapes in what is printed meanwhile
+                redirect_stderr=False,
             )
             self._live.start()
 

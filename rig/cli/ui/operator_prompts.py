@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Final, TextIO
 
 from rig.catalog import ObjectSummary
+from rig.cli.ui.terminal import unguarded
 from rig.core.errors import RigError, UsageError
 from rig.plans.tray import TrayDecision, TrayItem
 
@@ -55,9 +56,10 @@ class OperatorPrompts:
 
     def _ask(self, question: str, keys: dict[str, TrayDecision], hint: str) -> TrayDecision:
         self._before()
-        bell = BELL if self._questions.isatty() else ""
         while True:
-            print(f"{bell}{question}\n  {hint}, s: skip, q: stop ", end="", file=self._questions, flush=True)
+            if self._questions.isatty():
+                unguarded(self._questions).write(BELL)
+            print(f"{question}\n  {hint}, s: skip, q: stop ", end="", file=self._questions, flush=True)
             try:
                 answer = self._answers.readline()
             except (OSError, UnicodeDecodeError) as error:

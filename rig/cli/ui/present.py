@@ -1,14 +1,16 @@
 """The text of events and dry runs on a terminal, and progress bars."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
+from rich.segment import Segment
 
+from rig.cli.ui.terminal import neutral, unguarded
 from rig.events.events import (
     Accepted,
     Candidate,
@@ -55,13 +57,18 @@ class _Screen(Console):
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError  # `rig.cli.ui.command` handles it
 
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(neutral(segment.text), segment.style)
+
 
 def console(*, stderr: bool = False, plain: bool = False) -> Console:
     """Return a console for stdout or stderr; colors and width follow the terminal, NO_COLOR and COLUMNS.
 
     ``plain`` prints lines as into a pipe, on a terminal too.
     """
-    return _Screen(stderr=stderr, force_terminal=False if plain else None)
+    stream = unguarded(sys.stderr if stderr else sys.stdout)
+    return _Screen(file=stream, stderr=stderr, force_terminal=False if plain else None)
 
 
 def line(event: Event) -> str:
@@ -182,6 +189,8 @@ class Progress:
             TimeRemainingColumn(),
             console=console(stderr=True),
             disable=not sys.stderr.isatty(),
+            redirect_stdout=False,  # Rich would interpret terminal escapes in what is printed meanwhile
+            redirect_stderr=False,
         )
         self._task = self._bar.add_task(title, total=None, start=False)
 
