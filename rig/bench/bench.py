@@ -18,7 +18,7 @@ from rig.calibrations.store import CALIBRATIONS
 from rig.config import RigConfig
 from rig.config.values import Values, config_mistakes, validate
 from rig.core.clock import Clock
-from rig.core.errors import ConfigError, RigError
+from rig.core.errors import ConfigError, RigError, TorqueStaysOn
 from rig.devices.camera import Camera
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
@@ -102,7 +102,8 @@ class Bench(AbstractContextManager["Bench"]):
         try:
             self.close()
         except (RigError, OSError) as failure:
-            if error is None:  # otherwise the first error is the important one
+            # Of two errors the first one is important, unless the torque stays on. An interruption is no error.
+            if error is None or isinstance(failure, TorqueStaysOn) or not isinstance(error, Exception):
                 raise
             error.add_note(f"Closing the bench failed: {failure}")
 
@@ -122,6 +123,8 @@ class Bench(AbstractContextManager["Bench"]):
             try:
                 step()
             except (RigError, OSError) as failure:
+                if isinstance(failure, TorqueStaysOn):
+                    self.safety.latch(failure)
                 if not (step == self.servo.torque_off and self._unpowered()):
                     failures.append(failure)
         if failures:

@@ -171,6 +171,10 @@ class StateNotStored(RigError, code=515, title="bench state"):
     """The bench's state (revolutions, latched fault), which the next program needs, cannot be written to disk."""
 
 
+class TorqueStaysOn(RigError, code=516, title="torque on", latches=True):
+    """The servo accepted the instruction to switch its torque off, but its torque is still on."""
+
+
 class EmergencyStop(RigError, code=520, title="e-stop", latches=True):
     """The e-stop is pressed, or its loop is open: the rig head switched off light and servo power."""
 

@@ -122,7 +122,9 @@ class Servo(Protocol):
         """Set the goal to the present position, then switch the torque on."""
         ...
 
-    def torque_off(self) -> None: ...
+    def torque_off(self) -> None:
+        """Switch the torque off and read it back; raise `TorqueStaysOn` if it is still on."""
+        ...
 
     def move_to(self, position_deg: float) -> None:
         """Set the goal position and return at once."""

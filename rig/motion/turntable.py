@@ -20,10 +20,12 @@ from rig.core.errors import (
     RequestRejected,
     RigError,
     RotationDisagreement,
+    TorqueStaysOn,
+    UsageError,
 )
-from rig.devices.servo import MotionProfile
+from rig.devices.servo import MotionProfile, ServoState
 from rig.motion.fault_causes import explain_unsettled, find_cause
-from rig.motion.halt import QUIET_COUNTS, halt
+from rig.motion.halt import QUIET_COUNTS, MotionPath, halt, reachable
 from rig.motion.move import Move, equivalent_within, motion_seconds
 from rig.safety.gyro_rotation import GyroRotationMeter, Stillness, compare
 from rig.safety.motion_checks import MotionMonitor, SlipMonitor
@@ -66,6 +68,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         )
         self._profile: MotionProfile | None = None
         self._rest_deg = 0.0
+        self._path_deg = (0.0, 0.0)
+        self._believed: ServoState | None = None
         self._backlash_taken_up = False
 
     def __enter__(self) -> Self:
@@ -90,8 +94,11 @@ class Turntable(AbstractContextManager["Turntable"]):
         try:
             self._servo.torque_off()
             self._safety.released()
+        except TorqueStaysOn as stays_on:
+            self._safety.latch(stays_on)
+            raise
         except RigError:
-            if error is None:
+            if error is None or isinstance(error, KeyboardInterrupt | SystemExit):  # an error is the important one
                 raise
 
     @property
@@ -109,7 +116,9 @@ class Turntable(AbstractContextManager["Turntable"]):
         return self._safety.angle_reference.to_table(self._servo.read_state().position_deg)
 
     def check_target(self, target_deg: float) -> None:
-        """Raise `LimitExceeded` if the target is outside the cable budget."""
+        """Raise `LimitExceeded` if the target is outside the cable budget, `UsageError` if it is not a number."""
+        if not isfinite(target_deg):
+            raise UsageError(f"{target_deg} is not an angle.", next_step="Give an angle in degrees.")
         low, high = self._config.limits_deg
         if not low <= target_deg <= high:
             raise LimitExceeded(
@@ -226,6 +235,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         if not waypoints:
             self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
         else:
+            ends_deg = [self._safety.angle_reference.to_servo(angle) for angle in (start_deg, *waypoints)]
+            self._path_deg, self._believed = (min(ends_deg), max(ends_deg)), None
             with self._safety.motion((start_deg, *waypoints), self._stop) as motion:
                 slip = SlipMonitor(self._limits, start_deg) if self._trust_gyro else None
                 for waypoint in waypoints:
@@ -266,7 +277,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         allowed_s = 1.5 * motion_seconds(goal_deg - self._rest_deg, self._profile) + SETTLE_ALLOWANCE_S
         try:
             self._servo.arm_watchdog(self._config.watchdog_s)
-            self._servo.move_to(self._safety.angle_reference.to_servo(goal_deg))
+            self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
             self._wait_for_rest(goal_deg, quiet_s, allowed_s, monitor, slip)
         except (RequestRejected, FollowingError, MotionTimeout, NoProgress) as symptom:
             raise find_cause(symptom, self._servo, self._limits) from None
@@ -290,6 +301,8 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._clock.sleep(config.poll_s)
             self._safety.check_stop_request()
             state = self._servo.read_state()
+            if self._believed is None or reachable(self._believed, state, config.velocity_dps):
+                self._believed = state
             self._gyro.update()
             angle_deg = to_table(state.position_deg)
             if monitor:
@@ -332,4 +345,5 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def _stop(self) -> bool:
         ramp_dps2 = self._profile.acceleration_dps2 if self._profile else self._config.acceleration_dps2
-        return halt(self._servo, self._clock, ramp_dps2, self._config.poll_s)
+        path = MotionPath(self._path_deg, self._config.velocity_dps, self._believed)
+        return halt(self._servo, self._clock, self._safety.set_goal, path, ramp_dps2, self._config.poll_s)

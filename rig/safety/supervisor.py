@@ -212,6 +212,11 @@ class Safety:
             raise
         self._record.save_position(motion.position_deg)
 
+    def set_goal(self, position_deg: float) -> None:
+        """Give the servo a goal, moved into the table's limits. Nothing else in the program writes a goal."""
+        ends_deg = [self.angle_reference.to_servo(limit) for limit in self._config.table.limits_deg]
+        self._servo.move_to(min(max(position_deg, min(ends_deg)), max(ends_deg)))
+
     def check_stop_request(self) -> None:
         """Raise `MotionStopped` if the operator requested a stop, or the fault of a device that stopped the bench.
 

@@ -22,8 +22,12 @@ def goto(
 
     Example: rig goto -90 --bench sim
     """
+    from rig.config import MAX_LIMIT_DEG
+    from rig.core.errors import UsageError
     from rig.motion.turntable import Turntable
 
+    if not abs(angle_deg) <= MAX_LIMIT_DEG:  # also true for nan
+        raise UsageError(f"{angle_deg:g} is not an angle of the table.", next_step="Give the angle in degrees.")
     with settings.open_bench() as bench, Turntable(bench) as table:
         _rotate(settings, table, angle_deg)
 

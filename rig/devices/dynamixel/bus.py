@@ -177,10 +177,12 @@ class DynamixelBus:
                     self._unanswered = False
                     self._alerts |= {reply.bus_id: reply.alert for reply in replies.values()}
                     rejected = next((reply for reply in replies.values() if reply.error), None)
-                    if rejected:
+                    if rejected is None:
+                        return replies
+                    if rejected.error != self._packets.corrupted:
                         self.statistics.rejected += 1
                         raise self._rejected(what, rejected)
-                    return replies
+                    result, replies = COMM_RX_CORRUPT, {}  # the instruction was damaged on its way: send it again
                 self._count(result)
             missing = [device_id for device_id in device_ids if device_id not in replies]
             step = (

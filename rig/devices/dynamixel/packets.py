@@ -39,6 +39,8 @@ class Packets(Protocol):
 
     rejections: ClassVar[dict[int, str]]
     """Meaning of the error of a `Reply`."""
+    corrupted: ClassVar[int]
+    """The error of a `Reply` by which the device reports that the instruction arrived damaged."""
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
         """Drop unread bytes and send an instruction; return the SDK's result."""
@@ -73,6 +75,7 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
         6: "data limit error",
         7: "access error",
     }
+    corrupted: ClassVar[int] = 3
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
         length = len(parameters) + 3
@@ -122,11 +125,12 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
     """
 
     rejections: ClassVar[dict[int, str]] = {
+        0x10: "checksum error",
         0x02: "outside the angle limits",
         0x08: "value out of range",
-        0x10: "checksum error",
         0x40: "instruction error",
     }
+    corrupted: ClassVar[int] = 0x10
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
         return int(self.txPacket(port, [0, 0, bus_id, len(parameters) + 2, instruction, *parameters, 0]))

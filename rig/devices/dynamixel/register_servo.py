@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 
 from rig.core.clock import Clock
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_numbers
@@ -12,6 +12,9 @@ from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, Serv
 
 BOOT_ALLOWANCE_S = 3.0
 """How long a servo may be silent after a reboot: some tenths of a second; the e-manual states no number."""
+
+TORQUE_OFF_ATTEMPTS = 3
+"""How often the torque is switched off and read back before it counts as on."""
 
 _HARDWARE_ERRORS = {
     0: "input voltage",
@@ -154,7 +157,15 @@ class RegisterServo(ABC):
     def disarm_watchdog(self) -> None: ...
 
     def torque_off(self) -> None:
-        self._write("Torque Enable", 0)
+        for _ in range(TORQUE_OFF_ATTEMPTS):
+            self._write("Torque Enable", 0)
+            if not self._read("Torque Enable"):
+                return
+        raise TorqueStaysOn(
+            f"Servo {self._id} accepts the instruction to switch its torque off, but its torque stays on.",
+            next_step="Switch off the servo's supply. If this repeats, replace the servo.",
+            evidence={"attempts": TORQUE_OFF_ATTEMPTS},
+        ).ask_to_acknowledge()
 
     def move_to(self, position_deg: float) -> None:
         self._write("Goal Position", round(position_deg / self.resolution_deg))
