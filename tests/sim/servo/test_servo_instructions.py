@@ -37,9 +37,15 @@ def three(line: Line) -> Line:
 # -- ping, read, write ---------------------------------------------------------------------------------------------
 
 
-def test_ping_answer_equals_the_emanuals(line: Line) -> None:
+def test_bytes_on_the_wire_equal_the_emanuals_and_the_sdks(line: Line) -> None:
     assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, 0)
     assert line.sent(Source.HOST) == [bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))]
+    line.frames.clear()
+    recorded = []
+    write = line.port.writePort
+    line.port.writePort = lambda packet: recorded.append(bytes(packet)) or write(packet)
+    line.write("Goal Position", 512)
+    assert recorded == line.sent(Source.HOST) == [bytes.fromhex("FFFFFD00010900037400000200 00CA89".replace(" ", ""))]
 
 
 @pytest.mark.parametrize(
@@ -80,14 +86,6 @@ def test_registers_of_every_size_are_written_and_read(line: Line) -> None:
     assert line.read("Homing Offset") == -1_044_479
 
 
-def test_bytes_on_the_wire_equal_the_sdks(line: Line) -> None:
-    recorded = []
-    write = line.port.writePort
-    line.port.writePort = lambda packet: recorded.append(bytes(packet)) or write(packet)
-    line.write("Goal Position", 512)
-    assert recorded == line.sent(Source.HOST) == [bytes.fromhex("FFFFFD00010900037400000200 00CA89".replace(" ", ""))]
-
-
 @pytest.mark.parametrize(
     ("address", "data", "error"),
     [
@@ -121,12 +119,9 @@ def test_block_is_written_completely_or_not_at_all(line: Line) -> None:
     assert [line.read(f"{n}") for n in ("Profile Acceleration", "Profile Velocity", "Goal Position")] == [7, 8, 100]
 
 
-def test_reads_beyond_the_table_are_rejected(line: Line) -> None:
+def test_reads_beyond_the_table_and_unknown_instructions_are_rejected(line: Line) -> None:
     _, result, error = line.sdk.readTxRx(line.port, 1, 650, 20)
     assert (result, error) == (COMM_SUCCESS, StatusError.ACCESS)
-
-
-def test_unknown_instruction_is_answered_with_an_error(line: Line) -> None:
     line.serial.write(with_crc(bytes.fromhex("FFFFFD0001030077")))
     line.sleep(0.01)
     assert line.serial.read(11)[8] == StatusError.INSTRUCTION
@@ -144,23 +139,17 @@ def test_damaged_instruction_is_answered_with_a_crc_error_and_not_executed(line:
 # -- registered and group instructions -----------------------------------------------------------------------------
 
 
-def test_reg_write_waits_for_action(line: Line) -> None:
+def test_reg_write_is_checked_and_waits_for_action(line: Line) -> None:
+    line.sdk.action(line.port, 1)
+    line.sleep(0.01)
+    assert line.serial.read(11)[8] == StatusError.INSTRUCTION
+    assert line.sdk.regWriteTxRx(line.port, 1, 132, 4, [0] * 4) == (COMM_SUCCESS, StatusError.ACCESS)
+    assert line.read("Registered Instruction") == 0
     assert line.sdk.regWriteTxRx(line.port, 1, 65, 1, [1]) == (COMM_SUCCESS, 0)
     assert (line.read("LED"), line.read("Registered Instruction")) == (0, 1)
     assert line.sdk.action(line.port, 0xFE) == COMM_SUCCESS
     line.sleep(0.01)
     assert (line.read("LED"), line.read("Registered Instruction")) == (1, 0)
-
-
-def test_reg_write_is_checked_when_it_is_registered(line: Line) -> None:
-    assert line.sdk.regWriteTxRx(line.port, 1, 132, 4, [0] * 4) == (COMM_SUCCESS, StatusError.ACCESS)
-    assert line.read("Registered Instruction") == 0
-
-
-def test_action_without_reg_write_is_an_instruction_error(line: Line) -> None:
-    line.sdk.action(line.port, 1)
-    line.sleep(0.01)
-    assert line.serial.read(11)[8] == StatusError.INSTRUCTION
 
 
 @pytest.mark.parametrize("fast", [False, True])
@@ -238,27 +227,20 @@ def test_status_return_level_selects_the_answered_instructions(line: Line, level
     assert line.servos[1].memory["LED"] == 1
 
 
-def test_new_id_is_used_from_the_next_instruction(line: Line) -> None:
+def test_new_id_and_baud_rate_are_used_from_the_next_instruction(line: Line) -> None:
     assert line.write("ID", 9) == 0  # answered under the old id, else the SDK would find no answer
     assert line.sdk.ping(line.port, 9) == (1060, COMM_SUCCESS, 0)
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
-
-
-def test_new_baud_rate_is_used_from_the_next_instruction(line: Line) -> None:
-    assert line.write("Baud Rate", 2) == 0
-    assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
+    line.servos[9] = line.servos[1]
+    assert line.write("Baud Rate", 2, 9) == 0
+    assert line.sdk.ping(line.port, 9)[1] == COMM_RX_TIMEOUT
     line.serial.baudrate = 115_200
-    assert line.sdk.ping(line.port, 1)[1] == COMM_SUCCESS
-
-
-def test_eeprom_is_locked_while_torque_is_on(line: Line) -> None:
-    line.put(Torque_Enable=1)
-    assert line.write("Return Delay Time", 0) == StatusError.ACCESS
-    line.put(Torque_Enable=0, Return_Delay_Time=0)
-    assert line.read("Return Delay Time") == 0
+    assert line.sdk.ping(line.port, 9)[1] == COMM_SUCCESS
 
 
 def test_indirect_data_reads_and_writes_the_bytes_it_points_to(line: Line) -> None:
+    assert line.sdk.write1ByteTxRx(line.port, 1, 224, 42) == (COMM_SUCCESS, 0)
+    assert line.sdk.read1ByteTxRx(line.port, 1, 224) == (42, COMM_SUCCESS, 0)
     for i, target in enumerate((132, 133, 134, 135, 65)):
         assert line.sdk.write2ByteTxRx(line.port, 1, 168 + 2 * i, target) == (COMM_SUCCESS, 0)
     line.servos[1].turn_by_hand(90.0)
@@ -269,11 +251,6 @@ def test_indirect_data_reads_and_writes_the_bytes_it_points_to(line: Line) -> No
     assert line.read("LED") == 1
     assert line.sdk.write1ByteTxRx(line.port, 1, 224, 0) == (COMM_SUCCESS, StatusError.ACCESS)
     assert line.sdk.write2ByteTxRx(line.port, 1, 168, 7) == (COMM_SUCCESS, StatusError.DATA_RANGE)  # not of EEPROM
-
-
-def test_indirect_data_without_a_target_is_its_own_byte(line: Line) -> None:
-    assert line.sdk.write1ByteTxRx(line.port, 1, 224, 42) == (COMM_SUCCESS, 0)
-    assert line.sdk.read1ByteTxRx(line.port, 1, 224) == (42, COMM_SUCCESS, 0)
 
 
 # -- reboot, factory reset, clear ----------------------------------------------------------------------------------
@@ -299,15 +276,6 @@ def test_reboot_loses_the_revolutions(line: Line) -> None:
     line.sleep(0.5)
     assert line.read("Present Position") == 2148
     assert line.shaft() == pytest.approx(3 * 360 + 100 * 360 / 4096)
-
-
-def test_reboot_clears_hardware_errors(line: Line) -> None:
-    line.servos[1].fail(OVERLOAD_ERROR)
-    assert line.sdk.ping(line.port, 1)[2] == ALERT
-    line.sdk.reboot(line.port, 1)
-    line.sleep(0.5)
-    assert line.sdk.ping(line.port, 1)[2] == 0
-    assert line.read("Hardware Error Status") == 0
 
 
 @pytest.mark.parametrize(("option", "bus_id", "baudrate"), [(0xFF, 1, 57_600), (0x01, 5, 57_600), (0x02, 5, 1_000_000)])

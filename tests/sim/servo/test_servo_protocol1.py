@@ -110,10 +110,14 @@ def test_control_tables_of_driver_and_servo_are_equal() -> None:
     }
 
 
-def test_ax12_reports_its_model_number(line: Line1) -> None:
+def test_only_the_ax12_answers_protocol_1(line: Line1) -> None:
     assert line.sdk.ping(line.port, 1) == (12, COMM_SUCCESS, 0)
     assert line.read(0) == 12
     assert line.sdk.ping(line.port, 2)[1] == COMM_RX_TIMEOUT
+    x = XSeriesServo(World(clock=line.world.clock), bus_id=1, baudrate=1_000_000)
+    line.bus.attach(x)
+    assert line.sdk.ping(line.port, 1) == (12, COMM_SUCCESS, 0)
+    assert len([frame for frame in line.frames if frame[:3] == b"\xff\xff\xfd"]) == 0
 
 
 @pytest.mark.parametrize("goal", [0, 200, 512, 1023])
@@ -215,13 +219,6 @@ def test_servo_without_power_is_silent_and_loses_its_ram(line: Line1) -> None:
     line.sleep(BOOT_S)
     assert line.read(SPEED) == 0
     assert line.read(34) == 1023
-
-
-def test_protocols_do_not_answer_each_other(line: Line1) -> None:
-    x = XSeriesServo(World(clock=line.world.clock), bus_id=1, baudrate=1_000_000)
-    line.bus.attach(x)
-    assert line.sdk.ping(line.port, 1) == (12, COMM_SUCCESS, 0)
-    assert len([frame for frame in line.frames if frame[:3] == b"\xff\xff\xfd"]) == 0
 
 
 @pytest.mark.parametrize(("option", "value"), [("bus_id", 254), ("baudrate", 4_500_000)])
