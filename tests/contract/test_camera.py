@@ -54,19 +54,15 @@ def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Opened:
     return kind(tmp_path)
 
 
-def test_identity_has_the_image_size(opened: Opened) -> None:
+def test_frame_has_the_size_of_the_identity_eight_bits_and_its_time(opened: Opened) -> None:
     camera, clock = opened
     identity = camera.identity
     assert isinstance(identity, CameraIdentity)
     assert identity.name
     assert identity.fps == pytest.approx(30, abs=6)
-    assert camera.capture(clock.now_ns()).image_bgr.shape == (identity.height, identity.width, 3)
-
-
-def test_frame_is_eight_bit_colour_with_its_time(opened: Opened) -> None:
-    camera, clock = opened
     frame = camera.capture(clock.now_ns())
     assert isinstance(frame, Frame)
+    assert frame.image_bgr.shape == (identity.height, identity.width, 3)
     assert frame.image_bgr.dtype == np.uint8
     assert isinstance(frame.exposed_ns, int)
     assert frame.exposed_ns <= clock.now_ns()
@@ -81,26 +77,20 @@ def test_no_frame_is_older_than_requested(opened: Opened, ahead_ns: int) -> None
         assert camera.capture(after_ns).exposed_ns >= after_ns
 
 
-def test_frames_are_not_repeated(opened: Opened) -> None:
+def test_frames_are_not_repeated_and_keep_their_pixels(opened: Opened) -> None:
     camera, _ = opened
     frames = [camera.capture(0)]
+    before = frames[0].image_bgr.copy()
     for _ in range(4):
         frames.append(camera.capture(frames[-1].exposed_ns + 1))
     times = [frame.exposed_ns for frame in frames]
     assert times == sorted(set(times))
     for one, other in pairwise(frames):
         assert (one.image_bgr != other.image_bgr).any()
+    np.testing.assert_array_equal(frames[0].image_bgr, before)
 
 
-def test_frame_keeps_its_pixels_after_the_next_one(opened: Opened) -> None:
-    camera, _ = opened
-    frame = camera.capture(0)
-    before = frame.image_bgr.copy()
-    camera.capture(frame.exposed_ns + 1)
-    np.testing.assert_array_equal(frame.image_bgr, before)
-
-
-def test_locks_are_numbers_or_none(opened: Opened) -> None:
+def test_locks_are_numbers_or_none_and_close_can_be_called_twice(opened: Opened) -> None:
     camera, clock = opened
     locks = camera.read_locks()
     assert isinstance(locks, CameraLocks)
@@ -109,9 +99,5 @@ def test_locks_are_numbers_or_none(opened: Opened) -> None:
     assert locks.auto_exposure in (True, False, None)
     camera.capture(clock.now_ns())
     assert camera.read_locks() == locks
-
-
-def test_close_can_be_called_twice(opened: Opened) -> None:
-    camera, _ = opened
     camera.close()
     camera.close()

@@ -135,12 +135,10 @@ def test_quick_finds_attached_devices(wires: Wires) -> None:
     assert found == [AT]
 
 
-def test_each_byte_takes_its_time(wires: Wires) -> None:
+def test_messages_of_smbus2_are_recorded_and_each_byte_takes_its_time(wires: Wires) -> None:
     wires.master.read_i2c_block_data(AT, 0, 14)  # address and register, address and 14 bytes
     assert wires.clock.now_ns() == round(17 * BYTE_S * 1e9)
-
-
-def test_messages_of_smbus2_are_recorded(wires: Wires) -> None:
+    wires.bus.wire.clear()
     wires.master.write_word_data(AT, 0x21, 0x4433)
     wires.master.read_byte_data(AT, 0x21)
     assert [(m.address, m.reading, m.data) for m in wires.bus.wire] == [
@@ -213,14 +211,11 @@ def test_unsupported_functions_are_reported(wires: Wires) -> None:
             wires.master.i2c_rdwr(*messages)
 
 
-def test_addresses_are_checked_where_devices_are_attached(wires: Wires) -> None:
+def test_addresses_are_checked_and_several_buses_work_side_by_side(wires: Wires) -> None:
     with pytest.raises(ValueError, match="taken"):
         wires.bus.attach(AT, Memory())
     with pytest.raises(ValueError, match="reserved"):
         wires.bus.attach(0x78, Memory())
-
-
-def test_several_buses_work_side_by_side(wires: Wires) -> None:
     with SimI2cBus(wires.clock) as other, SMBus(other.path) as master:
         memory = Memory()
         other.attach(AT, memory)

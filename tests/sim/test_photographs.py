@@ -27,16 +27,9 @@ def shown(solid: Visible, azimuth_deg: float) -> Image:
 
 
 def test_objects_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    for name in (
-        "obj10__0.png",
-        "obj2__5.png",
-        "obj2__0.JPG",
-        "obj1__355.jpeg",
-        "obj1__2.5.png",
-        "notes.txt",
-        "obj3_0.png",
-    ):
-        save(tmp_path / name, 200) if not name.endswith("txt") else (tmp_path / name).write_text("obj")
+    for name in ("obj10__0.png", "obj2__5.png", "obj2__0.JPG", "obj1__355.jpeg", "obj1__2.5.png", "obj3_0.png"):
+        save(tmp_path / name, 200)
+    (tmp_path / "notes.txt").write_text("obj")
     objects = photographs(tmp_path)
     assert list(objects) == ["obj1", "obj2", "obj10"]
     assert objects["obj1"].azimuth_deg.tolist() == [2.5, 355]
@@ -48,16 +41,12 @@ def test_nearest_photograph_is_shown_around_the_circle(tmp_path: Path) -> None:
         save(tmp_path / f"obj1__{angle:g}.png", level)
     solid = photographs(tmp_path)["obj1"]
     for azimuth, level in (
-        (0, 50),
-        (359, 50),
-        (314, 200),
-        (-50, 200),
-        (136, 100),
-        (137, 150),
-        (720 + 44, 50),
-        (-270, 100),
+        *((0, 50), (359, 50), (314, 200), (-50, 200)),
+        *((136, 100), (137, 150), (720 + 44, 50), (-270, 100)),
     ):
-        assert shown(solid, azimuth)[240, 320].tolist() == [level] * 3
+        image = shown(solid, azimuth)
+        assert image[240, 320].tolist() == [level] * 3
+        image[:] = 0  # the next drawing must not see this
 
 
 @given(st.lists(st.floats(0, 359.9), min_size=1, max_size=20, unique=True), st.floats(-1000, 1000))
@@ -101,13 +90,6 @@ def test_damaged_photograph_is_reported_with_its_path(tmp_path: Path) -> None:
     shown(solid, 10)
     with pytest.raises(UsageError, match=r"obj1__90\.png"):
         shown(solid, 80)
-
-
-def test_changing_a_drawn_frame_does_not_change_the_photograph(tmp_path: Path) -> None:
-    save(tmp_path / "obj1__0.png", 200)
-    solid = photographs(tmp_path)["obj1"]
-    shown(solid, 0)[:] = 0
-    assert shown(solid, 0)[240, 320, 0] == 200
 
 
 def test_photographs_of_coil_100_are_found() -> None:

@@ -45,6 +45,12 @@ def bench() -> Iterator[Bench]:
     bench.bus.close()
 
 
+@pytest.fixture
+def imu(bench: Bench) -> Iterator[Bno055]:
+    with closing(bench.open()) as imu:
+        yield imu
+
+
 # -- opening -----------------------------------------------------------------------------------------------------------
 
 
@@ -116,73 +122,57 @@ def test_samples_sum_to_the_rotation_for_any_reading_pattern(angles: list[float]
             assert turned == pytest.approx(angle, abs=0.03)
 
 
-def test_long_gap_counts_as_lost_samples(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
-        imu.read_samples()
-        bench.clock.sleep(0.6)
-        assert imu.read_samples().lost == 60
-        assert imu.statistics.overflows == 1
-        bench.clock.sleep(0.1)
-        assert imu.read_samples().lost == 0
-
-
-def test_saturation_matches_the_stated_range(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
-        imu.read_samples()
-        bench.turn(2100.0)
-        bench.clock.sleep(0.1)
-        imu.read_samples()
-        bench.clock.sleep(0.02)
-        assert np.abs(imu.read_samples().gyro_dps).max() >= imu.range_dps
+def test_saturation_matches_the_stated_range(bench: Bench, imu: Bno055) -> None:
+    imu.read_samples()
+    bench.turn(2100.0)
+    bench.clock.sleep(0.1)
+    imu.read_samples()
+    bench.clock.sleep(0.02)
+    assert np.abs(imu.read_samples().gyro_dps).max() >= imu.range_dps
 
 
 # -- what goes wrong ---------------------------------------------------------------------------------------------------
 
 
-def test_reset_while_running_is_detected(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
-        bench.sensor.power_cycle()
-        with pytest.raises(DeviceSilent, match="acknowledge"):
-            imu.read_samples()
-        bench.clock.sleep(SILENT_S)
-        for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c, imu.calibration):
-            with pytest.raises(DeviceFault, match="supply was interrupted") as caught:
-                reading()
-        assert caught.value.evidence["operating_mode"] == {"got": 0, "expected": 8}
-
-
-def test_stopped_fusion_is_detected(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
-        bench.sensor.fail(0x0A)
-        with pytest.raises(DeviceFault, match="fusion") as caught:
-            imu.read_samples()
-        assert caught.value.evidence["system_error"] == 0x0A
-        assert "i2c-gpio" in caught.value.next_step
-
-
-def test_changed_units_are_detected(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
-        bench.sensor._registers[0x3B] = 0x02  # another program wants radians
-        with pytest.raises(DeviceFault) as caught:
-            imu.read_samples()
-        assert caught.value.evidence["unit_selection"] == {"got": 2, "expected": 0}
-
-
-def test_stuck_bus_and_missing_sensor_are_distinguished(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
-        bench.bus.stuck = True
-        with pytest.raises(DeviceSilent, match="stuck") as caught:
-            imu.read_samples()
-        assert "SDA" in caught.value.next_step
-
-
-def test_failed_transfer_is_repeated(bench: Bench) -> None:
-    with closing(bench.open()) as imu:
+def test_reset_while_running_is_detected(bench: Bench, imu: Bno055) -> None:
+    bench.sensor.power_cycle()
+    with pytest.raises(DeviceSilent, match="acknowledge"):
         imu.read_samples()
-        bench.clock.sleep(0.1)
-        bench.bus.nack(1)
-        assert imu.read_samples().time_ns.size == pytest.approx(10, abs=1)
-        assert imu.statistics.retries == 1
+    bench.clock.sleep(SILENT_S)
+    for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c, imu.calibration):
+        with pytest.raises(DeviceFault, match="supply was interrupted") as caught:
+            reading()
+    assert caught.value.evidence["operating_mode"] == {"got": 0, "expected": 8}
+
+
+def test_stopped_fusion_is_detected(bench: Bench, imu: Bno055) -> None:
+    bench.sensor.fail(0x0A)
+    with pytest.raises(DeviceFault, match="fusion") as caught:
+        imu.read_samples()
+    assert caught.value.evidence["system_error"] == 0x0A
+    assert "i2c-gpio" in caught.value.next_step
+
+
+def test_changed_units_are_detected(bench: Bench, imu: Bno055) -> None:
+    bench.sensor._registers[0x3B] = 0x02  # another program wants radians
+    with pytest.raises(DeviceFault) as caught:
+        imu.read_samples()
+    assert caught.value.evidence["unit_selection"] == {"got": 2, "expected": 0}
+
+
+def test_stuck_bus_and_missing_sensor_are_distinguished(bench: Bench, imu: Bno055) -> None:
+    bench.bus.stuck = True
+    with pytest.raises(DeviceSilent, match="stuck") as caught:
+        imu.read_samples()
+    assert "SDA" in caught.value.next_step
+
+
+def test_failed_transfer_is_repeated(bench: Bench, imu: Bno055) -> None:
+    imu.read_samples()
+    bench.clock.sleep(0.1)
+    bench.bus.nack(1)
+    assert imu.read_samples().time_ns.size == pytest.approx(10, abs=1)
+    assert imu.statistics.retries == 1
 
 
 # -- on a bench --------------------------------------------------------------------------------------------------------

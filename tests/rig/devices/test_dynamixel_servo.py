@@ -13,32 +13,34 @@ from sim.noise import NoiseModel
 from tests.rig.bench_parts import open_bus, open_servo, servo_wires
 
 
-def test_factory_settings_are_rejected_with_a_list_of_differences():
-    wires = servo_wires()
+@pytest.fixture
+def wires():
+    return servo_wires()
+
+
+@pytest.fixture
+def servo(wires):
+    return open_servo(wires)
+
+
+def test_factory_settings_are_rejected_with_a_list_of_differences_and_not_changed(wires):
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
     with pytest.raises(DeviceMismatch) as caught:
         prepare_servo(servo, write=False)
+    assert {frame[7] for frame in wires.instructions} <= {1, 2}  # Ping and Read
     told = {register: text.partition(":")[0] for register, text in caught.value.evidence.items()}
     assert told == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
     assert all(text.partition(": ")[2] for text in caught.value.evidence.values())  # each with its reason
     assert "write_settings" in caught.value.next_step
 
 
-def test_settings_are_written_once_and_reported():
-    wires = servo_wires()
+def test_settings_are_written_once_and_reported(wires):
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
     assert prepare_servo(servo, write=True) == (
         "servo: Operating Mode was 3, is now 4",
         "servo: Return Delay Time was 250, is now 0",
     )
     assert prepare_servo(servo, write=False) == ()
-
-
-def test_opening_moves_nothing_and_writes_nothing():
-    wires = servo_wires()
-    DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
-    assert {frame[7] for frame in wires.instructions} <= {1, 2}  # Ping and Read
-    assert wires.device.memory["Torque Enable"] == 0
 
 
 def test_wrong_model_is_named():
@@ -49,15 +51,12 @@ def test_wrong_model_is_named():
     assert 'servo.model = "xm430_w350"' in caught.value.next_step
 
 
-def test_missing_servo_raises_device_not_found():
-    wires = servo_wires()
+def test_missing_servo_raises_device_not_found(wires):
     with pytest.raises(DeviceNotFound, match="id 9"):
         DynamixelServo(open_bus(wires, retries=0), bus_id=9, model="xl430_w250", clock=wires.world.clock)
 
 
-def test_torque_on_sets_the_goal_to_the_present_position_first():
-    wires = servo_wires()
-    servo = open_servo(wires)
+def test_torque_on_sets_the_goal_to_the_present_position_first(wires, servo):
     wires.device.turn_by_hand(123.0)
     wires.world.clock.sleep(3.0)
     before = wires.world.shaft()[0]
@@ -82,17 +81,14 @@ def test_goal_is_reached_within_one_count_over_many_revolutions(goal_deg):
     assert not state.moving
 
 
-def test_profile_is_never_zero():
-    wires = servo_wires()
+def test_profile_is_never_zero(wires):
     got = open_servo(wires).set_profile(MotionProfile(0.01, 0.01))
     assert got.velocity_dps > 0
     assert got.acceleration_dps2 > 0
     assert wires.device.memory["Profile Velocity"] == 1
 
 
-def test_hardware_error_is_reported_and_prevents_torque():
-    wires = servo_wires()
-    servo = open_servo(wires)
+def test_hardware_error_is_reported_and_prevents_torque(wires, servo):
     wires.device.set_temperature(95.0)
     wires.world.clock.sleep(2.0)
     assert servo.read_state().hardware_errors == ("overheating",)
@@ -100,9 +96,7 @@ def test_hardware_error_is_reported_and_prevents_torque():
         servo.torque_on()
 
 
-def test_state_is_read_in_one_transaction():
-    wires = servo_wires()
-    servo = open_servo(wires)
+def test_state_is_read_in_one_transaction(wires, servo):
     before = len(wires.instructions)
     state = servo.read_state()
     assert len(wires.instructions) == before + 1
@@ -110,9 +104,7 @@ def test_state_is_read_in_one_transaction():
     assert 15 < state.temperature_c < 60
 
 
-def test_tripped_watchdog_is_cleared_only_by_torque_on():
-    wires = servo_wires()
-    servo = open_servo(wires)
+def test_tripped_watchdog_is_cleared_only_by_torque_on(wires, servo):
     servo.torque_on()
     servo.arm_watchdog(0.1)
     servo.move_to(servo.read_state().position_deg + 90)
@@ -143,9 +135,8 @@ def test_registers_round_trip(name):
         register.encode(high + 1)
 
 
-def test_drive_mode_with_torque_by_goal_is_corrected():
+def test_drive_mode_with_torque_by_goal_is_corrected(wires):
     """After a dip of the supply such a servo would obey the next goal, as fast as it can and perhaps a turn away."""
-    wires = servo_wires()
     wires.device.memory["Drive Mode"] = 0b1000
     servo = open_servo(wires)
     assert wires.device.memory["Drive Mode"] == 0

@@ -45,6 +45,11 @@ def go(devices: SimDevices, servo: RegisterServo, angle_deg: float) -> float:
     return devices.world.shaft()[0] - start_deg
 
 
+@pytest.fixture
+def devices() -> SimDevices:
+    return parts_of()
+
+
 # -- the models --------------------------------------------------------------------------------------------------------
 
 
@@ -80,18 +85,13 @@ def test_load_is_a_percentage_for_each_model(model: str) -> None:
 
 # -- AX-12A ------------------------------------------------------------------------------------------------------------
 
-AX = (
-    "servo.model=ax_12a",
-    "servo.baud=1000000",
-    "table.mode=pan",
-    "table.zero_deg=150",
-    "table.limits_deg=[-150, 150]",
-)
+AX_12A = ("servo.model=ax_12a", "servo.baud=1000000")
+AX = (*AX_12A, "table.mode=pan", "table.zero_deg=150", "table.limits_deg=[-150, 150]")
 
 
 def test_ax12_is_rejected_as_a_turntable() -> None:
     with pytest.raises(ConfigError, match="300°") as caught:
-        servo_of(parts_of(*AX[:2]), *AX[:2])
+        servo_of(parts_of(*AX_12A), *AX_12A)
     assert 'In [table] set mode = "pan"' in caught.value.next_step
 
 
@@ -228,8 +228,7 @@ def test_orientation_follows_what_the_servo_carries(carries: str, sign: int) -> 
 
 
 @pytest.mark.parametrize("dps", [30.0, -60.0])
-def test_spin_rotates_at_constant_speed_and_restores_the_mode(dps: float) -> None:
-    devices = parts_of()
+def test_spin_rotates_at_constant_speed_and_restores_the_mode(dps: float, devices: SimDevices) -> None:
     servo = servo_of(devices)
     assert isinstance(servo, DynamixelServo)
     speeds = [state.velocity_dps for state in servo.spin(dps, 5.0)]
@@ -241,8 +240,7 @@ def test_spin_rotates_at_constant_speed_and_restores_the_mode(dps: float) -> Non
     assert servo.setting_differences() == []
 
 
-def test_abandoned_spin_is_stopped_by_the_watchdog() -> None:
-    devices = parts_of()
+def test_abandoned_spin_is_stopped_by_the_watchdog(devices: SimDevices) -> None:
     servo = servo_of(devices)
     assert isinstance(servo, DynamixelServo)
     spin = servo.spin(60.0, 60.0)
@@ -276,8 +274,7 @@ WRONG = {
 }
 
 
-def test_wrong_settings_are_found_explained_written_and_verified() -> None:
-    devices = parts_of()
+def test_wrong_settings_are_found_explained_written_and_verified(devices: SimDevices) -> None:
     servo = servo_of(devices, write=False)
     for name, value in WRONG.items():
         devices.servo.memory[name] = value
@@ -293,34 +290,23 @@ def test_wrong_settings_are_found_explained_written_and_verified() -> None:
     assert devices.servo.memory["Shutdown"] == 52
 
 
-def test_settings_are_written_with_torque_off() -> None:
-    devices = parts_of()
+def test_settings_are_written_with_torque_off_and_without_write_replies(devices: SimDevices) -> None:
     servo = servo_of(devices, write=False)
     servo.torque_on()
-    prepare_servo(servo, write=True)
-    assert devices.servo.memory["Torque Enable"] == 0
-    assert servo.setting_differences() == []
-
-
-def test_servo_without_write_replies_is_configured_first() -> None:
-    devices = parts_of()
-    servo = servo_of(devices, write=False)
     devices.servo.memory["Status Return Level"] = 1
     prepare_servo(servo, write=True)
-    assert devices.servo.memory["Status Return Level"] == 2
+    assert (devices.servo.memory["Torque Enable"], devices.servo.memory["Status Return Level"]) == (0, 2)
     assert servo.setting_differences() == []
 
 
-def test_servo_that_answers_only_pings_is_reported() -> None:
-    devices = parts_of()
+def test_servo_that_answers_only_pings_is_reported(devices: SimDevices) -> None:
     devices.servo.memory["Status Return Level"] = 0
     with pytest.raises(DeviceSilent) as caught:
         servo_of(devices, write=False)
     assert "Status Return Level" in caught.value.__notes__[0]
 
 
-def test_setting_that_is_not_stored_is_reported() -> None:
-    devices = parts_of()
+def test_setting_that_is_not_stored_is_reported(devices: SimDevices) -> None:
     servo = servo_of(devices, write=False)
     devices.servo._on_write["Homing Offset"] = lambda: devices.servo.memory.__setitem__("Homing Offset", 5)
     with pytest.raises(RequestRejected, match="Homing Offset") as caught:
@@ -328,8 +314,7 @@ def test_setting_that_is_not_stored_is_reported() -> None:
     assert caught.value.evidence == {"register": "Homing Offset", "wrote": 0, "read_back": 5}
 
 
-def test_pan_servo_needs_the_position_mode() -> None:
-    devices = parts_of()
+def test_pan_servo_needs_the_position_mode(devices: SimDevices) -> None:
     servo = servo_of(devices, write=False)
     found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, ServoMode.PAN)}
     assert "Operating Mode" not in found  # the factory's

@@ -14,15 +14,7 @@ from sim.world import World
 from tests.contract.heads import mpu6050, needs
 
 MINUTES, RATE_HZ = 10, 200
-SMPLRT_DIV, INT_ENABLE, USER_CTRL, PWR_MGMT_1, FIFO_COUNTH, FIFO_R_W, WHO_AM_I = (
-    0x19,
-    0x38,
-    0x6A,
-    0x6B,
-    0x72,
-    0x74,
-    0x75,
-)
+INT_ENABLE, USER_CTRL, PWR_MGMT_1, FIFO_COUNTH, FIFO_R_W, WHO_AM_I = 0x38, 0x6A, 0x6B, 0x72, 0x74, 0x75
 FRAME = struct.Struct(">7h")
 
 

@@ -13,10 +13,10 @@ from dynamixel_sdk import (
 )
 
 from sim.servo import Source
-from sim.servo.device import BOOT_S, OVERLOAD_ERROR
+from sim.servo.device import BOOT_S
 from sim.servo.models import MODELS
 from sim.servo.protocol2 import StatusError, with_crc
-from tests.sim.servo.servo_bench import ALERT, Line, extended
+from tests.sim.servo.servo_bench import Line, extended
 
 
 def word(value: int) -> list[int]:
