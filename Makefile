@@ -49,6 +49,8 @@ bench: $(READY)
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
+	for tool in uv:uv cyclonedx-bom:sbom; do echo $${tool%:*} | uv pip compile - --universal --python-version 3.11 \
+	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
 
 $(READY): requirements.lock pyproject.toml
 	@sh .ci/setup "$(PYTHON)"
