@@ -140,16 +140,20 @@ class Chart:
             For a page with the report's style sheet: text, grid and background take the colours of its light or dark
             mode. Otherwise the chart needs no style sheet.
         """
-        file = StringIO()
-        with _style():
-            self._figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-        return _compact(file.getvalue(), self.label, themed=themed)
+        return _compact(self._markup, self.label, themed=themed)
 
     def png(self) -> bytes:
         """Return a PNG file of twice the size in CSS pixels."""
         file = BytesIO()
         with _style():
             self._figure.savefig(file, format="png", dpi=2 * _DPI)
+        return file.getvalue()
+
+    @cached_property
+    def _markup(self) -> str:
+        file = StringIO()
+        with _style():
+            self._figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
         return file.getvalue()
 
     @cached_property
@@ -171,6 +175,9 @@ class Chart:
                 figure.legend(loc="outside right upper")
             elif any(series.label for series in self.series):
                 figure.legend(loc="outside lower left", ncols=4)
+            # Lay the chart out once; each file would do it twice again, which takes most of its time.
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
         return figure
 
 

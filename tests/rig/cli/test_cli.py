@@ -159,13 +159,10 @@ def test_unknown_bench_and_unknown_command_are_rejected(rig):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(tmp_path, number, code):
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    (tmp_path / "rig.toml").write_text(SMALL, encoding="utf-8")
+def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(rig, number, code):
     process = subprocess.Popen(
-        [*RIG, "enroll", "dice", "--views", "36", "--json"],
-        cwd=tmp_path,
-        env=environment,
+        [*RIG, "enroll", "dice", "--views", "18", "--json"],
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -181,10 +178,8 @@ def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(
     stored += sum(json.loads(line).get("event") == "accepted" for line in rest.splitlines())
     assert process.returncode == code
     assert "--resume" in errors
-    resumed = subprocess.run(
-        [*RIG, "enroll", "dice", "--resume", "--json"], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    assert resumed.returncode == 0, resumed.stderr
+    resumed = rig("enroll", "dice", "--resume", "--json")
+    assert resumed.exit_code == 0, resumed.stderr
     events = lines(resumed.stdout)
-    assert events[0]["views"] == 36 - stored
-    assert events[-1] == {**events[-1], "event": "enrolled", "views": 36}
+    assert events[0]["views"] == 18 - stored
+    assert events[-1] == {**events[-1], "event": "enrolled", "views": 18}
