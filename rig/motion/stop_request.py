@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from rig.bench import open_servo
 from rig.config import RigConfig
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import BenchBusy, StateNotStored
-from rig.safety.saved_state import FileStore, Holder, holder
+from rig.core.errors import BenchBusy, StateNotStored, TorqueStaysOn
+from rig.safety.saved_state import FileStore, Holder, LatchedFault, holder
 
 REACTION_S = 2.0
 """How long a program may take to notice the request: many rounds of its control loop, and a long exposure."""
@@ -43,6 +43,8 @@ def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None)
         The program that uses the bench does not react.
     DeviceNotFound, DeviceMismatch, DeviceSilent
         No program uses the bench, and the servo cannot be reached.
+    TorqueStaysOn
+        The servo does not switch its torque off; the fault is latched.
     """
     path = config.state_path(name)
     who, signalled = holder(path), False
@@ -61,7 +63,12 @@ def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None)
             return StopReport(who, signalled, ended=False, torque_was_on=None)
     with open_servo(name, config, seed=seed) as servo:
         torque = servo.read_condition().torque
-        servo.torque_off()
+        try:
+            servo.torque_off()
+        except TorqueStaysOn as stays_on:
+            with suppress(StateNotStored):
+                FileStore(path).latch(LatchedFault.of(stays_on, clock.utc().isoformat(timespec="seconds")))
+            raise
     return StopReport(who, signalled, ended=True, torque_was_on=torque)
 
 

@@ -38,6 +38,8 @@ class AngleFinding(StrEnum):
     NOT_ON_PATH = "not-on-path"
     ROTATED_WITHOUT_POWER = "rotated-without-power"
     POSITION_CHANGED = "position-changed"
+    SETTINGS_CHANGED = "settings-changed"
+    BEYOND_LIMITS = "beyond-limits"
 
 
 _CERTAIN: Final = frozenset(
@@ -64,6 +66,9 @@ _TEXTS: Final[Mapping[AngleFinding, str]] = {
     AngleFinding.ROTATED_WITHOUT_POWER: "the table was rotated while the servo had no supply (now {now:.1f}°, before "
     "{before:.1f}°)",
     AngleFinding.POSITION_CHANGED: "the servo is at {now:.1f}°, but it was left at {before:.1f}°",
+    AngleFinding.SETTINGS_CHANGED: "table.zero_deg, table.direction or servo.gear_ratio was changed since the angle "
+    "was stored",
+    AngleFinding.BEYOND_LIMITS: "the table is at {table:.1f}°, beyond its cable budget",
 }
 
 
@@ -83,6 +88,8 @@ class SavedAngleCheck:
         The servo's firmware now and when it was stored.
     lost_revolutions
         Revolutions that the servo no longer counts.
+    table_deg
+        The table's angle, if it is beyond the limits.
     """
 
     finding: AngleFinding
@@ -92,6 +99,7 @@ class SavedAngleCheck:
     firmware: int = 0
     saved_firmware: int = 0
     lost_revolutions: int = 0
+    table_deg: float = 0.0
 
     @property
     def certain(self) -> bool:
@@ -105,6 +113,7 @@ class SavedAngleCheck:
             firmware=self.firmware,
             before_firmware=self.saved_firmware,
             lost=self.lost_revolutions,
+            table=self.table_deg,
         )
 
 

@@ -19,7 +19,10 @@ from rig.core import files
 from rig.core.clock import Clock
 from rig.core.errors import BenchBusy, RigError, StateNotStored
 
-VERSION = 1
+VERSION = 2
+"""Version 1 has neither the settings of the table nor the file of the latched fault."""
+LATCH_BYTES = 8192
+"""Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
 LOCK_ATTEMPTS = 3
 
 
@@ -31,7 +34,8 @@ class SavedTable(_Saved):
     """The table at its last rest; positions are the servo's own, in degrees, counted since its last power-up.
 
     ``shift_deg`` must be added to them (revolutions that the servo lost, an angle that the operator set). ``path_deg``
-    is the range of a motion that had not ended when this was stored.
+    is the range of a motion that had not ended when this was stored. ``zero_deg``, ``direction`` and ``gear_ratio`` are
+    the settings that turn positions into table angles; None if an earlier version stored this.
     """
 
     model_number: int
@@ -40,6 +44,9 @@ class SavedTable(_Saved):
     position_deg: float
     shift_deg: float
     path_deg: tuple[float, float] | None = None
+    zero_deg: float | None = None
+    direction: int | None = None
+    gear_ratio: float | None = None
 
 
 class LatchedFault(_Saved):
@@ -94,6 +101,16 @@ class StateStore(Protocol):
         """
         ...
 
+    def latch(self, fault: LatchedFault | None) -> None:
+        """Store the latched fault, also on a full disk if a state was saved before; None removes it.
+
+        Raises
+        ------
+        StateNotStored
+            The file may not be written to.
+        """
+        ...
+
     def stop_requested(self) -> bool:
         """Return whether the operator requested a stop; called in each round of the control loop."""
         ...
@@ -141,6 +158,9 @@ class MemoryStore:
     def save(self, state: BenchState) -> None:
         self.state = state
 
+    def latch(self, fault: LatchedFault | None) -> None:
+        self.state = self.state.model_copy(update={"fault": fault})
+
     def stop_requested(self) -> bool:
         return self.stop
 
@@ -158,34 +178,83 @@ class MemoryStore:
 
 
 class FileStore:
-    """State in the folder ``path``: ``state.json``, and the file ``stop`` that `request_stop` creates."""
+    """State in the folder ``path``: ``state.json``, the file ``latch`` with the latched fault, and the file ``stop``.
+
+    ``latch`` has a fixed size and is written in place, so a full disk does not lose a fault. It is filled with spaces
+    if there is no fault. `request_stop` creates ``stop``.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = path / "state.json"
         self._stop = path / "stop"
+        self._latch = path / "latch"
 
     def load(self) -> BenchState:
-        """Return the stored state; if the file cannot be read, an empty state that says why."""
+        """Return the stored state.
+
+        If a file cannot be read, the state is empty and says why, and a fault is latched: a fault may be lost.
+        """
+        state, fault, damage = BenchState(), None, ""
         try:
-            text = self._file.read_bytes()
+            state = BenchState.model_validate_json(self._file.read_bytes())
+            if not 1 <= state.version <= VERSION:
+                damage = f"{self._file} has version {state.version}, but this program reads version {VERSION}"
         except FileNotFoundError:
-            return BenchState()
+            if not self._latch.exists():
+                return state  # a new bench
+            damage = f"{self._file} is missing"
         except OSError as error:
-            return BenchState(damage=f"{self._file} cannot be read: {error.strerror}")
-        try:
-            state = BenchState.model_validate_json(text)
+            damage = f"{self._file} cannot be read: {error.strerror}"
         except ValidationError as error:
-            return BenchState(damage=f"{self._file} is damaged: {error.errors(include_url=False)[0]['msg']}")
-        if state.version != VERSION:
-            return BenchState(
-                damage=f"{self._file} has version {state.version}, but this program reads version {VERSION}"
-            )
-        return state
+            damage = f"{self._file} is damaged: {error.errors(include_url=False)[0]['msg']}"
+        try:
+            text = self._latch.read_bytes()
+            if len(text) != LATCH_BYTES:
+                damage = damage or f"{self._latch} is damaged: it has {len(text)} bytes"
+            if text.strip():
+                fault = LatchedFault.model_validate_json(text)
+        except FileNotFoundError:
+            damage = damage or (f"{self._latch} is missing" if state.version > 1 else "")
+        except OSError as error:
+            damage = damage or f"{self._latch} cannot be read: {error.strerror}"
+        except ValidationError as error:
+            damage = damage or f"{self._latch} is damaged: {error.errors(include_url=False)[0]['msg']}"
+        if damage:
+            return BenchState(damage=damage, fault=state.fault or fault or _fault_of_damage(damage))
+        return state.model_copy(update={"fault": state.fault or fault, "version": VERSION})
+
+    def latch(self, fault: LatchedFault | None) -> None:
+        try:
+            _make_folder(self.path)
+            self._write_latch(fault)
+        except OSError as error:
+            raise _not_stored(self._latch, error) from error
+
+    def _write_latch(self, fault: LatchedFault | None) -> None:
+        text = b"" if fault is None else fault.model_dump_json().encode()
+        if fault is not None and len(text) >= LATCH_BYTES:
+            short = fault.model_copy(update={"what": fault.what[:500], "next_step": fault.next_step[:500]})
+            text = short.model_copy(update={"evidence": {}}).model_dump_json().encode()
+        content = text.ljust(LATCH_BYTES - 1) + b"\n"
+        if not self._latch_is_reserved():
+            files.write(self._latch, content)
+            return
+        descriptor = os.open(self._latch, os.O_WRONLY | os.O_NOFOLLOW)
+        try:
+            os.pwrite(descriptor, content, 0)
+            os.fdatasync(descriptor)  # the file keeps its size and its place on the disk
+        finally:
+            os.close(descriptor)
+
+    def _latch_is_reserved(self) -> bool:
+        return self._latch.is_file() and self._latch.stat().st_size == LATCH_BYTES
 
     def save(self, state: BenchState) -> None:
         try:
             _make_folder(self.path)
+            if not self._latch_is_reserved():
+                self._write_latch(state.fault)
             files.write(self._file, state.model_dump_json(indent=1, exclude={"damage"}).encode())
         except OSError as error:
             raise _not_stored(self._file, error) from error
@@ -310,6 +379,16 @@ def busy(path: Path, who: Holder | None) -> BenchBusy:
         next_step="Wait until it ends, or run `rig stop` (stops the table, torque off). "
         "A second bench on this computer needs its own state_dir.",
         evidence={"state": str(path)},
+    )
+
+
+def _fault_of_damage(damage: str) -> LatchedFault:
+    return LatchedFault(
+        code=StateNotStored.code,
+        title=StateNotStored.title,
+        what=f"The bench's stored state is lost, and a fault may be lost with it: {damage}.",
+        next_step="Look at the table and its cable. Then `rig acknowledge`.",
+        utc="an unknown time",
     )
 
 

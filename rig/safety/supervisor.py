@@ -9,6 +9,7 @@ Decision: docs/decisions/0008.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Final
 
 from rig.config import RigConfig
 from rig.core.clock import Clock
@@ -20,14 +21,26 @@ from rig.core.errors import (
     RigError,
     StateNotStored,
     Unreferenced,
+    UsageError,
 )
 from rig.devices.servo import Servo, ServoState
-from rig.safety.angle_reference import AngleReference, SavedAngleCheck
+from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck
 from rig.safety.motion_checks import find_servo_fault
 from rig.safety.saved_state import LatchedFault, MemoryStore, StateStore
 from rig.safety.state_machine import StateEvent, StateMachine
 from rig.safety.state_machine import TableState as TableState
 from rig.safety.table_record import TableRecord
+
+_LOOK_AT_CABLE: Final = (
+    "Look at the cable. If it hangs free, run `rig home --turns 0`, else give the revolutions that it is wound up. Or "
+    "rotate the table by hand to its home and run `rig home --here`."
+)
+_SET_HOME: Final = "Rotate the table by hand to its home with the cable hanging free, then run `rig home --here`."
+_WAYS_OUT: Final = {
+    AngleFinding.SETTINGS_CHANGED: f"{_SET_HOME} Or restore the settings.",
+    AngleFinding.BEYOND_LIMITS: "Rotate the table by hand back into its limits, with the servo's supply on. Then run "
+    "the command again.",
+}
 
 
 class Motion:
@@ -212,6 +225,10 @@ class Safety:
             raise
         self._record.save_position(motion.position_deg)
 
+    def beyond_limits(self, table_deg: float) -> bool:
+        """Return whether the table may not rest at an angle, because it exceeds the cable budget."""
+        return self._record.beyond_limits(table_deg)
+
     def set_goal(self, position_deg: float) -> None:
         """Give the servo a goal, moved into the table's limits. Nothing else in the program writes a goal."""
         ends_deg = [self.angle_reference.to_servo(limit) for limit in self._config.table.limits_deg]
@@ -290,7 +307,15 @@ class Safety:
         ------
         NotReady
             The servo is not connected, or a fault is latched.
+        UsageError
+            The angle is beyond the table's limits; nothing is stored.
         """
+        if self._record.beyond_limits(table_deg):
+            low_deg, high_deg = self._config.table.limits_deg
+            raise UsageError(
+                f"The table cannot be at {table_deg:.1f}°: its cable budget is {low_deg:g}° to {high_deg:g}°.",
+                next_step=f"Check the revolutions that you gave. {_SET_HOME}",
+            )
         if not self._machine.accepts(StateEvent.REFER):
             raise self._not_ready()
         self._record.set_angle(table_deg)
@@ -302,13 +327,17 @@ class Safety:
         Raises
         ------
         NotReady
-            As in `set_angle`; or a gear hides the table's angle within its revolution from the servo.
+            As in `set_angle`; or a gear hides the table's angle within its revolution from the servo; or the settings
+            of the table were changed.
+        UsageError
+            As in `set_angle`.
         """
+        if self.doubt and self.doubt.finding is AngleFinding.SETTINGS_CHANGED:
+            raise self._not_ready()
         if self.doubt and self._servo.turn_deg < 360.0:
             raise NotReady(
                 "Because of its gear, the servo cannot measure the table's angle within a revolution.",
-                next_step="Rotate the table by hand to its home with the cable hanging free, then run "
-                "`rig home --here`.",
+                next_step=_SET_HOME,
             )
         self.set_angle(self.angle_reference.with_revolutions(self._servo.read_state().position_deg, revolutions))
 
@@ -359,9 +388,7 @@ class Safety:
             case TableState.UNREFERENCED:
                 return Unreferenced(
                     f"How far the table's cable is wound up is not known: {self.doubt}.",
-                    next_step="Look at the cable. If it hangs free, run `rig home --turns 0`, else give the "
-                    "revolutions that it is wound up. Or rotate the table by hand to its home and run "
-                    "`rig home --here`.",
+                    next_step=_WAYS_OUT.get(self.doubt.finding, _LOOK_AT_CABLE) if self.doubt else _LOOK_AT_CABLE,
                     evidence={"finding": self.doubt.finding} if self.doubt else None,
                 )
             case TableState.STOPPED:

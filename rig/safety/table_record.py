@@ -1,8 +1,12 @@
 """What is stored about one bench's table: its angle, how its cable is wound up, and the latched fault."""
 
+from dataclasses import replace
+from math import isclose
+
 from rig.config import TableConfig
+from rig.core.errors import StateNotStored
 from rig.devices.servo import Servo
-from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck, check_saved_angle
+from rig.safety.angle_reference import TOLERANCE_DEG, AngleFinding, AngleReference, SavedAngleCheck, check_saved_angle
 from rig.safety.saved_state import BenchState, LatchedFault, SavedTable, StateStore
 
 
@@ -21,6 +25,7 @@ class TableRecord:
 
     def __init__(self, servo: Servo, config: TableConfig, store: StateStore) -> None:
         self._servo = servo
+        self._config = config
         self._store = store
         self._state = store.load()
         shift_deg = self._state.table.shift_deg if self._state.table else 0.0
@@ -46,10 +51,28 @@ class TableRecord:
             self._state.table, self._servo.identity, state.position_deg, condition, self._servo.turn_deg
         )
         self.angle_reference.shift_deg = check.shift_deg
+        if check.finding is not AngleFinding.NEVER_REFERENCED and self._settings_changed():
+            check = replace(check, finding=AngleFinding.SETTINGS_CHANGED)
+        elif check.certain and self.beyond_limits(table_deg := self.angle_reference.to_table(state.position_deg)):
+            check = replace(check, finding=AngleFinding.BEYOND_LIMITS, table_deg=table_deg)
         self.doubt = None if check.certain else check
         if check.certain and check.finding is not AngleFinding.UNCHANGED and str(check) not in self.findings:
             self.findings.append(str(check))
         return check.certain
+
+    def beyond_limits(self, table_deg: float) -> bool:
+        """Return whether an angle at rest exceeds the cable budget by more than a shaft relaxes."""
+        low_deg, high_deg = self._config.limits_deg
+        return not low_deg - TOLERANCE_DEG <= table_deg <= high_deg + TOLERANCE_DEG
+
+    def _settings_changed(self) -> bool:
+        """Return whether positions meant other table angles when the state was stored."""
+        saved = self._state.table
+        if saved is None or saved.gear_ratio is None:
+            return False
+        return (saved.zero_deg, saved.direction) != (self._config.zero_deg, self._config.direction) or not isclose(
+            saved.gear_ratio * self._servo.turn_deg, 360.0
+        )
 
     def set_angle(self, table_deg: float) -> None:
         """Take ``table_deg`` for the table's present angle, and store it."""
@@ -70,14 +93,23 @@ class TableRecord:
             position_deg=position_deg,
             shift_deg=self.angle_reference.shift_deg,
             path_deg=path_deg,
+            zero_deg=self._config.zero_deg,
+            direction=self._config.direction,
+            gear_ratio=360.0 / self._servo.turn_deg,
         )
         self._save(self._state.model_copy(update={"table": table, "damage": ""}))
 
     def save_fault(self, fault: LatchedFault | None) -> None:
         """Store the latched fault; it holds in this process even if the disk cannot be written."""
         state = self._state.model_copy(update={"fault": fault, "damage": ""})
+        latched = False
         try:
+            self._store.latch(fault)
+            latched = fault is not None
             self._save(state)
+        except StateNotStored:
+            if not latched:
+                raise
         finally:
             if fault is not None:
                 self._state = state

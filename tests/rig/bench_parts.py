@@ -29,6 +29,7 @@ class Wires:
     device: XSeriesServo
     serial: SimSerial
     sent: list[Frame] = field(default_factory=list)
+    i2c: SimI2cBus | None = None
 
     @property
     def instructions(self) -> list[bytes]:
@@ -73,11 +74,11 @@ def sensor(wires: Wires) -> Iterator[tuple[Wires, SimI2cBus]]:
 
 
 @contextmanager
-def program(wires: Wires, i2c: SimI2cBus, state: StateStore, *settings: str) -> Iterator[Bench]:
+def program(wires: Wires, i2c: SimI2cBus, state: StateStore, *settings: str, **servo_options: Any) -> Iterator[Bench]:
     """Yield the bench as one program opens it; the next program finds the devices as this one leaves them."""
     if not wires.serial.is_open:
         wires.serial.open()
-    servo = open_servo(wires)
+    servo = open_servo(wires, **servo_options)
     imu = Mpu6050(i2c.path, clock=wires.world.clock)
     config = load_config(overrides=settings)
     bench = Bench("test", config, wires.world.clock, servo, imu, camera=None, state=state)  # type: ignore[arg-type]

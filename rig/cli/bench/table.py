@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_DECLINED
+from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -37,9 +39,17 @@ def home(
     settings: Settings,
     turns: Annotated[
         int | None,
-        typer.Option(metavar="N", help="The cable is wound up by N revolutions, as you saw; 0 if it hangs free."),
+        typer.Option(
+            metavar="N",
+            min=-250,
+            max=250,
+            help="The cable is wound up by N revolutions, as you saw; 0 if it hangs free.",
+        ),
     ] = None,
     here: Annotated[bool, typer.Option("--here", help="Make the present angle home. Moves nothing.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Rotate more than half a revolution without asking.")
+    ] = False,
 ) -> None:
     """Rotate the table to home (0°). If its revolutions are in doubt, look at the cable and give --turns.
 
@@ -56,6 +66,14 @@ def home(
             settings.say("The present angle is home now.", {"table_deg": 0.0})
             return
         if turns is not None:
+            position_deg = bench.servo.read_state().position_deg
+            angle_deg = bench.safety.angle_reference.with_revolutions(position_deg, turns)
+            if abs(angle_deg) > 180.0 and not bench.safety.beyond_limits(angle_deg) and not yes:
+                question = (
+                    f"The table is then at {angle_deg:.0f}° and rotates by {-angle_deg:+.0f}° to home. Rotate it?"
+                )
+                if not ask_yes_no(question):
+                    raise typer.Exit(EXIT_DECLINED)
             bench.safety.set_revolutions(turns)
         with Turntable(bench) as table:
             _rotate(settings, table, 0.0)

@@ -106,6 +106,28 @@ def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
     assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
 
 
+def test_home_shows_a_long_rotation_and_asks(rig):
+    rig("goto", "10")
+    asked = rig("home", "--turns", "1")  # standard input has ended: no answer
+    assert asked.exit_code == 2
+    assert "rotates by -370° to home" in asked.stderr
+    assert "--yes" in asked.stderr
+    assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(10, abs=0.3)
+    for turns in ("3", "249", "99999999", "9" * 400):
+        assert rig("home", "--turns", turns, "--yes").exit_code == 2, turns
+    assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(10, abs=0.3)
+    moved = [json.loads(line) for line in rig("home", "--turns", "1", "--yes", "--json").stdout.splitlines()]
+    assert moved[-1]["rotation_encoder_deg"] == pytest.approx(-370, abs=0.3)
+
+
+@pytest.mark.parametrize("angle", ["nan", "inf", "-inf", "1e308"])
+def test_angle_that_is_no_number_is_rejected_before_the_bench_opens(rig, angle):
+    done = rig("goto", "--", angle)
+    assert done.exit_code == 2
+    assert "not an angle" in done.stderr
+    assert not Path("state/sim/state.json").exists()
+
+
 def test_home_here_sets_the_angle(rig):
     rig("goto", "90")
     assert rig("home", "--here").exit_code == 0

@@ -12,16 +12,19 @@ from rig.core.errors import (
     DeviceNotFound,
     DeviceSilent,
     FaultLatched,
+    NoProgress,
     RigError,
     Stalled,
     SupplyLost,
     Unreferenced,
+    UsageError,
     WatchdogTripped,
 )
 from rig.motion.turntable import Turntable
 from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import FileStore
 from rig.safety.supervisor import TableState
+from sim import disk
 from sim.servo import XSeriesServo
 from tests.rig.bench_parts import Wires, kill, program, sensor, servo_wires
 
@@ -30,6 +33,7 @@ from tests.rig.bench_parts import Wires, kill, program, sensor, servo_wires
 def bench_of(tmp_path):
     """Return a function that starts a program on one and the same bench, whose cable hung free at first."""
     with sensor(servo_wires()) as (wires, i2c):
+        wires.i2c = i2c
         store = FileStore(tmp_path / "state")
         with program(wires, i2c, store) as bench:
             assert bench.safety.state is TableState.UNREFERENCED
@@ -38,6 +42,12 @@ def bench_of(tmp_path):
             assert "rig home --turns 0" in refused.value.next_step
             bench.safety.set_revolutions(0)
         yield lambda: program(wires, i2c, FileStore(tmp_path / "state")), wires
+
+
+def changed(wires: Wires, tmp_path, setting: str):
+    """Return a program with another setting of the table; the servo of the tests takes its gear ratio directly."""
+    gear = {"gear_ratio": 1.5} if "gear" in setting else {}
+    return program(wires, wires.i2c, FileStore(tmp_path / "state"), setting, **gear)
 
 
 def after(wires: Wires, seconds: float, happens) -> None:
@@ -312,7 +322,79 @@ def test_damaged_state_is_reported_and_needs_a_new_reference(bench_of, tmp_path)
     (tmp_path / "state" / "state.json").write_bytes(b'{"version": 1, "tab')
     with start() as bench:
         assert "is damaged" in bench.findings[0]
+        assert bench.safety.state is TableState.FAULT
+        with pytest.raises(FaultLatched), Turntable(bench):
+            pass
+        assert bench.safety.acknowledge() is TableState.UNREFERENCED
+        bench.safety.set_revolutions(0)
+        assert bench.safety.state is TableState.READY
+
+
+@pytest.mark.parametrize("change", ["table.zero_deg=360", "table.direction=-1", "servo.gear_ratio=1.5"])
+def test_changed_settings_of_the_table_need_home_here(bench_of, change, tmp_path):
+    start, wires = bench_of
+    with start() as bench, Turntable(bench) as table:
+        table.goto(390.0)
+    with changed(wires, tmp_path, change) as bench:
         assert bench.safety.state is TableState.UNREFERENCED
+        assert bench.safety.doubt.finding is AngleFinding.SETTINGS_CHANGED
+        with pytest.raises(Unreferenced) as refused, Turntable(bench):
+            pass
+        assert "rig home --here" in refused.value.next_step
+        with pytest.raises(Unreferenced):
+            bench.safety.set_revolutions(0)
+        bench.safety.set_angle(0.0)
+        assert bench.safety.state is TableState.READY
+    with changed(wires, tmp_path, change) as bench:
+        assert bench.safety.state is TableState.READY
+
+
+def test_position_beyond_the_limits_is_never_ready(bench_of):
+    start, wires = bench_of
+    with start() as bench, Turntable(bench) as table:
+        table.goto(390.0)
+    wires.world.clock.sleep(wires.device.turn_by_hand(30.0) + 0.1)
+    with start() as bench:
+        assert bench.safety.state is TableState.UNREFERENCED
+        assert bench.safety.doubt.finding is AngleFinding.BEYOND_LIMITS
+        with pytest.raises(Unreferenced, match=r"4[12]\d\.\d°, beyond its cable budget") as refused, Turntable(bench):
+            pass
+        assert "by hand back into its limits" in refused.value.next_step
+    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0) + 0.1)
+    with start() as bench, Turntable(bench) as table:
+        table.goto(300.0)
+
+
+@pytest.mark.parametrize("turns", [-3, 2, 3, 99_999_999])
+def test_revolutions_beyond_the_limits_are_rejected_and_not_stored(bench_of, tmp_path, turns):
+    start, _wires = bench_of
+    before = (tmp_path / "state" / "state.json").read_bytes()
+    with start() as bench, pytest.raises(UsageError, match="cable budget"):
+        bench.safety.set_revolutions(turns)
+    assert (tmp_path / "state" / "state.json").read_bytes() == before
+
+
+def test_full_disk_does_not_lose_the_fault_of_a_motion(bench_of):
+    start, wires = bench_of
+
+    def jam_on_full_disk() -> None:
+        nonlocal free
+        free = disk.fill()
+        wires.device.jam()
+
+    def free() -> None:
+        pytest.fail("the disk was never full")
+
+    with start() as bench:
+        with pytest.raises((Stalled, NoProgress)), Turntable(bench) as table:
+            after(wires, 1.0, jam_on_full_disk)
+            table.goto(300.0)
+        free()
+    wires.device.free()
+    with start() as bench:
+        assert bench.safety.state is TableState.FAULT
+        with pytest.raises(FaultLatched), Turntable(bench):
+            pass
 
 
 def test_stop_request_ends_the_motion_with_torque_off(bench_of, tmp_path):

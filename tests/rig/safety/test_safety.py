@@ -24,7 +24,7 @@ from rig.core.errors import (
 )
 from rig.devices.servo import ServoCondition, ServoIdentity, ServoLimits, ServoState
 from rig.safety.angle_reference import AngleFinding
-from rig.safety.saved_state import BenchState, MemoryStore
+from rig.safety.saved_state import BenchState, LatchedFault, MemoryStore
 from rig.safety.state_machine import TRANSITIONS, StateEvent
 from rig.safety.supervisor import Safety, TableState
 from sim.clock import VirtualClock
@@ -108,6 +108,7 @@ class Bench(RuleBasedStateMachine):
         if self.safety.state is TableState.READY:
             told_deg = self.safety.angle_reference.to_table(self.shaft.read_state().position_deg)
             assert told_deg == pytest.approx(self.shaft.cable_deg, abs=1e-6)
+            assert abs(told_deg) <= 402.0
 
     # -- programs -----------------------------------------------------------------------------------------------------
 
@@ -183,7 +184,7 @@ class Bench(RuleBasedStateMachine):
             assert self.safety.fault is None
             assert self.safety.state in (TableState.READY, TableState.UNREFERENCED)
             return
-        assert self.safety.fault == fault
+        assert fault is None or self.safety.fault == fault
         assert not well or fault is None
 
     @precondition(lambda self: self.connected)
@@ -208,6 +209,8 @@ class Bench(RuleBasedStateMachine):
     @precondition(lambda self: self.connected and self.shaft.there and not self.shaft.other)
     @rule(zero_here=st.booleans())
     def operator_checks_the_cable(self, zero_here: bool) -> None:
+        if abs(self.shaft.cable_deg) > 400.0:  # beyond the limits, the operator unwinds the cable by hand
+            self.shaft.cable_deg = float(wrap180(self.shaft.cable_deg))
         with suppress(NotReady):
             if zero_here:
                 self.safety.set_angle(0.0)
@@ -286,6 +289,11 @@ def test_nothing_moves_if_the_state_cannot_be_stored():
             if self.full:
                 raise StateNotStored("The disk is full.", next_step="Make room.")
             super().save(state)
+
+        def latch(self, fault: LatchedFault | None) -> None:
+            if self.full:
+                raise StateNotStored("The disk is full.", next_step="Make room.")
+            super().latch(fault)
 
     store = Full()
     safety = Safety(Shaft(), RigConfig(), VirtualClock(), store)

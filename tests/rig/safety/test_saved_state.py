@@ -13,7 +13,17 @@ from hypothesis import strategies as st
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, Stalled, StateNotStored
-from rig.safety.saved_state import BenchLock, BenchState, FileStore, Holder, LatchedFault, SavedTable, holder
+from rig.safety.saved_state import (
+    LATCH_BYTES,
+    BenchLock,
+    BenchState,
+    FileStore,
+    Holder,
+    LatchedFault,
+    SavedTable,
+    holder,
+)
+from sim import disk
 from tests.fuzzing import fuzz_settings
 
 HOLD = """
@@ -84,14 +94,23 @@ def test_damaged_state_is_reported_and_not_used(tmp_path_factory, damage):
     folder.mkdir(exist_ok=True)
     (folder / "state.json").write_bytes(damage)
     state = FileStore(folder).load()
-    assert (state.table, state.fault) == (None, None)
+    assert state.table is None
+    assert state.fault.code == StateNotStored.code  # a fault may be lost with the state
     assert state.damage
     FileStore(folder).save(state)
     assert not FileStore(folder).load().damage
+    assert FileStore(folder).load().fault == state.fault
+    FileStore(folder).latch(None)
 
 
 @pytest.mark.parametrize(
-    "text", ['{"version": 2}', '{"version": 1, "table": {"position_deg": 3}}', '{"version": 1, "colour": "red"}']
+    "text",
+    [
+        '{"version": 2}',
+        '{"version": 3}',
+        '{"version": 1, "table": {"position_deg": 3}}',
+        '{"version": 1, "colour": "red"}',
+    ],
 )
 def test_unknown_version_or_shape_is_not_used(tmp_path, text):
     (tmp_path / "state.json").write_text(text)
@@ -119,6 +138,52 @@ def test_interrupted_write_keeps_the_old_state(tmp_path, monkeypatch):
         store.save(BenchState())
     assert caught.value.evidence["reason"] == "No space left on device"
     assert store.load().table == TABLE
+
+
+STALLED = LatchedFault.of(Stalled("Blocked.", next_step="Free it.", evidence={"load_percent": 99.0}), "2026-01-02")
+
+
+def test_full_disk_does_not_lose_a_fault(tmp_path):
+    store = FileStore(tmp_path)
+    store.save(BenchState(table=TABLE))
+    free = disk.fill()
+    try:
+        with pytest.raises(StateNotStored):
+            store.save(BenchState())
+        store.latch(STALLED)
+    finally:
+        free()
+    assert FileStore(tmp_path).load() == BenchState(table=TABLE, fault=STALLED)
+    store.latch(None)
+    assert FileStore(tmp_path).load() == BenchState(table=TABLE)
+
+
+def test_fault_larger_than_its_file_is_stored_without_evidence(tmp_path):
+    store = FileStore(tmp_path)
+    store.save(BenchState(table=TABLE))
+    store.latch(LatchedFault.of(Stalled("x" * 9000, next_step="y", evidence={"z": "z" * 9000}), "2026-01-02"))
+    assert store.load().fault.what == "x" * 500
+    assert (tmp_path / "latch").stat().st_size == LATCH_BYTES
+
+
+@pytest.mark.parametrize("name", ["state.json", "latch"])
+@pytest.mark.parametrize("spoil", ["delete", "truncate", "half", "flip", "unreadable"])
+@pytest.mark.parametrize("fault", [None, STALLED], ids=["no fault", "fault"])
+def test_spoiled_state_counts_as_latched(tmp_path, name, spoil, fault):
+    store = FileStore(tmp_path)
+    store.save(BenchState(table=TABLE, fault=fault))
+    path = tmp_path / name
+    content = path.read_bytes()
+    if spoil in ("delete", "unreadable"):
+        path.unlink()
+    if spoil == "unreadable":
+        path.mkdir()
+    elif spoil != "delete":
+        path.write_bytes({"truncate": b"", "half": content[: len(content) // 2], "flip": b"}" + content[1:]}[spoil])
+    state = FileStore(tmp_path).load()
+    assert state.damage
+    assert state.fault == fault or state.fault.code in (StateNotStored.code, Stalled.code)
+    assert state.fault is not None
 
 
 def test_second_program_is_told_which_one_uses_the_bench(tmp_path, other_program):
