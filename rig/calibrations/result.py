@@ -20,7 +20,9 @@ from pydantic import (
 
 from rig.calibrations.refusal import Refusal, stored_refusal
 from rig.core.errors import ConfigError, UsageError
-from rig.core.files import write
+from rig.core.files import read, write
+
+MAX_FILE_BYTES = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +135,7 @@ class CalibrationResult:
             The file cannot be read, or is not a calibration result; the error lists all mistakes.
         """
         try:
-            result = _JSON.validate_json(path.read_bytes())
+            result = _JSON.validate_json(read(path, max_bytes=MAX_FILE_BYTES))
         except OSError as error:
             mistakes = [error.strerror or str(error)]
         except ValidationError as error:

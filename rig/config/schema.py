@@ -20,7 +20,7 @@ class Section(BaseModel):
 
 
 Degrees = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Harmonic = Annotated[float, Field(ge=-10, le=10)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -33,7 +33,7 @@ class ServoConfig(Section):
     model: str = Field("xl430_w250", description="model as in the SDK's control tables, or ax_12a")
     gear_ratio: float = Field(
         1.0,
-        gt=0,
+        ge=0.001,
         le=1000,
         description="revolutions of the servo for one revolution of the table; table.direction sets the direction",
     )
@@ -59,20 +59,27 @@ class TableConfig(Section):
         "object",
         description="what the servo rotates: the object in front of the camera, or the camera around the object",
     )
-    zero_deg: Degrees = Field(180.0, description="servo angle at home (table angle 0), on the table's side of the gear")
+    zero_deg: float = Field(
+        180.0,
+        ge=-MAX_LIMIT_DEG,
+        le=MAX_LIMIT_DEG,
+        description="servo angle at home (table angle 0), on the table's side of the gear",
+    )
     limits_deg: tuple[Degrees, Degrees] = Field(
         (-400.0, 400.0), description="cable budget: lowest and highest table angle"
     )
-    velocity_dps: float = Field(90.0, gt=0, le=200, description="cruise speed; must be within the gyro's range")
-    acceleration_dps2: float = Field(240.0, gt=0, le=5000, description="acceleration of the ramp")
+    velocity_dps: float = Field(90.0, ge=0.1, le=200, description="cruise speed; must be within the gyro's range")
+    acceleration_dps2: float = Field(240.0, ge=0.1, le=5000, description="acceleration of the ramp")
     approach_deg: float = Field(
         3.0,
         ge=0,
         le=30,
         description="each stop is approached upwards from at least this far below, which takes up the gears' backlash",
     )
-    tolerance_deg: float = Field(0.6, gt=0, le=5, description="largest distance from the goal that counts as arrived")
-    encoder_harmonics_deg: tuple[Degrees, Degrees, Degrees, Degrees] = Field(
+    tolerance_deg: float = Field(
+        0.6, ge=0.001, le=5, description="largest distance from the goal that counts as arrived"
+    )
+    encoder_harmonics_deg: tuple[Harmonic, Harmonic, Harmonic, Harmonic] = Field(
         (0.0, 0.0, 0.0, 0.0),
         description="encoder error over a revolution: cosine and sine of the first and the second harmonic, from "
         "calibration",
@@ -81,13 +88,13 @@ class TableConfig(Section):
         0.5, ge=0, le=10, description="largest backlash between encoder and platter that is not a fault"
     )
     settle_s: float = Field(
-        0.46, gt=0, le=10, description="time from the end of a motion until the table is at rest, for estimates"
+        0.46, ge=0.001, le=10, description="time from the end of a motion until the table is at rest, for estimates"
     )
     orientation: Literal["encoder", "imu"] = Field(
         "encoder",
         description="source of a view's angle: the servo's encoder, or only the gyro on the platter",
     )
-    quiet_dps: float = Field(0.35, gt=0, le=10, description="largest rate that the gyro may measure at rest")
+    quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
     poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
     watchdog_s: float = Field(
@@ -126,12 +133,15 @@ class SafetyConfig(Section):
 
     following_error_deg: float = Field(
         12.0,
-        gt=0,
+        ge=0.01,
         le=90,
         description="largest distance of the shaft from the servo's motion profile, and from its path",
     )
     max_load_percent: float = Field(
-        70.0, gt=0, le=100, description="largest part of the servo's torque (or current limit) that is not an overload"
+        70.0,
+        ge=0.1,
+        le=100,
+        description="largest part of the servo's torque (or current limit) that is not an overload",
     )
     stall_s: float = Field(0.25, ge=0.05, le=1, description="how long the servo may push without rotating")
     overload_s: float = Field(
@@ -145,7 +155,7 @@ class SafetyConfig(Section):
         0.2, ge=0, le=2, description="distance from the voltages at which the servo shuts down"
     )
     slip_deg: float = Field(
-        10.0, gt=0, le=90, description="difference of encoder and gyro (beyond 4 sigma) that stops a motion"
+        10.0, ge=0.01, le=90, description="difference of encoder and gyro (beyond 4 sigma) that stops a motion"
     )
 
 
@@ -192,7 +202,7 @@ class HeadConfig(Section):
     )
     light: float | None = Field(
         None,
-        gt=0,
+        ge=0.001,
         le=1,
         description="duty cycle of the ring light while the bench is open; none: no light is connected to the head",
     )
@@ -206,16 +216,18 @@ class CameraConfig(Section):
     source: int | str = Field(0, description="index or path of the camera, for OpenCV")
     width: int = Field(640, ge=80, le=8000, description="pixels")
     height: int = Field(480, ge=80, le=8000, description="pixels")
-    fps: float = Field(30.0, gt=0, le=500, description="frames per second")
+    fps: float = Field(30.0, ge=0.1, le=500, description="frames per second")
     exposure_us: float | None = Field(
-        8000.0, gt=0, le=1e6, description="locked exposure time; none keeps the camera's own"
+        8000.0, ge=1, le=1e6, description="locked exposure time; none keeps the camera's own"
     )
-    gain: float | None = Field(None, ge=0, description="locked gain in the camera's unit; none keeps the camera's own")
+    gain: float | None = Field(
+        None, ge=0, le=1e6, description="locked gain in the camera's unit; none keeps the camera's own"
+    )
     white_balance_k: float | None = Field(
         5000.0, ge=1000, le=20000, description="locked white balance; none keeps the camera's own"
     )
     focus: float | None = Field(
-        None, ge=0, description="locked focus in the camera's unit; none keeps the camera's own"
+        None, ge=0, le=1e6, description="locked focus in the camera's unit; none keeps the camera's own"
     )
 
 
@@ -225,7 +237,9 @@ class ViewConfig(Section):
     roi: tuple[int, int, int, int] | None = Field(
         (80, 0, 480, 480), description="x, y, width and height of the image region that is described"
     )
-    min_sharpness: NotNegative = Field(3.0, description="smallest variance of the Laplacian of the region in grey")
+    min_sharpness: float = Field(
+        3.0, ge=0, le=1e6, description="smallest variance of the Laplacian of the region in grey"
+    )
     max_dark: Fraction = Field(0.95, description="largest part of pixels below level 8")
     max_saturated: Fraction = Field(0.25, description="largest part of pixels at level 255")
     min_mean: float = Field(4.0, ge=0, le=255, description="smallest mean level")

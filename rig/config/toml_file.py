@@ -13,12 +13,20 @@ from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from rig.core.errors import ConfigError
-from rig.core.files import write
+from rig.core.files import read, write
 
 Key = tuple[str, ...]
+
+MAX_FILE_BYTES: Final = 100_000
+MAX_DEPTH: Final = 16
+"""Largest depth of tables and lists in a value; the configuration itself needs 5."""
+MAX_DOTS: Final = 1000
+"""In a line: the time that `tomllib` takes for a dotted key grows with the square of its parts."""
+MAX_INTEGER: Final = 2**63
+"""TOML 1.0, Integer: 64-bit signed."""
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -73,6 +81,31 @@ def statements(text: str) -> Iterator[Statement]:
         position = _line_end(text, position)
 
 
+def loads(text: str) -> dict[str, Any]:
+    """Return the values of a document.
+
+    Raises
+    ------
+    ValueError
+        It is not TOML, has an integer of more than 64 bits, or is nested too deeply. `tomllib.TOMLDecodeError` is one.
+    """
+    if any(line.count(".") > MAX_DOTS for line in text.splitlines()):
+        raise ValueError("a key has too many parts")
+    try:
+        values = tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError("tables or lists are nested too deeply") from error
+    inside: list[Any] = [values]
+    for _ in range(MAX_DEPTH):
+        items = [item for one in inside for item in (one.values() if isinstance(one, dict) else one)]
+        if any(isinstance(item, int) and not -MAX_INTEGER <= item < MAX_INTEGER for item in items):
+            raise ValueError("an integer has more than 64 bits")
+        inside = [item for item in items if isinstance(item, dict | list)]
+    if inside:
+        raise ValueError(f"tables or lists are nested more than {MAX_DEPTH} deep")
+    return values
+
+
 def line_numbers(text: str) -> dict[Key, int]:
     """Return the line of each key and table of a valid document."""
     return {statement.key: statement.line for statement in statements(text)}
@@ -87,8 +120,8 @@ def with_values(text: str, changes: Mapping[Key, Any]) -> str:
         The document is not TOML, or has a key in a form that cannot be edited without changing something else.
     """
     try:
-        before = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        before = loads(text)
+    except ValueError as error:
         raise ConfigError(
             "The file is not TOML.", next_step="Fix the line in the reason.", evidence={"reason": str(error)}
         ) from error
@@ -128,7 +161,7 @@ def read_text(path: Path) -> str:
         The file cannot be read, or is not text.
     """
     try:
-        return path.read_bytes().decode("utf-8")
+        return read(path, max_bytes=MAX_FILE_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"Cannot read the configuration {path}.",

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import platformdirs
 from pydantic import BaseModel, ValidationError
 
-from rig.config.toml_file import Key, line_numbers, read_text
+from rig.config.toml_file import MAX_DEPTH, Key, line_numbers, loads, read_text
 from rig.config.wording import mistakes
 from rig.core.errors import ConfigError
 
@@ -19,6 +19,8 @@ M = TypeVar("M", bound=BaseModel)
 
 APP = "hbr-rig"
 FILE_NAME = "rig.toml"
+MAX_VALUE_LENGTH = 2000
+SHOWN = 60
 
 _PATHS: tuple[Key, ...] = (("catalog", "path"), ("state_dir",), ("calibration_dir",))
 
@@ -63,8 +65,8 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = ()) -> Valu
     if source is not None:
         text = read_text(source)
         try:
-            values = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+            values = loads(text)
+        except ValueError as error:
             raise ConfigError(
                 f"{source} is not a TOML file.",
                 next_step="Fix this line.",
@@ -138,7 +140,7 @@ def _apply(values: dict[str, Any], override: str) -> Key:
     """Apply an override, and return its key."""
     key, sign, text = override.partition("=")
     parts = key.strip().split(".")
-    if not sign or not all(parts):
+    if not sign or not all(parts) or len(parts) > MAX_DEPTH:
         raise ConfigError(
             f"Cannot read the setting {override!r}.",
             next_step="Write SECTION.KEY=VALUE, e.g. --set identify.max_views=4.",
@@ -154,8 +156,24 @@ def _apply(values: dict[str, Any], override: str) -> Key:
 
 
 def parsed(text: str) -> Any:
-    """Return a typed value: parsed as TOML, or else as a bare word."""
+    """Return a typed value: parsed as TOML, or else as a bare word.
+
+    Raises
+    ------
+    ConfigError
+        The text has more than one line, or is too long, or its value is too large.
+    """
+    if len(text) > MAX_VALUE_LENGTH or len(text.strip().splitlines()) > 1:
+        raise ConfigError(
+            f"A value has more than one line, or more than {MAX_VALUE_LENGTH} characters.",
+            next_step="Give one value on one line. Put longer ones into the configuration file.",
+            evidence={"value": f"{text[:SHOWN]}…" if len(text) > SHOWN else text},
+        )
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return loads(f"value = {text.strip()}")["value"]
     except tomllib.TOMLDecodeError:
         return text.strip()
+    except ValueError as error:
+        raise ConfigError(
+            "A value is too large.", next_step="Give a value within the limits.", evidence={"reason": str(error)}
+        ) from error

@@ -1,12 +1,51 @@
-"""Writes files that survive a power cut: completely or not at all, with their name in the folder."""
+"""Reads files of limited size, and writes files that survive a power cut: completely or not at all."""
 
+import json
 import os
+import stat
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 MAX_SINGLE_SYNCS: Final = 100
 """Up to this number, files are synchronised one by one, without waiting for other programs' data."""
+
+
+def read(path: Path, *, max_bytes: int) -> bytes:
+    """Return the content of a regular file; a pipe or a device is never waited for.
+
+    Raises
+    ------
+    OSError
+        The file is missing, cannot be read, is not a regular file, or is larger than ``max_bytes``.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    with open(descriptor, "rb") as file:  # noqa: PTH123 - a path cannot be opened without waiting for a pipe
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode):
+            raise OSError(None, "it is a folder" if stat.S_ISDIR(mode) else "it is not a regular file", str(path))
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise OSError(None, f"it is larger than {max_bytes} bytes", str(path))
+    return content
+
+
+def json_values(content: bytes | str) -> Any:
+    """Return the values of a JSON document.
+
+    Raises
+    ------
+    ValueError
+        It is not JSON, is nested too deeply, or has a number that is not finite.
+    """
+    try:
+        return json.loads(content, parse_constant=_reject_constant)
+    except RecursionError as error:
+        raise ValueError("the JSON is nested too deeply") from error
+
+
+def _reject_constant(name: str) -> None:
+    raise ValueError(f"{name} is not a number in JSON")
 
 
 def write(path: Path, content: bytes) -> None:

@@ -12,10 +12,12 @@ from typing import Final, Protocol
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
 from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected
+from rig.core.files import read
 from rig.events.events import Event, Item, SkipReason
 from rig.plans.enroll import enroll
 
 COLUMNS: Final = ("name", "label", "note", "views")
+MAX_FILE_BYTES: Final = 1_000_000
 MIN_VIEWS, MAX_VIEWS = 4, 720
 """Limits of the number of views, as for `enroll.views` of the configuration."""
 
@@ -78,7 +80,7 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
         The file cannot be read, or it has mistakes; the evidence lists all of them with their lines.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read(path, max_bytes=MAX_FILE_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise UsageError(
             f"The list {path} cannot be read.",

@@ -18,12 +18,13 @@ from hbr.dense.filter import BETA
 from hbr.dense.stopping import Limitation, LimitationCode
 from hbr.descriptors import descriptor
 from rig.core.errors import CatalogError
-from rig.core.files import write
+from rig.core.files import json_values, read, write
 from rig.events.events import Note, NoteCode, plain
 
 FILE: Final = "search_rules.json"
 """Beside ``catalog.sqlite``."""
 FORMAT: Final = "hbr-rig search rules"
+MAX_FILE_BYTES: Final = 100_000_000
 VERSION: Final = 2
 """Version 1 stored limitations as sentences, and used other names."""
 ERROR_RATE: Final = 0.01
@@ -190,7 +191,7 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
     """
     path = folder / FILE
     try:
-        values = json.loads(path.read_bytes())
+        values = json_values(read(path, max_bytes=MAX_FILE_BYTES))
         if values["format"] != FORMAT or values["version"] not in range(1, VERSION + 1):
             raise ValueError(f"its format is {values['format']} {values['version']}")
         if values["version"] == 1:

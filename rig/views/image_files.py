@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.core import files
 from rig.core.errors import CatalogError, UsageError
 
 IMAGE_FOLDER: Final = "images"
@@ -132,9 +133,11 @@ def read(path: Path, sha256: str) -> NDArray[np.uint8]:
     """
     fix = "run rig catalog verify --repair to find a copy; otherwise enroll the object again with --replace"
     try:
-        content = path.read_bytes()
+        content = files.read(path, max_bytes=MAX_FILE_BYTES)
     except FileNotFoundError as error:
         raise CatalogError(f"the image {path} is missing", next_step=fix) from error
+    except OSError as error:
+        raise CatalogError(f"the image {path} cannot be read: {error.strerror}", next_step=fix) from error
     if digest(content) != sha256:
         raise CatalogError(f"the image {path} is not the one that was stored", next_step=fix)
     try:

@@ -1,14 +1,15 @@
 """Simulated faults with their times, in a short notation (``jam@move3+2s``) or in a TOML file."""
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any, Self
 
+from rig.config.toml_file import MAX_FILE_BYTES, loads
 from rig.core.errors import UsageError
+from rig.core.files import read
 from sim.faults.kind import FaultKind
 from sim.faults.lookup import find_fault
 
@@ -128,14 +129,14 @@ def load_faults(path: Path) -> list[Fault]:
         The file or one of its faults cannot be read; the message says which one.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = loads(read(path, max_bytes=MAX_FILE_BYTES).decode())
     except OSError as error:
         raise UsageError(
             f"Cannot read the faults in {path}.",
             next_step="Give an existing file.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise UsageError(
             f"{path} is not a TOML file.", next_step="Correct the line.", evidence={"reason": str(error)}
         ) from error

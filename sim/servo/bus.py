@@ -201,12 +201,13 @@ class ServoBus:
         links = ([answer for answer in answers if answer.bus_id == bus_id] for bus_id in requests)
         chain = list(takewhile(bool, links))
         fast = packet.instruction in FAST_READS
-        parts = fast_status_parts(
-            [size for _, size in requests.values()], [(link[0].bus_id, link[0].status) for link in chain]
-        )
+        parts = [b""] * len(chain)
+        if fast:  # without parts, because they need more than one packet, the devices stay silent
+            sizes = [size for _, size in requests.values()]
+            parts = fast_status_parts(sizes, [(link[0].bus_id, link[0].status) for link in chain])
         frames: list[Frame] = []
         free_ns = self.clock.now_ns()
-        for link, part in zip(chain, parts, strict=True):
+        for link, part in zip(chain, parts, strict=False):
             for answer in link:
                 start_ns = free_ns if fast and frames else free_ns + answer.delay_ns
                 data = part if fast else status_packet(answer.bus_id, answer.status)

@@ -141,9 +141,11 @@ def fast_status_parts(sizes: list[int], answers: list[tuple[int, Status]]) -> li
 
     The packet's length counts all devices asked (``sizes``: bytes asked of each), also those that stay silent; the CRC
     of each part covers everything before it, so the last one is the packet's own. Nothing is byte-stuffed (e-manual,
-    Fast Sync Read).
+    Fast Sync Read). There are no parts if the length does not fit into its two bytes.
     """
     length = 1 + sum(size + 4 for size in sizes)
+    if length > 0xFFFF:
+        return []
     frame = _HEADER + bytes((0, BROADCAST_ID)) + length.to_bytes(2, "little") + bytes((_STATUS,))
     ends = [0]
     for size, (bus_id, status) in zip(sizes, answers, strict=False):

@@ -36,7 +36,7 @@ def test_check_lists_all_mistakes_with_their_lines(rig, tmp_path):
         'line 6: imu.bus: must be a whole number or a text in "quotes" (found [1])',
         "line 7: imu.range_dps: must be one of 250, 500, 1000, 2000 °/s (found 300)",
         "line 9: table.limits_deg: must be [a number, a number] ° (found ['a', 3])",
-        "line 11: camera.exposure_us: must be a number above 0, up to 1000000 µs (found -1)",
+        "line 11: camera.exposure_us: must be a number from 1 to 1000000 µs (found -1)",
         "line 12: camera.heigth: unknown key; did you mean height?",
         "--set: identify.omega: must be a number from 0 to 100 (found -1)",
     ):

@@ -1,5 +1,6 @@
 """The configuration: every mistake at once, each with its key."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 
 from rig.bench import bench_names, open_bench
 from rig.config import RigConfig, load_config
+from rig.config.wording import key_info
 from rig.core.errors import ConfigError, DeviceNotFound
 
 
@@ -30,7 +32,7 @@ def test_all_mistakes_are_reported_with_range_and_suggestion(tmp_path):
     assert "line 2: servo.baud: must be a whole number from 9600 to 4500000 bit/s (found 3)" in mistakes
     assert "line 3: servo.prot: unknown key; did you mean port?" in mistakes
     assert "table.limits_deg: must span at least one revolution" in mistakes
-    assert "line 6: table.velocity_dps: must be a number above 0, up to 200 °/s (found -1)" in mistakes
+    assert "line 6: table.velocity_dps: must be a number from 0.1 to 200 °/s (found -1)" in mistakes
     assert "identify.min_views: must not be above max_views, which is 1 (found 2)" in mistakes
     assert "view: roi [80, 0, 480, 480] is not within the camera's frame of 320x480" in mistakes
     assert "identify.max_view: unknown key; did you mean max_views?" in mistakes
@@ -114,3 +116,62 @@ def test_settings_beyond_the_servos_limits_are_rejected(setting, words):
     with pytest.raises(ConfigError) as caught:
         load_config(None, [setting, "table.poll_s=0.06"])
     assert words in caught.value.evidence["mistakes"][0]
+
+
+BEYOND_LIMITS = {
+    "deep lists": "[" * 900 + "]" * 900,
+    "open lists": "[" * 1900,
+    "deep tables": "{a=" * 600 + "1" + "}" * 600,
+    "long integer": "9" * 1900,
+    "too long": "9" * 5000,
+    "two lines": "4\nthe second",
+    "carriage return": "4\rthe second",
+}
+
+
+@pytest.mark.parametrize("value", BEYOND_LIMITS.values(), ids=BEYOND_LIMITS)
+def test_values_beyond_the_limits_are_config_errors(value, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [f"identify.max_views={value}"])
+    assert caught.value.next_step
+    assert len(str(caught.value.evidence)) < 300
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a=" + "[" * 40_000 + "]" * 40_000, "a=" + "9" * 5000, ".".join("a" * 49_000) + "=1", "a.b=1\n" * 20_000],
+    ids=["deep", "long integer", "dotted key", "too large"],
+)
+def test_files_beyond_the_limits_are_config_errors(text, tmp_path):
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError):
+        load_config(tmp_path / "rig.toml")
+
+
+def test_pipes_and_devices_are_no_configurations(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero"), Path("/dev/tty"), tmp_path):
+        with pytest.raises(ConfigError, match="Cannot read"):
+            load_config(path)
+
+
+@pytest.mark.parametrize(
+    "setting", ["table.encoder_harmonics_deg=[1e18, 0, 0, 0]", "servo.gear_ratio=1e-320", "camera.gain=inf"]
+)
+def test_every_number_has_finite_limits(setting):
+    with pytest.raises(ConfigError):
+        load_config(None, [setting])
+
+
+@pytest.mark.parametrize("extreme", ["1e-320", "1e300", "inf", "nan"])
+def test_no_number_can_be_extreme(extreme):
+    numbers = [info for info in key_info(RigConfig) if isinstance(info.default, float) or "a number" in info.allowed]
+    assert len(numbers) > 30
+    for info in numbers:
+        accepted = []
+        for value in (extreme, f"-{extreme}"):
+            try:
+                accepted.append(load_config(None, [f"{info.name}={value}"]))
+            except ConfigError:
+                continue
+        assert not accepted or extreme == "1e-320", info.name

@@ -179,6 +179,17 @@ def test_bulk_read_reads_other_registers_of_each_servo(three: Line, fast: bool) 
     assert (group.getData(7, 146, 1), group.getData(1, 144, 2)) == (41, 120)
 
 
+@pytest.mark.parametrize("instruction", [0x82, 0x8A, 0x92, 0x9A])
+@pytest.mark.parametrize("size", [65_527, 65_528, 65_531, 65_535])
+def test_read_of_more_than_a_packet_holds_is_no_crash(three: Line, instruction: int, size: int) -> None:
+    request = [0, 0, *word(size), 1] if instruction in (0x82, 0x8A) else [1, 0, 0, *word(size)]
+    body = bytes([instruction, *request])
+    three.bus.send(with_crc(b"\xff\xff\xfd\x00\xfe" + bytes(word(len(body) + 2)) + body), three.baudrate)
+    three.sleep(2.0)
+    assert all(len(data) <= 7 + 65_535 for data in three.sent(Source.DEVICE))
+    assert three.sdk.ping(three.port, 1)[:2] == (1060, COMM_SUCCESS)
+
+
 def test_chain_ends_at_the_first_silent_servo(three: Line) -> None:
     three.servos[7].power_off()
     group = GroupSyncRead(three.port, three.sdk, 132, 4)
