@@ -38,16 +38,7 @@ MAX_RMS_PX = 0.3
 MAX_FOCAL_UNCERTAINTY = 0.005
 ENLARGED = 100
 """Enlargement of the residuals in the chart: a tenth of a pixel is drawn as 10."""
-PARAMETERS = (
-    ("fx", "px"),
-    ("fy", "px"),
-    ("cx", "px"),
-    ("cy", "px"),
-    ("k1", ""),
-    ("k2", ""),
-    ("p1", ""),
-    ("p2", ""),
-)
+PARAMETERS = (("fx", "px"), ("fy", "px"), ("cx", "px"), ("cy", "px"), ("k1", ""), ("k2", ""), ("p1", ""), ("p2", ""))
 
 
 def matrix_of(result: CalibrationResult) -> tuple["np.ndarray[tuple[int, int], np.dtype[np.float64]]", list[float]]:

@@ -239,9 +239,5 @@ def _recorded_move(kept: Recording, before_ns: int, column: int, sign: int, dire
     span_s = float(moving.sum()) * step_s
     sigma = float(noise) * sqrt(step_s * span_s + (step_s * span_s**2) / (float(at_rest.sum()) * step_s))
     return RecordedMove(
-        rotation,
-        net.sum(axis=0),
-        sigma,
-        (position - start - scale * gyro_deg)[cruising],
-        rate_dps[cruising],
+        rotation, net.sum(axis=0), sigma, (position - start - scale * gyro_deg)[cruising], rate_dps[cruising]
     )

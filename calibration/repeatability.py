@@ -113,10 +113,7 @@ class Repeatability(Procedure):
             placements.append(Placement(np.array(rounds)))
         identify = bench.config.identify
         found = evaluate(
-            placements,
-            error_rate=self.error_rate,
-            views=identify.min_views,
-            first_step_deg=identify.first_step_deg,
+            placements, error_rate=self.error_rate, views=identify.min_views, first_step_deg=identify.first_step_deg
         )
         found.evidence["object"] = self.name
         yield found

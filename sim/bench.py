@@ -36,8 +36,7 @@ class SimOptions(Section):
 
     objects: Path | None = Field(None, description="folder of photographs obj{N}__{A}.png; default: built-in objects")
     object: str | list[str] | None = Field(
-        None,
-        description="object on the table to identify, or a list that is repeated; default: random, from the seed",
+        None, description="object on the table to identify, or a list that is repeated; default: random, from the seed"
     )
     yaw_deg: float | None = Field(None, ge=-360, le=360, description="its rotation; default: random, from the seed")
     noise: dict[str, float] = Field(default_factory=dict, description="noise model: values to change")

@@ -91,12 +91,7 @@ def to_position(
     u_peak = min(v_max, sqrt(max(distance * a_max + 0.5 * u1 * u1, 0.0)))
     ramps = (2 * u_peak**2 - u1 * u1) / (2 * a_max)
     cruise = max(distance - ramps, 0.0) / u_peak if u_peak > 0 else 0.0
-    pieces = [
-        *braking,
-        ((u_peak - u1) / a_max, direction * a_max),
-        (cruise, 0.0),
-        (u_peak / a_max, -direction * a_max),
-    ]
+    pieces = [*braking, ((u_peak - u1) / a_max, direction * a_max), (cruise, 0.0), (u_peak / a_max, -direction * a_max)]
     path = _from_pieces(start_s, position_deg, v0, pieces)
     path.position_deg[-1], path.velocity_dps[-1] = goal_deg, 0.0  # the last knot carries no rounding
     return path

@@ -53,11 +53,7 @@ class Decision:
 
 
 def next_view(
-    ranking: Ranking,
-    *,
-    visited_deg: ArrayLike | None = None,
-    revisit_deg: float = 10.0,
-    side: Side | None = None,
+    ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit_deg: float = 10.0, side: Side | None = None
 ) -> Decision:
     """Choose the side on which the candidates differ most, and the rotation to the next sector centre there.
 

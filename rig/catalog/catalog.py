@@ -17,14 +17,7 @@ from rig.catalog.audit import AuditEntry
 from rig.catalog.database import Database, insert_row
 from rig.catalog.describing import known_descriptor
 from rig.catalog.enrollment import Enrollment
-from rig.catalog.queries import (
-    enrollment_summaries,
-    find,
-    in_use,
-    model_set,
-    object_summaries,
-    stored_views,
-)
+from rig.catalog.queries import enrollment_summaries, find, in_use, model_set, object_summaries, stored_views
 from rig.catalog.records import (
     EnrollmentStatus,
     EnrollmentSummary,
@@ -287,8 +280,7 @@ class Catalog:
             found = stored_views(connection, views.c.id == int(view_id))
         if not found:
             raise CatalogError(
-                f"there is no view {view_id} in the catalog {self.path}",
-                next_step="load the views again",
+                f"there is no view {view_id} in the catalog {self.path}", next_step="load the views again"
             )
         return found[0]
 

@@ -154,12 +154,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
         unused = connection.execute(
             select(enrollments.c.id, objects.c.name, objects.c.deleted_utc)
             .join(objects)
-            .where(
-                or_(
-                    objects.c.deleted_utc.is_not(None),
-                    enrollments.c.status.in_(_OLD if old else ()),
-                )
-            )
+            .where(or_(objects.c.deleted_utc.is_not(None), enrollments.c.status.in_(_OLD if old else ())))
         ).all()
         ids = [row.id for row in unused]
         files = _files_of(connection, ids)

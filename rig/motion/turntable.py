@@ -59,12 +59,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._trust_gyro = trust_gyro
         imu = bench.config.imu
         self._gyro = GyroRotationMeter(
-            bench.imu,
-            bench.clock,
-            axis=imu.axis,
-            sign=imu.sign,
-            scale=imu.scale,
-            scale_sigma=imu.scale_uncertainty,
+            bench.imu, bench.clock, axis=imu.axis, sign=imu.sign, scale=imu.scale, scale_sigma=imu.scale_uncertainty
         )
         self._profile: MotionProfile | None = None
         self._rest_deg = 0.0

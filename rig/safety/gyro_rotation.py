@@ -154,14 +154,7 @@ class GyroRotationMeter:
     """
 
     def __init__(
-        self,
-        imu: Imu,
-        clock: Clock,
-        *,
-        axis: Axis = "z",
-        sign: int = 1,
-        scale: float = 1.0,
-        scale_sigma: float = 0.01,
+        self, imu: Imu, clock: Clock, *, axis: Axis = "z", sign: int = 1, scale: float = 1.0, scale_sigma: float = 0.01
     ) -> None:
         if axis not in ("x", "y", "z") or sign not in (-1, 1) or not (scale > 0 and scale_sigma >= 0):
             raise ConfigError(

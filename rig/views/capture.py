@@ -142,10 +142,7 @@ class Viewer:
         self._last: NDArray[np.uint8] | None = None
 
     def attempts(
-        self,
-        settled_ns: int,
-        check_still: Callable[[int], Stillness],
-        meanwhile: Callable[[], object] | None = None,
+        self, settled_ns: int, check_still: Callable[[int], Stillness], meanwhile: Callable[[], object] | None = None
     ) -> Iterator[Attempt]:
         """Capture frames until one is accepted or ``retakes`` is used up.
 

@@ -43,10 +43,7 @@ class Board:
     def layout(self) -> "cv2.aruco.CharucoBoard":
         """Return the board as an OpenCV object."""
         return cv2.aruco.CharucoBoard(
-            (self.columns, self.rows),
-            self.square_mm,
-            self.marker_mm,
-            cv2.aruco.getPredefinedDictionary(DICTIONARY),
+            (self.columns, self.rows), self.square_mm, self.marker_mm, cv2.aruco.getPredefinedDictionary(DICTIONARY)
         )
 
     def points_mm(self) -> NDArray[np.float64]:

@@ -85,10 +85,7 @@ class ViewDescriber:
     """
 
     def __init__(
-        self,
-        config: ViewConfig,
-        names: tuple[str, ...] = DESCRIPTORS,
-        empty_table: NDArray[np.uint8] | None = None,
+        self, config: ViewConfig, names: tuple[str, ...] = DESCRIPTORS, empty_table: NDArray[np.uint8] | None = None
     ) -> None:
         self.region = config.roi
         self._descriptors = [hbr.descriptor(name) for name in names]

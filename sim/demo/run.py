@@ -165,13 +165,7 @@ def run_demo(
             _photograph(bench, operator)
         trials = [
             _identify(
-                bench,
-                model,
-                chosen,
-                operator,
-                thing,
-                enrolled=name in enrolled,
-                say=number == 0 and not settings.json,
+                bench, model, chosen, operator, thing, enrolled=name in enrolled, say=number == 0 and not settings.json
             )
             for number, (name, thing) in enumerate({**enrolled, **unknown}.items())
         ]

@@ -81,9 +81,7 @@ def _slow(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End
 
 
 @simulated_fault(
-    "servo.delayed",
-    "The servo reports old readings.",
-    seconds=Parameter(0.3, "age of the readings, s", 0, 10),
+    "servo.delayed", "The servo reports old readings.", seconds=Parameter(0.3, "age of the readings, s", 0, 10)
 )
 def _delayed(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
     delay = Delay(devices.world.clock, values["seconds"])

@@ -8,14 +8,7 @@ from typing import Protocol
 
 from sim.clock import VirtualClock
 from sim.servo.protocol1 import PacketParser1, status_packet1
-from sim.servo.protocol2 import (
-    BROADCAST_ID,
-    InstructionPacket,
-    PacketParser,
-    Status,
-    fast_status_parts,
-    status_packet,
-)
+from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, Status, fast_status_parts, status_packet
 from sim.servo.requests import CHAINED_READS, FAST_READS, chained_reads
 
 BITS_PER_BYTE = 10

@@ -82,10 +82,7 @@ class View(_Part):
     image_sha256: Sha256 | None = None
     image_bytes: Annotated[int, Field(ge=1)] | None = None
     evidence: Json = {}
-    segmentation: Json | None = Field(
-        default=None,
-        validation_alias=AliasChoices("segmentation", "front_end"),
-    )
+    segmentation: Json | None = Field(default=None, validation_alias=AliasChoices("segmentation", "front_end"))
     descriptors: tuple[BundledDescriptor, ...] = ()
 
     @field_validator("segmentation")

@@ -30,11 +30,7 @@ NAMES: Final = "objects.csv"
 """File with the names of obj1, obj2, ..., beside the photographs of an export."""
 
 SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
-_PARTS: Final = {
-    "{object}": r"(?P<object>[^/]+?)",
-    "{angle}": r"(?P<angle>[-+]?[0-9]+(?:\.[0-9]+)?)",
-    "*": r"[^/]*?",
-}
+_PARTS: Final = {"{object}": r"(?P<object>[^/]+?)", "{angle}": r"(?P<angle>[-+]?[0-9]+(?:\.[0-9]+)?)", "*": r"[^/]*?"}
 _MAX_NAMES_BYTES: Final = 100_000_000
 
 
@@ -120,8 +116,7 @@ def write_folder(folder: Path, objects: Iterable[ExportedObject]) -> int:
                 target = made / f"obj{count}__{angle}{Path(view.image).suffix}"
                 if target.exists():
                     raise ExportFailed(
-                        f"{item.name!r} has two views from {angle}°",
-                        next_step="export a bundle instead",
+                        f"{item.name!r} has two views from {angle}°", next_step="export a bundle instead"
                     )
                 target.write_bytes(read_stored(files[view.image], view.image_sha256))
     return count

@@ -39,10 +39,7 @@ class Ax12Servo(RegisterServo):
 
     @property
     def reach_deg(self) -> tuple[float, float]:
-        return (
-            self._read("CW Angle Limit") * self.resolution_deg,
-            self._read("CCW Angle Limit") * self.resolution_deg,
-        )
+        return (self._read("CW Angle Limit") * self.resolution_deg, self._read("CCW Angle Limit") * self.resolution_deg)
 
     @property
     def remarks(self) -> tuple[str, ...]:

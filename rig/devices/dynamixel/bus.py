@@ -13,16 +13,7 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceSilent, RequestRejected, UsageError
-from rig.devices.dynamixel.packets import (
-    PING,
-    READ,
-    REBOOT,
-    WRITE,
-    Packets,
-    Packets1,
-    Packets2,
-    Reply,
-)
+from rig.devices.dynamixel.packets import PING, READ, REBOOT, WRITE, Packets, Packets1, Packets2, Reply
 from rig.devices.dynamixel.port import BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import Register
 
@@ -143,8 +134,7 @@ class DynamixelBus:
         """
         if self.protocol == 1:
             raise UsageError(
-                "A servo with Protocol 1.0 cannot be restarted over its bus.",
-                next_step="Switch its supply off and on.",
+                "A servo with Protocol 1.0 cannot be restarted over its bus.", next_step="Switch its supply off and on."
             )
         self._transact("reboot", (device_id,), lambda: self._ask(device_id, REBOOT, b"", 0))
 

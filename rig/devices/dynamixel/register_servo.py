@@ -16,13 +16,7 @@ BOOT_ALLOWANCE_S = 3.0
 TORQUE_OFF_ATTEMPTS = 3
 """How often the torque is switched off and read back before it counts as on."""
 
-_HARDWARE_ERRORS = {
-    0: "input voltage",
-    2: "overheating",
-    3: "motor encoder",
-    4: "electrical shock",
-    5: "overload",
-}
+_HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 
 
 class RegisterServo(ABC):

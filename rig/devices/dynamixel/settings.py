@@ -65,10 +65,7 @@ def wanted(found: Mapping[str, int], mode: ServoMode = ServoMode.TURNTABLE) -> d
             "the rig sets the direction (table.direction); velocity-based profile; a goal must not switch torque on",
         ),
         "Operating Mode": _OPERATING_MODES[mode],
-        "Homing Offset": (
-            0,
-            "the software has the zero (table.zero_deg); an offset here can move the servo",
-        ),
+        "Homing Offset": (0, "the software has the zero (table.zero_deg); an offset here can move the servo"),
         "Return Delay Time": (0, _RETURN_DELAY),
         "Secondary ID": (255, "off: else the servo obeys instructions to a second id"),
         "Startup Configuration": (0, "no torque and no old goal at power-up"),

@@ -23,11 +23,7 @@ def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], cloc
     """
     imu = config.imu
     sensor = head_sensor(
-        imu.model,
-        address=imu.address,
-        range_dps=imu.range_dps,
-        rate_hz=imu.rate_hz,
-        bandwidth_hz=imu.bandwidth_hz,
+        imu.model, address=imu.address, range_dps=imu.range_dps, rate_hz=imu.rate_hz, bandwidth_hz=imu.bandwidth_hz
     )
     connection = open_port()
     try:

@@ -12,15 +12,7 @@ from rig.core.errors import (
     HeartbeatLost,
     RigError,
 )
-from rig.devices.head.protocol import (
-    HeadFault,
-    HeadState,
-    HeartbeatReply,
-    ImuStatus,
-    Input,
-    Reset,
-    StatusChanged,
-)
+from rig.devices.head.protocol import HeadFault, HeadState, HeartbeatReply, ImuStatus, Input, Reset, StatusChanged
 from rig.devices.head.sensors import HeadSensor
 from rig.devices.imu import ImuIdentity
 
