@@ -2,7 +2,6 @@
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 import serial
@@ -39,9 +38,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
     camera: SimCapture
     head: SimHead | None = None
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.i2c.close()
 
     @classmethod

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from errno import EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 import smbus2.smbus2 as smbus
@@ -36,15 +35,12 @@ class I2cDevice(Protocol):
 
     def start(self, reading: bool) -> None:
         """Receive a (repeated) start with this device's address."""
-        ...
 
     def write(self, data: bytes) -> int:
         """Receive the master's bytes and return how many are acknowledged."""
-        ...
 
     def read(self, count: int) -> bytes:
         """Return the next ``count`` bytes that the master clocks out."""
-        ...
 
     def stop(self) -> None: ...
 
@@ -83,9 +79,7 @@ class SimI2cBus:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -13,15 +13,12 @@ class Comparison(Protocol):
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
         """Return the similarity of every query, uint8 (n, length), to every row, float64 (n, m)."""
-        ...
 
     def only(self, rows: IndexArray, /) -> "Comparison":
         """Return the comparison with some of the rows, in this order."""
-        ...
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         """Return the similarity of rows to each other within groups: indices (g, k) in, float64 (g, k, k) out."""
-        ...
 
 
 class Descriptor(Protocol):
@@ -76,7 +73,6 @@ class Descriptor(Protocol):
         TypeError, ValueError
             The array is no such image.
         """
-        ...
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
         """Prepare rows, uint8 (m, length), for comparison with many queries; takes several times their memory.
@@ -86,7 +82,6 @@ class Descriptor(Protocol):
         TypeError, ValueError
             The rows are no levels of this descriptor.
         """
-        ...
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         """Return the similarity of every row of `a`, (n, length), to every row of `b`, (m, length).

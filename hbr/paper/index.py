@@ -132,7 +132,6 @@ def check_queries(queries: LevelArray) -> None:
 class _Searcher(Protocol):
     def extended(self, descriptors: LevelArray, /) -> Self | None:
         """Return a searcher of these rows, which start with its own; None if a new one is better."""
-        ...
 
     def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]: ...
 

@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
-from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
 
 from pydantic import BaseModel
@@ -34,7 +33,6 @@ class Operator(Protocol):
 
     def place(self, name: str | None) -> None:
         """Return when the object ``name`` (None: the one to identify) is on the table, and the hands are away."""
-        ...
 
 
 @runtime_checkable
@@ -43,7 +41,6 @@ class TableClearer(Protocol):
 
     def clear(self) -> bool:
         """Return True when the table is empty; False if that is not possible."""
-        ...
 
 
 class ObjectAlreadyPlaced:
@@ -96,9 +93,7 @@ class Bench(AbstractContextManager["Bench"]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         try:
             self.close()
         except (RigError, OSError) as failure:
@@ -154,11 +149,9 @@ class BenchKind(Protocol):
     @property
     def options(self) -> type[BaseModel]:
         """Model of the section ``[bench.<name>]``."""
-        ...
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
         """Open the devices; if one fails, close those already opened."""
-        ...
 
 
 @runtime_checkable

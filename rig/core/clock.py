@@ -12,22 +12,18 @@ class Clock(Protocol):
 
     def now_ns(self) -> int:
         """Return monotonic time in nanoseconds; only differences have a meaning."""
-        ...
 
     def sleep(self, seconds: float) -> None:
         """Wait for ``seconds``; zero and negative values return at once."""
-        ...
 
     def utc(self) -> datetime:
         """Return the civil time, for records that people read."""
-        ...
 
     def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
         """Call ``action`` about every ``seconds`` in the background, until the returned function is called.
 
         ``action`` may run in another thread: it must not raise, and must lock the data that it shares.
         """
-        ...
 
 
 class SystemClock:

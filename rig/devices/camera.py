@@ -50,10 +50,8 @@ class Camera(Protocol):
 
         ``meanwhile`` is called several times per second while the method waits for a slow camera.
         """
-        ...
 
     def read_locks(self) -> CameraLocks:
         """Return the settings as the camera reports them now."""
-        ...
 
     def close(self) -> None: ...

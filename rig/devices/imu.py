@@ -51,15 +51,12 @@ class Imu(Protocol):
     @property
     def range_dps(self) -> float:
         """Full scale of the gyro: a sample that reaches it is saturated."""
-        ...
 
     def read_samples(self) -> ImuSamples:
         """Return all samples since the last call."""
-        ...
 
     def read_gravity_g(self) -> NDArray[np.float64]:
         """Return one accelerometer reading (3,), in g."""
-        ...
 
     def temperature_c(self) -> float: ...
 

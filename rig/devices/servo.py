@@ -79,12 +79,10 @@ class Servo(Protocol):
     @property
     def resolution_deg(self) -> float:
         """Angle of one encoder count."""
-        ...
 
     @property
     def turn_deg(self) -> float:
         """Angle after which the encoder repeats; without supply, the servo loses the count of these."""
-        ...
 
     @property
     def limits(self) -> ServoLimits: ...
@@ -92,12 +90,10 @@ class Servo(Protocol):
     @property
     def reach_deg(self) -> tuple[float, float]:
         """Lowest and highest position in the present mode."""
-        ...
 
     @property
     def bus_statistics(self) -> Mapping[str, int]:
         """Statistics since the bus was opened: transactions, retries and their causes."""
-        ...
 
     def read_state(self) -> ServoState: ...
 
@@ -108,19 +104,15 @@ class Servo(Protocol):
 
         Call it after a cable was unplugged, after a reboot, or when the servo may have been replaced.
         """
-        ...
 
     def reboot(self) -> None:
         """Restart the servo, which clears its hardware errors, torque and count of revolutions; then `verify` it."""
-        ...
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
         """Set the profile; return it rounded to the servo's units."""
-        ...
 
     def torque_on(self) -> None:
         """Set the goal to the present position, then switch the torque on."""
-        ...
 
     def torque_off(self) -> None:
         """Switch the torque off and read it back; raise `TorqueStaysOn` if it is still on."""
@@ -128,11 +120,9 @@ class Servo(Protocol):
 
     def move_to(self, position_deg: float) -> None:
         """Set the goal position and return at once."""
-        ...
 
     def arm_watchdog(self, timeout_s: float) -> None:
         """Make the servo stop by itself if it receives nothing for ``timeout_s``."""
-        ...
 
     def disarm_watchdog(self) -> None: ...
 

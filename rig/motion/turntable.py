@@ -6,7 +6,6 @@ Decision: docs/decisions/0004.
 from collections import deque
 from contextlib import AbstractContextManager
 from math import isfinite, remainder
-from types import TracebackType
 from typing import Self
 
 from rig.bench import Bench
@@ -82,9 +81,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._profile = None
         try:
             self._servo.torque_off()

@@ -99,7 +99,6 @@ class StateStore(Protocol):
         StateNotStored
             The disk is full, or may not be written to.
         """
-        ...
 
     def latch(self, fault: LatchedFault | None) -> None:
         """Store the latched fault, also on a full disk if a state was saved before; None removes it.
@@ -113,11 +112,9 @@ class StateStore(Protocol):
 
     def stop_requested(self) -> bool:
         """Return whether the operator requested a stop; called in each round of the control loop."""
-        ...
 
     def clear_stop(self) -> None:
         """Remove the request: it was carried out, or it is old."""
-        ...
 
     def read_file(self, name: str) -> bytes | None:
         """Return the file ``name`` that was stored beside the state; None if there is none.
@@ -127,7 +124,6 @@ class StateStore(Protocol):
         StateNotStored
             The file exists but cannot be read.
         """
-        ...
 
     def store_file(self, name: str, content: bytes) -> None:
         """Store a file beside the state; on return it survives a power cut.
@@ -137,11 +133,9 @@ class StateStore(Protocol):
         StateNotStored
             The disk is full, or may not be written to.
         """
-        ...
 
     def remove_file(self, name: str) -> None:
         """Delete the file ``name`` if it exists."""
-        ...
 
 
 class MemoryStore:

@@ -47,7 +47,6 @@ class Visible(Protocol):
         ``azimuth_deg`` is the object's counter-clockwise rotation seen from above; ``offset_mm`` is the position of its
         axis in the room.
         """
-        ...
 
 
 class Drawing(NamedTuple):

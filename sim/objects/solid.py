@@ -17,7 +17,6 @@ class Part(Protocol):
     @property
     def reach_mm(self) -> float:
         """Radius of its shadow on the platter."""
-        ...
 
     def drawings(self, pose: Pose) -> list[Drawing]: ...
 

@@ -65,7 +65,6 @@ class Device(Protocol):
     @property
     def protocol(self) -> int:
         """Its protocol: 1 or 2."""
-        ...
 
     @property
     def bus_id(self) -> int: ...

@@ -5,7 +5,6 @@ import select
 import tty
 from bisect import insort
 from contextlib import AbstractContextManager, suppress
-from types import TracebackType
 from typing import Self
 
 from rig.core.clock import Clock
@@ -43,9 +42,7 @@ class ServoTerminal(AbstractContextManager["ServoTerminal"]):
             self._close()
             raise ValueError("the bus has a host already")
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bus.disconnect()
         self._close()
 

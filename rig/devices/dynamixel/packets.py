@@ -44,15 +44,12 @@ class Packets(Protocol):
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
         """Drop unread bytes and send an instruction; return the SDK's result."""
-        ...
 
     def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
         """Wait for the next intact status packet; return it, or None and the SDK's result."""
-        ...
 
     def reply_size(self, size: int) -> int:
         """Return the length of a status packet with ``size`` parameters, in bytes."""
-        ...
 
     def read_parameters(self, address: int, size: int) -> bytes: ...
 
@@ -60,7 +57,6 @@ class Packets(Protocol):
 
     def reason(self, result: int) -> str:
         """Return the SDK's words for a result."""
-        ...
 
 
 class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
