@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, refuse_slipped_leg, stored_valid
 from calibration.procedure import (
     Evaluation,
     Measured,
@@ -121,13 +121,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
         found.refuse_if(True, RefusalCode.WRONG_DIRECTION, ratio=ratio)
     else:
         found.refuse_if(not RATIO[0] < ratio < RATIO[1], RefusalCode.WRONG_GEAR_RATIO, ratio=ratio, table_deg=1 / ratio)
-    found.refuse_if(
-        found.residual > found.limit,
-        RefusalCode.LEG_SLIPPED,
-        leg=legs.index(used[worst]) + 1,
-        residual_deg=found.residual,
-        limit_deg=found.limit,
-    )
+    refuse_slipped_leg(found, legs.index(used[worst]) + 1)
     found.refuse_if(
         backlash > MAX_BACKLASH_DEG, RefusalCode.BACKLASH_TOO_LARGE, backlash_deg=backlash, limit_deg=MAX_BACKLASH_DEG
     )

@@ -63,10 +63,7 @@ def take_views(
 
     ``stands`` maps names to descriptions, as in `STANDS`. A wrong board becomes a refusal of ``found``.
 
-    Raises
-    ------
-    ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
-        See `rig.views.capture` and `rig.motion.turntable`.
+    Raises ViewRejected, MotionTimeout, DeviceFault, DeviceSilent: see `rig.views.capture` and `rig.motion.turntable`.
     """
     views: list[BoardView] = []
     foreign: set[int] = set()

@@ -338,13 +338,7 @@ def _board(columns: int, rows: int, square_mm: float) -> "Board":
 
 
 def _in_force(bench: "Bench", name: str) -> "CalibrationResult":
-    """Return the result called ``name`` that is in force on the bench.
-
-    Raises
-    ------
-    UsageError
-        There is none.
-    """
+    """Return the result called ``name`` that is in force on the bench. Raises `UsageError` if there is none."""
     from rig.calibrations import CalibrationStatus, CalibrationStore
     from rig.core.errors import UsageError
 

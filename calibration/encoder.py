@@ -16,7 +16,7 @@ from math import ceil, floor
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, refuse_slipped_leg, stored_valid
 from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RefusalCode
@@ -145,13 +145,7 @@ def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resoluti
     found.proposed = {"table.encoder_harmonics_deg": [round(float(value), 4) for value in fitted.values[1:]]}
 
     largest = float(np.abs(_basis(np.linspace(0.0, turn_deg, 361), turn_deg) @ fitted.values[1:]).max())
-    found.refuse_if(
-        found.residual > found.limit,
-        RefusalCode.LEG_SLIPPED,
-        leg=steps.index(used[fitted.worst]) + 1,
-        residual_deg=found.residual,
-        limit_deg=found.limit,
-    )
+    refuse_slipped_leg(found, steps.index(used[fitted.worst]) + 1)
     found.refuse_if(
         largest > MAX_ERROR_DEG, RefusalCode.ENCODER_ERROR_TOO_LARGE, error_deg=largest, limit_deg=MAX_ERROR_DEG
     )

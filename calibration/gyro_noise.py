@@ -170,15 +170,6 @@ def allan(
     return taus, np.sqrt(variance), np.maximum(freedom, 1.0)
 
 
-def rotation_sigma_deg(result: CalibrationResult, seconds: float) -> float:
-    """Return the standard uncertainty of a rotation measured over ``seconds`` due to noise and random walk.
-
-    The zero is assumed to be known exactly at the start of the rotation: σ² = N²·t + K²·t³/3.
-    """
-    arw, walk = result.estimates["angle_random_walk"].value, result.estimates["rate_random_walk"].value
-    return sqrt(arw**2 * seconds + walk**2 * seconds**3 / 3)
-
-
 def _fit(rate: NDArray[np.float64], period_s: float, trend: NDArray[np.float64]) -> tuple[float, float]:
     """Return angle random walk and rate random walk by weighted, non-negative least squares on the Allan variance.
 

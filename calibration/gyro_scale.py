@@ -18,7 +18,7 @@ from math import ceil, floor, hypot, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, refuse_slipped_leg, stored_valid
 from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RefusalCode
@@ -133,13 +133,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     (value_up, sigma_up), (value_down, sigma_down) = (_ratio(encoder[way], gyro[way], sigma[way]) for way in (up, ~up))
     found.evidence |= {"scale_up": value_up, "scale_down": value_down}
 
-    found.refuse_if(
-        found.residual > found.limit,
-        RefusalCode.LEG_SLIPPED,
-        leg=legs.index(used[worst]) + 1,
-        residual_deg=found.residual,
-        limit_deg=found.limit,
-    )
+    refuse_slipped_leg(found, legs.index(used[worst]) + 1)
     found.refuse_if(
         abs(value_up - value_down) > COVERAGE * hypot(sigma_up, sigma_down),
         RefusalCode.DIRECTIONS_DIFFER,

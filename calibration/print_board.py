@@ -23,10 +23,8 @@ RULER_MM: Final = 100.0
 def write_board(board: Board, path: Path) -> str:
     """Write the board to a file, and return instructions for the operator.
 
-    Raises
-    ------
-    UsageError
-        The file is neither .pdf nor .png, the board is larger than the page, or the file cannot be written.
+    Raises `UsageError` if the file is neither .pdf nor .png, the board is larger than the page, or the file cannot be
+    written.
     """
     suffix = path.suffix.lower()
     width, height = (side + 2 * board.margin_mm for side in board.size_mm)

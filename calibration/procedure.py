@@ -185,10 +185,7 @@ def require_at_least(minimum: float, value: float, what: str) -> None:
 def lower_end(bench: Bench, start_deg: float, length_deg: float) -> float:
     """Return the lower end of a range of ``length_deg`` that begins or ends at ``start_deg``, within the cable budget.
 
-    Raises
-    ------
-    LimitExceeded
-        The cable leaves too little room.
+    Raises `LimitExceeded` if the cable leaves too little room.
     """
     low, high = bench.config.table.limits_deg
     lower = start_deg if start_deg + length_deg <= high else start_deg - length_deg

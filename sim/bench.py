@@ -110,10 +110,7 @@ class ShelfOperator:
     def place(self, name: str | None) -> None:
         """Put the object called ``name`` on the table, or the next one to identify.
 
-        Raises
-        ------
-        ObjectNotFound
-            No object has that name.
+        Raises `ObjectNotFound` if no object has that name.
         """
         dx_mm, dy_mm = self._rng.normal(0.0, self.world.noise.placement_mm, 2).tolist()
         yaw_deg = 0.0

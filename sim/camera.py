@@ -19,12 +19,9 @@ from sim.sensor import Gains, Sensor, white_balance
 from sim.world import HISTORY_S, Activity, Scene, World
 
 FPS = 30
-NOMINAL_EXPOSURE = 100
-"""Exposure at which the frame has the scene's grey levels, in V4L2's unit of 100 µs."""
-READOUT_NS = 15_000_000
-"""Time from the end of the exposure until the computer has the frame."""
-SELECT_S = 10.0
-"""How long OpenCV's V4L2 backend waits for a frame (OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT)."""
+NOMINAL_EXPOSURE = 100  # exposure at which the frame has the scene's grey levels, in V4L2's unit of 100 µs
+READOUT_NS = 15_000_000  # time from the end of the exposure until the computer has the frame
+SELECT_S = 10.0  # how long OpenCV's V4L2 backend waits for a frame (OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT)
 V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY = 1, 3
 
 _EXPOSURE_RANGE = (1, 10_000 // FPS)

@@ -45,10 +45,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
     def connected(cls, config: RigConfig, world: World) -> Self:
         """Return the devices that ``config`` describes, with factory settings.
 
-        Raises
-        ------
-        ConfigError
-            The simulator has no servo of that model, or the model does not support the baud rate.
+        Raises `ConfigError` if the simulator has no servo of that model, or the model does not support the baud rate.
         """
         servo = simulated_servo(world, config.servo)
         servo_bus = ServoBus(world.clock)
@@ -68,13 +65,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
         return cls(world, servo_bus, servo, adapter, i2c, imu, camera, head)
 
     def head_port(self) -> HeadSerial:
-        """Open the rig head's port.
-
-        Raises
-        ------
-        DeviceNotFound
-            The bench has no head, or it is unplugged.
-        """
+        """Open the rig head's port. Raises `DeviceNotFound` if the bench has no head, or it is unplugged."""
         if self.head is None or self.head.unplugged:
             raise DeviceNotFound("No rig head is connected to this port.", next_step="Connect its USB cable.")
         return HeadSerial(self.head)
@@ -82,10 +73,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
     def reopen_camera(self) -> SimCapture:
         """Open the camera's stream again, for example after it was unplugged.
 
-        Raises
-        ------
-        DeviceNotFound
-            The camera is unplugged.
+        Raises `DeviceNotFound` if the camera is unplugged.
         """
         if not self.camera.reopen():
             raise DeviceNotFound("No camera is connected.", next_step="Connect the camera.")
@@ -94,10 +82,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
     def reopen_adapter(self) -> SimSerial:
         """Open the servo's port, also after its adapter was unplugged.
 
-        Raises
-        ------
-        DeviceNotFound
-            The adapter is unplugged.
+        Raises `DeviceNotFound` if the adapter is unplugged.
         """
         if not self.adapter.is_open:
             try:
@@ -113,10 +98,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
     def open_connections(self) -> None:
         """Open what closing a bench has closed: the port, and the camera's stream if the camera is plugged in.
 
-        Raises
-        ------
-        DeviceNotFound
-            The adapter is unplugged.
+        Raises `DeviceNotFound` if the adapter is unplugged.
         """
         self.camera.reopen()
         self.reopen_adapter()
@@ -125,10 +107,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
 def _head(config: RigConfig, world: World, servo: SimulatedServo) -> SimHead:
     """Return a rig head whose ring light is the only light and whose relay supplies the servo.
 
-    Raises
-    ------
-    ConfigError
-        The firmware cannot be built on this computer.
+    Raises `ConfigError` if the firmware cannot be built on this computer.
     """
     kind = str(config.bench.get("sim", {}).get("head", "memory"))
     error = world.noise.head_clock_error * float(world.rng("head").standard_normal())

@@ -21,10 +21,8 @@ import smbus2.smbus2 as smbus
 
 from sim.clock import VirtualClock
 
-BIT_NS = 2_500
-"""One bit at 400 kHz (fast mode); a byte takes nine, with its acknowledge."""
-TIMEOUT_S = 1.0
-"""How long the kernel waits for a bus that hangs (the default of ``i2c_adapter.timeout``)."""
+BIT_NS = 2_500  # one bit at 400 kHz (fast mode); a byte takes nine, with its acknowledge
+TIMEOUT_S = 1.0  # how long the kernel waits for a bus that hangs (the default of ``i2c_adapter.timeout``)
 
 _MAX_MESSAGES = 42
 _MAX_MESSAGE_LENGTH = 8192

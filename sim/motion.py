@@ -118,13 +118,9 @@ class Platter:
         self._half_play = play_deg / 2
         self._omega = 2 * np.pi * structure_hz
         self._zeta = damping
-        self._path = rest(0.0, 0.0)
+        self.shaft = rest(0.0, 0.0)
         self._platter = np.zeros(1)
         self._shake = np.zeros((1, 2))  # deflection and its rate at each knot
-
-    @property
-    def shaft(self) -> Trajectory:
-        return self._path
 
     def follow(self, path: Trajectory, previous: "Platter | None") -> None:
         """Take ``path`` as the shaft's motion, going on from where ``previous`` leaves the platter at its start."""
@@ -134,7 +130,7 @@ class Platter:
         else:
             platter = float(previous._rigid(np.array([t0]))[0][0])
             shake = tuple(float(s[0]) for s in previous._vibration(np.array([t0])))  # type: ignore[assignment]
-        self._path = path
+        self.shaft = path
         self._platter = np.empty(len(path.start_s))
         self._shake = np.empty((len(path.start_s), 2))
         for k, x in enumerate(path.position_deg):
@@ -152,10 +148,10 @@ class Platter:
         return angle + deflection, rate + deflection_rate
 
     def _knot(self, t: Floats) -> NDArray[np.intp]:
-        return np.maximum(np.searchsorted(self._path.start_s, t, side="right") - 1, 0)
+        return np.maximum(np.searchsorted(self.shaft.start_s, t, side="right") - 1, 0)
 
     def _rigid(self, t: Floats) -> tuple[Floats, Floats]:
-        x, v = self._path.at(t)
+        x, v = self.shaft.at(t)
         held = self._platter[self._knot(t)]
         angle = np.clip(held, x - self._half_play, x + self._half_play)
         engaged = ((v > 0) & (angle <= x - self._half_play)) | ((v < 0) & (angle >= x + self._half_play))
@@ -165,8 +161,8 @@ class Platter:
         if self._omega == 0:
             return np.zeros_like(t), np.zeros_like(t)
         k = self._knot(t)
-        tau = np.maximum(t - self._path.start_s[k], 0.0)
-        return self._response(self._shake[k, 0], self._shake[k, 1], self._path.acceleration_dps2[k], tau)
+        tau = np.maximum(t - self.shaft.start_s[k], 0.0)
+        return self._response(self._shake[k, 0], self._shake[k, 1], self.shaft.acceleration_dps2[k], tau)
 
     def _swing(self, state: tuple[float, float], acceleration: float, tau: float) -> tuple[float, float]:
         if self._omega == 0:

@@ -17,8 +17,7 @@ from sim.clock import VirtualClock
 from sim.motion import Floats, Platter, Trajectory, rest
 from sim.noise import NoiseModel
 
-HISTORY_S = 12.0
-"""How far back the past is stored: longer than the IMU's FIFO and the camera's buffers."""
+HISTORY_S = 12.0  # how far back the past is stored: longer than the IMU's FIFO and the camera's buffers
 
 
 class SimObject(Protocol):

@@ -17,8 +17,7 @@ Similarity = Callable[[LevelArray, LevelArray], FloatArray]
 
 SLACK: Final = 0.01
 """Similarities that differ by less count as equal: two frames of the same view differ by as much."""
-_MIN_VIEWS: Final = 18
-"""With fewer views, neighbours are more than 20° apart and too different to compare with."""
+_MIN_VIEWS: Final = 18  # with fewer views, neighbours are more than 20° apart and too different to compare with
 _ORDERS: Final = range(2, 13)
 
 

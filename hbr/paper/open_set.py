@@ -10,8 +10,7 @@ import numpy as np
 from hbr.core.arrays import FloatArray
 from hbr.model.views import Views
 
-_QUERIES: Final = 4
-"""Number of views of a typical retrieval, spread evenly around the object."""
+_QUERIES: Final = 4  # number of views of a typical retrieval, spread evenly around the object
 
 
 def open_set_threshold(views: Views, *, quantile: float = 0.05, repeatability: float = 0.97) -> float:

@@ -202,10 +202,7 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
 def open_servo(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Iterator[Servo]:
     """Open only the servo of a bench (all devices if its kind cannot do that); write nothing to it.
 
-    Raises
-    ------
-    ConfigError, DeviceNotFound, DeviceMismatch, DeviceSilent, BenchBusy
-        As in `open_bench`.
+    Raises ConfigError, DeviceNotFound, DeviceMismatch, DeviceSilent, BenchBusy as in `open_bench`.
     """
     config = config or RigConfig()
     kind, options = _kind(name or config.default_bench, config)

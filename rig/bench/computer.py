@@ -96,7 +96,6 @@ class Computer(Protocol):
 
     @property
     def clock(self) -> Clock: ...
-
     @property
     def user(self) -> User: ...
 

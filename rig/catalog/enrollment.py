@@ -115,10 +115,7 @@ class Enrollment:
     def store_empty_table(self, image_bgr: NDArray[np.uint8]) -> None:
         """Store the empty-table image of this session, uint8 (H, W, 3) BGR. It is durable when this returns.
 
-        Raises
-        ------
-        UsageError, CatalogError, CatalogBusy
-            As for `add`.
+        Raises UsageError, CatalogError, CatalogBusy as for `add`.
         """
         png = images.encode(image_bgr)
         with self._database.write() as connection:

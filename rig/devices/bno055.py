@@ -32,18 +32,14 @@ OTHERS = {
 _CHIP_ID, _PAGE_ID, _ACC_DATA, _FIRST, _TEMP = 0x00, 0x07, 0x08, 0x14, 0x34
 _UNIT_SEL, _OPR_MODE, _LAST = 0x3B, 0x3D, 0x3E
 _CONFIG_MODE, _IMU_MODE, _FUSION_RUNNING = 0x00, 0x08, 5
-_TO_CONFIG_S, _FROM_CONFIG_S = 0.02, 0.01
-"""Mode changes take 19 and 7 ms (3.3), plus a margin."""
+_TO_CONFIG_S, _FROM_CONFIG_S = 0.02, 0.01  # mode changes take 19 and 7 ms (3.3), plus a margin
 _START_S, _POLL_S = 1.2, 0.05
 """The sensor is silent for 650 ms after power-up (1.2), and its fusion needs some more time."""
-_LEARN_S = 3.0
-"""Longest time to wait for the gyro's calibration."""
-_GAP_S = 0.5
-"""Longest time between two readings: at its highest speed (200 °/s), the table rotates by 100°."""
+_LEARN_S = 3.0  # longest time to wait for the gyro's calibration
+_GAP_S = 0.5  # longest time between two readings: at its highest speed (200 °/s), the table rotates by 100°
 _CARRIED_DEG = 0.01
 """Difference between orientation and rate that the next reading corrects: the orientation's resolution."""
-_ORIENTATION_AGE_S = 0.015
-"""Largest age of an orientation: a period of the fusion, plus the reading."""
+_ORIENTATION_AGE_S = 0.015  # largest age of an orientation: a period of the fusion, plus the reading
 _G = 9.80665
 
 
@@ -79,8 +75,6 @@ class Bno055:
         Number of the I2C bus, or the path of its device file.
     address
         0x28, or 0x29 with ADR high.
-    clock
-        The bench's clock.
 
     Raises
     ------

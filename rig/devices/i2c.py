@@ -44,8 +44,6 @@ class I2cRegisters:
         Number of the I2C bus, or the path of its device file.
     address
         The device's address, 7 bits.
-    clock
-        The bench's clock.
 
     Raises
     ------

@@ -44,7 +44,6 @@ class Imu(Protocol):
 
     @property
     def identity(self) -> ImuIdentity: ...
-
     @property
     def rate_hz(self) -> float: ...
 
@@ -59,5 +58,4 @@ class Imu(Protocol):
         """Return one accelerometer reading (3,), in g."""
 
     def temperature_c(self) -> float: ...
-
     def close(self) -> None: ...

@@ -82,8 +82,6 @@ class OpenCvCamera:
     ----------
     capture
         An open source, for example from `open_capture`. The camera closes it.
-    clock
-        The bench's clock.
     settings
         Requested settings. `rejected_settings` lists those that the camera did not accept.
     name
@@ -121,23 +119,19 @@ class OpenCvCamera:
         self._timeout_s = timeout_s
         self._supported: set[int] = set()
         self.rejected_settings: tuple[RejectedSetting, ...] = self._configure(self._settings)
-        self._identity = CameraIdentity(
+        self.identity = CameraIdentity(
             name,
             round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
             round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
             capture.get(cv2.CAP_PROP_FPS),
         )
-        self._period_s = 1 / self._identity.fps if 1 <= self._identity.fps <= 1000 else 1 / 30
+        self._period_s = 1 / self.identity.fps if 1 <= self.identity.fps <= 1000 else 1 / 30
         self._latency_ns = round((3 * self._period_s if latency_s is None else latency_s) * 1e9)
         self._last_stamp_ns = -1
         self._arrived_ns = clock.now_ns()
         self._waits_s: deque[float] = deque([self._period_s], maxlen=4)
         self.time_base: TimeBase = TimeBase.STAMPED
         self.time_base = self._find_time_base()
-
-    @property
-    def identity(self) -> CameraIdentity:
-        return self._identity
 
     def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
@@ -164,7 +158,7 @@ class OpenCvCamera:
             dropped += 1
             if self._clock.now_ns() > deadline_ns:
                 raise DeviceSilent(
-                    f"{self._identity.name} delivered no new frame in {self._timeout_s:g} s",
+                    f"{self.identity.name} delivered no new frame in {self._timeout_s:g} s",
                     next_step="check the camera's cable; a long exposure or a busy USB bus needs a longer time-out",
                     evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
                 )
@@ -270,7 +264,7 @@ class OpenCvCamera:
             except DeviceNotFound as missing:
                 if self._clock.now_ns() > give_up_ns:
                     raise DeviceSilent(
-                        f"{self._identity.name} was disconnected for more than {self._timeout_s:g} s.",
+                        f"{self.identity.name} was disconnected for more than {self._timeout_s:g} s.",
                         next_step=missing.next_step,
                         evidence=missing.evidence,
                     ) from missing
@@ -279,11 +273,11 @@ class OpenCvCamera:
         rejected_settings, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
         got, expected = (
             tuple(round(self._capture.get(prop)) for prop in mode),
-            (self._identity.width, self._identity.height),
+            (self.identity.width, self.identity.height),
         )
         if got != expected or rejected_settings != self.rejected_settings:
             raise DeviceMismatch(
-                f"{self._identity.name} is another camera after it was unplugged, or has other settings.",
+                f"{self.identity.name} is another camera after it was unplugged, or has other settings.",
                 next_step="Connect the first camera again, or start again with this one.",
                 evidence={
                     "expected": list(expected),
@@ -306,9 +300,9 @@ class OpenCvCamera:
             attempts += 1
             waited_s = seconds_between(first_ns, self._clock.now_ns())
         raise DeviceSilent(
-            f"{self._identity.name} delivers no frames: {attempts} attempts failed."
+            f"{self.identity.name} delivers no frames: {attempts} attempts failed."
             if attempts > 1
-            else f"{self._identity.name} hangs: no frame in {waited_s:.0f} s.",
+            else f"{self.identity.name} hangs: no frame in {waited_s:.0f} s.",
             next_step="The recording has ended."
             if self._capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0
             else "Check the camera's cable, and that no other program uses it.",
@@ -342,18 +336,18 @@ class OpenCvCamera:
         ok, image = self._capture.retrieve()
         if not ok or image is None:
             raise DeviceSilent(
-                f"{self._identity.name} lost a frame between grabbing and decoding it.",
+                f"{self.identity.name} lost a frame between grabbing and decoding it.",
                 next_step="Try again. If this repeats, try another cable or USB port.",
             )
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise DeviceFault(
-                f"{self._identity.name} delivers {image.dtype} images of shape {image.shape}, not 8-bit colour images.",
+                f"{self.identity.name} delivers {image.dtype} images of shape {image.shape}, not 8-bit colour images.",
                 next_step="Choose a colour format that OpenCV converts (`v4l2-ctl --list-formats`).",
             )
-        expected, got = (self._identity.width, self._identity.height), (image.shape[1], image.shape[0])
+        expected, got = (self.identity.width, self.identity.height), (image.shape[1], image.shape[0])
         if got != expected and all(expected):
             raise DeviceFault(
-                f"{self._identity.name} delivers frames of {got[0]}x{got[1]} pixels, but it was opened with "
+                f"{self.identity.name} delivers frames of {got[0]}x{got[1]} pixels, but it was opened with "
                 f"{expected[0]}x{expected[1]}.",
                 next_step="Open the bench again. If this repeats, the camera resets: try another cable or USB port.",
                 evidence={"got": list(got), "expected": list(expected)},

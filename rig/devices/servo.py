@@ -96,7 +96,6 @@ class Servo(Protocol):
         """Statistics since the bus was opened: transactions, retries and their causes."""
 
     def read_state(self) -> ServoState: ...
-
     def read_condition(self) -> ServoCondition: ...
 
     def verify(self) -> None:
@@ -125,5 +124,4 @@ class Servo(Protocol):
         """Make the servo stop by itself if it receives nothing for ``timeout_s``."""
 
     def disarm_watchdog(self) -> None: ...
-
     def close(self) -> None: ...

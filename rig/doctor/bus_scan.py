@@ -18,16 +18,13 @@ from rig.devices.dynamixel.registers import model_numbers
 
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
 """Baud rates of Protocol 2.0: the factory setting first, then in order of frequency."""
-BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9_600)
-"""The same for Protocol 1.0."""
+BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9_600)  # the same for Protocol 1.0
 
-_ANSWER_1_S = 0.02
-"""Time for an answer of a servo of Protocol 1.0 and its adapter; each id is asked separately."""
+_ANSWER_1_S = 0.02  # time for an answer of a servo of Protocol 1.0 and its adapter; each id is asked separately
 _PING_ANSWER = 14
 _LISTEN_S = 0.05
 _STATUS_READS = 8
-_STATUS = (120, 27)
-"""Realtime Tick to Present Temperature: two servos with the same id soon differ in these."""
+_STATUS = (120, 27)  # realtime Tick to Present Temperature: two servos with the same id soon differ in these
 
 
 @dataclass(frozen=True, slots=True)

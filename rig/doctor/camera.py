@@ -18,8 +18,7 @@ QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
 """Time from the start of an exposure until the program has the frame; the table waits that long at each view."""
-MAX_FLICKER = 0.05
-"""Largest spread of the mean level of frames of one scene."""
+MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
 
 
 def camera(context: DoctorContext) -> Iterator[Finding]:

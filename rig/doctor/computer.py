@@ -9,12 +9,9 @@ from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, warning
 from rig.safety.saved_state import FileStore
 
-LATENCY_MS = 1
-"""Required latency timer of an FTDI adapter; the default is 16, and each reading waits for it."""
-_FTDI = "0403"
+LATENCY_MS = 1  # required latency timer of an FTDI adapter; the default is 16, and each reading waits for it
 
-VIEW_BYTES = 500_000
-"""An image of 640x480 with a sensor's noise, lossless."""
+VIEW_BYTES = 500_000  # an image of 640x480 with a sensor's noise, lossless
 LITTLE_ROOM, TOO_LITTLE_ROOM = 2_000_000_000, 200_000_000
 
 _PAUSE_S, _PAUSE_ERROR_S = 0.02, 0.25

@@ -16,13 +16,10 @@ from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
 SECONDS, DRAIN_S = 1.5, 0.25
-NOISY = 4.0
-"""Multiple of the datasheet's noise that a quiet table does not exceed."""
+NOISY = 4.0  # multiple of the datasheet's noise that a quiet table does not exceed
 NO_REST_DPS = 20.0
-MAX_BIAS_DPS = 20.0
-"""Zero-rate output of the MPU-6050's datasheet; more is a rotation, or a broken sensor."""
-UPRIGHT = 0.94
-"""Share of gravity along the table's axis when the sensor lies within 20° of it."""
+MAX_BIAS_DPS = 20.0  # zero-rate output of the MPU-6050's datasheet; more is a rotation, or a broken sensor
+UPRIGHT = 0.94  # share of gravity along the table's axis when the sensor lies within 20° of it
 
 
 def imu(context: DoctorContext) -> Iterator[Finding]:

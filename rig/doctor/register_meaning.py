@@ -5,8 +5,7 @@ from rig.devices.dynamixel.registers import ControlTable
 
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
 """Values of Baud Rate, Protocol 2.0."""
-AX_BAUD = 2_000_000
-"""Protocol 1.0: the value of Baud Rate is this divided by the rate, minus one."""
+AX_BAUD = 2_000_000  # protocol 1.0: the value of Baud Rate is this divided by the rate, minus one
 
 _OPERATING_MODES = {
     0: "current",
@@ -19,42 +18,18 @@ _OPERATING_MODES = {
 _DRIVE_BITS = ((0x01, "reversed direction"), (0x04, "time-based profile"), (0x08, "torque on by goal"))
 _STARTUP_BITS = ((0x01, "torque on at power-up"), (0x02, "RAM restored at power-up"))
 _RETURN_LEVELS = {0: "answers to ping only", 1: "answers to ping and read", 2: "answers to everything"}
-_AX_ERRORS = {
-    0: "input voltage",
-    1: "angle limit",
-    2: "overheating",
-    3: "range",
-    4: "checksum",
-    5: "overload",
-    6: "instruction",
-}
+_AX_ERRORS = ("input voltage", "angle limit", "overheating", "range", "checksum", "overload", "instruction")
 
-_SWITCHES = frozenset(
-    {"Torque Enable", "LED", "Moving", "Registered Instruction", "Backup Ready", "Lock", "Registered"}
-)
-_DEGREES = frozenset(
-    {
-        "Homing Offset",
-        "Max Position Limit",
-        "Min Position Limit",
-        "Goal Position",
-        "Present Position",
-        "Position Trajectory",
-        "CW Angle Limit",
-        "CCW Angle Limit",
-    }
-)
-_VELOCITIES = frozenset(
-    {
-        "Moving Threshold",
-        "Velocity Limit",
-        "Goal Velocity",
-        "Profile Velocity",
-        "Present Velocity",
-        "Velocity Trajectory",
-    }
-)
-_CURRENTS = frozenset({"Current Limit", "Goal Current", "Present Current"})
+_SWITCHES = {"Torque Enable", "LED", "Moving", "Registered Instruction", "Backup Ready", "Lock", "Registered"}
+_DEGREES = {
+    *("Homing Offset", "Max Position Limit", "Min Position Limit", "Goal Position", "Present Position"),
+    *("Position Trajectory", "CW Angle Limit", "CCW Angle Limit"),
+}
+_VELOCITIES = {
+    *("Moving Threshold", "Velocity Limit", "Goal Velocity", "Profile Velocity", "Present Velocity"),
+    "Velocity Trajectory",
+}
+_CURRENTS = {"Current Limit", "Goal Current", "Present Current"}
 _MILLIAMPERES = {"xl330": 1.0, "xc330": 1.0, "xm430": 2.69, "xh430": 2.69, "xd430": 2.69, "xm540": 2.69, "xh540": 2.69}
 """Unit of the currents by the first part of the model's name; unknown for other models."""
 
@@ -139,7 +114,7 @@ def _ax_meaning(name: str, value: int) -> str:
         case "Status Return Level":
             return _RETURN_LEVELS.get(value, "unknown level")
         case "Alarm LED" | "Shutdown":
-            return ", ".join(text for bit, text in _AX_ERRORS.items() if value >> bit & 1) or "nothing"
+            return ", ".join(text for bit, text in enumerate(_AX_ERRORS) if value >> bit & 1) or "nothing"
         case "Moving Speed" if value == 0:
             return "as fast as it can"
         case "Moving Speed" | "Present Speed":

@@ -15,10 +15,8 @@ from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
 READS = 100
-REPEATED = 2
-"""Number of repeated readings on a good bus."""
-SLOW = 1 / 3
-"""Share of the control loop's period that a reading may take; the usual cause of more is the latency timer."""
+REPEATED = 2  # number of repeated readings on a good bus
+SLOW = 1 / 3  # share of the control loop's period that a reading may take; the usual cause of more is the latency timer
 IMPOSSIBLE_C = 150
 POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then: "
 

@@ -15,8 +15,7 @@ from rig.doctor.context import DoctorContext
 from rig.doctor.register_meaning import baud_codes
 
 MAX_ID = 252
-_SETTLE_S = 0.05
-"""Time that a servo needs before it answers at a new rate."""
+_SETTLE_S = 0.05  # time that a servo needs before it answers at a new rate
 
 
 class SingleServo:

@@ -8,8 +8,7 @@ from rig.core.errors import CatalogError
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, bad, fine, of_error, warning
 
-IMAGES = 24
-"""Number of images that are verified; `rig catalog verify` verifies all."""
+IMAGES = 24  # number of images that are verified; `rig catalog verify` verifies all
 
 WANTED = {"imu.scale": "the gyro's scale may be off by a percent"}
 """Calibrations that every bench should have, and the consequence of a missing one."""

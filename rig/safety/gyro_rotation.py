@@ -143,8 +143,6 @@ class GyroRotationMeter:
     ----------
     imu
         The sensor on the platter.
-    clock
-        The bench's clock.
     axis, sign
         The sensor's vertical axis, and +1 if it points up, so that counter-clockwise is positive.
     scale

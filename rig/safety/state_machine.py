@@ -64,16 +64,12 @@ class StateMachine:
     """The state of one table."""
 
     def __init__(self, *, faulty: bool) -> None:
-        self._state = TableState.FAULT if faulty else TableState.DISCONNECTED
-
-    @property
-    def state(self) -> TableState:
-        return self._state
+        self.state = TableState.FAULT if faulty else TableState.DISCONNECTED
 
     def accepts(self, event: StateEvent) -> bool:
         """Return whether ``event`` is possible in this state."""
-        return event in TRANSITIONS[self._state]
+        return event in TRANSITIONS[self.state]
 
     def apply(self, event: StateEvent) -> None:
         """Change the state by ``event``; raises KeyError if the event is not possible in this state."""
-        self._state = TRANSITIONS[self._state][event]
+        self.state = TRANSITIONS[self.state][event]

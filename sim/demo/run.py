@@ -42,30 +42,23 @@ from sim.objects.solid import Solid
 from sim.world import World
 
 ENROLLED = (
-    "mug-white",
-    "mug-star",
-    "mug-dots",
-    "teapot",
-    "bowl-leaves",
-    "vase-blue",
-    "amphora",
-    "lamp",
-    "ball-beach",
-    "bottle-green",
-    "bottle-harvest",
-    "can-peach",
-    "cereal-puzzle",
-    "toy-house",
-    "toy-car",
-    "nutcracker",
+    *("mug-white", "mug-star", "mug-dots", "teapot", "bowl-leaves", "vase-blue", "amphora", "lamp"),
+    *(
+        "ball-beach",
+        "bottle-green",
+        "bottle-harvest",
+        "can-peach",
+        "cereal-puzzle",
+        "toy-house",
+        "toy-car",
+        "nutcracker",
+    ),
 )
 """Objects to enroll first: two similar pairs, a vase that is the same from everywhere, a bowl with 8-fold symmetry."""
 
-UNKNOWN_OBJECTS = ("radio", "clock")
-"""Objects that are put on the table but not enrolled."""
+UNKNOWN_OBJECTS = ("radio", "clock")  # objects that are put on the table but not enrolled
 
-COUNT_OF_FOLDER = 20
-"""Default number of objects of a folder to enroll."""
+COUNT_OF_FOLDER = 20  # default number of objects of a folder to enroll
 
 GOOD_SHARE = 0.8
 """Share of right answers below which the demo fails; of two very similar objects, an answer can be wrong."""

@@ -58,10 +58,7 @@ class FaultKind:
     def values(self, given: Mapping[str, float]) -> dict[str, float]:
         """Return all parameters, those not ``given`` at their defaults.
 
-        Raises
-        ------
-        UsageError
-            The fault has no such parameter, or its value is out of range.
+        Raises `UsageError` if the fault has no such parameter, or its value is out of range.
         """
         for name, value in given.items():
             if name not in self.parameters:

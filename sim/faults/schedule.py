@@ -63,10 +63,7 @@ class Fault:
     def parse(cls, text: str) -> Self:
         """Return the fault that a text in the short notation describes.
 
-        Raises
-        ------
-        UsageError
-            The text cannot be read, or the fault or a parameter does not exist.
+        Raises `UsageError` if the text cannot be read, or the fault or a parameter does not exist.
         """
         match = _SHORT.fullmatch(text.strip())
         if not match:
@@ -89,10 +86,7 @@ class Fault:
     def from_table(cls, table: Mapping[str, Any]) -> Self:
         """Return what a table says: ``name``, one of ``at_s``, ``during_move``, ``after_view``, ``for_s``, parameters.
 
-        Raises
-        ------
-        UsageError
-            There is no such fault or parameter, or a value is none.
+        Raises `UsageError` if there is no such fault or parameter, or a value is none.
         """
         name = table.get("name")
         if not isinstance(name, str):

@@ -8,17 +8,15 @@ import numpy as np
 from sim.devices import SimDevices
 from sim.faults.kind import Delay, End, Parameter, repeatedly, share, simulated_fault
 from sim.servo import Ax12Servo, Frame, XSeriesServo
+from sim.servo.base import OVERLOAD_ERROR
 from sim.servo.configured import SimulatedServo
 from sim.servo.control_table import Memory
-from sim.servo.device import OVERLOAD_ERROR
 from sim.world import World
 
 Values = Mapping[str, float]
 
-LOWEST_SUPPLY_V = 4.5
-"""Below this voltage the servo's controller resets. The e-manual states no value."""
-_OTHER_MODEL = 1020
-"""Model Number of an XM430-W350."""
+LOWEST_SUPPLY_V = 4.5  # below this voltage the servo's controller resets. The e-manual states no value.
+_OTHER_MODEL = 1020  # model Number of an XM430-W350
 _XL430_MODEL = 1060
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from ctypes import CFUNCTYPE, POINTER, Structure, c_bool, c_int32, c_uint8, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -23,10 +23,8 @@ from sim.i2c import I2cDevice
 from sim.world import World
 
 BYTE_NS = 10 * 1_000_000_000 // BAUD
-QUANTUM_S = 0.005
-"""Longest time between two runs of the board: limits how late its outputs change the world."""
-RECEIVER_BYTES = 4096
-"""Size of the host's receive buffer (N_TTY); later bytes are lost."""
+QUANTUM_S = 0.005  # longest time between two runs of the board: limits how late its outputs change the world
+RECEIVER_BYTES = 4096  # size of the host's receive buffer (N_TTY); later bytes are lost
 ABI = 1
 _NEVER = 2**64 - 1
 _ROOM = 1024
@@ -41,12 +39,6 @@ _Edge = CFUNCTYPE(c_uint64, c_uint64)
 
 class _Environment(Structure):
     _fields_ = (("i2c", _I2c), ("edge", _Edge))
-
-
-class EdgeSource(Protocol):
-    """A device whose interrupt pin is connected to the head's data-ready input."""
-
-    def next_edge_ns(self, after_ns: int) -> int | None: ...
 
 
 @dataclass(frozen=True, slots=True)

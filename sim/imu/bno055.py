@@ -37,16 +37,13 @@ FUSION_MODES = frozenset({IMU_MODE, 0x09, 0x0A, 0x0B, NDOF_MODE})
 IDLE, SYSTEM_ERROR, FUSION_RUNNING = 0, 1, 5  # values of SYS_STATUS
 RST_SYS = 0x20
 
-SILENT_S = 0.65
-"""Time from reset or power-up until it answers."""
+SILENT_S = 0.65  # time from reset or power-up until it answers
 TO_CONFIG_S, FROM_CONFIG_S = 0.019, 0.007
-TICK_NS = 10_000_000
-"""Period of the fusion."""
+TICK_NS = 10_000_000  # period of the fusion
 GYRO_BANDWIDTH_HZ = 32.0
 GYRO_NOISIER, GYRO_TRUER = 2.8, 0.2
 """Its gyro's noise, 0.014 °/s/√Hz, and zero rate, ±1 °/s, over those of the bench's noise model."""
-REST_TICKS, JUDGE_TICKS = 100, 20
-"""How long the sensor must be still to measure its bias, and how often it checks that."""
+REST_TICKS, JUDGE_TICKS = 100, 20  # how long the sensor must be still to measure its bias, and how often it checks that
 REST_DPS, REST_SPREAD_DPS = 3.0, 0.5
 
 _IDENTITY = {CHIP_ID: 0xA0, 0x01: 0xFB, 0x02: 0x32, 0x03: 0x0F, 0x04: 0x11, 0x05: 0x03, 0x06: 0x15}

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from sim.motion import Floats
 from sim.world import World
 
-WARM_UP_S = 300.0
-"""Time constant of the warming of a sensor on a small board in still air."""
-_NOTHING = 1e-12
-"""Share of an input that a 16-bit register cannot show."""
+WARM_UP_S = 300.0  # time constant of the warming of a sensor on a small board in still air
+_NOTHING = 1e-12  # share of an input that a 16-bit register cannot show
 
 
 class InertialModel:

@@ -99,7 +99,7 @@ def _tin() -> Solid:
 
     sides = painted(p.RED, wall)
     lid = painted(p.RED, lambda s: s.band(0.0, 0.45, p.YELLOW))
-    body = box((76, 76, 112), front=sides, right=sides, back=sides, left=sides, top=p.RED)
+    body = box((76, 76, 112), (sides, sides, sides, sides), top=p.RED)
     cover = Revolution(((0.0, 122.0), (28.0, 122.0), (29.0, 112.0)), lid, shine=0.6, layer=1)
     return Solid("tin-tea", (body, cover), 90.0)
 
@@ -129,7 +129,7 @@ def _cereal(name: str, *back: Brush) -> Solid:
     flank, face = painted(p.YELLOW, side), painted(p.YELLOW, front)
     return Solid(
         name,
-        (box((108, 46, 158), front=face, right=flank, back=painted(p.YELLOW, front, *back), left=flank, top=p.RED),),
+        (box((108, 46, 158), (face, flank, painted(p.YELLOW, front, *back), flank), top=p.RED),),
         360.0 if back else 180.0,
     )
 
@@ -157,16 +157,16 @@ def _book(name: str, size: tuple[float, float, float], cloth: Colour, cover: Bru
         s.panel(0.0, 0.0, 0.12, 1.0, cloth)
         s.panel(0.88, 0.0, 1.0, 1.0, cloth)
 
+    def blurb(s: Sheet) -> None:
+        s.lines(0.15, 0.2, 0.85, 0.6, 8, ink, 21)
+
     pages = painted(p.CREAM, paper)
     return Solid(
         name,
         (
             box(
                 size,
-                front=painted(cloth, cover),
-                right=pages,
-                back=painted(cloth, lambda s: s.lines(0.15, 0.2, 0.85, 0.6, 8, ink, 21)),
-                left=painted(cloth, spine),
+                (painted(cloth, cover), pages, painted(cloth, blurb), painted(cloth, spine)),
                 top=painted(p.CREAM, lambda s: s.band(0.0, 0.12, cloth), lambda s: s.band(0.88, 1.0, cloth)),
             ),
         ),
@@ -204,9 +204,7 @@ def _juice() -> Solid:
 
     w, h, peak = 33.0, 112.0, 142.0
     face, flank = painted(p.WHITE, front), painted(p.WHITE, side)
-    body = box(
-        (2 * w, 2 * w, h), front=face, right=flank, back=face, left=painted(p.WHITE, side, _recycled), top=p.WHITE
-    )
+    body = box((2 * w, 2 * w, h), (face, flank, face, painted(p.WHITE, side, _recycled)), top=p.WHITE)
     slopes = (
         quad([(-w, 0, peak), (-w, -w, h), (w, -w, h), (w, 0, peak)], p.ORANGE),
         quad([(w, 0, peak), (w, w, h), (-w, w, h), (-w, 0, peak)], p.ORANGE),
@@ -215,16 +213,7 @@ def _juice() -> Solid:
         triangle([(-w, w, h), (-w, -w, h), (-w, 0, peak)], (40, 150, 240)),
         triangle([(w, -w, h), (w, w, h), (w, 0, peak)], (40, 150, 240)),
     )
-    crest = box(
-        (2 * w, 3, 14),
-        front=p.WHITE,
-        right=p.WHITE,
-        back=p.WHITE,
-        left=p.WHITE,
-        top=p.WHITE,
-        at=(0, 0, peak - 1),
-        layer=2,
-    )
+    crest = box((2 * w, 3, 14), (p.WHITE, p.WHITE, p.WHITE, p.WHITE), top=p.WHITE, at=(0, 0, peak - 1), layer=2)
     return Solid("carton-juice", (body, Polyhedron((*slopes, *gables), layer=1), crest))
 
 
@@ -249,9 +238,7 @@ def _tissues() -> Solid:
     )
     tissue = Revolution(smooth((0, 108), (6, 107), (7, 96), (22, 84), (28, 80)), painted(p.WHITE), layer=1)
     return Solid(
-        "box-tissues",
-        (box((150, 82, 80), front=long, right=short, back=long, left=short, top=painted(p.TEAL, top)), tissue),
-        180.0,
+        "box-tissues", (box((150, 82, 80), (long, short, long, short), top=painted(p.TEAL, top)), tissue), 180.0
     )
 
 

@@ -53,10 +53,8 @@ class PhotographedObject:
 def photographs(folder: str | Path) -> Mapping[str, PhotographedObject]:
     """Return the objects of a folder by name, ``obj2`` before ``obj10``; photographs are read when they are drawn.
 
-    Raises
-    ------
-    UsageError
-        The folder does not exist, or holds no photograph in this layout, or shows an object twice at one angle.
+    Raises `UsageError` if the folder does not exist, or holds no photograph in this layout, or shows an object twice at
+    one angle.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -155,25 +155,25 @@ def _fill(image: Image, polygon: Floats, colour: Sequence[float]) -> None:
 
 def box(
     size_mm: tuple[float, float, float],
+    walls: tuple[Paint | Colour, Paint | Colour, Paint | Colour, Paint | Colour],
     *,
-    front: Paint | Colour,
-    right: Paint | Colour,
-    back: Paint | Colour,
-    left: Paint | Colour,
     top: Paint | Colour,
     at: tuple[float, float, float] = (0.0, 0.0, 0.0),
     turned_deg: float = 0.0,
     layer: int = 0,
 ) -> Polyhedron:
-    """Return a box (width, depth, height) at ``at``, rotated about its own axis, without a bottom."""
+    """Return a box (width, depth, height) at ``at``, rotated about its own axis, without a bottom.
+
+    The ``walls`` are front, right, back and left.
+    """
     w, d, h = size_mm[0] / 2, size_mm[1] / 2, size_mm[2]
     ring = [(-w, -d), (w, -d), (w, d), (-w, d)]
-    walls = [
+    sides = [
         quad([(*ring[i], h), (*ring[i], 0), (*ring[(i + 1) % 4], 0), (*ring[(i + 1) % 4], h)], paint)
-        for i, paint in enumerate((front, right, back, left))
+        for i, paint in enumerate(walls)
     ]
     lid = quad([(-w, d, h), (-w, -d, h), (w, -d, h), (w, d, h)], top)
-    return moved(Polyhedron((*walls, lid), layer), at, turned_deg)
+    return moved(Polyhedron((*sides, lid), layer), at, turned_deg)
 
 
 def prism(sides: int, radius_mm: float, height_mm: float, *, wall: Paint | Colour, top: Paint | Colour) -> Polyhedron:

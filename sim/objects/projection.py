@@ -24,14 +24,12 @@ Paint = Callable[[tuple[int, int]], Image]
 WIDTH, HEIGHT = 640, 480
 ELEVATION_DEG = 15.0
 PX_PER_MM = 2.0
-CENTRE_PX = (320, 398)
-"""Where the image shows the centre of the platter's top."""
+CENTRE_PX = (320, 398)  # where the image shows the centre of the platter's top
 
 SIN, COS = sin(radians(ELEVATION_DEG)), cos(radians(ELEVATION_DEG))
 TO_CAMERA: Floats = np.array([0.0, -COS, SIN])
 TO_LIGHT: Floats = np.array([-0.50, -0.62, 0.605]) / np.linalg.norm([-0.50, -0.62, 0.605])
-AMBIENT = 0.42
-"""Part of the light that comes from everywhere; the rest comes from the lamp at the front left."""
+AMBIENT = 0.42  # part of the light that comes from everywhere; the rest comes from the lamp at the front left
 
 
 @runtime_checkable

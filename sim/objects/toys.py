@@ -30,7 +30,7 @@ def _house(name: str, *door: Brush) -> Solid:
 
     front = painted(p.CREAM, windows, entrance, *door)
     gable = painted(p.CREAM, lambda s: s.disc(0.5, 0.4, 0.18, p.NAVY))
-    body = box((112, 84, 78), front=front, right=gable, back=painted(p.CREAM, windows), left=gable, top=p.CREAM)
+    body = box((112, 84, 78), (front, gable, painted(p.CREAM, windows), gable), top=p.CREAM)
     return Solid(
         name,
         (body, roof((128, 102, 54), slope=painted(p.RED, tiles), gable=p.CREAM, at=(0, 0, 78), layer=1), _chimney()),
@@ -69,17 +69,7 @@ def _blocks() -> Solid:
         size: float, letters: str, ink: Colour, at: tuple[float, float, float], turned: float, layer: int
     ) -> Polyhedron:
         front, right, back, left, top = (face(letter, ink) for letter in letters)
-        return box(
-            (size, size, size),
-            front=front,
-            right=right,
-            back=back,
-            left=left,
-            top=top,
-            at=at,
-            turned_deg=turned,
-            layer=layer,
-        )
+        return box((size, size, size), (front, right, back, left), top=top, at=at, turned_deg=turned, layer=layer)
 
     return Solid(
         "toy-blocks",
@@ -116,16 +106,8 @@ def _car() -> Solid:
     cabin = painted(p.BLUE, glass)
     shield = painted(p.BLUE, lambda s: s.panel(0.12, 0.15, 0.88, 0.9, (200, 170, 130)))
     hub = painted(p.BLACK, lambda s: s.disc(0.5, 0.5, 0.28, p.GREY), lambda s: s.disc(0.5, 0.5, 0.1, p.BLACK))
-    body = box(
-        (150, 62, 30),
-        front=side,
-        right=painted(p.BLUE, nose),
-        back=side,
-        left=painted(p.BLUE, tail),
-        top=p.BLUE,
-        at=(0, 0, 14),
-    )
-    top = box((78, 54, 28), front=cabin, right=shield, back=cabin, left=shield, top=p.WHITE, at=(-8, 0, 44), layer=2)
+    body = box((150, 62, 30), (side, painted(p.BLUE, nose), side, painted(p.BLUE, tail)), top=p.BLUE, at=(0, 0, 14))
+    top = box((78, 54, 28), (cabin, shield, cabin, shield), top=p.WHITE, at=(-8, 0, 44), layer=2)
     wheels = [
         lying_cylinder(18, 10, wall=p.BLACK, end=hub, at=(x, y, 18), turned_deg=turned, depth_at=(0.1 * x, y))
         for x in (-46, 46)
@@ -160,9 +142,7 @@ def _camera() -> Solid:
         s.disc(0.44, 0.42, 0.06, p.WHITE)
 
     side = painted(p.BLACK, leather, lambda s: s.band(0.0, 0.24, p.GREY))
-    body = box(
-        (132, 44, 86), front=painted(p.BLACK, front), right=side, back=painted(p.BLACK, back), left=side, top=p.GREY
-    )
+    body = box((132, 44, 86), (painted(p.BLACK, front), side, painted(p.BLACK, back), side), top=p.GREY)
     tube = lying_cylinder(32, 34, wall=p.BLACK, end=painted(p.BLACK, lens), at=(6, -22, 42), depth_at=(0, -39))
     knob = Revolution(((0.0, 96.0), (9.0, 96.0), (10.0, 86.0)), painted(p.RED), at=(44.0, 0.0), layer=1)
     dial = Revolution(
@@ -171,9 +151,7 @@ def _camera() -> Solid:
         at=(-42.0, 4.0),
         layer=1,
     )
-    finder = box(
-        (34, 30, 14), front=p.BLACK, right=p.GREY, back=p.BLACK, left=p.GREY, top=p.GREY, at=(6, 0, 86), layer=1
-    )
+    finder = box((34, 30, 14), (p.BLACK, p.GREY, p.BLACK, p.GREY), top=p.GREY, at=(6, 0, 86), layer=1)
     return Solid("camera", (body, tube, knob, finder, dial))
 
 
@@ -196,7 +174,7 @@ def _radio() -> Solid:
         lambda s: s.panel(0.2, 0.3, 0.8, 0.8, p.BLACK),
         lambda s: s.lines(0.25, 0.35, 0.75, 0.75, 7, p.GREY, 94),
     )
-    body = box((150, 52, 92), front=painted(p.TERRACOTTA, front), right=grain, back=back, left=grain, top=grain)
+    body = box((150, 52, 92), (painted(p.TERRACOTTA, front), grain, back, grain), top=grain)
     handle = Tube(
         smooth((-58, 0, 90, 4), (-58, 0, 118, 4), (58, 0, 118, 4), (58, 0, 90, 4)), p.BLACK, joints=0, layer=1
     )
@@ -246,7 +224,7 @@ def _dice() -> Solid:
 
         return painted(p.TEAL, brush)
 
-    return Solid("dice", (box((96, 96, 96), front=face(1), right=face(2), back=face(5), left=face(4), top=face(3)),))
+    return Solid("dice", (box((96, 96, 96), (face(1), face(2), face(5), face(4)), top=face(3)),))
 
 
 def _nutcracker() -> Solid:

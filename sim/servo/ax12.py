@@ -7,11 +7,9 @@ an error in one does not hide in the other. Kept but without effect: LEDs, compl
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
-from sim.clock import Timer
+from sim.servo.base import SimulatedServoBase
 from sim.servo.models import ServoModel
-from sim.servo.motor import Motor
 from sim.servo.protocol1 import Error
 from sim.servo.protocol2 import BROADCAST_ID, Instruction, InstructionPacket, Status
 from sim.servo.shaft import Shaft
@@ -19,9 +17,6 @@ from sim.servo.shaft import Shaft
 DEG_PER_COUNT = 300.0 / 1023.0
 DPS_PER_UNIT = 0.111 * 6.0
 CENTER_COUNTS = 512
-BOOT_S = 0.2
-SUPERVISION_S = 0.1
-RETURN_DELAY_UNIT_NS = 2_000
 BAUD_RATES = {
     1: 1_000_000,
     3: 500_000,
@@ -149,7 +144,7 @@ class Image:
         return found or None
 
 
-class Ax12Servo:
+class Ax12Servo(SimulatedServoBase):
     """A servo of Protocol 1.0 on the table's shaft: 0..300° in joint mode, endless rotation in wheel mode.
 
     Both angle limits 0 make a wheel. As on the device, a goal written while torque is off switches it on. After a
@@ -168,15 +163,10 @@ class Ax12Servo:
     ------
     ValueError
         No such id or baud rate.
-
-    Attributes
-    ----------
-    distortions
-        Called with the memory each time its live registers have been filled in: see `XSeriesServo`.
     """
 
     protocol = 1
-    model = AX_12A
+    memory: Image
 
     def __init__(
         self, shaft: Shaft, *, bus_id: int = 1, baudrate: int = 1_000_000, center_counts: int = CENTER_COUNTS
@@ -186,46 +176,28 @@ class Ax12Servo:
         if baudrate not in BAUD_RATES.values():
             known = ", ".join(map(str, sorted(BAUD_RATES.values())))
             raise ValueError(f"no AX-12A speaks at {baudrate} baud: choose one of {known}")
+        super().__init__(shaft, AX_12A)
         self.memory = Image()
         self.memory["ID"] = bus_id
         self.memory["Baud Rate"] = next(n for n, rate in BAUD_RATES.items() if rate == baudrate)
-        self.motor = Motor(shaft, AX_12A)
         self._shaft = shaft
-        self._clock = shaft.clock
         self._center = center_counts
         self._rng = shaft.rng(f"servo-{bus_id}")
-        self.distortions: list[Callable[[Any], None]] = []
-        self._registered: tuple[int, bytes] | None = None
         self._overload = False
         self._failed = 0
-        self._supervision: Timer | None = None
-        self._booting: Timer | None = None
         self._on_write: dict[str, Callable[[], None]] = {
             "Torque Enable": self._on_torque_enable,
             "Goal Position": self._on_goal,
             "Moving Speed": self._on_speed,
             "Torque Limit": self._on_torque_limit,
         }
-        self._powered = True
 
     # -- on the bus -----------------------------------------------------------------------------------------------
-
-    @property
-    def bus_id(self) -> int:
-        return self.memory["ID"]
 
     @property
     def baudrate(self) -> int:
         n = self.memory["Baud Rate"]
         return BAUD_RATES.get(n, 2_000_000 // (n + 1))
-
-    @property
-    def return_delay_ns(self) -> int:
-        return self.memory["Return Delay Time"] * RETURN_DELAY_UNIT_NS
-
-    @property
-    def powered(self) -> bool:
-        return self._powered
 
     def execute(self, packet: InstructionPacket) -> Status | None:
         """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
@@ -298,34 +270,6 @@ class Ax12Servo:
 
     # -- for tests and faults -------------------------------------------------------------------------------------
 
-    def turn_by_hand(self, angle_deg: float, speed_dps: float = 90.0) -> float:
-        """Rotate the shaft by hand by ``angle_deg``, with torque off; return how many seconds that takes.
-
-        Raises
-        ------
-        ValueError
-            The servo holds the shaft.
-        """
-        return self.motor.push(angle_deg, speed_dps, 4 * speed_dps)
-
-    def jam(self) -> None:
-        """Block the shaft."""
-        self.motor.jam()
-        self._supervise()
-
-    def free(self) -> None:
-        """Unblock the shaft."""
-        self.motor.free()
-        self._supervise()
-
-    def set_voltage(self, supply_v: float) -> None:
-        self.motor.supply_v = supply_v
-        self._supervise()
-
-    def set_temperature(self, temperature_c: float) -> None:
-        self.motor.set_temperature(temperature_c)
-        self._supervise()
-
     def fail(self, error: int) -> None:
         """Set bits of the error byte until the next power-up."""
         self._failed |= error
@@ -340,25 +284,6 @@ class Ax12Servo:
         if self.motor.driven:
             self._on_goal()
 
-    def power_on(self) -> None:
-        """Restore the supply; the servo answers after `BOOT_S`."""
-        if not self._powered:
-            self.power_cycle()
-
-    def power_off(self) -> None:
-        """Cut the supply."""
-        self._powered = False
-        self.memory["Torque Enable"] = 0
-        self.motor.release()
-        for timer in (self._supervision, self._booting):
-            if timer:
-                timer.cancel()
-
-    def power_cycle(self) -> None:
-        """Cut the supply and restore it; the servo answers after `BOOT_S`."""
-        self.power_off()
-        self._booting = self._clock.call_at(self._clock.now_ns() + round(BOOT_S * 1e9), self._start)
-
     # -- inside ---------------------------------------------------------------------------------------------------
 
     @property
@@ -372,29 +297,15 @@ class Ax12Servo:
 
     def _trouble(self) -> int:
         """Return the error bits of the hardware's state."""
-        motor, memory = self.motor, self.memory
-        bits = 0
-        if not memory["Min Voltage Limit"] <= motor.supply_v * 10 <= memory["Max Voltage Limit"]:
-            bits |= Error.VOLTAGE
-        if motor.temperature_c(motor.state().load) > memory["Temperature Limit"]:
-            bits |= Error.OVERHEATING
-        return bits | self._failed | (Error.OVERLOAD if self._overload else 0)
+        return self._supply_and_heat() | self._failed | (Error.OVERLOAD if self._overload else 0)
 
-    def _supervise(self) -> None:
-        """Check load, temperature and supply now, and repeatedly while the load varies."""
-        if self._supervision:
-            self._supervision.cancel()
-            self._supervision = None
+    def _judge(self) -> None:
         if not self._powered:
             return
-        self.motor.settle()
         self._overload |= self.motor.overloaded
         if self._trouble() & self.memory["Shutdown"] and self.memory["Torque Enable"]:
             self.memory["Torque Enable"] = self.memory["Torque Limit"] = 0
             self.motor.release()
-        if self.motor.busy:
-            due_ns = self._clock.now_ns() + round(SUPERVISION_S * 1e9)
-            self._supervision = self._clock.call_at(due_ns, self._supervise)
 
     def _on_torque_enable(self) -> None:
         if not self.memory["Torque Enable"]:

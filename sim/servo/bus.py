@@ -11,10 +11,8 @@ from sim.servo.protocol1 import PacketParser1, status_packet1
 from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, Status, fast_status_parts, status_packet
 from sim.servo.requests import CHAINED_READS, FAST_READS, chained_reads
 
-BITS_PER_BYTE = 10
-"""A start bit, 8 data bits, a stop bit."""
-ABANDON_S = 0.05
-"""Silence after which a device drops an incomplete packet; the e-manual states no value."""
+BITS_PER_BYTE = 10  # a start bit, 8 data bits, a stop bit
+ABANDON_S = 0.05  # silence after which a device drops an incomplete packet; the e-manual states no value
 PING_SLOT_S = 0.003
 PING_STATUS_BYTES = 14
 """Broadcast Ping: each id has a slot of one status packet and 3 ms, which is what the SDK's timeout reckons with."""

@@ -6,30 +6,15 @@ from rig.devices.dynamixel.registers import ControlTable, Register, control_tabl
 from sim.servo.models import ServoModel
 from sim.servo.protocol2 import StatusError
 
-RAM_START = 64
-"""Addresses below it are EEPROM: kept without power, locked while torque is on."""
-FIRST_LIVE_REGISTER = 120
-"""From Realtime Tick on, registers follow the world."""
+RAM_START = 64  # addresses below it are EEPROM: kept without power, locked while torque is on
+FIRST_LIVE_REGISTER = 120  # from Realtime Tick on, registers follow the world
 
 _READ_ONLY = frozenset(
     {
-        "Model Number",
-        "Model Information",
-        "Firmware Version",
-        "Registered Instruction",
-        "Hardware Error Status",
-        "Realtime Tick",
-        "Moving",
-        "Moving Status",
-        "Present PWM",
-        "Present Load",
-        "Present Current",
-        "Present Velocity",
-        "Present Position",
-        "Velocity Trajectory",
-        "Position Trajectory",
-        "Present Input Voltage",
-        "Present Temperature",
+        *("Model Number", "Model Information", "Firmware Version", "Registered Instruction", "Hardware Error Status"),
+        *("Realtime Tick", "Moving", "Moving Status", "Velocity Trajectory", "Position Trajectory"),
+        *("Present PWM", "Present Load", "Present Current", "Present Velocity", "Present Position"),
+        *("Present Input Voltage", "Present Temperature"),
     }
 )
 

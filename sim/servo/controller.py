@@ -19,10 +19,8 @@ from sim.servo.motor import Motor
 from sim.servo.shaft import Shaft
 
 IN_POSITION_COUNTS = 4
-FOLLOWING_ERROR_COUNTS = 100
-"""The e-manual calls these two thresholds of Moving Status predefined and states no values."""
-SINGLE_TURN_HOMING_COUNTS = 1024
-"""A Homing Offset beyond it is ignored in position mode."""
+FOLLOWING_ERROR_COUNTS = 100  # the e-manual calls these two thresholds of Moving Status predefined and states no values
+SINGLE_TURN_HOMING_COUNTS = 1024  # a Homing Offset beyond it is ignored in position mode
 TICK_MODULUS_MS = 32_768
 
 _REVERSE, _TIME_BASED = 0x01, 0x04  # bits of Drive Mode
@@ -238,5 +236,4 @@ class Controller:
         return self._counts(self._world.shaft()[0] + error_deg)
 
 
-_STANDSTILL = 1e-9
-"""Smallest limit of a profile: a profile of length 0 has no speed."""
+_STANDSTILL = 1e-9  # smallest limit of a profile: a profile of length 0 has no speed

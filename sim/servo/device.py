@@ -3,33 +3,24 @@
 from collections.abc import Callable
 
 from rig.devices.dynamixel.registers import Register
-from sim.clock import Timer
+from sim.servo.base import OVERLOAD_ERROR, SimulatedServoBase
 from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, Memory, Refusal
 from sim.servo.controller import Controller
 from sim.servo.models import BAUD_RATES, COUNTS_PER_TURN, MODELS, POSITION_MODE
-from sim.servo.motor import Motor
 from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, Status, StatusError
 from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
 from sim.servo.shaft import Shaft
 
-BOOT_S = 0.2
-"""How long a servo is silent after power-up or Reboot; the e-manual states no value."""
-SUPERVISION_S = 0.1
-"""How often the servo checks load and temperature while it works."""
 WATCHDOG_UNIT_NS = 20_000_000
 WATCHDOG_TRIPPED = 0xFF
-RETURN_DELAY_UNIT_NS = 2_000
 EXTENDED_RANGE_COUNTS = 1_048_575
-
-VOLTAGE_ERROR, OVERHEATING_ERROR, ENCODER_ERROR, ELECTRICAL_ERROR, OVERLOAD_ERROR = 0x01, 0x04, 0x08, 0x10, 0x20
-"""Bits of Hardware Error Status and Shutdown."""
 
 _TORQUE_BY_GOAL = 0x08  # bit of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 _CLEAR_MULTI_TURN = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 
 
-class XSeriesServo:
+class XSeriesServo(SimulatedServoBase):
     """A servo whose horn is the table's shaft.
 
     A block is written as a whole or, where one of its registers refuses, not at all. Writing an id, a baud rate or a
@@ -52,15 +43,10 @@ class XSeriesServo:
     ------
     ValueError
         No such model, id or baud rate.
-
-    Attributes
-    ----------
-    distortions
-        Called with the memory each time its live registers have been filled in, before they are read: a tired servo
-        reports something else.
     """
 
     protocol = 2
+    memory: Memory
 
     def __init__(
         self,
@@ -76,21 +62,14 @@ class XSeriesServo:
             raise ValueError(f"no simulated servo {model!r}: choose one of {', '.join(MODELS)}")
         if baudrate not in BAUD_RATES:
             raise ValueError(f"no servo speaks at {baudrate} baud: choose one of {', '.join(map(str, BAUD_RATES))}")
-        self.model = MODELS[model]
+        super().__init__(world, MODELS[model])
         if bus_id not in self.model.ranges["ID"]:
             raise ValueError(f"no servo has the id {bus_id}: choose one of 0 to 252")
         self.memory = Memory(self.model, self.model.firmware if firmware is None else firmware)
         self.memory["ID"] = bus_id
         self.memory["Baud Rate"] = BAUD_RATES.index(baudrate)
-        self.motor = Motor(world, self.model)
-        self._clock = world.clock
         self._controller = Controller(world, self.memory, self.motor, self.model, center_counts)
-        self.distortions: list[Callable[[Memory], None]] = []
-        self._registered: tuple[int, bytes] | None = None
         self._heard_ns = 0
-        self._watchdog: Timer | None = None
-        self._supervision: Timer | None = None
-        self._booting: Timer | None = None
         self._on_write: dict[str, Callable[[], None]] = {
             "Drive Mode": self._controller.wrap_position,
             "Operating Mode": self._controller.change_mode,
@@ -107,21 +86,8 @@ class XSeriesServo:
     # -- on the bus -----------------------------------------------------------------------------------------------
 
     @property
-    def bus_id(self) -> int:
-        return self.memory["ID"]
-
-    @property
     def baudrate(self) -> int:
         return BAUD_RATES[self.memory["Baud Rate"]]
-
-    @property
-    def return_delay_ns(self) -> int:
-        return self.memory["Return Delay Time"] * RETURN_DELAY_UNIT_NS
-
-    @property
-    def powered(self) -> bool:
-        """Whether the servo has power and has booted."""
-        return self._powered
 
     def execute(self, packet: InstructionPacket) -> Status | None:
         """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
@@ -227,36 +193,6 @@ class XSeriesServo:
 
     # -- for tests and faults -------------------------------------------------------------------------------------
 
-    def turn_by_hand(self, angle_deg: float, speed_dps: float = 90.0) -> float:
-        """Rotate the shaft by hand by ``angle_deg``, with torque off; return how many seconds that takes.
-
-        Raises
-        ------
-        ValueError
-            The servo holds the shaft.
-        """
-        return self.motor.push(angle_deg, speed_dps, 4 * speed_dps)
-
-    def jam(self) -> None:
-        """Block the shaft."""
-        self.motor.jam()
-        self._supervise()
-
-    def free(self) -> None:
-        """Unblock the shaft."""
-        self.motor.free()
-        self._supervise()
-
-    def set_voltage(self, supply_v: float) -> None:
-        """Set the supply voltage; the servo checks it at once."""
-        self.motor.supply_v = supply_v
-        self._judge()
-
-    def set_temperature(self, temperature_c: float) -> None:
-        """Set the temperature of the case; then it follows the thermal model again."""
-        self.motor.set_temperature(temperature_c)
-        self._judge()
-
     def fail(self, error: int) -> None:
         """Set bits of Hardware Error Status, such as `ENCODER_ERROR`."""
         self.memory["Hardware Error Status"] |= error
@@ -270,28 +206,8 @@ class XSeriesServo:
             self._trip()
 
     def slip_encoder(self, angle_deg: float) -> None:
-        """Let the encoder's magnet slip on the shaft by ``angle_deg``; the shaft follows what the encoder now reads."""
         self._controller.slip_encoder(angle_deg)
         self._supervise()
-
-    def power_off(self) -> None:
-        """Cut the supply."""
-        self._powered = False
-        self.memory["Torque Enable"] = 0
-        self.motor.release()
-        for timer in (self._watchdog, self._supervision, self._booting):
-            if timer:
-                timer.cancel()
-
-    def power_on(self) -> None:
-        """Restore the supply; the servo answers after `BOOT_S`."""
-        if not self._powered:
-            self.power_cycle()
-
-    def power_cycle(self) -> None:
-        """Cut the supply and restore it, like Reboot."""
-        self.power_off()
-        self._booting = self._clock.call_at(self._clock.now_ns() + round(BOOT_S * 1e9), self._start)
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
@@ -340,39 +256,17 @@ class XSeriesServo:
         pursue()
         self._supervise()
 
-    def _supervise(self) -> None:
-        """Check load, temperature and supply now, and repeatedly while the load varies."""
-        if self._supervision:
-            self._supervision.cancel()
-            self._supervision = None
-        self.motor.settle()
-        self._judge()
-        if self._powered and self.motor.busy:
-            due_ns = self._clock.now_ns() + round(SUPERVISION_S * 1e9)
-            self._supervision = self._clock.call_at(due_ns, self._supervise)
-
     def _judge(self) -> None:
         if not self._powered:
             return
-        motor, memory = self.motor, self.memory
-        errors = 0
-        if not memory["Min Voltage Limit"] <= motor.supply_v * 10 <= memory["Max Voltage Limit"]:
-            errors |= VOLTAGE_ERROR
-        if motor.temperature_c(motor.state().load) > memory["Temperature Limit"]:
-            errors |= OVERHEATING_ERROR
-        if motor.overloaded:
-            errors |= OVERLOAD_ERROR
-        if errors:
+        if errors := self._supply_and_heat() | (OVERLOAD_ERROR if self.motor.overloaded else 0):
             self.fail(errors)
 
     def _arm_watchdog(self) -> None:
         """Schedule the watchdog after the last instruction; only while torque is on."""
-        if self._watchdog:
-            self._watchdog.cancel()
-            self._watchdog = None
         units = self.memory["Bus Watchdog"]
-        if self.memory["Torque Enable"] and 0 < units < WATCHDOG_TRIPPED:
-            self._watchdog = self._clock.call_at(self._heard_ns + units * WATCHDOG_UNIT_NS, self._on_watchdog)
+        armed = self.memory["Torque Enable"] and 0 < units < WATCHDOG_TRIPPED
+        self._schedule(self._on_watchdog, self._heard_ns + units * WATCHDOG_UNIT_NS if armed else None)
 
     def _on_watchdog(self) -> None:
         if self._clock.now_ns() < self._heard_ns + self.memory["Bus Watchdog"] * WATCHDOG_UNIT_NS:

@@ -13,12 +13,9 @@ BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000
 
 COUNTS_PER_TURN = 4096
 DEG_PER_COUNT = 360.0 / COUNTS_PER_TURN
-DPS_PER_UNIT = 0.229 * 6.0
-"""Velocity registers count in 0.229 rev/min."""
-DPS2_PER_UNIT = 214.577 * 6.0 / 60.0
-"""Profile Acceleration counts in 214.577 rev/min²."""
-PWM_FULL = 885
-"""Goal and Present PWM at 100 %."""
+DPS_PER_UNIT = 0.229 * 6.0  # velocity registers count in 0.229 rev/min
+DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # profile Acceleration counts in 214.577 rev/min²
+PWM_FULL = 885  # goal and Present PWM at 100 %
 
 VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE = 1, 3, 4
 
@@ -109,116 +106,92 @@ class ServoModel:
 def _model(
     name: str,
     firmware: int,
-    initial: dict[str, int],
-    ranges: dict[str, Container[int]],
     *,
     supply_v: float,
     no_load_rpm: float,
+    temperature: int,
+    voltage: tuple[int, int],
+    lowest_voltage: int | None = None,
+    velocity: int,
+    gains: tuple[int, int, int],
+    initial: Mapping[str, int] = MappingProxyType({}),
+    ranges: Mapping[str, Container[int]] = MappingProxyType({}),
     stall_current: int | None = None,
 ) -> ServoModel:
+    """Return a model with its initial limits, velocity gains (I, P) and Position P Gain; ``ranges`` of other registers.
+
+    The voltage limits range from ``lowest_voltage`` (default: the initial lower limit) to the initial upper limit.
+    """
+    low, high = voltage
+    volts = range(low if lowest_voltage is None else lowest_voltage, high + 1)
+    own = {"Temperature Limit": temperature, "Min Voltage Limit": low, "Max Voltage Limit": high}
+    own |= dict(zip(("Velocity I Gain", "Velocity P Gain", "Position P Gain"), gains, strict=True))
     return ServoModel(
         name,
         firmware,
-        MappingProxyType(_INITIAL | initial),
-        MappingProxyType(_RANGES | ranges),
+        MappingProxyType(_INITIAL | own | {"Velocity Limit": velocity} | dict(initial)),
+        MappingProxyType(_RANGES | {"Max Voltage Limit": volts, "Min Voltage Limit": volts} | dict(ranges)),
         supply_v,
         no_load_rpm * 6.0,
         stall_current=stall_current,
     )
 
 
-MODELS: Mapping[str, ServoModel] = MappingProxyType(
-    {
-        model.name: model
-        for model in (
-            _model(
-                "xl430_w250",
-                46,
-                {
-                    "Temperature Limit": 72,
-                    "Max Voltage Limit": 140,
-                    "Min Voltage Limit": 60,
-                    "Velocity Limit": 265,
-                    "Velocity I Gain": 1000,
-                    "Velocity P Gain": 100,
-                    "Position D Gain": 4000,
-                    "Position P Gain": 640,
-                },
-                {"Max Voltage Limit": range(60, 141), "Min Voltage Limit": range(60, 141)},
-                supply_v=12.0,
-                no_load_rpm=61.0,
-            ),
-            _model(
-                "xm430_w350",
-                46,
-                {
-                    "Temperature Limit": 80,
-                    "Max Voltage Limit": 160,
-                    "Min Voltage Limit": 95,
-                    "Current Limit": 1193,
-                    "Velocity Limit": 200,
-                    "Velocity I Gain": 1920,
-                    "Velocity P Gain": 100,
-                    "Position P Gain": 800,
-                },
-                {
-                    "Max Voltage Limit": range(95, 161),
-                    "Min Voltage Limit": range(95, 161),
-                    "Current Limit": range(1194),
-                },
-                supply_v=12.0,
-                no_load_rpm=46.0,
-                stall_current=855,
-            ),
-            _model(
-                "xl330_m288",
-                52,
-                {
-                    "Temperature Limit": 70,
-                    "Max Voltage Limit": 70,
-                    "Min Voltage Limit": 35,
-                    "Current Limit": 1750,
-                    "Velocity Limit": 445,
-                    "PWM Slope": 140,
-                    "Shutdown": 53,
-                    "Velocity I Gain": 1600,
-                    "Velocity P Gain": 180,
-                    "Position P Gain": 400,
-                },
-                {
-                    "Baud Rate": range(7),
-                    "Max Voltage Limit": range(31, 71),
-                    "Min Voltage Limit": range(31, 71),
-                    "Current Limit": range(1751),
-                    "Velocity Limit": range(2048),
-                    "PWM Slope": range(1, 256),
-                },
-                supply_v=5.0,
-                no_load_rpm=103.0,
-                stall_current=1470,
-            ),
-            _model(
-                "mx_28",
-                43,
-                {
-                    "Temperature Limit": 80,
-                    "Max Voltage Limit": 160,
-                    "Min Voltage Limit": 95,
-                    "Acceleration Limit": 32_767,
-                    "Velocity Limit": 230,
-                    "Velocity I Gain": 1920,
-                    "Velocity P Gain": 100,
-                    "Position P Gain": 850,
-                },
-                {
-                    "Drive Mode": frozenset({0, 1, 4, 5}),
-                    "Max Voltage Limit": range(95, 161),
-                    "Min Voltage Limit": range(95, 161),
-                    "Acceleration Limit": range(32_768),
-                },
-                supply_v=12.0,
-                no_load_rpm=55.0,
-            ),
-        )
-    }
+_MODELS = (
+    _model(
+        "xl430_w250",
+        46,
+        supply_v=12.0,
+        no_load_rpm=61.0,
+        temperature=72,
+        voltage=(60, 140),
+        velocity=265,
+        gains=(1000, 100, 640),
+        initial={"Position D Gain": 4000},
+    ),
+    _model(
+        "xm430_w350",
+        46,
+        supply_v=12.0,
+        no_load_rpm=46.0,
+        temperature=80,
+        voltage=(95, 160),
+        velocity=200,
+        gains=(1920, 100, 800),
+        initial={"Current Limit": 1193},
+        ranges={"Current Limit": range(1194)},
+        stall_current=855,
+    ),
+    _model(
+        "xl330_m288",
+        52,
+        supply_v=5.0,
+        no_load_rpm=103.0,
+        temperature=70,
+        voltage=(35, 70),
+        lowest_voltage=31,
+        velocity=445,
+        gains=(1600, 180, 400),
+        initial={"Current Limit": 1750, "PWM Slope": 140, "Shutdown": 53},
+        ranges={
+            "Baud Rate": range(7),
+            "Current Limit": range(1751),
+            "Velocity Limit": range(2048),
+            "PWM Slope": range(1, 256),
+        },
+        stall_current=1470,
+    ),
+    _model(
+        "mx_28",
+        43,
+        supply_v=12.0,
+        no_load_rpm=55.0,
+        temperature=80,
+        voltage=(95, 160),
+        velocity=230,
+        gains=(1920, 100, 850),
+        initial={"Acceleration Limit": 32_767},
+        ranges={"Drive Mode": frozenset({0, 1, 4, 5}), "Acceleration Limit": range(32_768)},
+    ),
 )
+MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})

@@ -7,20 +7,15 @@ from sim.motion import Trajectory, rest, to_position, to_velocity
 from sim.servo.models import DEG_PER_COUNT, PWM_FULL, ServoModel
 from sim.servo.shaft import Shaft
 
-FRICTION_LOAD = 0.04
-"""Friction of the gears while the shaft rotates, as a part of the stall torque."""
+FRICTION_LOAD = 0.04  # friction of the gears while the shaft rotates, as a part of the stall torque
 PWM_PER_COUNT = 5.0
 """PWM that the position controller adds for each count of error: Position P Gain 640 / 128 (e-manual, XL430-W250)."""
-SUPPLY_DROP_V = 0.4
-"""Voltage lost in the supply's cable at stall."""
+SUPPLY_DROP_V = 0.4  # voltage lost in the supply's cable at stall
 
 AMBIENT_C = 25.0
-STANDBY_RISE_C = 8.0
-"""Warming by the electronics alone."""
-STALL_RISE_C = 90.0
-"""Final warming at stall torque; it is proportional to the square of the load."""
-THERMAL_TIME_S = 400.0
-"""Time constant of the case."""
+STANDBY_RISE_C = 8.0  # warming by the electronics alone
+STALL_RISE_C = 90.0  # final warming at stall torque; it is proportional to the square of the load
+THERMAL_TIME_S = 400.0  # time constant of the case
 
 OVERLOAD = 0.99
 OVERLOAD_S = 2.0
@@ -55,7 +50,7 @@ class Motor:
         self.commanded = rest(world.clock.now_ns() * 1e-9, world.shaft()[0])
         self._world = world
         self._model = model
-        self._driven = False
+        self.driven = False
         self._jammed = False
         self._temperature_c = AMBIENT_C + STANDBY_RISE_C
         self._overloaded_s = 0.0
@@ -73,18 +68,14 @@ class Motor:
         return self._model.acceleration_dps2
 
     @property
-    def driven(self) -> bool:
-        return self._driven
-
-    @property
     def profile_ongoing(self) -> bool:
         """Whether the commanded trajectory has not ended."""
-        return self._driven and self._now_s() < self.commanded.end_s
+        return self.driven and self._now_s() < self.commanded.end_s
 
     @property
     def busy(self) -> bool:
         """Whether the load varies: the shaft rotates, or is blocked while driven."""
-        return self._driven and (self._jammed or self.profile_ongoing or bool(self.commanded.velocity_dps[-1]))
+        return self.driven and (self._jammed or self.profile_ongoing or bool(self.commanded.velocity_dps[-1]))
 
     @property
     def overloaded(self) -> bool:
@@ -96,7 +87,7 @@ class Motor:
         position, velocity = self.commanded.at(now_s)
         target, target_dps = float(position), float(velocity)
         load = pwm = 0.0
-        if self._driven:
+        if self.driven:
             if self._jammed:
                 load = _clamp(PWM_PER_COUNT * (target - angle) / DEG_PER_COUNT / PWM_FULL)
             else:
@@ -159,7 +150,7 @@ class Motor:
         """Release a jammed shaft; it moves to its commanded angle at maximum speed."""
         self.settle()
         self._jammed = False
-        if not self._driven:
+        if not self.driven:
             return
         angle, cruise = self._world.shaft()[0], float(self.commanded.velocity_dps[-1])
         if cruise:
@@ -171,12 +162,9 @@ class Motor:
     def push(self, angle_deg: float, v_max: float, a_max: float) -> float:
         """Rotate the released shaft by hand by ``angle_deg``; return how many seconds that takes.
 
-        Raises
-        ------
-        ValueError
-            The shaft is driven or jammed.
+        Raises `ValueError` if the shaft is driven or jammed.
         """
-        if self._driven or self._jammed:
+        if self.driven or self._jammed:
             raise ValueError("A held shaft cannot be rotated: switch the servo's torque off and free it first.")
         angle, speed = self._world.shaft()
         self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, v_max, a_max))
@@ -191,7 +179,7 @@ class Motor:
         self.settle()
         self.commanded = path
         if driven is not None:
-            self._driven = driven
+            self.driven = driven
         if not self._jammed:
             self._world.drive(path)
 

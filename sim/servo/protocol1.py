@@ -11,8 +11,7 @@ from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, Status
 _HEADER = b"\xff\xff"
 _FIXED = 4  # header, id, length
 MAX_ID = 0xFD
-MAX_LENGTH = 143
-"""Largest valid value of a length field (the size of Protocol 1.0 buffers)."""
+MAX_LENGTH = 143  # largest valid value of a length field (the size of Protocol 1.0 buffers)
 
 
 class Error(IntFlag):

@@ -9,11 +9,9 @@ from itertools import pairwise
 
 BROADCAST_ID = 0xFE
 MAX_ID = 0xFC
-ALERT = 0x80
-"""Bit of a status packet's error byte: Hardware Error Status is not 0."""
+ALERT = 0x80  # bit of a status packet's error byte: Hardware Error Status is not 0
 
-MAX_LENGTH = 1024
-"""Largest valid value of a length field; a larger one is noise that looks like a header."""
+MAX_LENGTH = 1024  # largest valid value of a length field; a larger one is noise that looks like a header
 
 _HEADER = b"\xff\xff\xfd"
 _STUFFED = _HEADER + b"\xfd"

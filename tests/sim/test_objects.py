@@ -47,7 +47,7 @@ def solid(*parts: Part) -> Solid:
 HALVES = painted(BLUE, lambda s: s.panel(0.0, 0.0, 0.5, 1.0, RED))
 PATCH = painted(paint.GREY, lambda s: s.panel(0.48, 0.4, 0.52, 0.6, RED))
 CYLINDER = solid(Revolution(((50.0, 100.0), (50.0, 0.0)), PATCH))
-DIE = solid(box((80, 80, 80), front=RED, right=BLUE, back=paint.GREEN, left=paint.YELLOW, top=paint.WHITE))
+DIE = solid(box((80, 80, 80), (RED, BLUE, paint.GREEN, paint.YELLOW), top=paint.WHITE))
 
 
 # -- geometry and orientation -----------------------------------------------------------------------------------------
@@ -65,7 +65,7 @@ def test_mark_on_a_turned_body_is_where_the_projection_says(azimuth_deg: float) 
     "part",
     [
         Revolution(((40.0, 80.0), (40.0, 0.0)), HALVES),
-        box((80, 80, 80), front=HALVES, right=RED, back=RED, left=RED, top=paint.GREY),
+        box((80, 80, 80), (HALVES, RED, RED, RED), top=paint.GREY),
         lying_cylinder(40, 60, wall=paint.GREY, end=HALVES, at=(0, 30, 40)),
     ],
     ids=["revolution", "box", "lying cylinder"],

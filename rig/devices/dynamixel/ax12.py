@@ -11,10 +11,8 @@ from rig.devices.servo import MotionProfile, ServoCondition, ServoState
 RANGE_DEG, MAX_COUNTS = 300.0, 1023
 DPS_PER_UNIT = 0.111 * 6.0
 _DIRECTION = 0x400  # bit 10 of speed and load: clockwise, the position falls
-_STEEPEST_DPS2 = 2000.0
-"""Its fastest acceleration, which no document states: an estimate from its 354 °/s."""
-_ARRIVED_COUNTS = 2
-"""Largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise."""
+_STEEPEST_DPS2 = 2000.0  # its fastest acceleration, which no document states: an estimate from its 354 °/s
+_ARRIVED_COUNTS = 2  # largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise
 
 
 class Ax12Servo(RegisterServo):
@@ -61,7 +59,7 @@ class Ax12Servo(RegisterServo):
             temperature_c=float(values["Present Temperature"]),
             moving=moving,
             in_position=bool(values["Torque Enable"]) and not moving and away <= _ARRIVED_COUNTS,
-            hardware_errors=hardware_errors(self._bus.alert(self._id)),
+            hardware_errors=hardware_errors(self.bus.alert(self._id)),
         )
 
     def read_condition(self) -> ServoCondition:
@@ -71,7 +69,7 @@ class Ax12Servo(RegisterServo):
             watchdog_armed=False,
             watchdog_tripped=False,
             power_lost=values["Moving Speed"] == 0,  # 0 after power-up; the rig never sets 0
-            hardware_errors=hardware_errors(self._bus.alert(self._id)),
+            hardware_errors=hardware_errors(self.bus.alert(self._id)),
         )
 
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
@@ -81,7 +79,7 @@ class Ax12Servo(RegisterServo):
 
     def torque_on(self) -> None:
         position = self._read("Present Position")
-        if errors := hardware_errors(self._bus.alert(self._id)):
+        if errors := hardware_errors(self.bus.alert(self._id)):
             raise DeviceFault(
                 f"Servo {self._id} reports a hardware error: {', '.join(errors)}.",
                 next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",

@@ -20,8 +20,7 @@ from rig.devices.dynamixel.registers import Register
 OWED_S = 2.0
 """How long a missing reply may still arrive: longer than any buffer can delay it."""
 
-_ECHO_SIZE = 2
-"""In Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself."""
+_ECHO_SIZE = 2  # in Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself
 
 Answers = tuple[dict[int, Reply], int]
 """Replies by id, and the SDK's result for missing ones."""

@@ -16,8 +16,7 @@ PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 
 _HEADER = b"\xff\xff\xfd"
 _STUFFED = _HEADER + b"\xfd"
-_MALFORMED = -1
-"""Id of an inconsistent reply; no device has it."""
+_MALFORMED = -1  # id of an inconsistent reply; no device has it
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +51,6 @@ class Packets(Protocol):
         """Return the length of a status packet with ``size`` parameters, in bytes."""
 
     def read_parameters(self, address: int, size: int) -> bytes: ...
-
     def write_parameters(self, address: int, data: bytes) -> bytes: ...
 
     def reason(self, result: int) -> str:

@@ -30,8 +30,6 @@ class RegisterServo(ABC):
         The servo's bus.
     bus_id, model
         The servo's id, and its model as in `model_numbers`.
-    clock
-        The bench's clock.
     mode
         How the servo is used.
     gear_ratio
@@ -59,12 +57,12 @@ class RegisterServo(ABC):
         mode: ServoMode = ServoMode.TURNTABLE,
         gear_ratio: float = 1.0,
     ) -> None:
-        self._bus = bus
+        self.bus = bus
         self._clock = clock
         self._id = bus_id
         self._mode = mode
         self._gear_ratio = gear_ratio
-        self._resolution_deg = self.deg_per_count / gear_ratio
+        self.resolution_deg = self.deg_per_count / gear_ratio
         self._blocks: dict[tuple[str, str], Block] = {}
         try:
             number = bus.ping(bus_id)
@@ -88,35 +86,19 @@ class RegisterServo(ABC):
             silent.add_note("It answers a ping but no read: its Status Return Level is 0, or the bus has errors.")
             raise
         self._table: ControlTable = control_table(model, firmware)
-        self._identity = ServoIdentity(model, number, bus_id, firmware)
-        self._limits = ServoLimits(
+        self.identity = ServoIdentity(model, number, bus_id, firmware)
+        self.limits = ServoLimits(
             temperature_c=float(self._read("Temperature Limit")),
             voltage_v=(self._read("Min Voltage Limit") * 0.1, self._read("Max Voltage Limit") * 0.1),
         )
-
-    @property
-    def identity(self) -> ServoIdentity:
-        return self._identity
-
-    @property
-    def limits(self) -> ServoLimits:
-        return self._limits
-
-    @property
-    def resolution_deg(self) -> float:
-        return self._resolution_deg
 
     @property
     def turn_deg(self) -> float:
         return 360.0 / self._gear_ratio
 
     @property
-    def bus(self) -> DynamixelBus:
-        return self._bus
-
-    @property
     def bus_statistics(self) -> dict[str, int]:
-        return self._bus.statistics.as_dict()
+        return self.bus.statistics.as_dict()
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -124,29 +106,23 @@ class RegisterServo(ABC):
         return ()
 
     def close(self) -> None:
-        self._bus.close()
+        self.bus.close()
 
     # -- differences between models ---------------------------------------------------------------------------
 
     @property
     @abstractmethod
     def reach_deg(self) -> tuple[float, float]: ...
-
     @abstractmethod
     def read_state(self) -> ServoState: ...
-
     @abstractmethod
     def read_condition(self) -> ServoCondition: ...
-
     @abstractmethod
     def set_profile(self, profile: MotionProfile) -> MotionProfile: ...
-
     @abstractmethod
     def torque_on(self) -> None: ...
-
     @abstractmethod
     def arm_watchdog(self, timeout_s: float) -> None: ...
-
     @abstractmethod
     def disarm_watchdog(self) -> None: ...
 
@@ -168,28 +144,28 @@ class RegisterServo(ABC):
 
     def setting_differences(self) -> list[SettingDifference]:
         """Return the EEPROM settings that differ from what the rig needs."""
-        return settings.compare(self._bus, self._id, self._table, self._mode)
+        return settings.compare(self.bus, self._id, self._table, self._mode)
 
     def write_settings(self, differences: list[SettingDifference]) -> None:
         """Write EEPROM settings, with torque off, and read them back."""
-        settings.write(self._bus, self._id, self._table, differences)
+        settings.write(self.bus, self._id, self._table, differences)
 
     def verify(self) -> None:
-        self._bus.port.reconnect()
-        number, firmware = self._bus.ping(self._id), self._read("Firmware Version")
-        if (number, firmware) != (self._identity.model_number, self._identity.firmware):
+        self.bus.port.reconnect()
+        number, firmware = self.bus.ping(self._id), self._read("Firmware Version")
+        if (number, firmware) != (self.identity.model_number, self.identity.firmware):
             raise DeviceMismatch(
                 f"The servo that now answers at id {self._id} is a different one.",
                 next_step="Connect the bench's servo again, or start again with the new one.",
                 evidence={
-                    "expected": f"{self._identity.model}, firmware {self._identity.firmware}",
+                    "expected": f"{self.identity.model}, firmware {self.identity.firmware}",
                     "got": f"{model_numbers().get(number, f'unknown model {number}')}, firmware {firmware}",
                 },
             )
         prepare_servo(self, write=False)
 
     def reboot(self) -> None:
-        self._bus.reboot(self._id)
+        self.bus.reboot(self._id)
         give_up_ns = self._clock.now_ns() + round(BOOT_ALLOWANCE_S * 1e9)
         while True:
             self._clock.sleep(0.1)
@@ -204,10 +180,10 @@ class RegisterServo(ABC):
     # -- for the models -------------------------------------------------------------------------------------------
 
     def _read(self, name: str) -> int:
-        return self._bus.read(self._id, self._table[name])
+        return self.bus.read(self._id, self._table[name])
 
     def _write(self, name: str, value: int) -> None:
-        self._bus.write(self._id, self._table[name], value)
+        self.bus.write(self._id, self._table[name], value)
 
     def _read_registers(self, first: str, last: str) -> tuple[int, dict[str, int]]:
         """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name."""
@@ -215,7 +191,7 @@ class RegisterServo(ABC):
         if block is None:
             block = self._blocks[first, last] = Block.of(self._table, first, last)
         begun_ns = self._clock.now_ns()
-        image = self._bus.read_block(self._id, block.address, block.layout.size)
+        image = self.bus.read_block(self._id, block.address, block.layout.size)
         time_ns = (begun_ns + self._clock.now_ns()) // 2
         return time_ns, block.values(image)
 

@@ -43,15 +43,15 @@ class DynamixelServo(RegisterServo):
         time_ns, values = self._read_registers("Moving", "Present Temperature")
         return ServoState(
             time_ns=time_ns,
-            position_deg=values["Present Position"] * self._resolution_deg,
+            position_deg=values["Present Position"] * self.resolution_deg,
             velocity_dps=values["Present Velocity"] * self._dps_per_unit,
             load_percent=self._load_percent(values),
             voltage_v=values["Present Input Voltage"] * 0.1,
             temperature_c=float(values["Present Temperature"]),
             moving=bool(values["Moving"]),
             in_position=bool(values["Moving Status"] & 1),
-            hardware_errors=self._hardware_errors() if self._bus.alert(self._id) else (),
-            trajectory_deg=values["Position Trajectory"] * self._resolution_deg,
+            hardware_errors=self._hardware_errors() if self.bus.alert(self._id) else (),
+            trajectory_deg=values["Position Trajectory"] * self.resolution_deg,
         )
 
     def read_condition(self) -> ServoCondition:
@@ -157,5 +157,5 @@ class DynamixelServo(RegisterServo):
         return state
 
     def _change_mode(self, mode: ServoMode) -> None:
-        differences = settings.compare(self._bus, self._id, self._table, mode)
-        settings.write(self._bus, self._id, self._table, differences)
+        differences = settings.compare(self.bus, self._id, self._table, mode)
+        settings.write(self.bus, self._id, self._table, differences)

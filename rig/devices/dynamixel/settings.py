@@ -40,8 +40,7 @@ _OPERATING_MODES = {
 }
 _DRIVE_MODE_BITS = 0b1101
 """Drive Mode bits that must be 0: reverse direction, time-based profile, and torque on by goal update."""
-_SHUTDOWN = 0b110100
-"""Overload, electrical shock and overheating must switch the torque off."""
+_SHUTDOWN = 0b110100  # overload, electrical shock and overheating must switch the torque off
 _AX_SHUTDOWN = 0b100100
 _RETURN_DELAY = "no delay of replies; the factory setting of 250 costs 0.5 ms per reading"
 _ALL_ANSWERED = "the servo answers each instruction, so a lost one is noticed"

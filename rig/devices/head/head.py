@@ -61,8 +61,6 @@ class RigHead:
     ----------
     connection
         The open port, at `protocol.BAUD`.
-    clock
-        The bench's clock.
     sensor
         The sensor on the head's I2C bus, with its settings.
     deadman_s
@@ -223,10 +221,7 @@ class RigHead:
     def check(self) -> None:
         """Raise the fault for which the head switched its outputs off.
 
-        Raises
-        ------
-        EmergencyStop, HeartbeatLost, HeadRestarted
-            See `fault`.
+        Raises EmergencyStop, HeartbeatLost, HeadRestarted: see `fault`.
         """
         with self._in_use():
             pass

@@ -52,8 +52,6 @@ class HeadLink:
     ----------
     connection
         The open port; its reads return after a few milliseconds.
-    clock
-        The bench's clock.
     on_event
         Called with each `Sample` and `StatusChanged` that arrives.
     name

@@ -16,10 +16,7 @@ def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], cloc
 
     ``open_port`` opens its port, also again after the cable was unplugged.
 
-    Raises
-    ------
-    ConfigError, DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent
-        See `RigHead`.
+    Raises ConfigError, DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent: see `RigHead`.
     """
     imu = config.imu
     sensor = head_sensor(

@@ -13,7 +13,7 @@ from dynamixel_sdk import (
 )
 
 from sim.servo import Source
-from sim.servo.device import BOOT_S
+from sim.servo.base import BOOT_S
 from sim.servo.models import MODELS
 from sim.servo.protocol2 import StatusError, with_crc
 from tests.sim.servo.servo_bench import Line, extended

@@ -9,7 +9,8 @@ from rig.devices.dynamixel.port import ClockedPort
 from rig.devices.dynamixel.registers import control_table
 from sim.noise import NoiseModel
 from sim.servo import Ax12Servo, ServoBus, SimSerial, XSeriesServo
-from sim.servo.ax12 import BAUD_RATES, BOOT_S, DEG_PER_COUNT, DPS_PER_UNIT, ENTRIES
+from sim.servo.ax12 import BAUD_RATES, DEG_PER_COUNT, DPS_PER_UNIT, ENTRIES
+from sim.servo.base import BOOT_S
 from sim.servo.motor import OVERLOAD_S
 from sim.servo.protocol1 import Error, PacketParser1, checksum, status_packet1
 from sim.servo.protocol2 import InstructionPacket, Status

@@ -5,7 +5,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from sim.servo.device import BOOT_S, OVERLOAD_ERROR
+from sim.servo.base import BOOT_S, OVERLOAD_ERROR
 from sim.servo.protocol2 import StatusError
 from tests.sim.servo.servo_bench import ALERT, Line
 
