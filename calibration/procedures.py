@@ -1,18 +1,19 @@
 """All calibration procedures, in the order in which a bench is calibrated."""
 
-from calibration.backlash import Backlash
-from calibration.cable import Cable
-from calibration.camera_light import CameraCard, CameraNoise
-from calibration.camera_model import CameraModel
-from calibration.encoder import Encoder
-from calibration.gyro_noise import GyroNoise
-from calibration.gyro_rotation import GyroRotation
-from calibration.gyro_scale import GyroScale
-from calibration.imu_mounting import ImuMounting
-from calibration.motion_model import MotionModel
+from calibration.backlash import Backlash as Backlash
+from calibration.cable import Cable as Cable
+from calibration.camera_light import CameraCard as CameraCard
+from calibration.camera_light import CameraNoise as CameraNoise
+from calibration.camera_model import CameraModel as CameraModel
+from calibration.encoder import Encoder as Encoder
+from calibration.gyro_noise import GyroNoise as GyroNoise
+from calibration.gyro_rotation import GyroRotation as GyroRotation
+from calibration.gyro_scale import GyroScale as GyroScale
+from calibration.imu_mounting import ImuMounting as ImuMounting
+from calibration.motion_model import MotionModel as MotionModel
 from calibration.procedure import Procedure
-from calibration.repeatability import Repeatability
-from calibration.table_axis import TableAxis
+from calibration.repeatability import Repeatability as Repeatability
+from calibration.table_axis import TableAxis as TableAxis
 
 PROCEDURES: tuple[type[Procedure], ...] = (
     Cable,
@@ -29,20 +30,3 @@ PROCEDURES: tuple[type[Procedure], ...] = (
     TableAxis,
     Repeatability,
 )
-
-__all__ = [
-    "PROCEDURES",
-    "Backlash",
-    "Cable",
-    "CameraCard",
-    "CameraModel",
-    "CameraNoise",
-    "Encoder",
-    "GyroNoise",
-    "GyroRotation",
-    "GyroScale",
-    "ImuMounting",
-    "MotionModel",
-    "Repeatability",
-    "TableAxis",
-]

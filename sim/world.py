@@ -158,8 +158,6 @@ class World:
         finally:
             self.change(**{name: getattr(before, name) for name in values})
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     def _platter(self) -> Platter:
         return Platter(self.noise.backlash_deg, self.noise.structure_hz, self.noise.structure_damping)
 

@@ -130,20 +130,9 @@ class Runs:
     @classmethod
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
         """Nothing looked at yet."""
+        filled = {"rank": (-1, np.int32), "best": (-1, np.int32), "outcome": (-1, np.int8), "step_ns": (0, np.int64)}
         shape = (methods, objects, trials, views)
-        errors, alike, period, margin, score, travelled = np.full((6, *shape), np.nan)
-        return cls(
-            np.full(shape, -1, np.int32),
-            errors,
-            alike,
-            period,
-            margin,
-            np.full(shape, -1, np.int32),
-            score,
-            np.full(shape, -1, np.int8),
-            travelled,
-            np.zeros(shape, np.int64),
-        )
+        return cls(*(np.full(shape, *filled.get(item.name, (np.nan, np.float64))) for item in fields(cls)))
 
     def of(self, objects: slice) -> "Runs":
         """The runs of some objects alone."""

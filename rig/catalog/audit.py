@@ -6,7 +6,6 @@ Decision: docs/decisions/0016.
 import os
 import pwd
 import socket
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -54,11 +53,7 @@ def entries(connection: Connection, since: datetime | None = None, object_name: 
         wanted = wanted.where(audit.c.time_utc >= since)
     if object_name is not None:
         wanted = wanted.where(audit.c.object_name == object_name)
-    return [AuditEntry(**_fields(row._mapping)) for row in connection.execute(wanted)]
-
-
-def _fields(row: Mapping[Any, Any]) -> dict[str, Any]:
-    return {str(key): value for key, value in row.items()}
+    return [AuditEntry(*row) for row in connection.execute(wanted)]
 
 
 def _user() -> str:

@@ -123,18 +123,15 @@ def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[F
 
 def _duplicate(context: DoctorContext, scan: BaudScan) -> Finding:
     ids = ", ".join(map(str, scan.duplicate_ids))
+    taken = {servo.bus_id for servo in scan.servos} | set(scan.duplicate_ids)
+    free_id = next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
     return bad(
         "servo",
         f"two servos answer at once to id {ids} at {scan.baud} baud (or the connection is very bad)",
-        f"Unplug one of the two, then: {context.rig(f'servo set-id {_free_id(scan)}')}",
+        f"Unplug one of the two, then: {context.rig(f'servo set-id {free_id}')}",
         ids=list(scan.duplicate_ids),
         baud=scan.baud,
     )
-
-
-def _free_id(scan: BaudScan) -> int:
-    taken = {servo.bus_id for servo in scan.servos} | set(scan.duplicate_ids)
-    return next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
 
 
 def _settings(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:

@@ -193,8 +193,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         still = peak <= self._config.quiet_dps and change <= QUIET_COUNTS * self._servo.resolution_deg and not slipped
         return Stillness(peak, change, turned.angle_deg, still)
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     def _waypoints(self, target_deg: float) -> tuple[float, ...]:
         """Return the stops of a motion: if it would end downwards, it first goes below the target."""
         start = max(target_deg - self._config.approach_deg, self._config.limits_deg[0])

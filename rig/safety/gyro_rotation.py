@@ -290,8 +290,6 @@ class GyroRotationMeter:
             return inf
         return float(abs(self._to_table) * np.abs(recent - self.bias.rate_dps).max())
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     def _drain(self) -> None:
         new = self._imu.read_samples()
         self._drained_ns = self._clock.now_ns()

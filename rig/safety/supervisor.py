@@ -341,8 +341,6 @@ class Safety:
             )
         self.set_angle(self.angle_reference.with_revolutions(self._servo.read_state().position_deg, revolutions))
 
-    # -- inside -------------------------------------------------------------------------------------------------------
-
     def _run_monitors(self) -> None:
         """Raise the fault of a device that stopped the bench, and latch it."""
         for monitor in self.monitors:

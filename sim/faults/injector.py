@@ -74,8 +74,6 @@ class Faults:
         for number in list(self._active):
             self._end(number)
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     def _notice(self, activity: Activity) -> None:
         now_ns = self._clock.now_ns()
         if activity is Activity.MOTION_STARTED:

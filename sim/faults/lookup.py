@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from difflib import get_close_matches
 from functools import cache
+from itertools import product
 from types import MappingProxyType
 
 from rig.core.errors import UsageError
@@ -13,7 +14,8 @@ from sim.faults.kind import DEVICES, FaultKind, registry
 @cache
 def fault_kinds() -> Mapping[str, FaultKind]:
     """Return all kinds by name: first the faults that every device can have, then the others."""
-    order = {f"{device}.{word}": i for i, (device, word) in enumerate(_device_words())}
+    words = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
+    order = {f"{device}.{word}": i for i, (device, word) in enumerate(product(DEVICES, words))}
     return MappingProxyType(dict(sorted(registry.items(), key=lambda item: order.get(item[0], len(order)))))
 
 
@@ -33,8 +35,3 @@ def find_fault(name: str) -> FaultKind:
         f"There is no fault {name!r}.",
         next_step=f"Did you mean {' or '.join(near)}?" if near else "List the faults: rig faults",
     )
-
-
-def _device_words() -> list[tuple[str, str]]:
-    words = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
-    return [(device, word) for device in DEVICES for word in words]

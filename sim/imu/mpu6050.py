@@ -154,7 +154,7 @@ class SimMpu6050:
             if value & FIFO_RESET and not value & FIFO_ENABLED:
                 self._fifo.clear()
             if value & SIG_COND_RESET:
-                self._clear_data()
+                self._registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = bytes(GYRO_ZOUT_L + 1 - ACCEL_XOUT_H)
         elif register in _SAMPLING and changed:
             self._begin_sampling()
 
@@ -175,9 +175,6 @@ class SimMpu6050:
         """Return the nominal rate (Hz) before the divider, and the true period (ns)."""
         internal_hz = 8000 if self._registers[CONFIG] & 0x07 in (0, 7) else 1000
         return internal_hz, round(1e9 / internal_hz / (1 + self.clock_error))
-
-    def _clear_data(self) -> None:
-        self._registers[ACCEL_XOUT_H : GYRO_ZOUT_L + 1] = bytes(GYRO_ZOUT_L + 1 - ACCEL_XOUT_H)
 
     def _take_samples(self) -> None:
         """Take the samples that are due since the last call."""

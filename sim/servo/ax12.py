@@ -284,8 +284,6 @@ class Ax12Servo(SimulatedServoBase):
         if self.motor.driven:
             self._on_goal()
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     @property
     def _wheel(self) -> bool:
         return self.memory["CW Angle Limit"] == self.memory["CCW Angle Limit"] == 0

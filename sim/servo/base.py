@@ -109,8 +109,6 @@ class SimulatedServoBase(ABC):
         self.power_off()
         self._schedule(self._start, self._clock.now_ns() + round(BOOT_S * 1e9))
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     @abstractmethod
     def _start(self) -> None:
         """Boot: set the RAM to its initial values."""

@@ -50,7 +50,8 @@ class Memory:
         self._image = bytearray(self._size)
         last = self._registers["Present Temperature"]
         self._live_end = last.address + last.size
-        identity = {"Firmware Version": firmware, "Model Number": _model_number(model.name)}
+        number = next(number for number, name in model_numbers().items() if name == model.name)
+        identity = {"Firmware Version": firmware, "Model Number": number}
         self._defaults = {**model.initial, **identity}
         for address, pointer in self._indirect.items():
             self._defaults[pointer.name] = address
@@ -176,7 +177,3 @@ def _indirect_blocks(table: ControlTable) -> Iterator[tuple[int, int, int]]:
     second, second_data = table["Indirect Address Read"].address, table["Indirect Data Read"].address
     if second >= data + count:
         yield second, second_data, (second_data - second) // 2
-
-
-def _model_number(name: str) -> int:
-    return next(number for number, model in model_numbers().items() if model == name)

@@ -209,8 +209,6 @@ class XSeriesServo(SimulatedServoBase):
         self._controller.slip_encoder(angle_deg)
         self._supervise()
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     def _start(self) -> None:
         self._powered = True
         self._registered = None

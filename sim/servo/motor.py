@@ -170,8 +170,6 @@ class Motor:
         self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, v_max, a_max))
         return self.commanded.end_s - self._now_s()
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     def _stop(self) -> Trajectory:
         return to_velocity(self._now_s(), *self._world.shaft(), 0.0, self.steepest_dps2)
 

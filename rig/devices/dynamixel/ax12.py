@@ -94,8 +94,6 @@ class Ax12Servo(RegisterServo):
     def disarm_watchdog(self) -> None:
         """Do nothing: the servo has no watchdog."""
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     @property
     def _dps_per_unit(self) -> float:
         return DPS_PER_UNIT / self._gear_ratio

@@ -129,8 +129,6 @@ class DynamixelServo(RegisterServo):
             self._write("Bus Watchdog", 0)
             self._change_mode(self._mode)
 
-    # -- inside ---------------------------------------------------------------------------------------------------
-
     def _load_percent(self, values: dict[str, int]) -> float:
         if self._current_limit is not None:
             return 100.0 * values["Present Current"] / self._current_limit

@@ -137,8 +137,6 @@ class HeadLink:
         s.frames, s.crc_errors, s.malformed = d.frames, d.crc_errors, d.malformed
         return {name: getattr(s, name) for name in s.__dataclass_fields__}
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _answer(self, message: Request) -> Answer | None:
         """Return the reply to ``message`` if it has arrived."""
         frame, self._reply = self._reply, None
