@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.core.errors import UsageError
+from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.views.charuco_board import Board
 
@@ -41,14 +41,9 @@ def write_board(board: Board, path: Path) -> str:
         raise UsageError(
             f"{path.name} is neither .pdf nor .png.", next_step="Give a file name that ends in .pdf or .png."
         )
-    try:
+    step = "Give a file in an existing folder that you may write to."
+    with os_errors_as(UsageError, f"Cannot write {path}.", next_step=step):
         write(path, content)
-    except OSError as error:
-        raise UsageError(
-            f"Cannot write {path}.",
-            next_step="Give a file in an existing folder that you may write to.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
     return (
         f"{path}: {board.columns} x {board.rows} squares of {board.square_mm:g} mm. Print it at 100 % (not fitted to "
         f"the page), glue it to something stiff and flat, and measure: {board.columns} squares must be "

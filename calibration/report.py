@@ -11,7 +11,7 @@ from markupsafe import Markup
 from calibration.procedures import PROCEDURES
 from rig.calibrations import CalibrationResult, CalibrationStanding, CalibrationStatus
 from rig.charts.xy import Chart
-from rig.core.errors import UsageError
+from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 
 PLOTS = {name: procedure.plots for procedure in PROCEDURES for name in procedure.names}
@@ -83,14 +83,9 @@ def write_page(
         notes=notes,
         shown=shown,
     )
-    try:
+    step = "Give --out a file in an existing folder that you may write to."
+    with os_errors_as(UsageError, f"Cannot write the report {path}.", next_step=step):
         write(path, page.encode())
-    except OSError as error:
-        raise UsageError(
-            f"Cannot write the report {path}.",
-            next_step="Give --out a file in an existing folder that you may write to.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
 
 
 def _shown(standing: CalibrationStanding, history: Sequence[CalibrationResult]) -> _Shown:

@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rig.bench.computer import SERIAL_NAMES, LinuxComputer, User
+from rig.bench.computer import SERIAL_NAMES, Computer, User
 from rig.config import RigConfig
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.dynamixel import settings
@@ -91,7 +91,7 @@ class ComputerFiles:
             self.write("run/systemd/timesync/synchronized")
 
 
-class SimComputer(LinuxComputer):
+class SimComputer(Computer):
     """A simulated computer whose devices have the names in ``config``."""
 
     def __init__(self, root: Path, devices: SimDevices, config: RigConfig, user: User | None = None) -> None:

@@ -91,58 +91,12 @@ class Disk:
     writable: bool = True
 
 
-class Computer(Protocol):
-    """Finds and opens devices."""
-
-    @property
-    def clock(self) -> Clock: ...
-    @property
-    def user(self) -> User: ...
-
-    @property
-    def model(self) -> str:
-        """The computer's model; empty if it is not known."""
-
-    def serial_ports(self) -> list[SerialPort]: ...
-
-    def serial_port(self, path: str) -> SerialPort | None:
-        """Return the port ``path``, which may be a pseudo-terminal; None if it does not exist."""
-
-    def i2c_buses(self) -> list[DeviceFile]: ...
-    def cameras(self) -> list[DeviceFile]: ...
-
-    def same_file(self, one: str, other: str) -> bool:
-        """Return whether two paths, which may be links, are the same device."""
-
-    def joined(self, group: str) -> bool:
-        """Return whether the user is a member of the group, in this login or only after the next one."""
-
-    def time_synchronised(self) -> bool | None:
-        """Return whether a time server sets the clock; None if no service reports it."""
-
-    def disk(self, path: Path) -> Disk:
-        """Return the disk of ``path``, which need not exist yet."""
-
-    def open_serial(self, path: str, baud: int) -> "SerialConnection": ...
-    def i2c_name(self, bus: int | str) -> str:
-        """Return the name of a bus: its device file."""
-
-    def i2c_path(self, bus: int | str) -> str:
-        """Return the path by which smbus2 opens a bus."""
-
-    def open_capture(self, source: int | str) -> "Capture": ...
-
-
-@runtime_checkable
-class ComputerProvider(Protocol):
-    """A kind of bench whose computer can be examined while the bench is not open."""
-
-    def computer(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Computer]: ...
-
-
 @dataclass
-class LinuxComputer:
-    """A computer with Linux, as far as its files below ``root`` tell; the one that the program runs on by default."""
+class Computer:
+    """A computer with Linux, as far as its files below ``root`` tell; the one that the program runs on by default.
+
+    It finds and opens devices.
+    """
 
     root: Path = Path("/")
     clock: Clock = field(default_factory=SystemClock)
@@ -150,6 +104,7 @@ class LinuxComputer:
 
     @property
     def model(self) -> str:
+        """The computer's model; empty if it is not known."""
         return self._text("/proc/device-tree/model") or self._text("/sys/class/dmi/id/product_name")
 
     def serial_ports(self) -> list[SerialPort]:
@@ -176,6 +131,7 @@ class LinuxComputer:
         return sorted(ports, key=lambda port: (not port.usb, _natural(port.path)))
 
     def serial_port(self, path: str) -> SerialPort | None:
+        """Return the port ``path``, which may be a pseudo-terminal; None if it does not exist."""
         known = next((port for port in self.serial_ports() if self.same_file(port.path, path)), None)
         if known is not None or not self._at(path).exists():
             return known
@@ -192,9 +148,11 @@ class LinuxComputer:
         return [n for n in nodes if self._text(f"/sys/class/video4linux/{Path(n.path).name}/index") in ("", "0")]
 
     def same_file(self, one: str, other: str) -> bool:
+        """Return whether two paths, which may be links, are the same device."""
         return self._at(one).resolve() == self._at(other).resolve()
 
     def joined(self, group: str) -> bool:
+        """Return whether the user is a member of the group, in this login or only after the next one."""
         for line in self._text("/etc/group").splitlines():
             name, _, rest = line.partition(":")
             if name == group:
@@ -203,11 +161,13 @@ class LinuxComputer:
         return False
 
     def time_synchronised(self) -> bool | None:
+        """Return whether a time server sets the clock; None if no service reports it."""
         if self._at("/run/systemd/timesync").is_dir():
             return self._at("/run/systemd/timesync/synchronized").exists()
         return True if any(self._at(f"/run/{name}").exists() for name in ("chrony", "ntpd.pid", "ptp4l")) else None
 
     def disk(self, path: Path) -> Disk:
+        """Return the disk of ``path``, which need not exist yet."""
         there = path.absolute()
         while not there.exists():
             there = there.parent
@@ -224,9 +184,11 @@ class LinuxComputer:
         return open_serial(path, baud)
 
     def i2c_name(self, bus: int | str) -> str:
+        """Return the name of a bus: its device file."""
         return bus if isinstance(bus, str) else f"/dev/i2c-{bus}"
 
     def i2c_path(self, bus: int | str) -> str:
+        """Return the path by which smbus2 opens a bus."""
         return self.i2c_name(bus)
 
     def open_capture(self, source: int | str) -> "Capture":
@@ -316,6 +278,13 @@ class LinuxComputer:
             if folder == self.root.resolve():
                 break
         return {}
+
+
+@runtime_checkable
+class ComputerProvider(Protocol):
+    """A kind of bench whose computer can be examined while the bench is not open."""
+
+    def computer(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Computer]: ...
 
 
 def _natural(name: str) -> list[Any]:

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from rig.calibrations.refusal import Refusal, stored_refusal
-from rig.core.errors import ConfigError, UsageError
+from rig.core.errors import ConfigError, UsageError, os_errors_as
 from rig.core.files import read, write
 
 MAX_FILE_BYTES = 10_000_000
@@ -116,14 +116,9 @@ class CalibrationResult:
         UsageError
             The file cannot be written.
         """
-        try:
+        step = "Give a file in an existing folder that you may write to."
+        with os_errors_as(UsageError, f"Cannot write the calibration {path}.", next_step=step):
             write(path, _JSON.dump_json(self, indent=2) + b"\n")
-        except OSError as error:
-            raise UsageError(
-                f"Cannot write the calibration {path}.",
-                next_step="Give a file in an existing folder that you may write to.",
-                evidence={"reason": error.strerror or str(error)},
-            ) from error
 
     @classmethod
     def from_file(cls, path: Path) -> Self:

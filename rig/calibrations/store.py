@@ -10,7 +10,7 @@ from typing import Any
 
 from rig.calibrations.result import CalibrationResult
 from rig.config import RigConfig
-from rig.core.errors import ConfigError, UsageError
+from rig.core.errors import ConfigError, UsageError, os_errors_as
 
 CALIBRATIONS = "calibrations"
 """The key in a bench's conditions that names the results in force."""
@@ -79,14 +79,9 @@ class CalibrationStore:
         UsageError
             The folder cannot be created or written to.
         """
-        try:
+        step = "Set calibration_dir to a folder that you may write to."
+        with os_errors_as(UsageError, f"Cannot store calibrations in {self.folder}.", next_step=step):
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(
-                f"Cannot store calibrations in {self.folder}.",
-                next_step="Set calibration_dir to a folder that you may write to.",
-                evidence={"reason": error.strerror or str(error)},
-            ) from error
         # Numbered in the order of storing: a clock may be set back, and a simulated clock runs ahead.
         number = 1 + max((int(path.name.partition("-")[0]) for path in self._files()), default=0)
         path = self.folder / f"{number:05d}-{result.name}-{result.when_utc:%Y%m%dT%H%M%SZ}.json"

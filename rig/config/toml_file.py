@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from rig.core.errors import ConfigError
+from rig.core.errors import ConfigError, os_errors_as
 from rig.core.files import read, write
 
 Key = tuple[str, ...]
@@ -179,15 +179,10 @@ def save(path: Path, text: str) -> None:
         The file cannot be written.
     """
     target = path.resolve()
-    try:
+    step = "Give a file in a writable folder: --config FILE."
+    with os_errors_as(ConfigError, f"Cannot write the configuration {path}.", next_step=step):
         target.parent.mkdir(parents=True, exist_ok=True)
         write(target, text.encode("utf-8"))
-    except OSError as error:
-        raise ConfigError(
-            f"Cannot write the configuration {path}.",
-            next_step="Give a file in a writable folder: --config FILE.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
 
 
 def toml(value: Any) -> str:

@@ -4,7 +4,8 @@ The hundreds of a code are the exit code of the command line: 2 usage, 3 configu
 6 quality, 7 catalog, 8 unknown object, 9 busy. Decisions use the class, never the text.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
 Evidence = Mapping[str, Any]
@@ -61,6 +62,15 @@ class RigError(Exception):
             "evidence": self.evidence,
             "next_step": self.next_step,
         }
+
+
+@contextmanager
+def os_errors_as(kind: type[RigError], what: str, *, next_step: str) -> Iterator[None]:
+    """Raise an `OSError` in the ``with`` block as an error of ``kind``, with the system's reason as evidence."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(what, next_step=next_step, evidence={"reason": error.strerror or str(error)}) from error
 
 
 class UsageError(RigError, code=200, title="usage"):

@@ -21,7 +21,9 @@ Floats = NDArray[np.float64]
 
 EXPECTED_ID = 0xA0
 NOISE_DPS_RTHZ = 0.014
+"""Output noise density of the gyroscope (table 0-2)."""
 RATE_HZ, RANGE_DPS = 100.0, 2000.0
+"""Rate and range of its fusion modes, in which the sensor sets them itself (3.5)."""
 LSB_PER_DPS, LSB_PER_MS2, LSB_PER_QUATERNION = 16.0, 100.0, 16384.0
 OTHERS = {
     0x00: "no device: SDA is held low, or ground is missing",

@@ -8,7 +8,7 @@ from shlex import quote
 from typing import Any
 
 from rig.bench import bench_kind
-from rig.bench.computer import Computer, ComputerProvider, LinuxComputer
+from rig.bench.computer import Computer, ComputerProvider
 from rig.config import RigConfig
 from rig.config.values import validate
 from rig.safety.saved_state import Holder, busy, holder
@@ -82,4 +82,4 @@ def open_context(
         with kind.computer(config, chosen, seed) as computer:
             yield DoctorContext(computer, config, bench, options, file_options, who)
     else:
-        yield DoctorContext(LinuxComputer(), config, bench, options, file_options, who)
+        yield DoctorContext(Computer(), config, bench, options, file_options, who)

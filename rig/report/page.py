@@ -2,7 +2,6 @@
 
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -17,7 +16,8 @@ from rig.charts.azimuth_ring import RingView, azimuth_ring
 from rig.charts.decision_chart import decision_chart
 from rig.charts.polar_path import polar_path
 from rig.charts.score_chart import score_chart
-from rig.core.errors import UsageError
+from rig.core.errors import UsageError, os_errors_as
+from rig.core.files import write
 from rig.events.events import Candidate, Ranked
 from rig.events.wording import (
     answer_words,
@@ -101,19 +101,10 @@ def write_report(path: Path, html: str) -> None:
     UsageError
         The file cannot be written there.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
+    step = "Choose a folder that you may write to with --out, on a disk with free space."
+    with os_errors_as(UsageError, f"The report cannot be written to {path}.", next_step=step):
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(html, encoding="utf-8", newline="\n")
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise UsageError(
-            f"The report cannot be written to {path}.",
-            next_step="Choose a folder that you may write to with --out, on a disk with free space.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
+        write(path, html.encode())
 
 
 @cache

@@ -9,7 +9,7 @@ import json
 import os
 import signal
 import sys
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
@@ -17,13 +17,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.core import files
 from rig.core.clock import Clock
-from rig.core.errors import BenchBusy, RigError, StateNotStored
+from rig.core.errors import BenchBusy, RigError, StateNotStored, os_errors_as
 
 VERSION = 2
 """Version 1 has neither the settings of the table nor the file of the latched fault."""
 LATCH_BYTES = 8192
 """Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
 LOCK_ATTEMPTS = 3
+_MAKE_ROOM = "Make room on the disk, or set state_dir to a folder that you may write to."
 
 
 class _Saved(BaseModel):
@@ -245,13 +246,11 @@ class FileStore:
         return self._latch.is_file() and self._latch.stat().st_size == LATCH_BYTES
 
     def save(self, state: BenchState) -> None:
-        try:
+        with _storing(self._file):
             _make_folder(self.path)
             if not self._latch_is_reserved():
                 self._write_latch(state.fault)
             files.write(self._file, state.model_dump_json(indent=1, exclude={"damage"}).encode())
-        except OSError as error:
-            raise _not_stored(self._file, error) from error
 
     def stop_requested(self) -> bool:
         return self._stop.exists()
@@ -261,34 +260,22 @@ class FileStore:
 
     def request_stop(self) -> None:
         """Request a stop from the program that uses the bench."""
-        try:
+        with _storing(self._stop):
             _make_folder(self.path)
             self._stop.touch()
-        except OSError as error:
-            raise _not_stored(self._stop, error) from error
 
     def read_file(self, name: str) -> bytes | None:
-        try:
-            return (self.path / name).read_bytes()
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise StateNotStored(
-                f"{self.path / name} cannot be read.",
-                next_step="Give yourself permission to read the file, or delete it.",
-                evidence={"reason": error.strerror or str(error)},
-            ) from error
+        step = "Give yourself permission to read the file, or delete it."
+        with os_errors_as(StateNotStored, f"{self.path / name} cannot be read.", next_step=step):
+            try:
+                return (self.path / name).read_bytes()
+            except FileNotFoundError:
+                return None
 
     def store_file(self, name: str, content: bytes) -> None:
-        try:
+        with os_errors_as(StateNotStored, f"{name} cannot be stored in {self.path}.", next_step=_MAKE_ROOM):
             _make_folder(self.path)
             files.write(self.path / name, content)
-        except OSError as error:
-            raise StateNotStored(
-                f"{name} cannot be stored in {self.path}.",
-                next_step="Make room on the disk, or set state_dir to a folder that you may write to.",
-                evidence={"reason": error.strerror or str(error)},
-            ) from error
 
     def remove_file(self, name: str) -> None:
         with suppress(OSError):
@@ -307,11 +294,9 @@ class BenchLock:
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:
-        try:
+        with _storing(path / "lock"):
             _make_folder(path)
             self._file: TextIO = (path / "lock").open("a+", encoding="utf-8")
-        except OSError as error:
-            raise _not_stored(path / "lock", error) from error
         for attempt in range(LOCK_ATTEMPTS):
             if _try_lock(self._file):
                 break
@@ -391,9 +376,7 @@ def _make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
-def _not_stored(path: Path, error: OSError) -> StateNotStored:
-    return StateNotStored(
-        f"The bench's state cannot be written to {path}; the table may not move without it.",
-        next_step="Make room on the disk, or set state_dir to a folder that you may write to.",
-        evidence={"reason": error.strerror or str(error)},
-    )
+def _storing(path: Path) -> AbstractContextManager[None]:
+    """Raise `StateNotStored` if the system does not let the ``with`` block write to ``path``."""
+    what = f"The bench's state cannot be written to {path}; the table may not move without it."
+    return os_errors_as(StateNotStored, what, next_step=_MAKE_ROOM)

@@ -20,7 +20,7 @@ from rig.cli.ui.present import Progress, console, line
 from rig.cli.ui.settings import Settings
 from rig.config.values import validate
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import UsageError
+from rig.core.errors import UsageError, os_errors_as
 from rig.events.events import Accepted, Started
 from rig.events.wording import duration_words, signed
 from rig.plans.enroll import enroll
@@ -215,15 +215,9 @@ def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, SimObj
 
 def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":
     """Return a temporary folder for the catalog inside ``out``; this also checks that ``out`` is writable."""
-    try:
+    with os_errors_as(UsageError, f"The folder {out} is not writable.", next_step="Choose another folder with --out."):
         out.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryDirectory(prefix=".catalog-", dir=out)
-    except OSError as error:
-        raise UsageError(
-            f"The folder {out} is not writable.",
-            next_step="Choose another folder with --out.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
 
 
 def _photograph(bench: Bench, operator: ShelfOperator) -> None:

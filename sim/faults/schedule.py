@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from rig.config.toml_file import MAX_FILE_BYTES, loads
-from rig.core.errors import UsageError
+from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import read
 from sim.faults.kind import FaultKind
 from sim.faults.lookup import find_fault
@@ -123,13 +123,8 @@ def load_faults(path: Path) -> list[Fault]:
         The file or one of its faults cannot be read; the message says which one.
     """
     try:
-        content = loads(read(path, max_bytes=MAX_FILE_BYTES).decode())
-    except OSError as error:
-        raise UsageError(
-            f"Cannot read the faults in {path}.",
-            next_step="Give an existing file.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
+        with os_errors_as(UsageError, f"Cannot read the faults in {path}.", next_step="Give an existing file."):
+            content = loads(read(path, max_bytes=MAX_FILE_BYTES).decode())
     except ValueError as error:
         raise UsageError(
             f"{path} is not a TOML file.", next_step="Correct the line.", evidence={"reason": str(error)}

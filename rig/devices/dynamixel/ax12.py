@@ -3,7 +3,7 @@
 Decision: docs/decisions/0011.
 """
 
-from rig.core.errors import ConfigError, DeviceFault
+from rig.core.errors import ConfigError
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
 from rig.devices.dynamixel.settings import ServoMode
 from rig.devices.servo import MotionProfile, ServoCondition, ServoState
@@ -79,12 +79,7 @@ class Ax12Servo(RegisterServo):
 
     def torque_on(self) -> None:
         position = self._read("Present Position")
-        if errors := hardware_errors(self.bus.alert(self._id)):
-            raise DeviceFault(
-                f"Servo {self._id} reports a hardware error: {', '.join(errors)}.",
-                next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
-                evidence={"hardware_errors": list(errors)},
-            )
+        self._reject_errors(hardware_errors(self.bus.alert(self._id)))
         self._write("Goal Position", position)  # this also switches the torque on
         self._write("Torque Enable", 1)
 

@@ -13,7 +13,7 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceSilent, RequestRejected, UsageError
-from rig.devices.dynamixel.packets import PING, READ, REBOOT, WRITE, Packets, Packets1, Packets2, Reply
+from rig.devices.dynamixel.packets import PING, READ, REBOOT, WRITE, Packets, Packets1, Packets2, Reply, reason
 from rig.devices.dynamixel.port import BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import Register
 
@@ -180,7 +180,7 @@ class DynamixelBus:
                 if result == COMM_RX_CORRUPT
                 else "Check the servo's cable and its supply (its LED blinks at power-up), then start again."
             )
-            raise self._silent(what, missing or device_ids, self._packets.reason(result), step)
+            raise self._silent(what, missing or device_ids, reason(result), step)
 
     def _ask(
         self, target: int, instruction: int, parameters: bytes, size: int, answering: Sequence[int] | None = None

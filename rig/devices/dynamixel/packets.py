@@ -53,9 +53,6 @@ class Packets(Protocol):
     def read_parameters(self, address: int, size: int) -> bytes: ...
     def write_parameters(self, address: int, data: bytes) -> bytes: ...
 
-    def reason(self, result: int) -> str:
-        """Return the SDK's words for a result."""
-
 
 class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     """Protocol 2.0."""
@@ -93,9 +90,6 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
 
     def write_parameters(self, address: int, data: bytes) -> bytes:
         return address.to_bytes(2, "little") + data
-
-    def reason(self, result: int) -> str:
-        return _words(self, result)
 
     def addStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802 - the SDK's names
         """Stuff ``packet`` in place: the SDK's own version makes a new list, which its `txPacket` ignores."""
@@ -148,9 +142,6 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
     def write_parameters(self, address: int, data: bytes) -> bytes:
         return bytes((address,)) + data
 
-    def reason(self, result: int) -> str:
-        return _words(self, result)
-
 
 def _restuff(packet: list[int], body: Sequence[int] | bytes) -> list[int]:
     length = len(body) + 2
@@ -158,5 +149,6 @@ def _restuff(packet: list[int], body: Sequence[int] | bytes) -> list[int]:
     return packet
 
 
-def _words(handler: Protocol1PacketHandler | Protocol2PacketHandler, result: int) -> str:
-    return str(handler.getTxRxResult(result)).removeprefix("[TxRxResult] ")
+def reason(result: int) -> str:
+    """Return the SDK's words for a result."""
+    return str(Protocol2PacketHandler().getTxRxResult(result)).removeprefix("[TxRxResult] ")

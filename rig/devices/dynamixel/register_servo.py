@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 
 from rig.core.clock import Clock
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
+from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_numbers
@@ -184,6 +184,15 @@ class RegisterServo(ABC):
 
     def _write(self, name: str, value: int) -> None:
         self.bus.write(self._id, self._table[name], value)
+
+    def _reject_errors(self, errors: tuple[str, ...], **evidence: float) -> None:
+        """Raise `DeviceFault` if the servo reports hardware errors."""
+        if errors:
+            raise DeviceFault(
+                f"Servo {self._id} reports a hardware error: {', '.join(errors)}.",
+                next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
+                evidence={"hardware_errors": list(errors), **evidence},
+            )
 
     def _read_registers(self, first: str, last: str) -> tuple[int, dict[str, int]]:
         """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name."""

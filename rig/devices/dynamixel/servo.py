@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from rig.core.clock import seconds_between
-from rig.core.errors import DeviceFault, UsageError
+from rig.core.errors import UsageError
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import watchdog_units
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
@@ -75,7 +75,7 @@ class DynamixelServo(RegisterServo):
         return MotionProfile(velocity * self._dps_per_unit, acceleration * self._dps2_per_unit)
 
     def torque_on(self) -> None:
-        self._check_hardware_errors()
+        self._reject_errors(self._hardware_errors())
         # After a killed program the torque may be on: the old goal must not continue when the watchdog is cleared.
         self._write("Torque Enable", 0)
         self._write("Bus Watchdog", 0)
@@ -109,7 +109,7 @@ class DynamixelServo(RegisterServo):
                 f"The servo cannot rotate the table at {velocity_dps:g} °/s.",
                 next_step=f"Give {unit_dps:.2f} to {limit * unit_dps:.0f} °/s, in either direction.",
             )
-        self._check_hardware_errors()
+        self._reject_errors(self._hardware_errors())
         self._change_mode(ServoMode.SPIN)
         try:
             self._write("Bus Watchdog", 0)
@@ -137,21 +137,9 @@ class DynamixelServo(RegisterServo):
     def _hardware_errors(self) -> tuple[str, ...]:
         return hardware_errors(self._read("Hardware Error Status"))
 
-    def _check_hardware_errors(self) -> None:
-        if errors := self._hardware_errors():
-            raise DeviceFault(
-                f"Servo {self._id} reports a hardware error: {', '.join(errors)}.",
-                next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
-                evidence={"hardware_errors": list(errors)},
-            )
-
     def _checked(self, state: ServoState) -> ServoState:
-        if state.hardware_errors:
-            raise DeviceFault(
-                f"Servo {self._id} reports a hardware error: {', '.join(state.hardware_errors)}.",
-                next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
-                evidence={"temperature_c": state.temperature_c, "voltage_v": round(state.voltage_v, 1)},
-            )
+        volts = round(state.voltage_v, 1)
+        self._reject_errors(state.hardware_errors, temperature_c=state.temperature_c, voltage_v=volts)
         return state
 
     def _change_mode(self, mode: ServoMode) -> None:

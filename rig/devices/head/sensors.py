@@ -4,14 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from rig.core.errors import ConfigError
-from rig.devices import mpu6050
+from rig.devices import bno055, mpu6050
 from rig.devices.head.protocol import Imu, ImuModel
-
-BNO055_RANGE_DPS = 2000.0
-BNO055_RATE_HZ = 100.0
-"""Rate and range of its fusion modes, in which the sensor sets them itself (BST-BNO055-DS000, 3.5)."""
-BNO055_NOISE_DPS_RTHZ = 0.014
-"""BST-BNO055-DS000, table 0-2: output noise density of the gyroscope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +40,13 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
         return HeadSensor(
             name="BNO055",
             setup=Imu(ImuModel.BNO055, address, divider=0, filter=1, range=0),
-            rate_hz=BNO055_RATE_HZ,
-            range_dps=BNO055_RANGE_DPS,
-            noise_dps_rthz=BNO055_NOISE_DPS_RTHZ,
-            lsb_per_dps=16.0,
+            rate_hz=bno055.RATE_HZ,
+            range_dps=bno055.RANGE_DPS,
+            noise_dps_rthz=bno055.NOISE_DPS_RTHZ,
+            lsb_per_dps=bno055.LSB_PER_DPS,
             lsb_per_g=1000.0,
             temperature_c=float,
-            who_am_i=0xA0,
+            who_am_i=bno055.EXPECTED_ID,
             others={},
             start_s=6.0,
         )

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from rig.bench.computer import LinuxComputer, Process, User
+from rig.bench.computer import Computer, Process, User
 from sim.computer import ComputerFiles
 
 GID = os.getgid()
@@ -15,8 +15,8 @@ def computer(tmp_path):
     return ComputerFiles(tmp_path)
 
 
-def host(computer: ComputerFiles, *gids: int, uid: int = 4242) -> LinuxComputer:
-    return LinuxComputer(computer.root, user=User("ada", uid, frozenset(gids)))
+def host(computer: ComputerFiles, *gids: int, uid: int = 4242) -> Computer:
+    return Computer(computer.root, user=User("ada", uid, frozenset(gids)))
 
 
 def test_serial_port_has_adapter_stable_name_and_latency(computer):
@@ -136,7 +136,7 @@ def test_network_disk_is_detected(computer, tmp_path):
 
 
 def test_this_computer_can_be_examined():
-    here = LinuxComputer()
+    here = Computer()
     for node in [*here.serial_ports(), *here.i2c_buses(), *here.cameras()]:
         assert node.path.startswith("/dev/")
     assert here.user.gids
