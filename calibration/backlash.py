@@ -102,9 +102,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     found = Evaluation(name=NAME, residual_unit="°", evidence={"legs": plain(list(legs))})
     used = [leg for leg in legs if not leg.invalid]
     if len(used) < MIN_REVERSALS:
-        code = RefusalCode.TOO_FEW_REVERSALS
-        found.refuse_if(True, code, used=len(used), needed=MIN_REVERSALS, reasons=reasons(legs))
-        return found
+        return found.refuse(RefusalCode.TOO_FEW_REVERSALS, used=len(used), needed=MIN_REVERSALS, reasons=reasons(legs))
     encoder = np.array([leg.encoder_deg for leg in used])
     gyro = np.array([leg.gyro_deg for leg in used])
     fitted = fit(used, np.column_stack([gyro, np.sign(encoder)]), resolution_deg)
@@ -118,7 +116,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     found.proposed = {"table.backlash_deg": round(margin_deg, 3)}
 
     if ratio < 0:
-        found.refuse_if(True, RefusalCode.WRONG_DIRECTION, ratio=ratio)
+        found.refuse(RefusalCode.WRONG_DIRECTION, ratio=ratio)
     else:
         found.refuse_if(not RATIO[0] < ratio < RATIO[1], RefusalCode.WRONG_GEAR_RATIO, ratio=ratio, table_deg=1 / ratio)
     refuse_slipped_leg(found, legs.index(used[worst]) + 1)

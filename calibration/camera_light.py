@@ -180,8 +180,7 @@ def photon_transfer(frames: NDArray[np.uint8]) -> Evaluation:
     mean, variance, region = mean[usable], variance[usable], _regions(green.shape[1:])[usable]
     low, high = (np.quantile(mean, [0.02, 0.98]).tolist()) if mean.size else (0.0, 0.0)
     if high - low < MIN_SPAN:
-        found.refuse_if(True, RefusalCode.CONTRAST_TOO_LOW, span=high - low, needed=MIN_SPAN)
-        return found
+        return found.refuse(RefusalCode.CONTRAST_TOO_LOW, span=high - low, needed=MIN_SPAN)
     # Bin the pixels by their mean, in each region. Sums of pixels, means and variances: float64 (3, regions, bins).
     edges = np.linspace(low, high, BINS + 1)
     cell = region * BINS + np.clip(np.digitize(mean, edges) - 1, 0, BINS - 1)
@@ -258,8 +257,7 @@ def drift(card: CardFrames, before: CameraLocks, after: CameraLocks) -> Evaluati
         "locks": plain(after),
     }
     if card.levels.min() < 1.0:
-        found.refuse_if(True, RefusalCode.CARD_BLACK)
-        return found
+        return found.refuse(RefusalCode.CARD_BLACK)
     grey = card.levels.mean(axis=1)
     relative = grey / grey.mean()
     minutes = card.seconds / 60

@@ -142,8 +142,7 @@ def evaluate(
     }
     if len(views) < MIN_VIEWS:
         values = {"found": len(views), "span_deg": span_deg(views), "needed": MIN_VIEWS, "needed_deg": 0}
-        found.refuse_if(True, RefusalCode.TOO_FEW_VIEWS, **values)
-        return found
+        return found.refuse(RefusalCode.TOO_FEW_VIEWS, **values)
     rms, matrix, distortion, rotations, translations, deviations, _, each = cv2.calibrateCameraExtended(
         [points(board, view).astype(np.float32) for view in views],
         [view.corners_px.astype(np.float32) for view in views],

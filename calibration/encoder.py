@@ -131,8 +131,7 @@ def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resoluti
     used = [step for step in steps if not step.leg.invalid]
     if len(used) < STEPS_PER_TURN:
         why = reasons([step.leg for step in steps])
-        found.refuse_if(True, RefusalCode.TOO_FEW_STEPS, used=len(used), needed=STEPS_PER_TURN, reasons=why)
-        return found
+        return found.refuse(RefusalCode.TOO_FEW_STEPS, used=len(used), needed=STEPS_PER_TURN, reasons=why)
     gyro = np.array([step.leg.gyro_deg for step in used])
     basis = _basis(np.array([s.to_deg for s in used]), turn_deg) - _basis(
         np.array([s.from_deg for s in used]), turn_deg

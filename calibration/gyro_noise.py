@@ -231,5 +231,5 @@ def _check_rest(found: Evaluation, rest: RestRecord, column: int) -> None:
     jumps = np.flatnonzero(np.abs(steps) > MAX_STEP_SIGMA * max(typical, 1e-9))
     if jumps.size:
         at_s = (int(jumps[0]) + 1) * rest.block_s
-        found.refuse_if(True, RefusalCode.RATE_JUMPED, at_s=at_s, jump_dps=abs(steps[jumps[0]]))
+        found.refuse(RefusalCode.RATE_JUMPED, at_s=at_s, jump_dps=abs(steps[jumps[0]]))
     found.refuse_if(rest.lost, RefusalCode.SAMPLES_LOST, lost=rest.lost)

@@ -120,7 +120,7 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
         ways = [[m for m in used if (m.leg.encoder_deg > 0) == up] for up in (True, False)]
         if min(map(len, ways)) < MIN_REPEATS:
             why = reasons([move.leg for move in moves])
-            found.refuse_if(True, RefusalCode.TOO_FEW_MOVES, speed=speed, needed=MIN_REPEATS, reasons=why)
+            found.refuse(RefusalCode.TOO_FEW_MOVES, speed=speed, needed=MIN_REPEATS, reasons=why)
             continue
         squares, stated = [], []
         for way in ways:

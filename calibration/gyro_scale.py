@@ -117,12 +117,11 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     up = encoder > 0
     upwards, downwards = int(up.sum()), int((~up).sum())
     if min(upwards, downwards) < MIN_LEGS:
-        code = RefusalCode.TOO_FEW_REVOLUTIONS
-        found.refuse_if(True, code, up=upwards, down=downwards, needed=MIN_LEGS, reasons=reasons(legs))
-        return found
+        return found.refuse(
+            RefusalCode.TOO_FEW_REVOLUTIONS, up=upwards, down=downwards, needed=MIN_LEGS, reasons=reasons(legs)
+        )
     if not PLAUSIBLE[0] < (ratio := float(np.median(gyro / encoder))) < PLAUSIBLE[1]:
-        found.refuse_if(True, RefusalCode.GYRO_IMPLAUSIBLE, ratio=ratio)
-        return found
+        return found.refuse(RefusalCode.GYRO_IMPLAUSIBLE, ratio=ratio)
     fitted = fit(used, gyro[:, None], resolution_deg)
     value, uncertainty = float(fitted.values[0]), float(fitted.sigma[0])
     residuals = np.abs(encoder - value * gyro)

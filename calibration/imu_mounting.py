@@ -132,8 +132,7 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
         "levels": [{"table_deg": level.table_deg, "mean_g": level.mean_g.tolist()} for level in levels],
     }
     if len(moves) < STEPS // 2:
-        found.refuse_if(True, RefusalCode.TOO_FEW_RECORDED_MOVES, used=len(moves), planned=STEPS)
-        return found
+        return found.refuse(RefusalCode.TOO_FEW_RECORDED_MOVES, used=len(moves), planned=STEPS)
     total = np.sum([move.rotation_deg for move in moves], axis=0)
     length = float(np.linalg.norm(total))
     axis = total / length  # of a counter-clockwise rotation: upwards

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate, Refusal, RefusalCode
@@ -68,7 +68,12 @@ class Evaluation:
     def refuse_if(self, condition: object, code: RefusalCode, **values: Any) -> None:
         """Add a refusal with the numbers that its words need, if ``condition`` is true."""
         if condition:
-            self.refusals.append(refusal(code, values))
+            self.refuse(code, **values)
+
+    def refuse(self, code: RefusalCode, **values: Any) -> Self:
+        """Add a refusal with the numbers that its words need, and return the evaluation."""
+        self.refusals.append(refusal(code, values))
+        return self
 
     def estimate(self, name: str, value: Any, uncertainty: Any, unit: str = "") -> None:
         """Add an estimate."""

@@ -174,8 +174,7 @@ def evaluate(
     span = span_deg(views)
     if len(views) < MIN_VIEWS or span < MIN_SPAN_DEG:
         values = {"found": len(views), "span_deg": span, "needed": MIN_VIEWS, "needed_deg": MIN_SPAN_DEG}
-        found.refuse_if(True, RefusalCode.TOO_FEW_VIEWS, **values)
-        return found
+        return found.refuse(RefusalCode.TOO_FEW_VIEWS, **values)
     matrix, distortion = matrix_of(intrinsics)
     poses = [_pose(board, view, matrix, distortion) for view in views]
     refuse_loose_board(found, views, poses)

@@ -2,13 +2,13 @@
 
 import sys
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from sim.sim_servo import Link, Seconds, create_link
 
 
 @command
@@ -23,10 +23,8 @@ def sim_head(
     spin: Annotated[
         float, typer.Option(metavar="DPS", help="Rotate the platter at this speed, in degrees per second.")
     ] = 0.0,
-    link: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Create this link to the port while the program runs.")
-    ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this time. Default: until Ctrl+C.")] = None,
+    link: Link = None,
+    seconds: Seconds = None,
 ) -> None:
     """Simulate a rig head with its IMU on a pseudo-terminal in real time, and print the port to connect to.
 
@@ -34,7 +32,6 @@ def sim_head(
 
     Example: rig sim-head --spin 30
     """
-    from rig.core.errors import UsageError
     from sim.devices import SimDevices
     from sim.head.realtime import HeadPty, PacedClock
     from sim.motion import to_velocity
@@ -55,14 +52,7 @@ def sim_head(
             world.drive(to_velocity(0.0, 0.0, spin, abs(spin), 100.0))
         terminal = HeadPty(head)
         ends.callback(terminal.close)
-        if link is not None:
-            try:
-                link.symlink_to(terminal.port)
-            except OSError as error:
-                raise UsageError(
-                    f"Cannot create {link}: {error.strerror}.", next_step="Give a name that is not in use."
-                ) from error
-            ends.callback(link.unlink, missing_ok=True)
+        create_link(link, terminal.port, ends)
         if settings.json:
             settings.print_json({"port": terminal.port, "kind": kind, "imu": config.imu.model})
         else:

@@ -9,6 +9,21 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError
+
+Link = Annotated[Path | None, typer.Option(metavar="PATH", help="Create this link to the port while the program runs.")]
+Seconds = Annotated[float | None, typer.Option(min=0, help="Stop after this time. Default: until Ctrl+C.")]
+
+
+def create_link(link: Path | None, port: str, ends: ExitStack) -> None:
+    """Create a link to a port, and remove it at the end of ``ends``. Raises `UsageError` if that is not possible."""
+    if link is not None:
+        try:
+            link.symlink_to(port)
+        except OSError as error:
+            step = "Give a name that is not in use."
+            raise UsageError(f"Cannot create {link}: {error.strerror}.", next_step=step) from error
+        ends.callback(link.unlink, missing_ok=True)
 
 
 @command
@@ -17,10 +32,8 @@ def sim_servo(
     ids: Annotated[
         list[int] | None, typer.Option("--id", min=0, max=252, help="Id of a servo. Repeatable. Default: servo.id.")
     ] = None,
-    link: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Create this link to the port while the program runs.")
-    ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this time. Default: until Ctrl+C.")] = None,
+    link: Link = None,
+    seconds: Seconds = None,
 ) -> None:
     """Simulate servos on a pseudo-terminal in real time, and print the port to connect to.
 
@@ -29,7 +42,6 @@ def sim_servo(
     Example: rig sim-servo --set servo.model=xm430_w350 --id 1 --id 2
     """
     from rig.core.clock import SystemClock
-    from rig.core.errors import UsageError
     from sim.servo import ServoBus
     from sim.servo.configured import simulated_servo
     from sim.servo.terminal import ServoTerminal
@@ -46,14 +58,7 @@ def sim_servo(
     with ExitStack() as ends:
         terminal = ends.enter_context(ServoTerminal(bus, config.servo.baud, SystemClock()))
         port = terminal.port
-        if link is not None:
-            try:
-                link.symlink_to(port)
-            except OSError as error:
-                raise UsageError(
-                    f"Cannot create {link}: {error.strerror}.", next_step="Give a name that is not in use."
-                ) from error
-            ends.callback(link.unlink, missing_ok=True)
+        create_link(link, port, ends)
         if settings.json:
             settings.print_json({"port": port, "model": config.servo.model, "ids": wanted})
         else:

@@ -1,7 +1,7 @@
 """Insert sessions and views into the tables. Enrolled and imported views take the same path."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Final
 
@@ -43,17 +43,8 @@ def insert_session(
     empty_table: ImageFile | None = None,
 ) -> int:
     """Insert a session and return its id."""
-    return insert_row(
-        connection,
-        sessions,
-        enrollment_id=enrollment_id,
-        started_utc=started_utc,
-        bench=provenance.bench,
-        software=provenance.software,
-        devices=provenance.devices,
-        conditions=provenance.conditions,
-        **empty_table_columns(empty_table),
-    )
+    columns = {**asdict(provenance), **empty_table_columns(empty_table)}
+    return insert_row(connection, sessions, enrollment_id=enrollment_id, started_utc=started_utc, **columns)
 
 
 def empty_table_columns(image: ImageFile | None) -> dict[str, Any]:

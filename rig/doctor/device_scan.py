@@ -88,8 +88,7 @@ class DeviceScan:
 
     def _on_port(self, context: DoctorContext, port: SerialPort) -> Iterator[Finding | str]:
         """Scan a port, the fast scans first: the ids of AX-12A can only be asked one by one."""
-        problems = [finding for finding in access(context, "servo", port, "dialout") if finding.fix]
-        if problems:
+        if problems := [finding for finding in access(context, "servo", port, "dialout") if finding.fix]:
             yield from problems
             return
         known_head = context.config.imu.connection == "head" and context.computer.same_file(
@@ -163,8 +162,7 @@ class DeviceScan:
             if _COMPUTERS_OWN.search(node.name) and not context.computer.same_file(node.path, configured):
                 continue
             asked += 1
-            problems = [finding for finding in access(context, "imu", node, "i2c") if finding.fix]
-            if problems:
+            if problems := [finding for finding in access(context, "imu", node, "i2c") if finding.fix]:
                 yield from problems
                 continue
             yield f"{node.path}: searching for IMUs ..."
@@ -191,8 +189,7 @@ class DeviceScan:
         if not nodes:
             yield warning("camera", "no camera", "Connect the camera, then: " + context.rig("find"))
         for node in nodes:
-            problems = [finding for finding in access(context, "camera", node, "video") if finding.fix]
-            if problems:
+            if problems := [finding for finding in access(context, "camera", node, "video") if finding.fix]:
                 yield from problems
                 continue
             yield f"{node.path}: opening ..."

@@ -164,22 +164,14 @@ class ServoBus:
             for device, bus_id, delay_ns in called
             if (status := device.execute(packet)) is not None
         ]
-        if protocol == 1:
-            now_ns = self.clock.now_ns()
-            frames = [
-                Frame(Source.DEVICE, now_ns + a.delay_ns, baudrate, status_packet1(a.bus_id, a.status)) for a in answers
-            ]
-        elif packet.instruction in CHAINED_READS:
+        if protocol == 2 and packet.instruction in CHAINED_READS:
             frames = self._chain(packet, answers, baudrate)
         else:
-            slot_ns = 0
-            if packet.bus_id == BROADCAST_ID:  # only a ping is answered then
+            packed, slot_ns, now_ns = (status_packet1 if protocol == 1 else status_packet), 0, self.clock.now_ns()
+            if protocol == 2 and packet.bus_id == BROADCAST_ID:  # only a ping is answered then
                 slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
-            now_ns = self.clock.now_ns()
             frames = [
-                Frame(
-                    Source.DEVICE, now_ns + a.delay_ns + a.bus_id * slot_ns, baudrate, status_packet(a.bus_id, a.status)
-                )
+                Frame(Source.DEVICE, now_ns + a.delay_ns + a.bus_id * slot_ns, baudrate, packed(a.bus_id, a.status))
                 for a in answers
             ]
         for frame in superpose(frames):

@@ -10,6 +10,7 @@ from sim.servo.models import (
     DPS2_PER_UNIT,
     DPS_PER_UNIT,
     EXTENDED_POSITION_MODE,
+    GAINS,
     POSITION_MODE,
     PWM_FULL,
     VELOCITY_MODE,
@@ -24,15 +25,6 @@ SINGLE_TURN_HOMING_COUNTS = 1024  # a Homing Offset beyond it is ignored in posi
 TICK_MODULUS_MS = 32_768
 
 _REVERSE, _TIME_BASED = 0x01, 0x04  # bits of Drive Mode
-_GAINS = (
-    "Velocity I Gain",
-    "Velocity P Gain",
-    "Position D Gain",
-    "Position I Gain",
-    "Position P Gain",
-    "Feedforward 2nd Gain",
-    "Feedforward 1st Gain",
-)
 
 
 class Profile(IntEnum):
@@ -82,7 +74,7 @@ class Controller:
         """Reset what a change of the Operating Mode resets (e-manual, Operating Mode and Present Position)."""
         for name in ("Profile Velocity", "Profile Acceleration", "Goal Velocity"):
             self._memory[name] = 0
-        for name in _GAINS:
+        for name in GAINS:
             self._memory[name] = self._model.initial.get(name, 0)
         self._memory["Goal PWM"] = self._memory["PWM Limit"]
         if self._memory["Operating Mode"] in (POSITION_MODE, EXTENDED_POSITION_MODE):

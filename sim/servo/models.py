@@ -19,6 +19,11 @@ PWM_FULL = 885  # goal and Present PWM at 100 %
 
 VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE = 1, 3, 4
 
+GAINS = (
+    *("Velocity I Gain", "Velocity P Gain", "Position D Gain", "Position I Gain", "Position P Gain"),
+    *("Feedforward 2nd Gain", "Feedforward 1st Gain"),
+)
+
 _INITIAL = {
     "ID": 1,
     "Baud Rate": 1,
@@ -55,13 +60,7 @@ _RANGES: dict[str, Container[int]] = {
     "LED": range(2),
     "Status Return Level": range(3),
     "Startup Configuration": range(2),  # its bit for restoring RAM is not emulated
-    "Velocity I Gain": range(16_384),
-    "Velocity P Gain": range(16_384),
-    "Position D Gain": range(16_384),
-    "Position I Gain": range(16_384),
-    "Position P Gain": range(16_384),
-    "Feedforward 2nd Gain": range(16_384),
-    "Feedforward 1st Gain": range(16_384),
+    **dict.fromkeys(GAINS, range(16_384)),
     "Bus Watchdog": range(128),
     "Profile Acceleration": range(32_768),
     "Profile Velocity": range(32_768),

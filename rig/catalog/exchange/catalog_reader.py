@@ -86,16 +86,8 @@ def _sessions(
         if row.empty_table_image is not None:
             exported = (folder / f"empty-{number:03d}{Path(row.empty_table_image).suffix}").as_posix()
             files[exported] = root / row.empty_table_image
-        found[row.id] = Session(
-            started_utc=row.started_utc,
-            bench=row.bench,
-            software=row.software,
-            devices=row.devices,
-            conditions=row.conditions,
-            empty_table_image=exported,
-            empty_table_image_sha256=row.empty_table_image_sha256,
-            empty_table_image_bytes=row.empty_table_image_bytes,
-        )
+        columns = {name: getattr(row, name) for name in Session.model_fields}
+        found[row.id] = Session(**(columns | {"empty_table_image": exported}))
     return found
 
 

@@ -94,15 +94,8 @@ class _Inserter:
             self._insert_enrollment(connection, object_id, item.name, enrollment)
 
     def _insert_enrollment(self, connection: Connection, object_id: int, name: str, enrollment: Enrollment) -> None:
-        enrollment_id = insert_row(
-            connection,
-            enrollments,
-            object_id=object_id,
-            status=enrollment.status,
-            started_utc=enrollment.started_utc,
-            finished_utc=enrollment.finished_utc,
-            planned_azimuth_deg=enrollment.planned_azimuth_deg,
-        )
+        columns = enrollment.model_dump(exclude={"sessions", "views"})
+        enrollment_id = insert_row(connection, enrollments, object_id=object_id, **columns)
         target = images.folder(object_id, name, enrollment_id)
         names = [view.image for view in enrollment.views]
         names += [session.empty_table_image for session in enrollment.sessions if session.empty_table_image]
