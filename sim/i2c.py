@@ -11,7 +11,7 @@ import ctypes
 import os
 import tempfile
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from errno import EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
 from pathlib import Path
@@ -41,6 +41,15 @@ class I2cDevice(Protocol):
         """Return the next ``count`` bytes that the master clocks out."""
 
     def stop(self) -> None: ...
+
+
+def acknowledging(
+    devices: Mapping[int, I2cDevice], address: int, nacks: int, nack_conditions: Sequence[Callable[[int], bool]]
+) -> I2cDevice | None:
+    """Return the device that acknowledges ``address``; None while ``nacks`` are due or a condition holds."""
+    device = devices.get(address)
+    silent = nacks or not getattr(device, "answers", True) or any(refuses(address) for refuses in nack_conditions)
+    return None if silent else device
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,13 +210,8 @@ class SimI2cBus:
 
     def _start(self, address: int, reading: bool) -> I2cDevice:
         self._pass(1)
-        device = self._devices.get(address)
-        if (
-            device is None
-            or self._nacks
-            or not getattr(device, "answers", True)
-            or any(refuses(address) for refuses in self.nack_conditions)
-        ):
+        device = acknowledging(self._devices, address, self._nacks, self.nack_conditions)
+        if device is None:
             self._nacks = max(self._nacks - 1, 0)
             raise _os_error(ENXIO)
         device.start(reading)

@@ -11,7 +11,7 @@ import numpy as np
 
 from rig.core.clock import seconds_between
 from rig.core.errors import UsageError
-from sim.clock import Timer, VirtualClock
+from sim.clock import VirtualClock
 from sim.devices import SimDevices
 
 DEVICES = ("servo", "imu", "camera")
@@ -91,19 +91,8 @@ def simulated_fault(name: str, what: str, **parameters: Parameter) -> Callable[[
 
 def repeatedly(clock: VirtualClock, period_s: float, action: Callable[[], None]) -> End:
     """Call ``action`` now and every ``period_s`` from now on; return the function that stops it."""
-    timer: Timer | None = None
-
-    def act() -> None:
-        nonlocal timer
-        timer = clock.call_at(clock.now_ns() + round(period_s * 1e9), act)
-        action()
-
-    def stop() -> None:
-        if timer:
-            timer.cancel()
-
-    act()
-    return stop
+    action()
+    return clock.every(period_s, action)
 
 
 class Delay:

@@ -19,7 +19,7 @@ import numpy as np
 from rig.devices.head.protocol import BAUD, Reset
 from sim.clock import VirtualClock
 from sim.head import build
-from sim.i2c import I2cDevice
+from sim.i2c import I2cDevice, acknowledging
 from sim.world import World
 
 BYTE_NS = 10 * 1_000_000_000 // BAUD
@@ -285,15 +285,9 @@ class SimHead:
     def _transfer(self, operation: int, data: Any, length: int) -> int:
         device = self._addressed
         if operation in (_START_WRITE, _START_READ):
-            self._addressed = device = self._devices.get(data[0])
-            if (
-                device is None
-                or self._nacks
-                or not getattr(device, "answers", True)
-                or any(refuses(data[0]) for refuses in self.nack_conditions)
-            ):
+            self._addressed = device = acknowledging(self._devices, data[0], self._nacks, self.nack_conditions)
+            if device is None:
                 self._nacks = max(self._nacks - 1, 0)
-                self._addressed = None
                 return 0
             device.start(operation == _START_READ)
             return 1
