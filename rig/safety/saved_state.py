@@ -220,11 +220,9 @@ class FileStore:
         return state.model_copy(update={"fault": state.fault or fault, "version": VERSION})
 
     def latch(self, fault: LatchedFault | None) -> None:
-        try:
+        with _storing(self._latch):
             _make_folder(self.path)
             self._write_latch(fault)
-        except OSError as error:
-            raise _not_stored(self._latch, error) from error
 
     def _write_latch(self, fault: LatchedFault | None) -> None:
         text = b"" if fault is None else fault.model_dump_json().encode()
