@@ -18,7 +18,9 @@ from rig.config import RigConfig
 from rig.config.values import Values, config_mistakes, validate
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError, TorqueStaysOn
+from rig.core.signals import uninterrupted
 from rig.devices.camera import Camera
+from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
 from rig.devices.servo import Servo
@@ -68,6 +70,8 @@ class Bench(AbstractContextManager["Bench"]):
         The rig head that `imu` is connected to; None if `imu` is on the computer's own I2C bus.
     connections
         What must be closed after the devices.
+    guardian
+        Switches the torque off if this program is killed; None if the servo is simulated in this program.
     """
 
     name: str
@@ -83,6 +87,7 @@ class Bench(AbstractContextManager["Bench"]):
     state: StateStore = field(default_factory=MemoryStore, repr=False)
     head: RigHead | None = None
     connections: ExitStack = field(default_factory=ExitStack, repr=False)
+    guardian: Guardian | None = None
     safety: Safety = field(init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)
     _as_opened: tuple[RigConfig, tuple[str, ...]] | None = field(default=None, init=False, repr=False)
@@ -106,24 +111,34 @@ class Bench(AbstractContextManager["Bench"]):
         """Switch the torque off and close all devices, also if one of them fails; a second call does nothing."""
         if not self._open:
             return
-        self._open = False
+        with uninterrupted():
+            self._open = False
+            self._close()
+
+    def _close(self) -> None:
         failures: list[Exception] = []
         for step in (
-            self.servo.torque_off,
+            self._torque_off,
             self.servo.close,
             self.imu.close,
             self.camera.close,
             self.connections.close,
+            *((self.guardian.close,) if self.guardian else ()),
         ):
             try:
                 step()
             except (RigError, OSError) as failure:
                 if isinstance(failure, TorqueStaysOn):
                     self.safety.latch(failure)
-                if not (step == self.servo.torque_off and self._unpowered()):
+                if not (step == self._torque_off and self._unpowered()):
                     failures.append(failure)
         if failures:
             raise failures[0]
+
+    def _torque_off(self) -> None:
+        self.servo.torque_off()
+        if self.guardian:
+            self.guardian.disarm()
 
     def _unpowered(self) -> bool:
         """Return whether the rig head's relay cuts the servo's supply: then it has no torque either."""

@@ -13,6 +13,7 @@ from rig.bench import Bench, BenchKind
 from rig.config import RigConfig, Section
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, RigError, StateNotStored
+from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection, open_serial
 from rig.devices.dynamixel.register_servo import prepare_servo
@@ -58,6 +59,7 @@ class HardwareBench:
                 head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
             bench.connections = connections.pop_all()
+            bench.guardian = Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id)
             return bench
 
     @contextmanager

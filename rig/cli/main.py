@@ -25,10 +25,11 @@ from rig.cli.ui.command import (
     show_error,
     without_color,
 )
-from rig.cli.ui.exit_codes import EXIT_BY_SIGNAL, EXIT_CODES
+from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import checked_output, discard, neutral
 from rig.core.errors import OutputFailed, UsageError
+from rig.core.signals import EXIT_BY_SIGNAL
 
 GROUP = "rig.commands"
 _WANTS_JSON = "rig.wants_json"

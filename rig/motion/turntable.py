@@ -22,6 +22,7 @@ from rig.core.errors import (
     TorqueStaysOn,
     UsageError,
 )
+from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
 from rig.motion.fault_causes import explain_unsettled, find_cause
 from rig.motion.halt import QUIET_COUNTS, MotionPath, halt, reachable
@@ -55,6 +56,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._servo = bench.servo
         self._clock = bench.clock
         self._safety = bench.safety
+        self._guardian = bench.guardian
         self._trust_gyro = trust_gyro
         imu = bench.config.imu
         self._gyro = GyroRotationMeter(
@@ -69,6 +71,8 @@ class Turntable(AbstractContextManager["Turntable"]):
     def __enter__(self) -> Self:
         self._safety.prepare()
         try:
+            if self._guardian is not None:
+                self._guardian.arm()
             self._servo.torque_on()
             # After torque on, which clears the watchdog: a watchdog that trips resets the profile to unlimited.
             self._profile = self._servo.set_profile(
@@ -82,16 +86,19 @@ class Turntable(AbstractContextManager["Turntable"]):
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        self._profile = None
-        try:
-            self._servo.torque_off()
-            self._safety.released()
-        except TorqueStaysOn as stays_on:
-            self._safety.latch(stays_on)
-            raise
-        except RigError:
-            if error is None or isinstance(error, KeyboardInterrupt | SystemExit):  # an error is the important one
+        with uninterrupted():
+            self._profile = None
+            try:
+                self._servo.torque_off()
+                if self._guardian is not None:
+                    self._guardian.disarm()
+                self._safety.released()
+            except TorqueStaysOn as stays_on:
+                self._safety.latch(stays_on)
                 raise
+            except RigError:
+                if error is None or isinstance(error, KeyboardInterrupt | SystemExit):  # an error is the important one
+                    raise
 
     @property
     def rest_deg(self) -> float:

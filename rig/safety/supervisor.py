@@ -23,6 +23,7 @@ from rig.core.errors import (
     Unreferenced,
     UsageError,
 )
+from rig.core.signals import uninterrupted
 from rig.devices.servo import Servo, ServoState
 from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck
 from rig.safety.motion_checks import find_servo_fault
@@ -207,19 +208,20 @@ class Safety:
                 raise MotionStopped("The motion was interrupted.", next_step="Start it again.")
             self._apply(StateEvent.ARRIVE)
         except BaseException as symptom:
-            error = self._find_monitor_fault(symptom)
-            received = False
-            try:
-                received = stop()
-                if not received:
-                    error.add_note(
-                        "The servo did not receive the stop: its watchdog stops the table, its torque stays on."
-                    )
-            finally:
-                if isinstance(error, RigError) and error.latches:
-                    self.latch(error)
-                elif self.state is TableState.MOVING:
-                    self._apply(StateEvent.STOP if received else StateEvent.LOSE)
+            with uninterrupted():
+                error = self._find_monitor_fault(symptom)
+                received = False
+                try:
+                    received = stop()
+                    if not received:
+                        error.add_note(
+                            "The servo did not receive the stop: its watchdog stops the table, its torque stays on."
+                        )
+                finally:
+                    if isinstance(error, RigError) and error.latches:
+                        self.latch(error)
+                    elif self.state is TableState.MOVING:
+                        self._apply(StateEvent.STOP if received else StateEvent.LOSE)
             if error is not symptom:
                 raise error from symptom
             raise

@@ -16,10 +16,11 @@ from typing import Annotated, Any
 import typer
 
 from rig.cli.ui.complete import bench_names
-from rig.cli.ui.exit_codes import EXIT_BY_SIGNAL, EXIT_INTERRUPTED
+from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import discard, guarded_output
 from rig.core.errors import OutputFailed, RigError
+from rig.core.signals import EXIT_BY_SIGNAL, handle_signals
 
 COMMON: str = "Common options"
 """Panel of the help."""
@@ -65,8 +66,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     """Turn a function whose first parameter is `Settings` into a command.
 
     The command also takes the common options. It prints an error of the registry with its next step and exits with the
-    error's exit code. Ctrl+C, SIGTERM and SIGHUP unwind the stack, so that every open device is closed (torque off)
-    before the program ends.
+    error's exit code. Ctrl+C and every other signal that can be handled unwind the stack, so that every open device is
+    closed (torque off) before the program ends; see `rig.core.signals`.
     """
     signature = inspect.signature(function, eval_str=True)
     own = list(signature.parameters.values())[1:]
@@ -89,7 +90,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         settings = (ctx.obj or Settings()).merged(*given)
         if values.pop("no_color"):
             without_color()
-        _handle_signals()
+        handle_signals()
         try:
             with guarded_output():
                 try:
@@ -132,20 +133,3 @@ def show_error(error: RigError, settings: Settings) -> None:
     lines += [f"  {note}" for note in getattr(error, "__notes__", ())]
     with suppress(OutputFailed):
         print("\n".join([*lines, f"Next step: {error.next_step}"]), file=sys.stderr)
-
-
-def _handle_signals() -> None:
-    """Have SIGINT, SIGTERM and SIGHUP unwind the stack, so that the table stops with its torque off.
-
-    A shell without job control starts background jobs with SIGINT ignored, and their children inherit that. A stop must
-    reach a moving table anyway. An ignored SIGHUP is what `nohup` is for, and stays ignored.
-    """
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, _terminate)
-
-
-def _terminate(number: int, _frame: object) -> None:
-    raise SystemExit(EXIT_BY_SIGNAL + number)

@@ -5,8 +5,6 @@ from typing import Final
 EXIT_DECLINED: Final = 1
 EXIT_QUALITY: Final = 6
 EXIT_UNKNOWN: Final = 8
-EXIT_BY_SIGNAL: Final = 128
-"""Plus the number of the signal, as in shells."""
 EXIT_INTERRUPTED: Final = 130
 
 EXIT_CODES: Final = {
@@ -21,6 +19,6 @@ EXIT_CODES: Final = {
     EXIT_UNKNOWN: "The object is unknown.",
     9: "Another program uses the bench or the catalog.",
     EXIT_INTERRUPTED: "You pressed Ctrl+C.",
-    143: "The program was terminated (SIGTERM; 129 for SIGHUP).",
+    143: "A signal ended the program: 128 plus its number (SIGTERM 15, SIGHUP 1).",
 }
 """Exit code and meaning, in the order of the help and of the reference."""

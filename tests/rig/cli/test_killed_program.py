@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -13,18 +14,21 @@ from typer.testing import CliRunner
 from rig.cli.main import app
 from rig.config import load_config
 from rig.core.clock import SystemClock
+from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
 
 CLOCK = SystemClock()
 
 PROGRAM = """
+import os
 import numpy as np
 import typer
 from rig.bench import Bench
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
+from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
 from rig.devices.dynamixel.register_servo import prepare_servo
@@ -54,6 +58,8 @@ def go(settings: Settings) -> None:
     servo = open_servo(bus, config.servo, CLOCK)
     prepare_servo(servo, write=True)
     bench = Bench("hardware", config, CLOCK, servo, StillImu(), None, state=FileStore(config.state_path("hardware")))
+    if "GUARD" in os.environ:
+        bench.guardian = Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id)
     bench.safety.connect()
     if bench.safety.doubt:
         bench.safety.set_angle(0.0)
@@ -89,12 +95,12 @@ def servo(tmp_path):
     process.stdout.close()
 
 
-def moving(settings: list[str]) -> tuple[subprocess.Popen, str]:
+def moving(settings: list[str], **environment: str) -> tuple[subprocess.Popen, str]:
     """Start the program; return it while the table moves, with its findings about the servo."""
     options = [word for setting in settings for word in ("--set", setting)]
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *options],
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -168,3 +174,51 @@ def test_table_stops_however_the_program_ends(servo, tmp_path):
     result = json.loads(rig([*servo, f"state_dir={str(tmp_path / 'full')!r}"], "stop", "--json").stdout)
     assert (result["pid"], result["torque_was_on"]) == (None, True)
     assert observed(servo) == (False, False, False)
+
+
+@pytest.mark.parametrize("number", ["SIGKILL", pytest.param("SIGSEGV", marks=pytest.mark.nightly)])
+def test_guardian_switches_the_torque_off_of_a_killed_program(servo, number):
+    process, _ = moving(servo, GUARD="1")
+    process.send_signal(signal.Signals[number])
+    ended(process)
+    assert torque_off_within(servo, 2.0)
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        ["SIGINT"] * 5,
+        *(
+            pytest.param(numbers, marks=pytest.mark.nightly)
+            for numbers in (
+                *(["SIGINT"] * 10, ["SIGTERM"] * 4, ["SIGINT", "SIGTERM"] * 3),
+                *([name] for name in ("SIGQUIT", "SIGUSR1", "SIGABRT", "SIGALRM", "SIGXCPU")),
+            )
+        ),
+    ],
+    ids="+".join,
+)
+def test_torque_is_off_after_a_burst_of_signals(servo, numbers):
+    process, _ = moving(servo)
+    for name in numbers:
+        process.send_signal(signal.Signals[name])
+        CLOCK.sleep(0.002)
+    codes = {130 if name == "SIGINT" else 128 + signal.Signals[name] for name in numbers}
+    assert ended(process)[0] in codes
+    assert observed(servo) == (False, False, False)
+
+
+def torque_off_within(settings: list[str], seconds: float) -> bool:
+    """Return whether the servo's torque is off before so many seconds have passed."""
+    config = load_config(None, settings)
+    give_up_ns = CLOCK.now_ns() + round(seconds * 1e9)
+    while CLOCK.now_ns() < give_up_ns:
+        with suppress(DeviceNotFound):  # the guardian has opened the port
+            bus = open_serial(config.servo.port, config.servo.baud)
+            try:
+                if not open_servo(bus, config.servo, CLOCK).read_condition().torque:
+                    return True
+            finally:
+                bus.close()
+        CLOCK.sleep(0.1)
+    return False

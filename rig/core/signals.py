@@ -1,0 +1,93 @@
+"""Signals that end the program: they unwind the stack once, and do not interrupt a clean-up that has begun."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+from rig.core.clock import SystemClock
+
+EXIT_BY_SIGNAL: Final = 128
+"""Plus the number of the signal: the exit code of a program that a signal ended, as in shells."""
+HOLD_S: Final = 2.0
+"""How long signals wait for a clean-up, and for the stack to unwind. Then the next signal interrupts again."""
+
+ENDING: Final = tuple(
+    signal.Signals[name]
+    for name in (
+        *("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGABRT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM"),
+        *("SIGPROF", "SIGXCPU", "SIGPOLL", "SIGPWR", "SIGSTKFLT", "SIGSYS", "SIGTRAP"),
+    )
+    if name in signal.Signals.__members__
+)
+"""Signals that end a program by default, and that a program can handle."""
+
+
+@dataclass(slots=True)
+class _State:
+    depth: int = 0
+    held_ns: int = 0
+    waiting: int | None = None
+    raised_ns: int | None = None
+
+
+_state = _State()
+_clock = SystemClock()
+
+
+def handle_signals() -> None:
+    """Have each signal in `ENDING` unwind the stack, so that every open device is closed (torque off).
+
+    A shell without job control starts background jobs with SIGINT ignored, and their children inherit that. A stop must
+    reach a moving table anyway. Other ignored signals stay ignored: SIGHUP is what `nohup` ignores.
+    """
+    _state.raised_ns = None
+    for number in ENDING:
+        found = signal.getsignal(number)
+        if found is signal.SIG_DFL or (number is signal.SIGINT and found in (signal.SIG_IGN, _python_default)):
+            signal.signal(number, _end)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let signals wait until the end of a ``with`` block, but at most `HOLD_S`: the block stops the table.
+
+    Signals that `handle_signals` handles wait, and Ctrl+C in a program that does not call it.
+    """
+    if threading.current_thread() is not threading.main_thread():  # signals interrupt only the main thread
+        yield
+        return
+    swapped = _state.depth == 0 and signal.getsignal(signal.SIGINT) is _python_default
+    if _state.depth == 0:
+        _state.held_ns = _clock.now_ns()
+    _state.depth += 1
+    try:
+        if swapped:
+            signal.signal(signal.SIGINT, _end)
+        yield
+    finally:
+        _state.depth -= 1
+        if swapped:
+            signal.signal(signal.SIGINT, _python_default)
+        if _state.depth == 0 and (number := _state.waiting) is not None:
+            _state.waiting = None
+            _raise(number)
+
+
+_python_default = signal.default_int_handler
+
+
+def _end(number: int, _frame: object) -> None:
+    now_ns = _clock.now_ns()
+    if _state.depth and now_ns - _state.held_ns < HOLD_S * 1e9:
+        _state.waiting = _state.waiting or number
+    elif _state.raised_ns is None or now_ns - _state.raised_ns >= HOLD_S * 1e9:
+        _raise(number)
+    # else the stack unwinds already
+
+
+def _raise(number: int) -> None:
+    _state.raised_ns = _clock.now_ns()
+    raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(EXIT_BY_SIGNAL + number)
