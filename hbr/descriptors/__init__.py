@@ -1,6 +1,18 @@
 """Descriptors of views: one interface, chosen by name. A catalog can store several descriptors for each view."""
 
 from hbr.descriptors.base import Comparison, Descriptor
-from hbr.descriptors.registry import PAPERS, descriptor, names
+from hbr.descriptors.embedding import MODEL_NAME, PREFIX
+from hbr.descriptors.registry import PAPERS, descriptor, load_descriptor, load_model, loaded_models, names
 
-__all__ = ["PAPERS", "Comparison", "Descriptor", "descriptor", "names"]
+__all__ = [
+    "MODEL_NAME",
+    "PAPERS",
+    "PREFIX",
+    "Comparison",
+    "Descriptor",
+    "descriptor",
+    "load_descriptor",
+    "load_model",
+    "loaded_models",
+    "names",
+]

@@ -1,6 +1,8 @@
 """Embedding of the object by a neural network, from a model file that the user provides."""
 
+import re
 import zlib
+from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
@@ -13,8 +15,12 @@ from hbr.descriptors.base import Descriptor
 from hbr.descriptors.cosine import Cosine
 from hbr.segmentation import Segmentation, segment
 
-#: The name of such a descriptor is this prefix and the path of the model file.
+#: The name of such a descriptor is this prefix and the SHA-256 of the model file.
 PREFIX: Final = "onnx:"
+#: The name of a model; earlier versions named the path of the file instead.
+MODEL_NAME: Final = re.compile(PREFIX + "[0-9a-f]{64}")
+#: Reading and running a larger model would need more than 1 GiB.
+MAX_MODEL_BYTES: Final = 256_000_000
 _SIDE_PX: Final = 224
 #: Mean and standard deviation of R, G, B in ImageNet, with which most models were trained.
 _MEAN: Final = (0.485 * 255, 0.456 * 255, 0.406 * 255)
@@ -37,15 +43,22 @@ class Embedding(Descriptor):
     Raises
     ------
     ValueError
-        The file is missing, OpenCV cannot run the model, or it does not return one vector.
+        The file is missing, is not a regular one or is too large, OpenCV cannot run the model, or it does not return
+        one vector.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         try:
-            content = path.read_bytes()
+            if path.exists() and not path.is_file():  # reading a pipe waits, and a device can have no end
+                raise ValueError(f"the model {path} is not a regular file; check the path")
+            with path.open("rb") as file:
+                content = file.read(MAX_MODEL_BYTES + 1)
         except OSError as error:
             raise ValueError(f"the model {path} cannot be read: {error.strerror}; check the path") from error
+        if len(content) > MAX_MODEL_BYTES:
+            raise ValueError(f"the model {path} is larger than {MAX_MODEL_BYTES} bytes; use a smaller one")
+        self._digest = sha256(content).hexdigest()
         self._checksum = zlib.crc32(content)
         try:
             self._net = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
@@ -57,11 +70,11 @@ class Embedding(Descriptor):
 
     @property
     def name(self) -> str:
-        return f"{PREFIX}{self._path}"
+        return f"{PREFIX}{self._digest}"
 
     @property
     def version(self) -> int:
-        """Checksum of the model's content, whatever its file is called."""
+        """CRC-32 of the model's content, by which earlier versions checked it."""
         return self._checksum
 
     @property

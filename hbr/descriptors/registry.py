@@ -1,13 +1,12 @@
 """The known descriptors and their names."""
 
-from functools import cache
 from pathlib import Path
 from typing import Final
 
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.colours import Colours
 from hbr.descriptors.edges import Edges
-from hbr.descriptors.embedding import PREFIX, Embedding
+from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
 from hbr.descriptors.joined import Joined
 from hbr.descriptors.plain_cedd import Cedd
 
@@ -30,24 +29,53 @@ _KNOWN: Final[dict[str, Descriptor]] = {
 PAPERS: Final = tuple(known.name for known in _KNOWN.values() if known.whole_image)
 
 
+_MODELS: Final[dict[str, Embedding]] = {}
+
+
 def descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name; ``onnx:FILE`` is the embedding of a neural network.
+    """Return the descriptor of this name. It opens no file: names come from saved runs and from catalogs of others.
 
     Raises
     ------
     ValueError
-        The name is unknown (the message lists the known ones), or the model file cannot be used.
+        The name is unknown (the message lists the known ones), or it names a model that is not loaded.
     """
-    if name.startswith(PREFIX):
-        return _embedding(name.removeprefix(PREFIX))
-    if name not in _KNOWN:
+    known = _KNOWN.get(name) or _MODELS.get(name)
+    if known is None and name.startswith(PREFIX):
+        raise ValueError(f"the model of descriptor {name!r} is not loaded; load its file first")
+    if known is None:
         raise ValueError(f"descriptor {name!r} is unknown; use one of {', '.join(names())}, or {PREFIX}FILE")
-    return _KNOWN[name]
+    return known
 
 
-@cache
-def _embedding(path: str) -> Descriptor:
-    return Embedding(Path(path))
+def load_descriptor(given: str) -> Descriptor:
+    """Return the descriptor that the user names: ``onnx:FILE`` loads a model, other names are those of `descriptor`.
+
+    Raises
+    ------
+    ValueError
+        The name is unknown, or the model file cannot be used.
+    """
+    if given.startswith(PREFIX) and not MODEL_NAME.fullmatch(given):
+        return load_model(Path(given.removeprefix(PREFIX)))
+    return descriptor(given)
+
+
+def load_model(path: Path) -> Embedding:
+    """Load a model file; from now on `descriptor` knows it by its digest.
+
+    Raises
+    ------
+    ValueError
+        The model file cannot be used.
+    """
+    model = Embedding(path)
+    return _MODELS.setdefault(model.name, model)
+
+
+def loaded_models() -> tuple[Embedding, ...]:
+    """Return the models that were loaded."""
+    return tuple(_MODELS.values())
 
 
 def names() -> tuple[str, ...]:

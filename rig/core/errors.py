@@ -209,6 +209,10 @@ class ReplayMismatch(RigError, code=602, title="replay mismatch"):
     """A saved run leads to different decisions when it is computed again."""
 
 
+class RunIncomplete(RigError, code=604, title="run incomplete"):
+    """A saved run is cut off, or has no answer."""
+
+
 class TableNotEmpty(RigError, code=603, title="table not empty"):
     """Something is on the table, which should be empty."""
 

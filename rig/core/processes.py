@@ -3,11 +3,12 @@
 import os
 import signal
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from rig.core.errors import RigError
@@ -41,7 +42,10 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
     # there is a process for each core, so further threads in a process only slow it down
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (work,))
+    from hbr.descriptors import loaded_models
+
+    models = [model.path for model in loaded_models()]
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (work, models))
     futures: dict[Future[_T], _Item] = {}
     try:
         while waiting or futures:
@@ -73,9 +77,13 @@ def _ignoring_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(work: Callable[[Any], object]) -> None:
+def _start_worker(work: Callable[[Any], object], models: Sequence[Path]) -> None:
     import cv2
 
+    from hbr.descriptors import load_model
+
+    for path in models:  # whose descriptors this process knows only by their digests
+        load_model(path)
     global _work
     _work = work
     cv2.setNumThreads(1)

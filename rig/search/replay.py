@@ -32,10 +32,11 @@ class Difference:
 
 @dataclass(slots=True)
 class Check:
-    """The result of checking a run."""
+    """The result of checking a run; a complete one ends with an answer or an error."""
 
     views: int = 0
     decisions: int = 0
+    is_complete: bool = False
     differences: list[Difference] = field(default_factory=list)
 
 
@@ -56,7 +57,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     """
     started = run.started
     tolerance = TOLERANCE if run.is_current else EARLIER_TOLERANCE
-    found = Check()
+    found = Check(is_complete=run.error is not None and not run.is_cut)
     search: Search | None = None
     describe = ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
     ranked: Ranked | None = None
@@ -91,6 +92,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 end = step if isinstance(step, Finish) else Finish()
                 answer = search.answer(ranked, end, travelled_deg=event.travelled_deg, seconds=event.seconds)
                 computed = replace(answer, candidates=answer.candidates[: len(event.candidates)])
+                found.is_complete = not run.is_cut
             case _:
                 pass
         if computed is not None:

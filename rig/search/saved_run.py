@@ -9,10 +9,11 @@ Decision: docs/decisions/0018.
 
 import json
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from importlib.metadata import version
-from math import nan
+from math import isfinite, nan
 from pathlib import Path
 from types import NoneType, TracebackType, UnionType
 from typing import Any, Final, Self, TextIO, Union, get_args, get_origin, get_type_hints
@@ -22,13 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.descriptors import descriptor
+from hbr.core.validation import MIN_SIDE_PX
+from hbr.descriptors import MODEL_NAME, PREFIX, Descriptor, descriptor, loaded_models
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError
-from rig.core.files import write
-from rig.events.events import Accepted, Event, Started, event_dict, event_kind
+from rig.core.files import json_values, read, write
+from rig.events.events import Accepted, Event, Identified, Moved, Ranked, Started, event_dict, event_kind
 from rig.search.earlier_runs import NOT_SAVED, upgraded
 from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as STOPPING_RULE
@@ -39,6 +41,14 @@ FORMAT: Final = "hbr-rig run"
 VERSION: Final = 3
 """Version 2 brought the dense search; version 3 stores codes instead of sentences, and terms of the glossary."""
 EMPTY_TABLE: Final = "empty_table.png"
+
+MAX_FRAME_PIXELS: Final = 64_000_000
+"""Of 8000 x 8000, the largest frame of the configuration."""
+MAX_REASON: Final = 300
+_MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.jsonl": 10_000_000}
+"""Far above those of real runs. Values of JSON can need twenty times as much memory as their text."""
+_DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
+"""What values of the wrong kind raise."""
 
 _KINDS: Final[dict[str, type]] = {event_kind(kind): kind for kind in get_args(Event)}
 
@@ -157,6 +167,8 @@ class SavedRun:
         The bench without an object.
     error
         What ended it, where that was an error, as `RigError.as_dict` tells it.
+    is_cut
+        Whether the last line of the events was cut off while it was written.
     """
 
     folder: Path
@@ -165,6 +177,7 @@ class SavedRun:
     model: Model
     empty_table: NDArray[np.uint8] | None
     error: dict[str, Any] | None
+    is_cut: bool
     _lines: tuple[dict[str, Any], ...]
 
     @property
@@ -182,9 +195,27 @@ class SavedRun:
         """
         for number, line in enumerate(self._lines, 1):
             try:
-                yield event_of(line if self.is_current else upgraded(line), self._frame)
-            except (KeyError, TypeError, ValueError) as error:
-                raise _damaged(self.folder, f"events.jsonl, line {number}: {error}") from error
+                event = event_of(line if self.is_current else upgraded(line), self._frame)
+                _check_event(event)
+            except _DAMAGE as error:
+                raise _damaged(self.folder, f"events.jsonl, line {number}: {_reason(error)}") from error
+            yield event
+
+    @contextmanager
+    def damage(self) -> Iterator[None]:
+        """Report errors of a computation with the run's values as damage of the run, in a ``with`` block.
+
+        Values can have the right types and still not fit together, such as a list of candidates that is empty.
+
+        Raises
+        ------
+        UsageError
+            The values do not fit together.
+        """
+        try:
+            yield
+        except _DAMAGE as error:
+            raise _damaged(self.folder, f"its values do not fit together: {_reason(error)}") from error
 
     @property
     def started(self) -> Started:
@@ -210,7 +241,11 @@ class SavedRun:
         return bool(self.about["version"] == VERSION)
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
-        return _image(frame_path(self.folder, index))
+        frame = _image(self.folder, frame_path(self.folder, index))
+        x, y, width, height = self.config.view.roi or (0, 0, 0, 0)
+        if x + width > frame.shape[1] or y + height > frame.shape[0]:
+            raise ValueError(f"frame {index} has {frame.shape[1]} x {frame.shape[0]} pixels, less than the region")
+        return frame
 
 
 def load_run(folder: Path) -> SavedRun:
@@ -219,10 +254,11 @@ def load_run(folder: Path) -> SavedRun:
     Raises
     ------
     UsageError
-        The folder holds no run, a damaged one, or one of a newer version.
+        The folder holds no run, a damaged one, or one of a newer version; or the run needs a model that is not loaded
+        (`hbr.descriptors.load_model`).
     """
     try:
-        about = json.loads(_bytes(folder / "run.json"))
+        about = json_values(_bytes(folder, "run.json"))
         if about.get("format") != FORMAT:
             raise ValueError("run.json is not that of a saved run")
         if about["version"] not in range(1, VERSION + 1):
@@ -230,21 +266,27 @@ def load_run(folder: Path) -> SavedRun:
                 f"The run {folder} has the format version {about['version']}; this program reads 1 to {VERSION}.",
                 next_step="Use the program that saved it, or a newer one.",
             )
-        used = about["descriptor"]
-        if used["version"] != descriptor(used["name"]).version:
-            raise ValueError(f"it was described by {used['name']} {used['version']}, which this program has not")
+        if not all(isinstance(about[key], str) for key in ("bench", "software", "started_utc")):
+            raise TypeError("bench, software or started_utc in run.json is not text")
+        if not isinstance(about["devices"], dict):
+            raise TypeError("devices in run.json is not an object")
+        kind = _descriptor(folder, about["descriptor"])
         config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
-        views = _views(_json_lines(_bytes(folder / "model.jsonl")), used["name"])
+        views = _views((_object(line) for line in _lines(_bytes(folder, "model.jsonl"))), kind.name)
         stored = read_stopping_rule(folder)
         model = model_of(views, rule=None if stored is None else stored.adapted(views))
-        empty_table = _image(folder / EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
-        lines = _json_lines(_bytes(folder / "events.jsonl"), cut=True)
+        empty_table = _image(folder, folder / EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
+        content = _bytes(folder, "events.jsonl")
+        is_cut = bool(content) and not content.endswith(b"\n")
+        lines = [_object(line) for line in _lines(content)[: -1 if is_cut else None]]
+        failed = lines.pop() if lines and "event" not in lines[-1] else None
+        if failed is not None and not {"code", "error", "what"} <= failed.keys():
+            raise ValueError("the last line of events.jsonl is neither an event nor an error")
     except CatalogError as error:
         raise _damaged(folder, f"{error.what}: {error.evidence['reason']}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _damaged(folder, str(error)) from error
-    failed = lines.pop() if lines and "event" not in lines[-1] else None
-    return SavedRun(folder, about, config, model, empty_table, failed, tuple(lines))
+    except _DAMAGE as error:
+        raise _damaged(folder, _reason(error)) from error
+    return SavedRun(folder, about, config, model, empty_table, failed, is_cut, tuple(lines))
 
 
 def frame_path(folder: Path, index: int) -> Path:
@@ -259,7 +301,7 @@ def event_of(values: dict[str, Any], frame: Any) -> Event:
 
     Raises
     ------
-    KeyError, TypeError, ValueError
+    LookupError, TypeError, ValueError, ArithmeticError
         It is no event, or its fields are not those of its kind.
     """
     values = dict(values)
@@ -289,7 +331,11 @@ def built(kind: Any, value: Any) -> Any:
     if isinstance(kind, type) and issubclass(kind, Enum):
         return kind(value)
     if kind is float:
-        return nan if value is None else float(value)
+        if value is None:
+            return nan
+        if type(value) not in (int, float) or not isfinite(value):
+            raise TypeError(f"{value!r} is no finite number")
+        return float(value)
     if kind in (str, bool, int) and type(value) is not kind:
         raise TypeError(f"{value!r} is no {kind.__name__}")
     return value
@@ -320,31 +366,74 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
     return hbr.Views.concatenate(parts) if parts else hbr.Views.empty(kind)
 
 
-def _image(path: Path) -> NDArray[np.uint8]:
-    image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ValueError(f"{path.name} is no image")
-    return np.asarray(image, np.uint8)
-
-
-def _json_lines(content: bytes, *, cut: bool = False) -> list[dict[str, Any]]:
-    """Return the values of JSON Lines; with ``cut``, a last line without its end is left out."""
-    text = content.decode()
-    lines = text.splitlines()
-    if cut and lines and not text.endswith("\n"):
-        lines.pop()
-    return [json.loads(line) for line in lines]
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
+def _descriptor(folder: Path, used: dict[str, Any]) -> Descriptor:
+    """Return the descriptor of a run. A network is known by its digest: the path of its file is the user's to give."""
+    name, number = used["name"], used["version"]
+    if name.startswith(PREFIX):
+        for model in loaded_models():
+            if model.name == name or (model.version == number and not MODEL_NAME.fullmatch(name)):  # earlier: a path
+                return model
         raise UsageError(
-            f"There is no saved run in {path.parent}: {path.name} cannot be read.",
+            f"The run {folder} needs the model {name}.",
+            next_step="Give the ONNX file with this SHA-256: --model FILE.",
+            evidence={"CRC-32": number},
+        )
+    kind = descriptor(name)
+    if number != kind.version:
+        raise ValueError(f"it was described by {name} {number}, which this program does not have")
+    return kind
+
+
+def _check_event(event: Event) -> None:
+    """Check the values that a search computes with; those of other events are only shown."""
+    if isinstance(event, Accepted) and not isfinite(event.azimuth_deg):
+        raise ValueError("the azimuth is not a number")
+    if isinstance(event, Moved) and not isfinite(event.encoder_deg):
+        raise ValueError("the table angle is not a number")
+    if isinstance(event, Started) and event.seed is not None and event.seed < 0:
+        raise ValueError("the seed is negative")
+    if isinstance(event, Ranked | Identified) and not event.candidates:
+        raise ValueError("there are no candidates")
+
+
+def _image(folder: Path, path: Path) -> NDArray[np.uint8]:
+    image = images.decode(_bytes(folder, str(path.relative_to(folder))), max_pixels=MAX_FRAME_PIXELS)
+    if min(image.shape[:2]) < MIN_SIDE_PX:
+        raise ValueError(f"{path.name} has {image.shape[1]} x {image.shape[0]} pixels")
+    return image
+
+
+def _lines(content: bytes) -> list[str]:
+    """Return the lines of JSON Lines; only a line feed ends a line, and the last line may lack it."""
+    return content.decode().removesuffix("\n").split("\n") if content else []
+
+
+def _object(line: str) -> dict[str, Any]:
+    values = json_values(line)
+    if not isinstance(values, dict):
+        raise TypeError("a line is no JSON object")
+    return values
+
+
+def _bytes(folder: Path, name: str) -> bytes:
+    """Return the content of one of the run's files; a link that leads out of the folder is not followed."""
+    path = folder / name
+    try:
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise OSError(None, "it is a link to a file outside the run", str(path))
+        return read(path, max_bytes=_MAX_BYTES.get(name, images.MAX_FILE_BYTES))
+    except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle
+        raise UsageError(
+            f"There is no saved run in {folder}: {name} cannot be read.",
             next_step="Give a folder that rig identify --save-run has written.",
-            evidence={"reason": error.strerror or str(error)},
+            evidence={"reason": getattr(error, "strerror", None) or str(error)},
         ) from error
+
+
+def _reason(error: Exception) -> str:
+    """Return what an error says about a value; that of a KeyError is only the key."""
+    text = str(error) if type(error) in (ValueError, TypeError) else f"{type(error).__name__}: {error}"
+    return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}…"
 
 
 def _damaged(folder: Path, reason: str) -> UsageError:

@@ -24,7 +24,7 @@ from rig.events.events import Note, NoteCode, plain
 FILE: Final = "search_rules.json"
 """Beside ``catalog.sqlite``."""
 FORMAT: Final = "hbr-rig search rules"
-MAX_FILE_BYTES: Final = 100_000_000
+MAX_FILE_BYTES: Final = 16_000_000
 VERSION: Final = 2
 """Version 1 stored limitations as sentences, and used other names."""
 ERROR_RATE: Final = 0.01
@@ -216,7 +216,7 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
         return StoredRule(rule, tuple(usual), str(values["model"]["sha256"]), str(values["made_utc"]))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise CatalogError(
             f"the stopping rule in {path} cannot be read",
             next_step="to renew it: rig catalog calibrate",

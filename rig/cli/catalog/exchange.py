@@ -10,6 +10,7 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
+from rig.cli.ui.models import descriptor_name
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def import_(
         _read_batch(source, pattern, table_angles),
         on_conflict=on_conflict,
         label=label,
-        descriptors=descriptor or (),
+        descriptors=[descriptor_name(one) for one in descriptor or ()],
         strict=strict,
         dry_run=dry_run,
         jobs=jobs,

@@ -11,6 +11,7 @@ from rig.cli.catalog.catalog import YesOption, app
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
+from rig.cli.ui.models import descriptor_name
 from rig.cli.ui.settings import Settings
 
 JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")]
@@ -87,7 +88,7 @@ def redescribe(
     with settings.open_catalog() as catalog:
         done = run_job(
             "describing",
-            job(catalog, descriptor, region=part, again=again, jobs=jobs),
+            job(catalog, descriptor_name(descriptor), region=part, again=again, jobs=jobs),
             interrupted="Interrupted; the results so far are stored. The same command continues.",
         )
     if settings.json:

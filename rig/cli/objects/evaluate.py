@@ -10,6 +10,7 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
+from rig.cli.ui.models import descriptor_name
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ def evaluate(
     from rig.evaluation.write import write_results
 
     jobs = jobs or os.cpu_count() or 1
+    descriptor = descriptor_name(descriptor)
     try:
         plan = Plan.of(
             _dataset(settings, folder, objects),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rig.cli.ui.command import command
+from rig.cli.ui.models import ModelOption, load_model_file
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def replay(
         bool,
         typer.Option("--check", help="Compute every decision again from the images; exit code 6 if one differs."),
     ] = False,
+    model: ModelOption = None,
 ) -> None:
     """Show a saved run again: each view, the candidates after it, and each decision.
 
@@ -31,6 +33,7 @@ def replay(
     """
     from rig.search.saved_run import load_run
 
+    load_model_file(model)
     saved = load_run(run)
     if check:
         _check(settings, saved)
@@ -48,7 +51,7 @@ def replay(
     started = str(about["started_utc"])[:16].replace("T", " ")
     objects = counted(len(saved.views.object_names), "enrolled object")
     print(f"Bench {about['bench']}, {started} UTC, {objects}")
-    with IdentifyView(console(plain=True)) as view:
+    with saved.damage(), IdentifyView(console(plain=True)) as view:
         for event in saved.events():
             view.show(event)
     if saved.error:
@@ -62,6 +65,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="File to write (default: report.html in the run's folder).")
     ] = None,
+    model: ModelOption = None,
 ) -> None:
     """Write an HTML page about a saved run: the answer, the camera's path, the scores, the views and the decisions.
 
@@ -71,30 +75,34 @@ def report(
     from rig.report import IdentificationRecord, Meta, render_report, write_report
     from rig.search.saved_run import load_run
 
+    load_model_file(model)
     saved = load_run(run)
     record = IdentificationRecord(region=saved.config.view.roi)
-    for event in saved.events():
-        record.add(event)
-    answer = record.answer
-    found = "no answer" if answer is None else answer.name or "unknown object"
-    summary = answer_words(answer) if answer else "The search ended without an answer."
     about = saved.about
-    meta = Meta(
-        conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
-        wall_clock={"date": about["started_utc"], "software": about["software"]},
-    )
+    with saved.damage():
+        for event in saved.events():
+            record.add(event)
+        answer = record.answer
+        found = "no answer" if answer is None else answer.name or "unknown object"
+        summary = answer_words(answer) if answer else "The search ended without an answer."
+        meta = Meta(
+            conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
+            wall_clock={"date": about["started_utc"], "software": about["software"]},
+        )
+        page = render_report(f"Search: {found}", summary, [], [record], meta=meta)
     path = out or run / "report.html"
-    write_report(path, render_report(f"Search: {found}", summary, [], [record], meta=meta))
+    write_report(path, page)
     settings.say(f"Report: {path}", {"report": str(path)})
 
 
 def _check(settings: Settings, saved: "SavedRun") -> None:
-    from rig.core.errors import ReplayMismatch
+    from rig.core.errors import ReplayMismatch, RunIncomplete
     from rig.events.events import plain
     from rig.events.wording import counted
     from rig.search.replay import check
 
-    found = check(saved)
+    with saved.damage():
+        found = check(saved)
     done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."
     if found.differences:
         more = len(found.differences) - SHOWN
@@ -104,5 +112,11 @@ def _check(settings: Settings, saved: "SavedRun") -> None:
             next_step="Check whether the files of the run were changed. If not, this version of the program decides "
             f"differently from {saved.about['software']}, which saved the run.",
             evidence={"differences": [*listed, f"and {more} more"] if more > 0 else listed},
+        )
+    if not found.is_complete:
+        raise RunIncomplete(
+            f"The saved run has no end: {'its last line is cut off' if saved.is_cut else 'the answer is missing'}. "
+            f"{done} All are as saved.",
+            next_step="Search again, or take the run from a backup. The images and decisions so far are good.",
         )
     settings.say(f"{done} All are as saved.", plain(found))

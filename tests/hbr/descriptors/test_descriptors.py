@@ -1,10 +1,13 @@
+import os
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hbr import DenseIndex, ViewIndex, Views, update_belief
-from hbr.descriptors import Descriptor, descriptor, names
+from hbr.descriptors import Descriptor, descriptor, load_descriptor, load_model, loaded_models, names
+from hbr.descriptors.embedding import MAX_MODEL_BYTES
 
 
 @pytest.fixture(params=names())
@@ -86,9 +89,11 @@ def model() -> bytes:
 def test_embedding_of_a_neural_network_is_a_descriptor(tmp_path: Path) -> None:
     file = tmp_path / "means.onnx"
     file.write_bytes(model())
-    own = descriptor(f"onnx:{file}")
+    own = load_descriptor(f"onnx:{file}")
     assert (own.length, own.size_bytes) == (3, 3)
-    assert own.name == f"onnx:{file}"
+    assert own.name == f"onnx:{sha256(model()).hexdigest()}"
+    assert descriptor(own.name) is load_descriptor(own.name) is load_model(file) is own
+    assert own in loaded_models()
     red, blue = (np.full((60, 60, 3), colour, np.uint8) for colour in ((20, 20, 220), (220, 20, 20)))
     levels = np.stack([own.describe(image) for image in (red, blue)])
     assert levels[0].argmax() == 0  # R, G, B
@@ -103,10 +108,27 @@ def test_embedding_of_a_neural_network_is_a_descriptor(tmp_path: Path) -> None:
 
 def test_unusable_model_is_rejected_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be read: No such file"):
-        descriptor(f"onnx:{tmp_path / 'none.onnx'}")
+        load_model(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(ValueError, match="no model that OpenCV can run"):
-        descriptor(f"onnx:{tmp_path / 'text.onnx'}")
+        load_model(tmp_path / "text.onnx")
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path):
+        with pytest.raises(ValueError, match="not a regular file"):
+            load_model(path)
+    with (tmp_path / "large.onnx").open("wb") as file:
+        file.truncate(MAX_MODEL_BYTES + 1)
+    with pytest.raises(ValueError, match="larger than"):
+        load_model(tmp_path / "large.onnx")
+
+
+def test_name_of_a_descriptor_opens_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "means.onnx"
+    file.write_bytes(model())
+    monkeypatch.setattr(Path, "open", None)
+    for name in (f"onnx:{file}", "onnx:", f"onnx:{'0' * 64}"):
+        with pytest.raises(ValueError, match="is not loaded"):
+            descriptor(name)
 
 
 def test_blur_of_a_block_makes_cedd_robust_to_noise() -> None:

@@ -200,7 +200,7 @@ def test_catalog_without_dense_descriptors_is_searched_by_ahbr_with_a_note(enrol
     run = CliRunner().invoke
     done = run(app, ["identify", "--set", "bench.sim.object=lamp"])
     assert done.exit_code == 0, done.output
-    assert "rig catalog redescribe --descriptor edges+colours adds it" in done.stdout
+    assert "rig catalog redescribe --descriptor edges+colours" in done.stdout
     assert "S_left" in done.stdout or "fixed" in done.stdout
     for words in (["identify", "--strategy", "dense"], ["catalog", "calibrate"]):
         rejected = run(app, words)

@@ -1,19 +1,34 @@
 """Saved runs: stored in open formats, read, and computed again to the same decisions."""
 
 import json
+import os
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import hbr
 from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
+from rig.cli.main import app
 from rig.config import load_config
 from rig.core.errors import UsageError
-from rig.events.events import Accepted, Decided, Identified, NoteCode, Rejected, RotationReason, Started, event_dict
+from rig.events.events import (
+    Accepted,
+    Decided,
+    Identified,
+    NoteCode,
+    Ranked,
+    Rejected,
+    RotationReason,
+    Started,
+    event_dict,
+)
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
@@ -235,6 +250,123 @@ def test_a_damaged_run_is_rejected(saved, tmp_path, name, content, words):
         check(load_run(folder))
     assert words in str(caught.value)
     assert caught.value.next_step
+
+
+def spoiled(saved, tmp_path: Path, strategy: str = "ahbr") -> Path:
+    """Return a copy of a run."""
+    return Path(shutil.copytree(saved[strategy][0], tmp_path / "spoiled"))
+
+
+def png(width: int, height: int) -> bytes:
+    return cv2.imencode(".png", np.zeros((height, width, 3), np.uint8))[1].tobytes()
+
+
+def huge_png(side: int) -> bytes:
+    """Return a PNG whose header promises more pixels than the file has."""
+    content = bytearray(png(4, 4))
+    content[16:24] = struct.pack(">II", side, side)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    return bytes(content)
+
+
+@pytest.mark.parametrize("frame", [b"", png(1, 1), png(320, 1), png(239, 239), huge_png(60_000), huge_png(19_000)])
+@pytest.mark.parametrize(("strategy", "name"), [("ahbr", "frames/000.png"), ("dense", "empty_table.png")])
+def test_a_frame_of_another_size_is_damage(saved, tmp_path, frame, strategy, name):
+    folder = spoiled(saved, tmp_path, strategy)
+    (folder / name).write_bytes(frame)
+    try:
+        assert check(load_run(folder)).differences
+    except UsageError as error:
+        assert error.next_step  # noqa: PT017
+
+
+SPOILED_EVENTS = {
+    "negative seed": (Started, {"seed": -1}),
+    "seed of text": (Started, {"seed": "1"}),
+    "azimuth unknown": (Accepted, {"azimuth_deg": None}),
+    "azimuth beyond numbers": (Accepted, {"azimuth_deg": 10**400}),
+    "azimuth is true": (Accepted, {"azimuth_deg": True}),
+    "index is a path": (Accepted, {"index": "../../frames/000"}),
+    "evidence is a list": (Accepted, {"evidence": []}),
+    "no candidates": (Identified, {"candidates": []}),
+    "candidates of lists": (Ranked, {"candidates": [[]]}),
+    "candidates is a number": (Ranked, {"candidates": 3}),
+    "conditions is a list": (Started, {"strategy": []}),
+}
+
+
+@pytest.mark.parametrize(("kind", "values"), SPOILED_EVENTS.values(), ids=SPOILED_EVENTS)
+def test_a_spoiled_event_is_damage(saved, tmp_path, kind, values):
+    with pytest.raises(UsageError) as caught:
+        check(load_run(changed(saved, tmp_path, place(saved, kind), **values)))
+    assert caught.value.evidence["reason"]
+
+
+@pytest.mark.parametrize("name", ["run.json", "model.jsonl", "events.jsonl"])
+@pytest.mark.parametrize(
+    "content", [b"[]\n", b"3\n", b"null\n", b"[" * 100_000, b'{"event": NaN}\n', b"9" * 5000 + b"\n"]
+)
+def test_json_of_another_kind_is_damage(saved, tmp_path, name, content):
+    folder = spoiled(saved, tmp_path)
+    (folder / name).write_bytes(content)
+    try:
+        assert not check(load_run(folder)).is_complete
+    except UsageError as error:
+        assert error.evidence  # noqa: PT017
+
+
+def test_a_run_opens_no_file_outside_its_folder(saved, tmp_path, monkeypatch):
+    folder = spoiled(saved, tmp_path)
+    secret = tmp_path / "secret.png"
+    shutil.copy(folder / "frames/000.png", secret)
+    (folder / "frames/000.png").unlink()
+    (folder / "frames/000.png").symlink_to(secret)
+    with pytest.raises(UsageError) as caught:
+        check(load_run(folder))
+    assert "outside" in caught.value.evidence["reason"]
+    (folder / "frames/000.png").unlink()
+    os.mkfifo(folder / "frames/000.png")
+    with pytest.raises(UsageError) as caught:
+        check(load_run(folder))
+    assert "not a regular file" in caught.value.evidence["reason"]
+
+
+def test_a_run_names_a_network_by_its_digest(saved, tmp_path):
+    folder = spoiled(saved, tmp_path)
+    about = json.loads((folder / "run.json").read_text())
+    os.mkfifo(tmp_path / "pipe")
+    for name in (f"onnx:{tmp_path / 'pipe'}", "onnx:/dev/zero", f"onnx:{'0' * 64}"):
+        about["descriptor"] = {"name": name, "version": 1}
+        (folder / "run.json").write_text(json.dumps(about))
+        with pytest.raises(UsageError, match="needs the model") as caught:
+            load_run(folder)
+        assert "--model" in caught.value.next_step
+
+
+def test_a_name_with_a_line_separator_is_read_again(saved, tmp_path):
+    folder = spoiled(saved, tmp_path)
+    for name in ("model.jsonl", "events.jsonl"):
+        text = (folder / name).read_text(encoding="utf-8").replace("mug-star", "mug\u2028star")
+        (folder / name).write_text(text, encoding="utf-8")
+    found = check(load_run(folder))
+    assert (found.differences, found.is_complete) == ([], True)
+
+
+def test_a_run_without_its_end_is_noticed(saved, tmp_path):
+    folder = spoiled(saved, tmp_path)
+    assert check(load_run(folder)).is_complete
+    events = folder / "events.jsonl"
+    whole = events.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    for content in (whole[:-1], whole[:-20], b"".join(lines[:-1]), whole + b'{"event"', lines[0]):
+        events.write_bytes(content)
+        found = check(load_run(folder))
+        assert (found.differences, found.is_complete) == ([], False)
+        done = CliRunner().invoke(app, ["replay", str(folder), "--check"])
+        assert done.exit_code == 6, done.output
+        assert "Error 604" in done.stderr
+    events.write_bytes(whole + json.dumps({"code": 1, "error": "a", "what": "b"}).encode() + b"\n")
+    assert load_run(folder).error is not None
 
 
 def test_a_folder_without_a_run_or_not_empty_is_rejected(saved, tmp_path, simulated):
