@@ -18,6 +18,8 @@ BEGIN, END = "<!-- generated from protocol.toml -->", "<!-- end of generated par
 
 Table = dict[str, Any]
 
+FIRMWARE_ONLY = {"tick_us", "estop_ticks", "deadman_default_ms", "trigger_min_us", "trigger_max_us"}
+
 
 def size(message: Table) -> int:
     return sum(C_TYPES[kind][1] for _, kind, _ in message["fields"])
@@ -132,6 +134,8 @@ def module(table: Table) -> str:
         f"MAX_BODY = {table['max_body']}",
     ]
     for name, (value, doc) in table["constants"].items():
+        if name in FIRMWARE_ONLY:
+            continue
         shown = f"0x{value:08X}" if value > 1 << 31 else f"{value:_}" if value > 99_999 else str(value)
         lines += [f"{name.upper()} = {shown}", f'"""{sentence(doc)}"""']
     for enum in table["enum"]:
@@ -160,8 +164,9 @@ def module(table: Table) -> str:
     lines += ["", "MESSAGES: dict[int, type[Request] | type[Answer]] = {"]
     lines += ["    message.ID: message for message in (*get_args(Request), *get_args(Answer))", "}"]
     lines += ["", "REPLIES: dict[type[Request], type[Answer]] = {"]
-    lines += [f"    {camel(m['name'])}: {camel(m['reply'])}," for m in table["message"] if m["from"] == "host"]
-    return "\n".join([*lines, "}", '"""The reply to a request that is not rejected."""', ""])
+    replies = {camel(m["name"]): camel(m["reply"]) for m in table["message"] if m["from"] == "host"}
+    lines += [f"    {request}: {reply}," for request, reply in replies.items() if reply != "Done"]
+    return "\n".join([*lines, "}", '"""The reply to a request that is not rejected, if it is not `Done`."""', ""])
 
 
 def tables(table: Table) -> str:

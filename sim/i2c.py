@@ -12,10 +12,11 @@ import os
 import tempfile
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from errno import EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import smbus2.smbus2 as smbus
 
@@ -62,7 +63,7 @@ class Message:
     data: bytes
 
 
-class SimI2cBus:
+class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     """A bus with a path that ``smbus2.SMBus(path)`` opens.
 
     Tests use `attach`, `detach` (unplug), `nack`, `nack_conditions` (called with an address; True: no acknowledge),
@@ -82,9 +83,6 @@ class SimI2cBus:
         self._key = _file_key(handle)
         os.close(handle)
         _install(self._key, self)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -5,10 +5,10 @@ Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`
 
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel
 
@@ -95,9 +95,6 @@ class Bench(AbstractContextManager["Bench"]):
     def __post_init__(self) -> None:
         self.safety = Safety(self.servo, self.config, self.clock, self.state)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         try:
             self.close()
@@ -146,11 +143,12 @@ class Bench(AbstractContextManager["Bench"]):
 
     def devices(self) -> dict[str, Any]:
         """Return the identities of the devices, for records."""
-        return {
-            "servo": _plain(self.servo.identity),
-            "imu": _plain(self.imu.identity),
-            "camera": _plain(self.camera.identity),
+        identities: dict[str, Any] = {
+            "servo": self.servo.identity,
+            "imu": self.imu.identity,
+            "camera": self.camera.identity,
         }
+        return {name: asdict(identity) for name, identity in identities.items()}
 
     def apparatus(self, *parts: str) -> dict[str, Any]:
         """Return the part of the bench that a calibration of ``parts`` (default: all devices) depends on."""
@@ -316,7 +314,3 @@ def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
     if found:
         raise config_mistakes(found, where)
     return config, options
-
-
-def _plain(identity: Any) -> dict[str, Any]:
-    return {name: getattr(identity, name) for name in identity.__dataclass_fields__}

@@ -1,6 +1,7 @@
 """The catalog: objects with their enrollments and views."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
@@ -45,7 +46,7 @@ class ModelSet(NamedTuple):
     view_ids: NDArray[np.int64]
 
 
-class Catalog:
+class Catalog(AbstractContextManager["Catalog"]):
     """Objects with their enrollments and views in one folder: ``catalog.sqlite`` and ``images/``.
 
     Open it with `Catalog.open`. Several processes may read and write at once. To edit, check, clean up, import and
@@ -99,9 +100,6 @@ class Catalog:
         """
         root = Path(path).expanduser().absolute()
         return cls(Database(root, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

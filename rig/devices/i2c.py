@@ -1,7 +1,7 @@
 """Registers of a sensor on an I2C bus of the computer, through smbus2, with retries and explained errors."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from errno import EAGAIN, EBUSY, EIO, ENXIO, EREMOTEIO, ETIMEDOUT
 from typing import TypeVar
 
@@ -30,9 +30,6 @@ class I2cStatistics:
     transfers: int = 0
     retries: int = 0
     overflows: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        return asdict(self)
 
 
 class I2cRegisters:

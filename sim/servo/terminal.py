@@ -5,7 +5,6 @@ import select
 import tty
 from bisect import insort
 from contextlib import AbstractContextManager, suppress
-from typing import Self
 
 from rig.core.clock import Clock
 from sim.servo.bus import Frame, ServoBus
@@ -45,9 +44,6 @@ class ServoTerminal(AbstractContextManager["ServoTerminal"]):
     def __exit__(self, *_: object) -> None:
         self._bus.disconnect()
         self._close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def serve(self, seconds: float | None = None) -> None:
         """Answer for ``seconds``, or without end."""

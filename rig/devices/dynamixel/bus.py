@@ -5,7 +5,7 @@ Decision: docs/decisions/0010.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from threading import RLock
 
 import serial
@@ -40,9 +40,6 @@ class BusStatistics:
     late: int = 0
     foreign: int = 0
     rejected: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        return asdict(self)
 
 
 class DynamixelBus:

@@ -1,6 +1,7 @@
 """Base of all Dynamixel servos of the rig: identity, permanent settings, and the gear between servo and table."""
 
 from abc import ABC, abstractmethod
+from dataclasses import asdict
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
@@ -98,7 +99,7 @@ class RegisterServo(ABC):
 
     @property
     def bus_statistics(self) -> dict[str, int]:
-        return self.bus.statistics.as_dict()
+        return asdict(self.bus.statistics)
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -11,20 +11,10 @@ FIRMWARE = (1, 0, 0)
 MAX_BODY = 24
 BAUD = 250_000
 """Bits per second; exact on 16 MHz."""
-TICK_US = 200
-"""Period of the safety tick."""
-ESTOP_TICKS = 5
-"""Ticks for which the e-stop loop must be open: 1 ms."""
 DEADMAN_MIN_MS = 50
 """Shortest deadman."""
-DEADMAN_DEFAULT_MS = 250
-"""Deadman before the first heartbeat sets it."""
 DEADMAN_MAX_MS = 2000
 """Longest deadman."""
-TRIGGER_MIN_US = 10
-"""Shortest trigger pulse."""
-TRIGGER_MAX_US = 30000
-"""Longest trigger pulse."""
 SERIAL_UNSET = 0xFFFFFFFF
 """Serial number of a board without one."""
 
@@ -331,13 +321,7 @@ MESSAGES: dict[int, type[Request] | type[Answer]] = {
 REPLIES: dict[type[Request], type[Answer]] = {
     Hello: Identity,
     Heartbeat: HeartbeatReply,
-    Shutdown: Done,
-    Acknowledge: Done,
-    Light: Done,
-    Relay: Done,
     Trigger: Triggered,
-    Imu: Done,
-    Stream: Done,
     ReadCounters: Counters,
 }
-"""The reply to a request that is not rejected."""
+"""The reply to a request that is not rejected, if it is not `Done`."""
