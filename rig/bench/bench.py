@@ -143,12 +143,8 @@ class Bench(AbstractContextManager["Bench"]):
 
     def devices(self) -> dict[str, Any]:
         """Return the identities of the devices, for records."""
-        identities: dict[str, Any] = {
-            "servo": self.servo.identity,
-            "imu": self.imu.identity,
-            "camera": self.camera.identity,
-        }
-        return {name: asdict(identity) for name, identity in identities.items()}
+        identities: dict[str, Any] = {part: getattr(self, part).identity for part in ("servo", "imu", "camera")}
+        return {part: asdict(identity) for part, identity in identities.items()}
 
     def apparatus(self, *parts: str) -> dict[str, Any]:
         """Return the part of the bench that a calibration of ``parts`` (default: all devices) depends on."""

@@ -20,6 +20,16 @@ _STARTUP_BITS = ((0x01, "torque on at power-up"), (0x02, "RAM restored at power-
 _RETURN_LEVELS = {0: "answers to ping only", 1: "answers to ping and read", 2: "answers to everything"}
 _AX_ERRORS = ("input voltage", "angle limit", "overheating", "range", "checksum", "overload", "instruction")
 
+_SCALED = {
+    "Return Delay Time": (2, "{:g} µs"),
+    "Realtime Tick": (1, "{:g} ms"),
+    **dict.fromkeys(("Temperature Limit", "Present Temperature"), (1, "{:g} °C")),
+    **dict.fromkeys(("Max Voltage Limit", "Min Voltage Limit"), (0.1, "{:.1f} V")),
+    **dict.fromkeys(("Present Input Voltage", "Present Voltage"), (0.1, "{:.1f} V")),
+    **dict.fromkeys(("PWM Limit", "Goal PWM", "Present PWM"), (0.113, "{:.1f} %")),
+}
+"""Registers that count in a unit: its size, and the template of the value."""
+
 _SWITCHES = {"Torque Enable", "LED", "Moving", "Registered Instruction", "Backup Ready", "Lock", "Registered"}
 _DEGREES = {
     *("Homing Offset", "Max Position Limit", "Min Position Limit", "Goal Position", "Present Position"),
@@ -47,13 +57,18 @@ def baud_codes(table: ControlTable) -> dict[int, int]:
 
 def meaning(table: ControlTable, name: str, value: int) -> str:
     """Return the meaning of a register's value; empty if the number needs none."""
+    if name in _SCALED:
+        factor, template = _SCALED[name]
+        return template.format(factor * value)
+    if name in _SWITCHES:
+        return "on" if value else "off"
+    if name == "Status Return Level":
+        return _RETURN_LEVELS.get(value, "unknown level")
     if table.ram_start != 64:
         return _ax_meaning(name, value)
     match name:
         case "Baud Rate":
             return next((f"{rate} bit/s" for rate, code in BAUD_CODES.items() if code == value), "unknown rate")
-        case "Return Delay Time":
-            return f"{2 * value} µs"
         case "Drive Mode":
             return _bits(value, _DRIVE_BITS, "normal direction, velocity-based profile")
         case "Operating Mode":
@@ -62,34 +77,22 @@ def meaning(table: ControlTable, name: str, value: int) -> str:
             return "off" if value > 252 else "obeys this id, too"
         case "Protocol Type":
             return f"protocol {value}.0"
-        case "Temperature Limit" | "Present Temperature":
-            return f"{value} °C"
-        case "Max Voltage Limit" | "Min Voltage Limit" | "Present Input Voltage":
-            return f"{0.1 * value:.1f} V"
-        case "PWM Limit" | "Goal PWM" | "Present PWM":
-            return f"{0.113 * value:.1f} %"
         case "Startup Configuration":
             return _bits(value, _STARTUP_BITS, "nothing at power-up")
         case "Shutdown":
             return ", ".join(hardware_errors(value)) or "nothing takes the torque away"
         case "Hardware Error Status":
             return ", ".join(hardware_errors(value)) or "none"
-        case "Status Return Level":
-            return _RETURN_LEVELS.get(value, "unknown level")
         case "Bus Watchdog":
             return "off" if value == 0 else "tripped" if value in (0xFF, -1) else f"{20 * value} ms"
         case "Profile Acceleration":
             return "as fast as it can" if value == 0 else f"{value * 214.577 * 6 / 60:.1f} °/s²"
         case "Profile Velocity" if value == 0:
             return "as fast as it can"
-        case "Realtime Tick":
-            return f"{value} ms"
         case "Moving Status":
             return "arrived" if value & 1 else "not arrived"
         case "Present Load":
             return f"{0.1 * value:.1f} %"
-    if name in _SWITCHES:
-        return "on" if value else "off"
     if name in _DEGREES:
         return f"{value * 360 / 4096:.2f}°"
     if name in _VELOCITIES:
@@ -103,16 +106,8 @@ def _ax_meaning(name: str, value: int) -> str:
     match name:
         case "Baud Rate":
             return f"{AX_BAUD / (value + 1):.0f} bit/s"
-        case "Return Delay Time":
-            return f"{2 * value} µs"
-        case "Temperature Limit" | "Present Temperature":
-            return f"{value} °C"
-        case "Max Voltage Limit" | "Min Voltage Limit" | "Present Voltage":
-            return f"{0.1 * value:.1f} V"
         case "Max Torque" | "Torque Limit":
             return f"{value / 10.23:.0f} %"
-        case "Status Return Level":
-            return _RETURN_LEVELS.get(value, "unknown level")
         case "Alarm LED" | "Shutdown":
             return ", ".join(text for bit, text in enumerate(_AX_ERRORS) if value >> bit & 1) or "nothing"
         case "Moving Speed" if value == 0:
@@ -121,8 +116,6 @@ def _ax_meaning(name: str, value: int) -> str:
             return f"{(value & 0x3FF) * 0.111 * 6:.1f} °/s{' clockwise' if value & 0x400 else ''}"
         case "Present Load":
             return f"{(value & 0x3FF) / 10.23:.0f} %{' clockwise' if value & 0x400 else ''}"
-    if name in _SWITCHES:
-        return "on" if value else "off"
     return f"{value * 300 / 1023:.1f}°" if name in _DEGREES else ""
 
 

@@ -1,6 +1,6 @@
 """Captures frames for views and checks them: image quality, camera settings, and whether the table stood still."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from math import isfinite
@@ -195,33 +195,23 @@ class Viewer:
         return Attempt(number, frame.image_bgr, evidence, tuple(reasons))
 
 
+_TEXTS: Mapping[str, str] = {
+    RejectReason.EXPOSED_EARLY: "exposed before the table stood still",
+    RejectReason.GYRO_INCOMPLETE: "the gyro's samples are incomplete: it is unknown whether the table stood still",
+    RejectReason.TABLE_MOVED: "the table moved ({0.stillness.peak_rate_dps:.2f} °/s, "
+    "shaft {0.stillness.encoder_change_deg:.2f}°, platter {0.stillness.platter_change_deg:+.2f}°)",
+    RejectReason.REPEATED_FRAME: "the camera repeated its last frame",
+    RejectReason.LOCKS_CHANGED: "exposure or white balance has changed",
+    RejectReason.TOO_DARK: "too dark (mean level {0.mean_level:.1f}, {0.dark_share:.0%} black)",
+    RejectReason.OVEREXPOSED: "overexposed ({0.saturated_share:.0%} saturated)",
+    RejectReason.BLURRED: "blurred (sharpness {0.sharpness:.1f})",
+    RejectReason.NOISE: "noise instead of an image",
+}
+
+
 def rejection_text(reason: str, evidence: ViewEvidence | ImageQuality) -> str:
     """Return the text of a `RejectReason`, with the numbers of the evidence; any other text as it is.
 
     Version 0.1 saved the text itself.
     """
-    match reason:
-        case RejectReason.EXPOSED_EARLY:
-            return "exposed before the table stood still"
-        case RejectReason.GYRO_INCOMPLETE:
-            return "the gyro's samples are incomplete: it is unknown whether the table stood still"
-        case RejectReason.TABLE_MOVED if isinstance(evidence, ViewEvidence):
-            still = evidence.stillness
-            return (
-                f"the table moved ({still.peak_rate_dps:.2f} °/s, shaft {still.encoder_change_deg:.2f}°, "
-                f"platter {still.platter_change_deg:+.2f}°)"
-            )
-        case RejectReason.REPEATED_FRAME:
-            return "the camera repeated its last frame"
-        case RejectReason.LOCKS_CHANGED:
-            return "exposure or white balance has changed"
-        case RejectReason.TOO_DARK:
-            return f"too dark (mean level {evidence.mean_level:.1f}, {evidence.dark_share:.0%} black)"
-        case RejectReason.OVEREXPOSED:
-            return f"overexposed ({evidence.saturated_share:.0%} saturated)"
-        case RejectReason.BLURRED:
-            return f"blurred (sharpness {evidence.sharpness:.1f})"
-        case RejectReason.NOISE:
-            return "noise instead of an image"
-        case _:
-            return str(reason)
+    return _TEXTS[reason].format(evidence) if reason in _TEXTS else str(reason)

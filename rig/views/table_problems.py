@@ -47,35 +47,31 @@ class TableProblem:
         return problem_text(self.as_json())
 
 
+_TEXTS: Mapping[str, str] = {
+    TableProblemCode.CAMERA_MOVES: "the camera moves around the object, so that every view has another background",
+    TableProblemCode.MISSING: "there is no empty-table image yet",
+    TableProblemCode.UNREADABLE: "the empty-table image is not usable: {detail}",
+    TableProblemCode.OTHER_SIZE: "the empty-table image has {image_px[0]} x {image_px[1]} pixels, "
+    "but the camera's frames have {frame_px[0]} x {frame_px[1]}",
+    TableProblemCode.OTHER_CAMERA: "the empty-table image is from another camera: {image_camera}, not {camera}",
+    TableProblemCode.FUTURE: "its date is in the future: check the computer's clock",
+    TableProblemCode.SURROUNDINGS: "{frames} frames in a row agree with it over at most {agreement:.0%} of their "
+    "border. The table or its surroundings have changed, the camera was moved, or the object reaches the border",
+    TableProblemCode.OTHER: "{text}",
+}
+
+
 def problem_text(problem: Mapping[str, Any]) -> str:
     """Return a problem in words, from its JSON values."""
     match problem:
-        case {"code": "camera-moves"}:
-            return "the camera moves around the object, so that every view has another background"
-        case {"code": "missing"}:
-            return "there is no empty-table image yet"
-        case {"code": "unreadable", "detail": detail}:
-            return f"the empty-table image is not usable: {detail}"
-        case {"code": "other-size", "image_px": (width, height), "frame_px": (now_width, now_height)}:
-            return (
-                f"the empty-table image has {width} x {height} pixels, "
-                f"but the camera's frames have {now_width} x {now_height}"
-            )
-        case {"code": "other-camera", "image_camera": before, "camera": now}:
-            return f"the empty-table image is from another camera: {before}, not {now}"
         case {"code": "old", "hours": hours}:
             return f"it is {hours:.0f} hours old" if hours < 48 else f"it is {hours / 24:.0f} days old"
-        case {"code": "future"}:
-            return "its date is in the future: check the computer's clock"
         case {"code": "setting", "name": name, "before": before, "now": now}:
             return f"{name} was {_setting(before)}, is {_setting(now)}"
-        case {"code": "surroundings", "frames": frames, "agreement": agreement}:
-            return (
-                f"{frames} frames in a row agree with it over at most {agreement:.0%} of their border. The table or "
-                "its surroundings have changed, the camera was moved, or the object reaches the border"
-            )
-        case _:
-            return str(problem.get("text", problem["code"]))
+    try:
+        return _TEXTS[problem["code"]].format_map(problem)
+    except LookupError:  # a code or a parameter of another version
+        return str(problem.get("text", problem["code"]))
 
 
 def _setting(value: float | bool) -> str:
