@@ -14,6 +14,7 @@ from sqlalchemy import Connection, insert, select
 
 from rig.catalog.records import JsonObject, as_json, this_software
 from rig.catalog.schema import audit
+from rig.catalog.seal import seal_log
 from rig.core.clock import Clock
 
 
@@ -44,11 +45,12 @@ def append(connection: Connection, clock: Clock, action: str, object_name: str |
             details=as_json(details, "the details of the log entry"),
         )
     )
+    seal_log(connection)
 
 
 def entries(connection: Connection, since: datetime | None = None, object_name: str | None = None) -> list[AuditEntry]:
     """Return the log, oldest first."""
-    wanted = select(audit).order_by(audit.c.id)
+    wanted = select(*(column for column in audit.c if column.name != "digest")).order_by(audit.c.id)
     if since is not None:
         wanted = wanted.where(audit.c.time_utc >= since)
     if object_name is not None:

@@ -17,6 +17,7 @@ from rig.catalog.audit import AuditEntry
 from rig.catalog.database import Database, insert_row
 from rig.catalog.describing import known_descriptor
 from rig.catalog.enrollment import Enrollment
+from rig.catalog.places import image_file, make_folder_within
 from rig.catalog.queries import enrollment_summaries, find, in_use, model_set, object_summaries, stored_views
 from rig.catalog.records import (
     EnrollmentStatus,
@@ -30,11 +31,11 @@ from rig.catalog.records import (
     check_text,
     clean_name,
 )
-from rig.catalog.rows import abandon_unfinished, insert_session, of_status
+from rig.catalog.rows import abandon_unfinished, insert_session, of_status, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, views
+from rig.catalog.seal import changing_enrollments, changing_object, seal_enrollments, seal_objects
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, ObjectExists, UsageError
-from rig.core.files import make_folder
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
 
@@ -163,12 +164,15 @@ class Catalog(AbstractContextManager["Catalog"]):
                 object_id = insert_row(
                     connection, objects, name=name, created_utc=now, **({"label": "", "note": ""} | texts)
                 )
+                seal_objects(connection, [object_id])
             else:
                 if not replace:
                     _check_not_enrolled(connection, object_id, name)
-                abandon_unfinished(connection, object_id, now)
+                with changing_enrollments(connection, unfinished_and_complete(connection, object_id)):
+                    abandon_unfinished(connection, object_id, now)
                 if texts:
-                    connection.execute(update(objects).where(objects.c.id == object_id).values(texts))
+                    with changing_object(connection, object_id):
+                        connection.execute(update(objects).where(objects.c.id == object_id).values(texts))
             enrollment_id = insert_row(
                 connection,
                 enrollments,
@@ -177,6 +181,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 started_utc=now,
                 planned_azimuth_deg=plan,
             )
+            seal_enrollments(connection, [enrollment_id])
             details = {"enrollment_id": enrollment_id, "views": len(plan), "replace": replace}
             audit.append(connection, self.clock, "enrollment started", name, **details)
             return self._start_session(connection, enrollment_id, object_id, name, plan, provenance)
@@ -248,6 +253,8 @@ class Catalog(AbstractContextManager["Catalog"]):
             There is no such descriptor.
         DescriptorOutdated
             Some views are not described by this version of it and cannot be compared.
+        CatalogDamaged
+            An object or a view is not as it was stored.
         """
         kind = known_descriptor(descriptor)
         with self.database.read() as connection:
@@ -280,8 +287,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         return found[0]
 
     def image_path(self, view: StoredView) -> Path:
-        """Return the path of the image of a view."""
-        return self.path / view.image
+        """Return the path of the image of a view; a `CatalogDamaged` if it leads out of the catalog."""
+        return image_file(self.path, view.image)
 
     def read_image(self, view: StoredView) -> NDArray[np.uint8]:
         """Return the pixels that were stored, uint8 (H, W, 3) BGR.
@@ -304,9 +311,10 @@ class Catalog(AbstractContextManager["Catalog"]):
         provenance: Provenance,
     ) -> Enrollment:
         now = self.clock.utc()
-        session = Session(insert_session(connection, enrollment_id, now, provenance), now, provenance)
+        with changing_enrollments(connection, [enrollment_id]):
+            session = Session(insert_session(connection, enrollment_id, now, provenance), now, provenance)
         enrollment = Enrollment(self.database, self.clock, enrollment_id, object_id, object_name, session, plan)
-        make_folder(self.path / enrollment.folder, within=self.path)
+        make_folder_within(self.path, image_file(self.path, enrollment.folder.as_posix()))
         return enrollment
 
 

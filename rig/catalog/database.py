@@ -5,6 +5,7 @@ Decision: docs/decisions/0014.
 
 import os
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
@@ -13,9 +14,11 @@ from tempfile import TemporaryDirectory
 
 from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, event, insert
 
+from rig.catalog.columns import FIX, damaged
 from rig.catalog.failures import DATABASE_NAME, absent, catalog_errors
-from rig.catalog.schema import APPLICATION_ID, METADATA, SCHEMA_VERSION
-from rig.core.errors import CatalogError, CatalogOutdated
+from rig.catalog.places import check_folder
+from rig.catalog.schema import APPLICATION_ID, KNOWN_NAMES, METADATA, SCHEMA_VERSION, expected_schema, schema_digest
+from rig.core.errors import CatalogDamaged, CatalogError, CatalogOutdated
 from rig.core.files import make_folder, sync_folder
 
 
@@ -84,25 +87,22 @@ class Database:
         if not database_exists(self.root):
             if not create:
                 raise absent(self.root)
-            make_folder(self.root, within=next(parent for parent in self.root.parents if parent.exists()))
+            check_folder(self.root)
+            parent = next(parent for parent in self.root.parents if parent.exists())
+            make_folder(self.root, within=parent, mode=0o700)
             self._create()
+        check_folder(self.root)
         with self.read() as connection:
             _check_up_to_date(connection, self.root)
+            check_schema(connection, self.root, SCHEMA_VERSION)
 
     def _connect(self) -> sqlite3.Connection:
         mode = "rw"
         if self._read_only:
             mode = "ro" if self._is_shareable() else "ro&immutable=1"
-        connection = sqlite3.connect(
-            f"{self._file.as_uri()}?mode={mode}",
-            uri=True,
-            timeout=self._busy_timeout_s,
-            isolation_level=None,
-            check_same_thread=False,
-        )
+        connection = connect(f"{self._file.as_uri()}?mode={mode}", self._busy_timeout_s)
         try:
             connection.execute("PRAGMA foreign_keys = ON")
-            connection.execute("PRAGMA synchronous = FULL")
         except BaseException:
             connection.close()
             raise
@@ -120,6 +120,7 @@ class Database:
         """
         with TemporaryDirectory(prefix=".new-", dir=self.root) as folder:
             made = Path(folder, DATABASE_NAME)
+            made.touch(0o600)  # private; whoever shares a catalog changes the permissions of its database
             engine = create_engine("sqlite://", creator=partial(sqlite3.connect, made), poolclass=NullPool)
             with engine.connect() as connection:
                 connection.exec_driver_sql("PRAGMA journal_mode = WAL")
@@ -140,6 +141,24 @@ class Database:
                 made.replace(self._file)
 
 
+def connect(uri: str, busy_timeout_s: float) -> sqlite3.Connection:
+    """Open a database that may come from somebody else.
+
+    Nothing in its schema may call functions with side effects. Where Python can (from 3.12), SQLite's defensive mode
+    also rejects statements that could damage the file.
+    """
+    connection = sqlite3.connect(uri, uri=True, timeout=busy_timeout_s, isolation_level=None, check_same_thread=False)
+    try:
+        if sys.version_info >= (3, 12):
+            connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)
+        for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
+            connection.execute(f"PRAGMA {setting}")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
 def database_exists(root: Path) -> bool:
     """Return whether a folder has a database. A program that was killed may have left an empty file."""
     if root.exists() and not root.is_dir():
@@ -155,6 +174,8 @@ def version_of(connection: Connection, root: Path) -> int:
     ------
     CatalogError
         It is the database of another program or of a newer version.
+    CatalogDamaged
+        No program has written such a version.
     """
     application_id = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
     version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
@@ -169,7 +190,23 @@ def version_of(connection: Connection, root: Path) -> int:
             next_step="update hbr-rig on this computer",
             evidence={"found": version, "known": SCHEMA_VERSION},
         )
+    if version < 1:
+        raise damaged("the version of its schema", version)
     return version
+
+
+def check_schema(connection: Connection, root: Path, version: int) -> None:
+    """Raise `CatalogDamaged` if a database has other tables, indexes, triggers or views than those of its version."""
+    database = connection.connection.driver_connection
+    assert isinstance(database, sqlite3.Connection)
+    if schema_digest(database) != expected_schema(version):
+        names = sorted({str(name) for (name,) in database.execute("SELECT name FROM sqlite_master")} - KNOWN_NAMES)
+        raise CatalogDamaged(
+            f"the database of the catalog {root} has other tables, triggers or views than this program made; "
+            "nothing was changed",
+            next_step=FIX,
+            evidence={"version": version, "unknown": names[:20]},
+        )
 
 
 def _check_up_to_date(connection: Connection, root: Path) -> None:

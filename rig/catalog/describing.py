@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.descriptors import PAPERS, Descriptor, descriptor, names
-from rig.catalog.records import JsonObject, PackedDescriptor, Region
+from rig.catalog.columns import damaged
+from rig.catalog.places import image_file
+from rig.catalog.records import JsonObject, PackedDescriptor, Region, is_region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
@@ -31,7 +33,7 @@ def stored_describer(
     """
     if empty_table is None or all(name in PAPERS for name in names):  # the paper's descriptors need no segmentation
         return ViewDescriber(ViewConfig(roi=region), names)
-    return ViewDescriber(ViewConfig(roi=region), names, images.read(root / empty_table[0], empty_table[1]))
+    return ViewDescriber(ViewConfig(roi=region), names, images.read(image_file(root, empty_table[0]), empty_table[1]))
 
 
 def known_descriptor(name: str) -> Descriptor:
@@ -58,7 +60,7 @@ def region_of(settings: JsonObject) -> Region | None:
     match dict(settings):
         case {} if not settings:
             return None
-        case {"region": [int(x), int(y), int(width), int(height)], **other} if not other:
+        case {"region": [x, y, width, height], **other} if not other and is_region((x, y, width, height)):
             return x, y, width, height
     raise CatalogError(
         f"a view is described with settings that this program does not know: {dict(settings)}",
@@ -88,4 +90,11 @@ def pack(levels: Mapping[str, NDArray[np.uint8]], region: Region | None) -> list
 
 def unpack(packed: Iterable[PackedDescriptor]) -> dict[str, NDArray[np.uint8]]:
     """Return the levels of a view by name. Versions that this program does not compute are left out."""
-    return {one.name: descriptor(one.name).unpack(one.packed) for one in packed if is_current(one.name, one.version)}
+    found = {}
+    for one in packed:
+        if is_current(one.name, one.version):
+            try:
+                found[one.name] = descriptor(one.name).unpack(one.packed)
+            except ValueError as error:
+                raise damaged(f"a descriptor {one.name}", one.packed) from error
+    return found

@@ -1,6 +1,5 @@
 """Questions about how the enrolled views are described: by which descriptors, within which region, with which table."""
 
-import json
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,9 @@ from sqlalchemy import Text, cast, select
 from hbr.descriptors import descriptor
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog.catalog import Catalog
+from rig.catalog.columns import parse_mapping
 from rig.catalog.describing import EmptyTable, region_of
+from rig.catalog.places import image_file
 from rig.catalog.queries import described_by, retrieved
 from rig.catalog.records import Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
@@ -65,7 +66,7 @@ def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.ui
     """
     path, sha256 = empty_table
     with catalog.database.catalog_errors():
-        return images.read(catalog.path / path, sha256)
+        return images.read(image_file(catalog.path, path), sha256)
 
 
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
@@ -85,6 +86,6 @@ def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, 
             .distinct()
         )
         return {
-            (region_of(json.loads(settings)), tuple(json.loads(conditions).get(CALIBRATIONS, ())))
+            (region_of(parse_mapping(settings)), tuple(map(str, parse_mapping(conditions).get(CALIBRATIONS) or ())))
             for settings, conditions in rows
         }

@@ -7,6 +7,7 @@ from rig.catalog.catalog import Catalog, checked_texts
 from rig.catalog.queries import check_free, find, object_summaries
 from rig.catalog.records import ObjectSummary, clean_name
 from rig.catalog.schema import objects
+from rig.catalog.seal import changing_object
 
 
 def rename(catalog: Catalog, name: str, new_name: str) -> None:
@@ -27,7 +28,8 @@ def rename(catalog: Catalog, name: str, new_name: str) -> None:
         if new_name == name:
             return
         check_free(connection, new_name)
-        connection.execute(update(objects).where(objects.c.id == object_id).values(name=new_name))
+        with changing_object(connection, object_id):
+            connection.execute(update(objects).where(objects.c.id == object_id).values(name=new_name))
         audit.append(connection, catalog.clock, "renamed", new_name, before=name)
 
 
@@ -45,7 +47,8 @@ def set_texts(catalog: Catalog, name: str, *, label: str | None = None, note: st
     with catalog.database.write() as connection:
         object_id, name = find(connection, name)
         if texts:
-            connection.execute(update(objects).where(objects.c.id == object_id).values(texts))
+            with changing_object(connection, object_id):
+                connection.execute(update(objects).where(objects.c.id == object_id).values(texts))
             audit.append(connection, catalog.clock, "labelled", name, **texts)
 
 
@@ -58,8 +61,10 @@ def delete(catalog: Catalog, *names: str) -> None:
         There is no object of one of these names.
     """
     with catalog.database.write() as connection:
+        now = catalog.clock.utc()
         for object_id, name in [find(connection, name) for name in dict.fromkeys(names)]:
-            connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=catalog.clock.utc()))
+            with changing_object(connection, object_id):
+                connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=now))
             audit.append(connection, catalog.clock, "deleted", name)
 
 
@@ -76,7 +81,8 @@ def undelete(catalog: Catalog, name: str) -> None:
     with catalog.database.write() as connection:
         object_id, name = find(connection, name, deleted=True)
         check_free(connection, name)
-        connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=None))
+        with changing_object(connection, object_id):
+            connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=None))
         audit.append(connection, catalog.clock, "undeleted", name)
 
 

@@ -11,9 +11,11 @@ from sqlalchemy import Connection, delete, select, update
 from rig.catalog import audit
 from rig.catalog.database import Database
 from rig.catalog.describing import pack
+from rig.catalog.places import file_mode, image_file
 from rig.catalog.records import EnrollmentStatus, ImageFile, Session, StoredView, ViewRecord
-from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede
+from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, sessions, views
+from rig.catalog.seal import changing_enrollments
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.core.files import write
@@ -99,7 +101,8 @@ class Enrollment:
                 )
             image = self._write_image(f"{index:03d}.png", png)
             new = NewView(index, measured(record), self.session.id, captured_utc, image, packed)
-            (view_id,) = insert_views(connection, self.id, [new])
+            with changing_enrollments(connection, [self.id]):
+                (view_id,) = insert_views(connection, self.id, [new])
         return StoredView(
             id=view_id,
             object_name=self.object_name,
@@ -121,9 +124,10 @@ class Enrollment:
         with self._database.write() as connection:
             self._check_in_progress(connection)
             image = self._write_image(f"empty-{self.session.id:06d}.png", png)
-            connection.execute(
-                update(sessions).where(sessions.c.id == self.session.id).values(empty_table_columns(image))
-            )
+            with changing_enrollments(connection, [self.id]):
+                connection.execute(
+                    update(sessions).where(sessions.c.id == self.session.id).values(empty_table_columns(image))
+                )
         self.session = replace(self.session, empty_table_image=image.path)
 
     def finish(self) -> None:
@@ -143,8 +147,9 @@ class Enrollment:
                     next_step="resume the enrollment (--resume), or abandon it",
                     evidence={"missing_views": list(missing)},
                 )
-            supersede(connection, self.object_id)
-            self._close(connection, EnrollmentStatus.COMPLETE)
+            with changing_enrollments(connection, unfinished_and_complete(connection, self.object_id)):
+                supersede(connection, self.object_id)
+                self._close(connection, EnrollmentStatus.COMPLETE)
             details = {"enrollment_id": self.id, "views": len(self.planned_azimuth_deg)}
             audit.append(connection, self._clock, "enrolled", self.object_name, **details)
 
@@ -152,7 +157,8 @@ class Enrollment:
         """Abandon the enrollment. Its images stay, and the complete enrollment before it stays in use."""
         with self._database.write() as connection:
             self._check_in_progress(connection)
-            self._close(connection, EnrollmentStatus.ABANDONED)
+            with changing_enrollments(connection, [self.id]):
+                self._close(connection, EnrollmentStatus.ABANDONED)
             audit.append(connection, self._clock, "enrollment abandoned", self.object_name, enrollment_id=self.id)
 
     def discard(self) -> None:
@@ -179,7 +185,8 @@ class Enrollment:
 
     def _write_image(self, name: str, png: bytes) -> ImageFile:
         path = self.folder / name
-        write(self._database.root / path, png)
+        root = self._database.root
+        write(image_file(root, path.as_posix()), png, mode=file_mode(root))
         return ImageFile(path.as_posix(), images.digest(png), len(png))
 
     def _close(self, connection: Connection, status: EnrollmentStatus) -> None:

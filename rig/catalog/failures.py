@@ -9,7 +9,7 @@ from typing import Final
 
 from sqlalchemy.exc import DBAPIError
 
-from rig.core.errors import CatalogBusy, CatalogError, RigError
+from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, RigError
 
 DATABASE_NAME: Final = "catalog.sqlite"
 
@@ -51,7 +51,7 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
                 f"{root / DATABASE_NAME} is not a catalog", next_step="give the folder of a catalog", evidence=evidence
             )
         case sqlite3.SQLITE_CORRUPT:
-            return CatalogError(
+            return CatalogDamaged(
                 f"the catalog {root / DATABASE_NAME} is damaged",
                 next_step="copy the folder, then restore the database from a backup",
                 evidence=evidence,
@@ -62,6 +62,12 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
             return _of_system(OSError(errno.EACCES, str(error)), root)
         case sqlite3.SQLITE_IOERR:
             return _of_system(OSError(errno.EIO, str(error)), root)
+    if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.ProgrammingError):
+        return CatalogDamaged(
+            f"the catalog {root / DATABASE_NAME} is damaged",
+            next_step="use a backup of the catalog; rig catalog verify reports more",
+            evidence=evidence,
+        )
     return None
 
 

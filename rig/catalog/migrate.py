@@ -1,6 +1,7 @@
 """Migrate a catalog of an earlier version, with a backup."""
 
 import sqlite3
+import stat
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -10,12 +11,14 @@ from pathlib import Path
 from sqlalchemy import Connection, NullPool, create_engine
 
 from rig.catalog import audit, migrations
-from rig.catalog.database import database_exists, version_of
+from rig.catalog.columns import FIX
+from rig.catalog.database import check_schema, connect, database_exists, version_of
 from rig.catalog.failures import DATABASE_NAME, absent, catalog_errors
+from rig.catalog.places import check_folder, image_file
 from rig.catalog.schema import SCHEMA_VERSION
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged
-from rig.core.files import sync_file, sync_folder
+from rig.core.files import open_new, sync_file, sync_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +48,15 @@ def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 
     with catalog_errors(root, busy_timeout_s):
         if not database_exists(root):
             raise absent(root)
+        check_folder(root)
         file = root / DATABASE_NAME
         engine = create_engine(
             "sqlite://",
-            creator=partial(sqlite3.connect, file, timeout=busy_timeout_s, isolation_level=None),
+            creator=partial(connect, f"{file.as_uri()}?mode=rw", busy_timeout_s),
             poolclass=NullPool,
         )
         with engine.connect() as connection:
             connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # the steps replace tables that others refer to
-            connection.exec_driver_sql("PRAGMA synchronous = FULL")
             connection.exec_driver_sql("BEGIN IMMEDIATE")
             try:
                 done = _migrate(connection, root, file, clock)
@@ -66,11 +69,21 @@ def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 
 
 def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Migration:
     before = version_of(connection, root)
+    check_schema(connection, root, before)
     if before == SCHEMA_VERSION:
         return Migration(before, before, None)
+    for name in connection.exec_driver_sql("SELECT image FROM views").scalars():
+        image_file(root, name)
     backup = root / f"catalog-v{before}-{clock.utc():%Y%m%dT%H%M%SZ}.sqlite"
     _back_up(file, backup)
-    _run_steps(connection, before)
+    try:
+        _run_steps(connection, before)
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        raise CatalogDamaged(
+            f"the catalog {root} has a value that no program stored; nothing was changed",
+            next_step=FIX,
+            evidence={"error": str(error)},
+        ) from error
     if broken := connection.exec_driver_sql("PRAGMA foreign_key_check").all():
         raise CatalogDamaged(
             f"{len(broken)} rows of the catalog {root} refer to missing rows; nothing was changed",
@@ -84,7 +97,7 @@ def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Mi
 
 def _back_up(file: Path, backup: Path) -> None:
     part = backup.with_suffix(".part")
-    part.unlink(missing_ok=True)
+    open_new(part, mode=stat.S_IMODE(file.stat().st_mode)).close()
     with closing(sqlite3.connect(file)) as source, closing(sqlite3.connect(part)) as target:
         source.backup(target)
     sync_file(part)

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Row, and_, func, select
+from sqlalchemy import ColumnElement, Connection, Row, Table, and_, func, select
 
 import hbr
 from hbr.descriptors import Descriptor
+from rig.catalog.columns import damaged
 from rig.catalog.describing import is_current, region_of, unpack
 from rig.catalog.records import (
     EnrollmentStatus,
@@ -26,6 +27,7 @@ from rig.catalog.records import (
 )
 from rig.catalog.rows import measured
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
+from rig.catalog.seal import check_loaded
 from rig.core.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
 from rig.views.description import PAPER_DESCRIPTOR
 
@@ -86,6 +88,7 @@ def object_summaries(connection: Connection, where: ColumnElement[bool]) -> list
     }
     summaries = []
     for row in connection.execute(select(objects).where(where).order_by(objects.c.id)):
+        check_complete(row, objects)
         enrolled_utc, view_count = current.get((row.id, EnrollmentStatus.COMPLETE), (None, 0))
         _, unfinished_views = current.get((row.id, EnrollmentStatus.IN_PROGRESS), (None, None))
         summaries.append(
@@ -116,6 +119,9 @@ def enrollment_summaries(connection: Connection, where: ColumnElement[bool]) -> 
     taken = defaultdict(list)
     for row in connection.execute(select(sessions).join(enrollments).where(where).order_by(sessions.c.id)):
         taken[row.enrollment_id].append(_session(row))
+    found = connection.execute(select(enrollments).where(where).order_by(enrollments.c.id.desc())).all()
+    for row in found:
+        check_complete(row, enrollments)
     return [
         EnrollmentSummary(
             id=row.id,
@@ -126,7 +132,7 @@ def enrollment_summaries(connection: Connection, where: ColumnElement[bool]) -> 
             present=tuple(present[row.id]),
             sessions=tuple(taken[row.id]),
         )
-        for row in connection.execute(select(enrollments).where(where).order_by(enrollments.c.id.desc()))
+        for row in found
     ]
 
 
@@ -144,6 +150,10 @@ def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[Sto
         row.id: _session(row) for row in connection.execute(select(sessions).where(sessions.c.id.in_(session_ids)))
     }
     packed = packed_descriptors(connection, where)
+    for row in rows:
+        check_complete(row, views)
+        if row.session_id not in taken:
+            raise damaged("the session of a view", row.session_id)
     return [
         StoredView(
             id=row.id,
@@ -207,9 +217,11 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
     ------
     DescriptorOutdated
         Some views are not described by this version of the descriptor and cannot be compared.
+    CatalogDamaged
+        An object or a view is not as it was stored.
     """
     rows = connection.execute(
-        select(objects.c.id, objects.c.name, views.c.id, views.c.azimuth_deg, descriptors.c.packed)
+        select(objects.c.id, objects.c.name, views.c.id, views.c.azimuth_deg, descriptors.c.packed, enrollments.c.id)
         .select_from(objects)
         .join(enrollments)
         .join(views, views.c.enrollment_id == enrollments.c.id)
@@ -219,9 +231,12 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
     ).all()
     if not rows:
         return hbr.Views.empty(kind.name), np.empty(0, np.int64)
-    object_ids, names, view_ids, azimuths_deg, packed = zip(*rows, strict=True)
+    object_ids, names, view_ids, azimuths_deg, packed, enrollment_ids = zip(*rows, strict=True)
     if None in packed:
         raise _outdated(connection, kind, {name for name, levels in zip(names, packed, strict=True) if levels is None})
+    check_loaded(connection, set(object_ids), set(enrollment_ids))
+    if set(map(len, packed)) != {kind.size_bytes}:
+        raise damaged("the length of a descriptor", sorted(set(map(len, packed))))
     _, first, object_index = np.unique(np.array(object_ids, np.int64), return_index=True, return_inverse=True)
     loaded = hbr.Views(
         descriptors=kind.unpack_rows(b"".join(packed)),
@@ -248,7 +263,15 @@ def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> Desc
     )
 
 
+def check_complete(row: Row[Any], table: Table) -> None:
+    """Raise `CatalogDamaged` if a row of a table lacks a value."""
+    for column in table.columns:
+        if not column.nullable and row._mapping[column] is None:
+            raise damaged(f"{table.name}.{column.name}", None)
+
+
 def _session(row: Row[Any]) -> Session:
+    check_complete(row, sessions)
     return Session(
         id=row.id,
         started_utc=row.started_utc,

@@ -4,7 +4,7 @@ import json
 import math
 import operator
 import unicodedata
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
@@ -21,6 +21,12 @@ MAX_NAME_LENGTH: Final = 100
 JsonObject = Mapping[str, Any]
 Region = tuple[int, int, int, int]
 """Part of an image: x, y, width, height in pixels."""
+
+
+def is_region(value: Sequence[object]) -> bool:
+    """Return whether these are x, y, width and height of a part of some image."""
+    numbers = [number for number in value if type(number) is int]
+    return len(numbers) == len(value) == 4 and min(numbers[:2]) >= 0 and min(numbers[2:]) >= 1
 
 
 class EnrollmentStatus(StrEnum):
@@ -172,6 +178,10 @@ class ViewRecord:
             )
         convert(lambda values: as_json(values, f"the evidence of view {self.index}"), "evidence", "segmentation")
         convert(lambda region: tuple(map(operator.index, region)), "region")
+        if self.region is not None and not is_region(self.region):
+            raise UsageError(
+                f"view {self.index} has the region {self.region}", next_step="give x, y, width, height in pixels"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

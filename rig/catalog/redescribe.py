@@ -12,8 +12,10 @@ from sqlalchemy import and_, bindparam, delete, insert, select, update
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import EmptyTable, known_descriptor, pack, region_of, settings_of, stored_describer
 from rig.catalog.jobs import JobProgress, portions, processes
+from rig.catalog.places import image_file
 from rig.catalog.records import EnrollmentStatus, JsonObject, PackedDescriptor, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
+from rig.catalog.seal import changing_enrollments
 from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import map_in_processes
 from rig.views import image_files as images
@@ -102,22 +104,24 @@ def redescribe(
         with catalog.database.write() as connection:
             ids = [row["view_id"] for row in rows]
             alive = set(connection.scalars(select(views.c.id).where(views.c.id.in_(ids))))
-            connection.execute(
-                delete(descriptors).where(
-                    and_(
-                        descriptors.c.view_id.in_(ids),
-                        descriptors.c.name == kind.name,
-                        descriptors.c.version == kind.version,
+            owners = connection.scalars(select(views.c.enrollment_id).where(views.c.id.in_(ids)).distinct())
+            with changing_enrollments(connection, owners):
+                connection.execute(
+                    delete(descriptors).where(
+                        and_(
+                            descriptors.c.view_id.in_(ids),
+                            descriptors.c.name == kind.name,
+                            descriptors.c.version == kind.version,
+                        )
                     )
                 )
-            )
-            if alive:
-                connection.execute(insert(descriptors), [row for row in rows if row["view_id"] in alive])
-            if segmentations:
-                connection.execute(
-                    update(views).where(views.c.id == bindparam("of_view")).values(segmentation=bindparam("new")),
-                    segmentations,
-                )
+                if alive:
+                    connection.execute(insert(descriptors), [row for row in rows if row["view_id"] in alive])
+                if segmentations:
+                    connection.execute(
+                        update(views).where(views.c.id == bindparam("of_view")).values(segmentation=bindparam("new")),
+                        segmentations,
+                    )
         done += len(portion)
         yield JobProgress(done, len(items))
     if items:
@@ -177,7 +181,8 @@ def _items(
 
 def _configured_region(conditions: JsonObject) -> Region | None:
     """The region in the configuration of a session, for views without descriptors."""
-    roi = conditions.get("view", {}).get("roi")
+    view = conditions.get("view")
+    roi = view.get("roi") if isinstance(view, dict) else None
     return None if roi is None else region_of({"region": roi})
 
 
@@ -186,7 +191,7 @@ def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[_Descri
     found = []
     for item in portion:
         try:
-            image = images.read(root / item.image, item.sha256)
+            image = images.read(image_file(root, item.image), item.sha256)
             described = stored_describer(root, (kind.name,), item.region, item.empty_table)(image)
             (packed,) = pack(described.levels, item.region)
             found.append(_Described(packed, described.segmentation))

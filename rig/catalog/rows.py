@@ -92,6 +92,13 @@ def of_status(object_id: int, status: EnrollmentStatus) -> ColumnElement[bool]:
     return and_(enrollments.c.object_id == object_id, enrollments.c.status == status)
 
 
+def unfinished_and_complete(connection: Connection, object_id: int) -> list[int]:
+    """Return the ids of the enrollments of an object whose status can change."""
+    changing = (EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS)
+    wanted = and_(enrollments.c.object_id == object_id, enrollments.c.status.in_(changing))
+    return list(connection.scalars(select(enrollments.c.id).where(wanted)))
+
+
 def supersede(connection: Connection, object_id: int) -> None:
     """Mark the complete enrollment of an object as superseded, if there is one."""
     connection.execute(

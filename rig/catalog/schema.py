@@ -1,30 +1,41 @@
-"""The tables of a catalog."""
+"""The tables of a catalog, and the check that a database has these tables and nothing else."""
 
-from datetime import UTC, datetime
+import hashlib
+import re
+import sqlite3
+from contextlib import closing
+from functools import cache
 from typing import Final
 
 from sqlalchemy import (
     DDL,
-    JSON,
-    BigInteger,
     CheckConstraint,
     Column,
-    DateTime,
-    Dialect,
-    Float,
     ForeignKey,
     Index,
     Integer,
-    LargeBinary,
     MetaData,
-    String,
+    StaticPool,
     Table,
-    Text,
-    TypeDecorator,
     UniqueConstraint,
+    create_engine,
     event,
 )
 
+from rig.catalog.columns import (
+    Azimuths,
+    Bytes,
+    Count,
+    ImagePath,
+    JsonMapping,
+    Name,
+    Nanoseconds,
+    Number,
+    SegmentationEvidence,
+    Status,
+    Utc,
+    Words,
+)
 from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
 
 APPLICATION_ID: Final = 0x48425247
@@ -32,19 +43,6 @@ APPLICATION_ID: Final = 0x48425247
 
 SCHEMA_VERSION: Final = 3
 """Version of the tables below (`PRAGMA user_version`). `rig.catalog.migrations` has a step for each version."""
-
-
-class Utc(TypeDecorator[datetime]):
-    """Time with a time zone, stored as UTC. SQLite itself would drop the zone."""
-
-    impl = DateTime
-    cache_ok = True
-
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
-        return value if value is None else value.astimezone(UTC).replace(tzinfo=None)
-
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
-        return value if value is None else value.replace(tzinfo=UTC)
 
 
 METADATA: Final = MetaData(
@@ -62,11 +60,12 @@ objects = Table(
     "objects",
     METADATA,
     Column("id", Integer, primary_key=True),
-    Column("name", String(MAX_NAME_LENGTH), nullable=False),
-    Column("label", Text, nullable=False),
-    Column("note", Text, nullable=False),
+    Column("name", Name(MAX_NAME_LENGTH), nullable=False),
+    Column("label", Words, nullable=False),
+    Column("note", Words, nullable=False),
     Column("created_utc", Utc, nullable=False),
     Column("deleted_utc", Utc),  # a deleted object stays until `rig catalog gc`
+    Column("digest", Name(64)),  # `rig.catalog.seal`
     sqlite_autoincrement=True,
 )
 
@@ -79,10 +78,11 @@ enrollments = Table(
     METADATA,
     Column("id", Integer, primary_key=True),
     Column("object_id", ForeignKey("objects.id"), nullable=False, index=True),
-    Column("status", Text, CheckConstraint(f"status IN ({_STATUSES})", name="status"), nullable=False),
+    Column("status", Status, CheckConstraint(f"status IN ({_STATUSES})", name="status"), nullable=False),
     Column("started_utc", Utc, nullable=False),
     Column("finished_utc", Utc),
-    Column("planned_azimuth_deg", JSON, nullable=False),
+    Column("planned_azimuth_deg", Azimuths, nullable=False),
+    Column("digest", Name(64)),  # of this row and of all sessions, views and descriptors of the enrollment
     sqlite_autoincrement=True,
 )
 
@@ -101,13 +101,13 @@ sessions = Table(
     Column("id", Integer, primary_key=True),
     Column("enrollment_id", ForeignKey("enrollments.id"), nullable=False, index=True),
     Column("started_utc", Utc, nullable=False),
-    Column("bench", Text, nullable=False),
-    Column("software", Text, nullable=False),
-    Column("devices", JSON, nullable=False),
-    Column("conditions", JSON, nullable=False),
-    Column("empty_table_image", Text),
-    Column("empty_table_image_sha256", String(64)),
-    Column("empty_table_image_bytes", Integer),
+    Column("bench", Words, nullable=False),
+    Column("software", Words, nullable=False),
+    Column("devices", JsonMapping, nullable=False),
+    Column("conditions", JsonMapping, nullable=False),
+    Column("empty_table_image", ImagePath),
+    Column("empty_table_image_sha256", Name(64)),
+    Column("empty_table_image_bytes", Count),
 )
 
 views = Table(
@@ -115,25 +115,25 @@ views = Table(
     METADATA,
     Column("id", Integer, primary_key=True),
     Column("enrollment_id", ForeignKey("enrollments.id"), nullable=False),
-    Column("view_index", Integer, CheckConstraint("view_index >= 0", name="view_index"), nullable=False),
+    Column("view_index", Count, CheckConstraint("view_index >= 0", name="view_index"), nullable=False),
     Column("session_id", ForeignKey("sessions.id"), nullable=False, index=True),
-    Column("commanded_deg", Float),  # NULL: the view was not taken by a bench
-    Column("encoder_deg", Float),
-    Column("imu_deg", Float),
-    Column("imu_sigma_deg", Float),
+    Column("commanded_deg", Number),  # NULL: the view was not taken by a bench
+    Column("encoder_deg", Number),
+    Column("imu_deg", Number),
+    Column("imu_sigma_deg", Number),
     Column(
         "azimuth_deg",
-        Float,
+        Number,
         CheckConstraint("azimuth_deg >= 0 AND azimuth_deg < 360", name="azimuth_deg"),
         nullable=False,
     ),
     Column("captured_utc", Utc),
-    Column("captured_ns", BigInteger),
-    Column("image", Text, nullable=False),
-    Column("image_sha256", String(64), nullable=False),
-    Column("image_bytes", Integer, nullable=False),
-    Column("evidence", JSON, nullable=False),
-    Column("segmentation", JSON(none_as_null=True)),
+    Column("captured_ns", Nanoseconds),
+    Column("image", ImagePath, nullable=False),
+    Column("image_sha256", Name(64), nullable=False),
+    Column("image_bytes", Count, nullable=False),
+    Column("evidence", JsonMapping, nullable=False),
+    Column("segmentation", SegmentationEvidence(none_as_null=True)),
     UniqueConstraint("enrollment_id", "view_index"),
     sqlite_autoincrement=True,
 )
@@ -143,10 +143,10 @@ descriptors = Table(
     "descriptors",
     METADATA,
     Column("view_id", ForeignKey("views.id"), primary_key=True),
-    Column("name", Text, primary_key=True),
-    Column("version", Integer, primary_key=True),
-    Column("settings", JSON, nullable=False),
-    Column("packed", LargeBinary, nullable=False),
+    Column("name", Words, primary_key=True),
+    Column("version", Count, primary_key=True),
+    Column("settings", JsonMapping, nullable=False),
+    Column("packed", Bytes, nullable=False),
     sqlite_with_rowid=False,
 )
 
@@ -155,20 +155,50 @@ audit = Table(
     METADATA,
     Column("id", Integer, primary_key=True),
     Column("time_utc", Utc, nullable=False),
-    Column("user", Text, nullable=False),
-    Column("host", Text, nullable=False),
-    Column("software", Text, nullable=False),
-    Column("action", Text, nullable=False),
-    Column("object_name", Text),
-    Column("details", JSON, nullable=False),
+    Column("user", Words, nullable=False),
+    Column("host", Words, nullable=False),
+    Column("software", Words, nullable=False),
+    Column("action", Words, nullable=False),
+    Column("object_name", Words),
+    Column("details", JsonMapping, nullable=False),
+    Column("digest", Name(64)),  # of this row and of the digest before
     sqlite_autoincrement=True,
 )
 
 APPEND_ONLY: Final = tuple(
-    f"CREATE TRIGGER audit_no_{change.lower()} BEFORE {change} ON audit "
+    f"CREATE TRIGGER audit_no_{change.lower()} BEFORE {change} ON audit {when}"
     "BEGIN SELECT RAISE(ABORT, 'the audit log is only appended to'); END"
-    for change in ("UPDATE", "DELETE")
+    for change, when in (("UPDATE", "WHEN old.digest IS NOT NULL "), ("DELETE", ""))
 )
 
 for _trigger in APPEND_ONLY:
     event.listen(audit, "after_create", DDL(_trigger))  # type: ignore[no-untyped-call]
+
+KNOWN_NAMES: Final = frozenset(
+    {"sqlite_sequence", "audit_no_update", "audit_no_delete"}
+    | {name for table in METADATA.tables.values() for name in (table.name, *(str(one.name) for one in table.indexes))}
+)
+"""Names in a database of this version."""
+
+EARLIER: Final = {
+    1: "5cc1e1349036d986279635bedfe0fdcd8ce6a1b65339143ae92fb792727ce570",
+    2: "f50ddb136d952675dd4df7138c4cc7abed2db9bd5c56b48267cd784db6c344b6",
+}
+"""`schema_digest` of earlier versions."""
+
+
+def schema_digest(connection: sqlite3.Connection) -> str:
+    """Return the SHA-256 of the definitions of all tables, indexes, triggers and views, whatever their white space."""
+    rows = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchall()
+    definitions = sorted(ascii((*row[:3], re.sub(r'[\s"]+', "", str(row[3])))) for row in rows)
+    return hashlib.sha256("\n".join(definitions).encode()).hexdigest()
+
+
+@cache
+def expected_schema(version: int) -> str | None:
+    """Return the `schema_digest` of a catalog of a version; None for an unknown version."""
+    if version != SCHEMA_VERSION:
+        return EARLIER.get(version)
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        METADATA.create_all(create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool))
+        return schema_digest(connection)

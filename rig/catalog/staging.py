@@ -7,16 +7,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Final
 
-INCOMING: Final = "incoming"
+from rig.catalog.places import INCOMING
 
 
 @contextmanager
 def staging(root: Path) -> Iterator[Path]:
     """Yield a new folder, and delete it with its contents at the end. After a kill, `abandoned` finds it."""
     parent = root / INCOMING
-    parent.mkdir(exist_ok=True)
+    parent.mkdir(mode=0o700, exist_ok=True)
     folder = Path(mkdtemp(dir=parent))
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -33,7 +32,9 @@ def abandoned(root: Path) -> Iterator[Path]:
     """Yield the folders of imports whose process no longer runs."""
     parent = root / INCOMING
     for folder in sorted(parent.iterdir()) if parent.is_dir() else ():
-        lock = os.open(folder, os.O_RDONLY)
+        if folder.is_symlink() or not folder.is_dir():
+            continue
+        lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

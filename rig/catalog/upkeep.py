@@ -16,11 +16,10 @@ from hbr.descriptors import descriptor, names
 from rig.catalog import audit, staging
 from rig.catalog.catalog import Catalog
 from rig.catalog.failures import DATABASE_NAME
+from rig.catalog.places import LOST, files_within, image_file
 from rig.catalog.records import EnrollmentStatus
 from rig.catalog.schema import SCHEMA_VERSION, descriptors, enrollments, objects, sessions, views
-
-LOST: Final = "lost+found"
-"""Folder for files that `verify` moves away."""
+from rig.catalog.seal import changing_enrollments
 
 _OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
 
@@ -157,20 +156,19 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
             .where(or_(objects.c.deleted_utc.is_not(None), enrollments.c.status.in_(_OLD if old else ())))
         ).all()
         ids = [row.id for row in unused]
-        files = _files_of(connection, ids)
+        paths = [image_file(catalog.path, name) for name in _files_of(connection, ids)]
         view_count = connection.scalar(select(func.count()).where(views.c.enrollment_id.in_(ids))) or 0
         deleted = tuple(
             connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_not(None)).order_by(objects.c.id))
         )
         if not dry_run:
             _delete_rows(connection, ids)
-    paths = [catalog.path / file for file in files]
     for folder in (catalog.path / LOST, *staging.abandoned(catalog.path)):
-        paths += [path for path in folder.rglob("*") if path.is_file()]
+        paths += files_within(folder)
     size = 0
     for path in paths:
         with suppress(FileNotFoundError):
-            size += path.stat().st_size
+            size += path.lstat().st_size
     collected = GarbageReport(deleted, len(ids), view_count, len(paths), size)
     if not dry_run:
         with catalog.database.catalog_errors():
@@ -203,15 +201,16 @@ def _delete_rows(connection: Connection, ids: Sequence[int]) -> None:
     later = descriptors.alias()
     for name in names():
         version = descriptor(name).version
-        connection.execute(
-            delete(descriptors).where(
-                descriptors.c.name == name,
-                descriptors.c.version < version,
-                select(later.c.view_id)
-                .where(and_(later.c.view_id == descriptors.c.view_id, later.c.name == name, later.c.version == version))
-                .exists(),
-            )
+        replaced = and_(
+            descriptors.c.name == name,
+            descriptors.c.version < version,
+            select(later.c.view_id)
+            .where(and_(later.c.view_id == descriptors.c.view_id, later.c.name == name, later.c.version == version))
+            .exists(),
         )
+        owners = connection.scalars(select(views.c.enrollment_id).join(descriptors).where(replaced).distinct())
+        with changing_enrollments(connection, owners):
+            connection.execute(delete(descriptors).where(replaced))
 
 
 def _remove(root: Path, paths: Sequence[Path]) -> None:

@@ -1,6 +1,8 @@
 """Check whether a catalog is as it was stored: rows, images and descriptors. Repair it on request."""
 
 import json
+import os
+import stat
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -11,18 +13,20 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, delete, null, select, true, update
+from sqlalchemy import Connection, delete, func, null, select, true, update
 
 from hbr.descriptors import PAPERS, Descriptor, descriptor
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import EmptyTable, is_current, region_of, stored_describer
 from rig.catalog.jobs import JobProgress, portions, processes
+from rig.catalog.places import LOST, file_mode, files_within, image_file, lost_file, make_folder_within
 from rig.catalog.queries import packed_descriptors
+from rig.catalog.schema import audit as audit_log
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
-from rig.catalog.upkeep import LOST
+from rig.catalog.seal import enrollment_digests, log_digests, object_digests
 from rig.core.errors import CatalogError, UsageError
-from rig.core.files import make_folder, write
+from rig.core.files import write
 from rig.core.processes import map_in_processes
 from rig.views import image_files as images
 
@@ -48,6 +52,14 @@ class Problem(StrEnum):
     NOT_DESCRIBED = "not described"
     DESCRIPTOR_DIFFERS = "descriptor differs"
     """The stored levels of ``descriptor`` are not those of the image."""
+    OBJECT_CHANGED = "object changed"
+    """Its name, label, note or dates are not those that were stored."""
+    ENROLLMENT_CHANGED = "enrollment changed"
+    """Something that ``enrollment_id`` says of its sessions, views or descriptors is not what was stored."""
+    LOG_CHANGED = "log changed"
+    """Entry ``entry_id`` of the audit log is not the one that was written, or entries before it are missing."""
+    SETTING_CHANGED = "setting changed"
+    """``setting`` of the database is ``found``, not ``stored``."""
     ORPHANED_FILE = "orphaned file"
     """``moved_to``: path after a repair, or None."""
 
@@ -151,8 +163,11 @@ def verify(
     # The files are listed before the rows: an image whose row is committed in the meantime is not an orphan.
     with catalog.database.catalog_errors():
         files = _files(catalog.path)
-    _check_rows(state)
     items, object_count = _items(catalog)
+    for item in items:  # before anything is repaired
+        image_file(catalog.path, item.image)
+    if _check_rows(state):
+        items, object_count = _items(catalog)
 
     yield JobProgress(0, len(items))
     checked: dict[_Item, _Checked] = {}
@@ -169,6 +184,7 @@ def verify(
     _report_sizes(state, checked)
     _report_descriptors(state, checked)
     _report_orphans(state, orphans)
+    _report_digests(state)
     if repair and state.findings:
         repaired = [f"{one.problem}: {one.path}, {one.repair}" for one in state.findings if one.repair is not None]
         catalog.note("verified and repaired", found=len(state.findings), repaired=repaired)
@@ -182,12 +198,14 @@ def verify(
 
 def _files(root: Path) -> set[str]:
     folder = root / images.IMAGE_FOLDER
-    return {path.relative_to(root).as_posix() for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()}
+    return {path.relative_to(root).as_posix() for path in files_within(folder)}
 
 
-def _check_rows(state: _State) -> None:
+def _check_rows(state: _State) -> bool:
+    """Check the structure of the database, and return whether rows were removed."""
+    removed = False
     with state.catalog.database.read() as connection:
-        messages = connection.exec_driver_sql("PRAGMA quick_check(20)").scalars().all()
+        messages = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
     if messages != ["ok"]:
         state.findings += [Finding(Problem.DAMAGED_DATABASE, details={"message": message}) for message in messages]
     transaction = state.catalog.database.write if state.repair else state.catalog.database.read
@@ -205,9 +223,11 @@ def _check_rows(state: _State) -> None:
                     finding = replace(finding, repair=Repair.REMOVED)
                 state.findings.append(finding)
             if not state.repair:
-                return
+                return False
+            removed = True
             if any(rowid is None for _, rowid, _, _ in broken):
                 connection.execute(delete(descriptors).where(descriptors.c.view_id.not_in(select(views.c.id))))
+    return removed
 
 
 def _row(connection: Connection, table: str, rowid: int | None) -> dict[str, Any]:
@@ -261,7 +281,7 @@ def _check_portion(root: Path, quick: bool, portion: tuple[_Item, ...]) -> list[
 
 def _check(root: Path, item: _Item, quick: bool) -> _Checked:
     try:
-        content = (root / item.image).read_bytes()
+        content = images.read_file(root / item.image)
     except OSError as error:
         return _Checked(None, reason=error.strerror or str(error))
     sha256 = images.digest(content)
@@ -321,10 +341,10 @@ def _find_copies(state: _State, checked: Mapping[_Item, _Checked], orphans: Iter
     for item, found in checked.items():
         if found.sha256 is not None:
             state.copies.setdefault(found.sha256, root / item.image)
-    lost = [path for path in (root / LOST).rglob("*") if path.is_file()]
-    for path in [*(root / name for name in orphans), *lost]:
-        if path.is_file() and not path.is_symlink():
-            state.copies.setdefault(images.digest(path.read_bytes()), path)
+    for path in [*(root / name for name in orphans), *files_within(root / LOST)]:
+        with suppress(OSError):
+            if stat.S_ISREG(path.lstat().st_mode):
+                state.copies.setdefault(images.digest(images.read_file(path)), path)
 
 
 def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
@@ -332,7 +352,7 @@ def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
     wrong = {item: found for item, found in checked.items() if found.sha256 != item.sha256}
     copies = {item: state.copies[item.sha256] for item in wrong if item.sha256 in state.copies}
     # Read all before writing any: two images may have been swapped.
-    contents = {item: path.read_bytes() for item, path in copies.items()} if state.repair else {}
+    contents = {item: images.read_file(path) for item, path in copies.items()} if state.repair else {}
     for item, found in checked.items():
         if item not in wrong:
             if found.reason:
@@ -340,10 +360,10 @@ def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
             continue
         repair = None
         if item in contents:
-            make_folder((root / item.image).parent, within=root)
+            make_folder_within(root, (root / item.image).parent)
             if found.sha256 is not None and found.sha256 not in {other.sha256 for other in wrong}:
                 _set_aside(root, item.image)
-            write(root / item.image, contents[item])
+            write(image_file(root, item.image), contents[item], mode=file_mode(root))
             repair = Repair.RESTORED
         copy = copies[item].relative_to(root).as_posix() if item in copies else None
         if found.sha256 is None:
@@ -386,13 +406,50 @@ def _report_descriptors(state: _State, checked: Mapping[_Item, _Checked]) -> Non
             state.findings.append(item.finding(Problem.NOT_DESCRIBED))
 
 
+def _report_digests(state: _State) -> None:
+    """Compare the digests, after the repairs: a repaired row is again the one that was stored."""
+    report = state.findings.append
+    with state.catalog.database.read() as connection:
+        owners = dict(connection.execute(select(enrollments.c.id, objects.c.name).join(objects)).all())
+        names = dict(connection.execute(select(objects.c.id, objects.c.name)).all())
+        for object_id, sealed, found in object_digests(connection):
+            if sealed != found:
+                report(Finding(Problem.OBJECT_CHANGED, names.get(object_id)))
+        for enrollment_id, sealed, found in enrollment_digests(connection):
+            if sealed != found:
+                details = {"enrollment_id": enrollment_id}
+                report(Finding(Problem.ENROLLMENT_CHANGED, owners.get(enrollment_id), details=details))
+        entry_ids = [0]
+        for entry_id, sealed, found in log_digests(connection):
+            entry_ids.append(entry_id)
+            if sealed != found:
+                report(Finding(Problem.LOG_CHANGED, details={"entry_id": entry_id}))
+        given = {
+            row[0]: row[1]
+            for row in connection.exec_driver_sql("SELECT name, CAST(seq AS INTEGER) FROM sqlite_sequence")
+        }
+        if given.get(audit_log.name, 0) != entry_ids[-1]:
+            report(Finding(Problem.LOG_CHANGED, details={"entry_id": given.get(audit_log.name)}))
+        for table in (objects, enrollments, sessions, views):
+            last = connection.scalar(select(func.max(table.c.id))) or 0
+            if table.kwargs.get("sqlite_autoincrement") and last > given.get(table.name, 0):
+                report(_changed(f"last id of {table.name}", given.get(table.name), last))
+        journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
+        if journal not in ("wal", "off"):  # off: opened without permission to write
+            report(_changed("journal", journal, "wal"))
+
+
+def _changed(setting: str, found: object, stored: object) -> Finding:
+    return Finding(Problem.SETTING_CHANGED, details={"setting": setting, "found": found, "stored": stored})
+
+
 def _report_orphans(state: _State, orphans: Iterable[str]) -> None:
     root = state.catalog.path
     for name in orphans:
         repair = moved_to = None
         if state.repair:
             with state.catalog.database.write() as connection:
-                if name in _referenced(connection) or not (root / name).is_file():
+                if name in _referenced(connection) or not os.path.lexists(root / name):
                     continue
                 moved_to = _set_aside(root, name)
             repair = Repair.MOVED
@@ -400,10 +457,10 @@ def _report_orphans(state: _State, orphans: Iterable[str]) -> None:
 
 
 def _set_aside(root: Path, name: str) -> str:
-    target = root / LOST / name
-    make_folder(target.parent, within=root)
+    target = lost_file(root, name)
+    make_folder_within(root, target.parent)
     number = 1
-    while target.exists():
+    while os.path.lexists(target):
         target = target.with_name(f"{Path(name).stem}-{number}{Path(name).suffix}")
         number += 1
     (root / name).rename(target)

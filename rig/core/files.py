@@ -4,8 +4,9 @@ import json
 import os
 import stat
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 MAX_SINGLE_SYNCS: Final = 100
 """Up to this number, files are synchronised one by one, without waiting for other programs' data."""
@@ -48,11 +49,11 @@ def _reject_constant(name: str) -> None:
     raise ValueError(f"{name} is not a number in JSON")
 
 
-def write(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all; on return it is on the disk."""
+def write(path: Path, content: bytes, *, mode: int = 0o666) -> None:
+    """Write a file completely or not at all; on return it is on the disk. The umask limits its ``mode``."""
     temporary = path.with_name(f"{path.name}.part")
     try:
-        with temporary.open("wb") as file:
+        with open_new(temporary, mode=mode) as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -62,6 +63,23 @@ def write(path: Path, content: bytes) -> None:
             temporary.unlink()
         raise
     sync_folder(path.parent)
+
+
+def open_new(path: Path, *, mode: int = 0o666) -> BinaryIO:
+    """Open a file of the program's own for writing, empty.
+
+    What was put under its name to write elsewhere (a link, a second name of a file) or to block (a pipe) is removed.
+    """
+    with suppress(FileNotFoundError):
+        found = path.lstat()
+        if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+            path.unlink()
+    return open(path, "wb", opener=partial(no_follow, mode=mode))
+
+
+def no_follow(path: str, flags: int, *, mode: int = 0o666) -> int:
+    """Open a file, but not through a link: an ``opener`` for `open`."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
 
 
 def sync_folder(path: Path) -> None:
@@ -88,9 +106,11 @@ def sync_tree(folder: Path) -> None:
         sync_file(path)
 
 
-def make_folder(path: Path, *, within: Path) -> None:
+def make_folder(path: Path, *, within: Path, mode: int = 0o777) -> None:
     """Create ``path`` and the folders between it and ``within``, and return when their names are on the disk."""
-    path.mkdir(parents=True, exist_ok=True)
+    for folder in reversed([path, *path.parents]):
+        if folder.is_relative_to(within):
+            folder.mkdir(mode=mode, exist_ok=True)
     for above in path.parents:
         sync_folder(above)
         if above == within:

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from rig.core import files
 from rig.core.clock import Clock
 from rig.core.errors import BenchBusy, RigError, StateNotStored, os_errors_as
+from rig.core.files import no_follow
 
 VERSION = 2
 """Version 1 has neither the settings of the table nor the file of the latched fault."""
@@ -294,7 +295,7 @@ class BenchLock:
     def __init__(self, path: Path, clock: Clock) -> None:
         with _storing(path / "lock"):
             _make_folder(path)
-            self._file: TextIO = (path / "lock").open("a+", encoding="utf-8")
+            self._file: TextIO = open(path / "lock", "a+", encoding="utf-8", opener=no_follow)  # noqa: SIM115
         for attempt in range(LOCK_ATTEMPTS):
             if _try_lock(self._file):
                 break
@@ -326,7 +327,7 @@ def holder(path: Path) -> Holder | None:
     The name of a killed program does not count, because its lock is gone. A holder whose name is not known has pid 0.
     """
     try:
-        with (path / "lock").open("r", encoding="utf-8") as file:
+        with open(path / "lock", encoding="utf-8", opener=no_follow) as file:
             if _try_lock(file):
                 return None
             text = file.read()

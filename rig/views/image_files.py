@@ -57,6 +57,11 @@ def encode(image_bgr: NDArray[np.uint8]) -> bytes:
     return png.tobytes()
 
 
+def read_file(path: Path) -> bytes:
+    """Return the bytes of an image file. An `OSError` says why it cannot be read, or that it is too large."""
+    return files.read(path, max_bytes=MAX_FILE_BYTES)
+
+
 def digest(png: bytes) -> str:
     """Return the SHA-256 of an image file, 64 hexadecimal digits."""
     return hashlib.sha256(png).hexdigest()
@@ -133,7 +138,7 @@ def read(path: Path, sha256: str) -> NDArray[np.uint8]:
     """
     fix = "run rig catalog verify --repair to find a copy; otherwise enroll the object again with --replace"
     try:
-        content = files.read(path, max_bytes=MAX_FILE_BYTES)
+        content = read_file(path)
     except FileNotFoundError as error:
         raise CatalogError(f"the image {path} is missing", next_step=fix) from error
     except OSError as error:

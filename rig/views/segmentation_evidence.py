@@ -77,6 +77,23 @@ class SegmentationSummary:
         )
 
 
+def check_evidence(evidence: object) -> None:
+    """Raise TypeError if a JSON value is not segmentation evidence, so that a reader would fail on it."""
+    if not isinstance(evidence, Mapping) or not isinstance(evidence.get("issues", []), list):
+        raise TypeError("the evidence of a segmentation that is not one")
+    for issue in evidence.get("issues", []):
+        if not isinstance(issue, Mapping) or not isinstance(issue.get("code"), str):
+            raise TypeError("the evidence of a segmentation with an issue without a code")
+    for name, length in (("box_px", 4), ("gains_bgr", 3)):
+        numbers = evidence.get(name)
+        if numbers is not None and not (
+            isinstance(numbers, list | tuple)
+            and len(numbers) == length
+            and all(isinstance(number, int | float) for number in numbers)
+        ):
+            raise TypeError(f"the evidence of a segmentation whose {name} is not {length} numbers")
+
+
 _OLD: Final = {
     re.compile(pattern): code
     for pattern, code in {

@@ -4,11 +4,20 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
-from pydantic import AliasChoices, AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    AliasChoices,
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
 
 from rig.catalog.describing import region_of, unpack
 from rig.catalog.records import (
@@ -20,13 +29,25 @@ from rig.catalog.records import (
     check_text,
     clean_name,
 )
-from rig.core.errors import UsageError
-from rig.views.segmentation_evidence import upgrade_evidence
+from rig.core.errors import RigError, UsageError
+from rig.views.segmentation_evidence import check_evidence, upgrade_evidence
 
 Degrees = Annotated[float, Field(allow_inf_nan=False)]
 Azimuth = Annotated[float, Field(ge=0, lt=360)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Json = dict[str, Any]
+
+
+def in_utc(time: datetime) -> datetime:
+    """Return a time in UTC. ValueError if it is beyond the calendar there."""
+    try:
+        return time.astimezone(UTC)
+    except OverflowError as error:
+        raise ValueError("a time beyond the calendar") from error
+
+
+Time = Annotated[AwareDatetime, AfterValidator(in_utc)]
+Integer = Annotated[int, Field(strict=True)]
 
 MAX_VIEWS = 10_000
 """Most views of one enrollment: one every 0.036°."""
@@ -52,13 +73,17 @@ class BundledDescriptor(_Part):
     """A `PackedDescriptor` in JSON: ``packed`` as hexadecimal digits."""
 
     name: Annotated[str, Field(min_length=1, max_length=100)]
-    version: Annotated[int, Field(ge=1)]
+    version: Annotated[Integer, Field(ge=1)]
     settings: Json
     packed: Annotated[str, Field(pattern=r"^([0-9a-f]{2})+$", max_length=100_000)]
 
     @model_validator(mode="after")
     def _is_valid(self) -> Self:
-        unpack([self.as_packed()])
+        try:
+            unpack([self.as_packed()])
+            region_of(self.settings)
+        except RigError as error:
+            raise ValueError(error.what) from error
         as_json(self.settings, "the settings of a descriptor")
         return self
 
@@ -69,18 +94,18 @@ class BundledDescriptor(_Part):
 class View(_Part):
     """A view; ``image`` is the path of its image in the bundle, ``session`` the index of its session."""
 
-    index: Annotated[int, Field(ge=0, lt=MAX_VIEWS)]
-    session: Annotated[int, Field(ge=0)] = Field(validation_alias=AliasChoices("session", "sitting"))
+    index: Annotated[Integer, Field(ge=0, lt=MAX_VIEWS)]
+    session: Annotated[Integer, Field(ge=0)] = Field(validation_alias=AliasChoices("session", "sitting"))
     azimuth_deg: Azimuth
     commanded_deg: Degrees | None = None
     encoder_deg: Degrees | None = None
     imu_deg: Degrees | None = None
     imu_sigma_deg: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
-    captured_utc: AwareDatetime | None = None
-    captured_ns: Annotated[int, Field(ge=-(2**63), lt=2**63)] | None = None
+    captured_utc: Time | None = None
+    captured_ns: Annotated[Integer, Field(ge=-(2**63), lt=2**63)] | None = None
     image: str
     image_sha256: Sha256 | None = None
-    image_bytes: Annotated[int, Field(ge=1)] | None = None
+    image_bytes: Annotated[Integer, Field(ge=1)] | None = None
     evidence: Json = {}
     segmentation: Json | None = Field(default=None, validation_alias=AliasChoices("segmentation", "front_end"))
     descriptors: tuple[BundledDescriptor, ...] = ()
@@ -88,7 +113,14 @@ class View(_Part):
     @field_validator("segmentation")
     @classmethod
     def _has_codes(cls, segmentation: Json | None) -> Json | None:
-        return None if segmentation is None else upgrade_evidence(segmentation)
+        if segmentation is None:
+            return None
+        try:
+            upgraded = upgrade_evidence(segmentation)
+            check_evidence(upgraded)
+        except TypeError as error:
+            raise ValueError(str(error)) from error
+        return upgraded
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
@@ -104,7 +136,7 @@ class View(_Part):
 class Session(_Part):
     """A session: `rig.catalog.Session` in JSON."""
 
-    started_utc: AwareDatetime
+    started_utc: Time
     bench: str
     software: str
     devices: Json = {}
@@ -126,8 +158,8 @@ class Enrollment(_Part):
     """An enrollment with its sessions and views."""
 
     status: EnrollmentStatus
-    started_utc: AwareDatetime
-    finished_utc: AwareDatetime | None = None
+    started_utc: Time
+    finished_utc: Time | None = None
     planned_azimuth_deg: Annotated[tuple[Azimuth, ...], Field(min_length=1, max_length=MAX_VIEWS)]
     sessions: Annotated[tuple[Session, ...], Field(max_length=MAX_VIEWS)] = Field(
         validation_alias=AliasChoices("sessions", "sittings")
@@ -158,7 +190,7 @@ class Object(_Part):
     name: str
     label: str = ""
     note: str = ""
-    created_utc: AwareDatetime
+    created_utc: Time
     enrollments: Annotated[tuple[Enrollment, ...], Field(max_length=MAX_VIEWS)]
 
     @field_validator("name")

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from rig.catalog.exchange.batch import ExportedObject, ImageSource, ImportBatch, Object
 from rig.core.errors import ExportFailed, ImportRejected, RigError
-from rig.core.files import sync_file, sync_folder
+from rig.core.files import open_new, sync_file, sync_folder
 from rig.views import image_files as images
 
 SUFFIX: Final = ".rigcat.zip"
@@ -92,7 +92,7 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
         raise ExportFailed(f"{path} exists already", next_step="give another name, or remove it")
     part = path.with_name(f"{path.name}.part")
     try:
-        with part.open("wb") as file:
+        with open_new(part) as file:
             yield file
         sync_file(part)
         part.replace(path)
@@ -111,7 +111,7 @@ def read_stored(path: Path, sha256: str | None) -> bytes:
     """Return the bytes of an image of the catalog. `ExportFailed` if it is not the stored one."""
     fix = "check the catalog: rig catalog verify --repair"
     try:
-        content = path.read_bytes()
+        content = images.read_file(path)
     except OSError as error:
         raise ExportFailed(f"the image {path} cannot be read: {error.strerror}", next_step=fix) from error
     if images.digest(content) != sha256:
@@ -213,7 +213,9 @@ def _objects(path: Path, archive: ZipFile, members: dict[str, ZipInfo]) -> tuple
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise rejected(path, f"its {MANIFEST} is not the manifest of a bundle")
     version = manifest.get("version")
-    if not isinstance(version, int) or version > VERSION:
+    if type(version) is not int or version < 1:
+        raise rejected(path, f"its format has version {version!r:.40}")
+    if version > VERSION:
         raise ImportRejected(
             f"{path} was written by a newer program: its format has version {version}, this program knows {VERSION}",
             next_step="update hbr-rig on this computer",

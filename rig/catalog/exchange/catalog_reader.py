@@ -16,9 +16,11 @@ from rig.catalog.exchange.batch import (
     Session,
     View,
 )
+from rig.catalog.places import image_file
 from rig.catalog.queries import find, packed_descriptors
 from rig.catalog.rows import measured
 from rig.catalog.schema import enrollments, objects, sessions, views
+from rig.catalog.seal import check_loaded
 from rig.views import image_files as images
 
 
@@ -44,6 +46,8 @@ def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Iterator[Expo
         enrollment_numbers = iter(range(1, 1 << 62))
         rows = connection.execute(select(objects).where(*wanted).order_by(objects.c.id)).all()
         for number, row in enumerate(rows, start=1):
+            theirs = select(enrollments.c.id).where(enrollments.c.object_id == row.id)
+            check_loaded(connection, [row.id], list(connection.scalars(theirs)))
             files: dict[str, Path] = {}
             found = []
             for enrollment in connection.execute(
@@ -85,7 +89,7 @@ def _sessions(
         exported = None
         if row.empty_table_image is not None:
             exported = (folder / f"empty-{number:03d}{Path(row.empty_table_image).suffix}").as_posix()
-            files[exported] = root / row.empty_table_image
+            files[exported] = image_file(root, row.empty_table_image)
         columns = {name: getattr(row, name) for name in Session.model_fields}
         found[row.id] = Session(**(columns | {"empty_table_image": exported}))
     return found
@@ -103,7 +107,7 @@ def _views(
     packed = packed_descriptors(connection, of_enrollment)
     for row in connection.execute(select(views).where(of_enrollment).order_by(views.c.view_index)).all():
         exported = (folder / f"{row.view_index:03d}{Path(row.image).suffix}").as_posix()
-        files[exported] = root / row.image
+        files[exported] = image_file(root, row.image)
         yield View(
             index=row.view_index,
             session=session_ids.index(row.session_id),

@@ -13,12 +13,21 @@ from rig.catalog.database import insert_row
 from rig.catalog.exchange.batch import Enrollment, Object
 from rig.catalog.exchange.plan import Plan, make_plan, names_in_use
 from rig.catalog.exchange.stage import StagedImage
+from rig.catalog.places import image_file, lost_file, make_folder_within
 from rig.catalog.queries import in_use
 from rig.catalog.records import EnrollmentStatus, ImageFile, Provenance
-from rig.catalog.rows import NewView, abandon_unfinished, insert_session, insert_views, measured, supersede
+from rig.catalog.rows import (
+    NewView,
+    abandon_unfinished,
+    insert_session,
+    insert_views,
+    measured,
+    supersede,
+    unfinished_and_complete,
+)
 from rig.catalog.schema import enrollments, objects
-from rig.catalog.upkeep import LOST
-from rig.core.files import make_folder, sync_folder
+from rig.catalog.seal import changing_enrollments, seal_enrollments, seal_objects
+from rig.core.files import sync_folder
 from rig.views import image_files as images
 
 
@@ -84,12 +93,14 @@ class _Inserter:
                 note=item.note,
                 created_utc=item.created_utc,
             )
+            seal_objects(connection, [object_id])
         else:
             statuses = {enrollment.status for enrollment in item.enrollments}
-            if EnrollmentStatus.COMPLETE in statuses:
-                supersede(connection, object_id)
-            if EnrollmentStatus.IN_PROGRESS in statuses:
-                abandon_unfinished(connection, object_id, self.catalog.clock.utc())
+            with changing_enrollments(connection, unfinished_and_complete(connection, object_id)):
+                if EnrollmentStatus.COMPLETE in statuses:
+                    supersede(connection, object_id)
+                if EnrollmentStatus.IN_PROGRESS in statuses:
+                    abandon_unfinished(connection, object_id, self.catalog.clock.utc())
         for enrollment in item.enrollments:
             self._insert_enrollment(connection, object_id, item.name, enrollment)
 
@@ -119,6 +130,7 @@ class _Inserter:
             image = self._image_file(view.image, target)
             new.append(NewView(view.index, columns, session_ids[view.session], view.captured_utc, image, packed))
         insert_views(connection, enrollment_id, new)
+        seal_enrollments(connection, [enrollment_id])
 
     def _image_file(self, name: str, target: Path) -> ImageFile:
         one = self.staged[name]
@@ -126,11 +138,12 @@ class _Inserter:
 
     def _move(self, source: Path, target: Path) -> None:
         root = self.catalog.path
-        make_folder((root / target).parent, within=root)
-        if (root / target).exists():  # left by an import that was killed before its commit: no row refers to it
-            aside = root / LOST / target
-            make_folder(aside.parent, within=root)
+        place = image_file(root, target.as_posix())
+        make_folder_within(root, place.parent)
+        if place.exists():  # left by an import that was killed before its commit: no row refers to it
+            aside = lost_file(root, target.as_posix())
+            make_folder_within(root, aside.parent)
             shutil.rmtree(aside, ignore_errors=True)
-            (root / target).rename(aside)
-        source.rename(root / target)
-        self.moved.append((source, root / target))
+            place.rename(aside)
+        source.rename(place)
+        self.moved.append((source, place))

@@ -11,9 +11,11 @@ from zipfile import BadZipFile, ZipFile
 from rig.catalog.describing import pack
 from rig.catalog.exchange.batch import ImageSource
 from rig.catalog.exchange.plan import Plan
+from rig.catalog.places import file_mode, folder_mode
 from rig.catalog.records import PackedDescriptor, Region
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
+from rig.core.files import open_new
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
 
@@ -69,10 +71,11 @@ def items_of(plan: Plan, descriptors: tuple[str, ...] = ()) -> Iterator[Item]:
 
 def stage(root: Path | None, portion: tuple[Item, ...]) -> list[StagedImage]:
     """Check images; if ``root`` is not None, copy them there and describe them. Runs in a worker process."""
-    return [_stage_one(root, item) for item in portion]
+    mode = 0 if root is None else file_mode(root.parent.parent)  # of the catalog that the images will belong to
+    return [_stage_one(root, item, mode) for item in portion]
 
 
-def _stage_one(root: Path | None, item: Item) -> StagedImage:
+def _stage_one(root: Path | None, item: Item, mode: int) -> StagedImage:
     try:
         content = _read(item.source)
         image = images.decode(content)
@@ -97,11 +100,9 @@ def _stage_one(root: Path | None, item: Item) -> StagedImage:
         packed = pack(described.levels, item.region)
         segmentation = described.segmentation
     file = f"{item.folder}/{item.stem}{images.suffix(content)}"
-    try:
-        (root / file).write_bytes(content)
-    except FileNotFoundError:
-        (root / item.folder).mkdir(exist_ok=True)
-        (root / file).write_bytes(content)
+    (root / item.folder).mkdir(mode=folder_mode(mode), exist_ok=True)
+    with open_new(root / file, mode=mode) as staged:
+        staged.write(content)
     return StagedImage(file, sha256, len(content), tuple(packed), segmentation)
 
 

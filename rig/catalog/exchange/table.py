@@ -18,6 +18,7 @@ from rig.catalog.exchange.batch import (
     RejectedFile,
     View,
     assemble,
+    in_utc,
     parse_region,
     region_of_view,
     region_text,
@@ -184,6 +185,7 @@ def _photograph(row: Mapping[str, str | None], folder: Path) -> Photograph:
         values["captured_utc"] = datetime.fromisoformat(texts["captured_utc"])
         if values["captured_utc"].tzinfo is None:
             raise ValueError(f"captured_utc {texts['captured_utc']} has no time zone")
+        values["captured_utc"] = in_utc(values["captured_utc"])
     azimuth_deg = _number(texts["azimuth_deg"], "azimuth_deg")
     return Photograph(
         path,

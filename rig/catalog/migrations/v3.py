@@ -1,7 +1,7 @@
 """Rename sittings to sessions, reference images to empty-table images, and front_end to segmentation.
 
 The tables are rebuilt as in step 2, so that the names of their constraints change, too. The sentences of a segmentation
-become codes.
+become codes. Objects, enrollments and the audit log get digests.
 """
 
 import json
@@ -10,6 +10,8 @@ from typing import Final
 
 from alembic import op
 
+from rig.catalog.schema import APPEND_ONLY
+from rig.catalog.seal import seal_enrollments, seal_log, seal_objects
 from rig.views.segmentation_evidence import upgrade_evidence
 
 revision = "3"
@@ -44,3 +46,12 @@ def upgrade() -> None:
     for view_id, segmentation in stored:
         converted = json.dumps(upgrade_evidence(json.loads(segmentation)))
         connection.exec_driver_sql("UPDATE views SET segmentation = ? WHERE id = ?", (converted, view_id))
+    for trigger in ("audit_no_update", "audit_no_delete"):
+        connection.exec_driver_sql(f"DROP TRIGGER {trigger}")
+    for table in ("objects", "enrollments", "audit"):
+        connection.exec_driver_sql(f"ALTER TABLE {table} ADD COLUMN digest VARCHAR(64)")
+    for trigger in APPEND_ONLY:
+        connection.exec_driver_sql(trigger)
+    seal_objects(connection, None)
+    seal_enrollments(connection, None)
+    seal_log(connection)

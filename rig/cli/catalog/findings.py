@@ -30,6 +30,14 @@ def _evidence(finding: "Finding") -> list[str]:
         case Problem.SIZES_DIFFER:
             size, first = ("{} x {}".format(*details[key]) for key in ("size_px", "first_size_px"))
             return [f"{size} pixels, the first view of its enrollment has {first}"]
+        case Problem.OBJECT_CHANGED:
+            return ["its name, label, note or dates are not those that were stored"]
+        case Problem.ENROLLMENT_CHANGED:
+            return [f"something in enrollment {details['enrollment_id']} is not what was stored"]
+        case Problem.LOG_CHANGED:
+            return [f"entry {details['entry_id']} of the log is not the one that was written, or one before is missing"]
+        case Problem.SETTING_CHANGED:
+            return [f"the {details['setting']} is {details['found']}, not {details['stored']}"]
         case Problem.DESCRIPTOR_DIFFERS:
             return [f"the stored {details['descriptor']} is not that of the image"]
         case _:
@@ -40,7 +48,9 @@ def _fix(finding: "Finding") -> str:
     from rig.catalog.verify import Problem
 
     match finding.problem:
-        case Problem.DAMAGED_DATABASE:
+        case Problem.OBJECT_CHANGED | Problem.ENROLLMENT_CHANGED:
+            return "restore the database from a backup, or delete the object and enroll it again"
+        case Problem.DAMAGED_DATABASE | Problem.LOG_CHANGED | Problem.SETTING_CHANGED:
             return "restore it from a backup"
         case Problem.MISSING_IMAGE | Problem.CHANGED_IMAGE:
             if copy := finding.details["copy"]:

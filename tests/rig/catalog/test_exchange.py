@@ -41,7 +41,7 @@ from rig.catalog.exchange import (
     write_table,
 )
 from rig.catalog.exchange.bundle import MANIFEST, OBJECTS
-from rig.catalog.upkeep import LOST
+from rig.catalog.places import LOST
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ExportFailed, ImportRejected, ObjectExists, UsageError
 from rig.views import image_files as images

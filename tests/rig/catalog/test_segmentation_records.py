@@ -22,6 +22,7 @@ from rig.catalog.exchange import (
 )
 from rig.catalog.redescribe import redescribe
 from rig.catalog.schema import descriptors
+from rig.catalog.seal import changing_enrollments
 from rig.catalog.verify import Problem, verify
 from rig.config import ViewConfig
 from rig.core.clock import SystemClock
@@ -150,7 +151,7 @@ def test_verify_tolerates_rounded_levels(
     off = catalog.views(BENCH_DESCRIPTOR).views.descriptors[0].copy()
     entries = np.arange(levels)
     off[entries] = np.where(off[entries] >= 2, off[entries] - step, off[entries] + step)
-    with catalog.database.write() as connection:
+    with catalog.database.write() as connection, changing_enrollments(connection, [1]):
         connection.execute(
             update(descriptors)
             .where(descriptors.c.view_id == 1, descriptors.c.name == BENCH_DESCRIPTOR)

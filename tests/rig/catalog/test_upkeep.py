@@ -16,11 +16,12 @@ from hbr.descriptors.plain_cedd import Cedd
 from rig.catalog import Catalog
 from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelete
 from rig.catalog.redescribe import redescribe
+from rig.catalog.seal import seal_enrollments
 from rig.catalog.staging import staging
 from rig.catalog.upkeep import collect_garbage, statistics
 from rig.catalog.verify import Problem, Verification, verify
 from rig.cli.catalog.findings import finding_text
-from rig.core.errors import CatalogError, DescriptorOutdated, ObjectExists, ObjectNotFound, UsageError
+from rig.core.errors import CatalogDamaged, CatalogError, DescriptorOutdated, ObjectExists, ObjectNotFound, UsageError
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
     PROVENANCE,
@@ -300,18 +301,22 @@ class TestVerify:
     def test_wrong_descriptor_is_computed_again(self, catalog: Catalog) -> None:
         sql(catalog, "UPDATE descriptors SET packed = zeroblob(54) WHERE view_id IN (2, 5)")
         found = finished(verify(catalog))
-        assert problems(found) == [Problem.DESCRIPTOR_DIFFERS] * 2
-        assert [finding.object_name for finding in found.findings] == ["mug", "tin"]
+        assert problems(found) == [Problem.DESCRIPTOR_DIFFERS] * 2 + [Problem.ENROLLMENT_CHANGED] * 2
+        assert [finding.object_name for finding in found.findings] == ["mug", "tin"] * 2
         assert len(self.repaired(catalog)) == 2
 
     def test_view_without_descriptor_is_described_within_its_region(self, catalog: Catalog) -> None:
         before = catalog.views().views.descriptors
         sql(catalog, "DELETE FROM descriptors WHERE view_id = 4")
-        assert problems(finished(verify(catalog))) == [Problem.NOT_DESCRIBED]
+        assert problems(finished(verify(catalog))) == [Problem.NOT_DESCRIBED, Problem.ENROLLMENT_CHANGED]
         sql(catalog, """UPDATE sessions SET conditions = '{"view": {"roi": [2, 0, 12, 12]}}' WHERE id = 2""")
         with pytest.raises(DescriptorOutdated, match="'tin'"):
             catalog.views()
         assert finished(redescribe(catalog)).described == 1
+        with pytest.raises(CatalogDamaged, match="'tin'"):  # its session was changed
+            catalog.views()
+        with catalog.database.write() as connection:
+            seal_enrollments(connection, None)
         assert np.array_equal(catalog.views().views.descriptors, before)
 
     def test_orphaned_rows_are_recorded_in_the_log(self, catalog: Catalog) -> None:
@@ -424,4 +429,4 @@ def test_unknown_settings_are_reported(catalog: Catalog) -> None:
         catalog.object("mug")
     assert "redescribe" in error.value.next_step
     values: dict[str, Any] = {"jobs": 1}
-    assert problems(finished(verify(catalog, **values))) == [Problem.DESCRIPTOR_DIFFERS]
+    assert problems(finished(verify(catalog, **values))) == [Problem.DESCRIPTOR_DIFFERS, Problem.ENROLLMENT_CHANGED]

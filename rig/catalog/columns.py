@@ -1,0 +1,211 @@
+"""Types of the columns of a catalog. A value that this program would not have stored is damage, not data.
+
+Every reader gets its values through these types. A damaged or hostile database ends in a `CatalogDamaged`.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import PurePosixPath
+from typing import Any
+
+from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Float, Integer, LargeBinary, String, Text, TypeDecorator
+from sqlalchemy.types import TypeEngine
+
+from rig.catalog.records import EnrollmentStatus
+from rig.core.errors import CatalogDamaged
+from rig.views.image_files import IMAGE_FOLDER
+from rig.views.segmentation_evidence import check_evidence
+
+FIX = "use a backup of the catalog; if it came from somebody else, ask for an export (rig export) instead"
+
+
+def damaged(what: str, found: object) -> CatalogDamaged:
+    """Return the error for a value that this program would not have stored."""
+    shown = ascii(found)
+    return CatalogDamaged(
+        f"the catalog is damaged: {what} is {shown if len(shown) <= 80 else shown[:79] + '…'}", next_step=FIX
+    )
+
+
+def image_path(name: str) -> str:
+    """Return the path of an image as it is recorded. ValueError if it does not stay within ``images/``."""
+    pure = PurePosixPath(name)
+    parts = name.split("/")
+    if pure.is_absolute() or parts[0] != IMAGE_FOLDER or len(parts) < 2 or {"", ".", ".."} & set(parts):
+        raise ValueError("an image path that leads out of the catalog")
+    if "\0" in name or "\\" in name:
+        raise ValueError("an image path with characters that this program does not use")
+    return name
+
+
+class _Checked(TypeDecorator[Any]):
+    """A column whose values are checked when they are read; NULL is left to the definition of the column."""
+
+    def __init_subclass__(cls) -> None:
+        cls.cache_ok = True  # SQLAlchemy does not inherit it
+
+    def check(self, value: Any) -> None:
+        """Raise ValueError or TypeError for a value that this program would not have stored."""
+        raise NotImplementedError
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[Any], Any]:
+        convert = super().result_processor(dialect, coltype)
+        check = self.check
+
+        def process(value: Any) -> Any:
+            if value is None:
+                return None
+            try:
+                found = value if convert is None else convert(value)
+                check(found)
+            except (ValueError, TypeError, OverflowError, RecursionError, AttributeError) as error:
+                raise damaged(str(error) or "a value", value) from error
+            return found
+
+        return process
+
+
+class Utc(_Checked):
+    """Time with a time zone, stored as UTC. SQLite itself would drop the zone."""
+
+    impl = DateTime
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
+        return value if value is None else value.astimezone(UTC).replace(tzinfo=None)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
+        return value if value is None else value.replace(tzinfo=UTC)
+
+    def check(self, value: Any) -> None:
+        pass  # the conversion has checked it
+
+
+class Words(_Checked):
+    """Text."""
+
+    impl = Text
+
+    def check(self, value: Any) -> None:
+        _is(value, str)
+
+
+class Name(_Checked):
+    """Text of limited length."""
+
+    impl = String
+
+    def check(self, value: Any) -> None:
+        _is(value, str)
+
+
+class Status(_Checked):
+    """An `EnrollmentStatus`."""
+
+    impl = Text
+
+    def check(self, value: Any) -> None:
+        EnrollmentStatus(value)
+
+
+class ImagePath(_Checked):
+    """Path of an image, relative to the catalog, within ``images/``.
+
+    `rig.catalog.places` makes it a file, and checks that no link leads out.
+    """
+
+    impl = Text
+
+    def check(self, value: Any) -> None:
+        _is(value, str)
+        image_path(value)
+
+
+class Number(_Checked):
+    """A finite number."""
+
+    impl = Float
+
+    def check(self, value: Any) -> None:
+        _is_number(value)
+
+
+class Count(_Checked):
+    """An integer."""
+
+    impl = Integer
+
+    def check(self, value: Any) -> None:
+        _is(value, int)
+
+
+class Nanoseconds(Count):
+    """An integer of 64 bits."""
+
+    impl = BigInteger
+
+
+class Bytes(_Checked):
+    """Bytes."""
+
+    impl = LargeBinary
+
+    def check(self, value: Any) -> None:
+        _is(value, bytes)
+
+
+class _Json(_Checked):
+    impl = JSON
+
+    def coerce_compared_value(self, op: Any, value: Any) -> TypeEngine[Any]:
+        return self.impl_instance.coerce_compared_value(op, value)
+
+
+class JsonMapping(_Json):
+    """A JSON object."""
+
+    def check(self, value: Any) -> None:
+        _is(value, dict)
+
+
+class SegmentationEvidence(_Json):
+    """The evidence of a segmentation as JSON."""
+
+    def check(self, value: Any) -> None:
+        check_evidence(value)
+
+
+class Azimuths(_Json):
+    """A list of azimuths as JSON."""
+
+    def check(self, value: Any) -> None:
+        _is(value, list)
+        for azimuth_deg in value:
+            _is_number(azimuth_deg)
+
+
+def parse_mapping(text: str) -> Mapping[str, Any]:
+    """Return a JSON object from the text of a column.
+
+    Raises
+    ------
+    CatalogDamaged
+        It is not one.
+    """
+    try:
+        found = json.loads(text)
+        _is(found, dict)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise damaged("a text that should be a JSON object", text) from error
+    return dict(found)
+
+
+def _is(value: object, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"a value that should be of type {kind.__name__}")
+
+
+def _is_number(value: object) -> None:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        raise ValueError("a value that should be a finite number")
