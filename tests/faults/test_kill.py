@@ -14,7 +14,7 @@ from tests.faults.fault_runs import NAME, check_stored, enrolled, enrollment, ne
 from tests.faults.killed_enrollments import VIEWS
 
 
-@pytest.mark.parametrize("kills", [16, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
+@pytest.mark.parametrize("kills", [10, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
 def test_killed_enrollment_keeps_reported_views_and_resumes(tmp_path: Path, kills: int) -> None:
     done = subprocess.run(
         [sys.executable, killed_enrollments.__file__, str(tmp_path), str(kills), "1"],

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 from rig.cli.main import app
 
 SETTINGS = (
-    *("enroll.views=12", "identify.max_views=4"),
+    *("enroll.views=8", "identify.max_views=4"),
     *("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]"),
 )
-SMALL = ("--count", "3", *(word for setting in SETTINGS for word in ("--set", setting)))
+SMALL = ("--count", "2", *(word for setting in SETTINGS for word in ("--set", setting)))
 
 
 def demo(*arguments: str):
@@ -57,7 +57,7 @@ def test_demo_enrolls_and_finds_objects_and_recognizes_unknown_ones(small):
         assert leader
         assert 0 < float(percent) < 100
     assert text.count("(not enrolled)") == 2
-    assert "3 objects enrolled with 36 views" in text
+    assert "2 objects enrolled with 16 views" in text
 
 
 def test_demo_leaves_only_the_report(small):
@@ -74,8 +74,8 @@ def test_report_depends_on_nothing_but_the_seed(small, in_json, tmp_path):
 
 def test_json_is_one_object_with_every_trial(in_json):
     result = json.loads(in_json[0].stdout)
-    assert result["enrolled"] == 3
-    assert len(result["trials"]) == 5
+    assert result["enrolled"] == 2
+    assert len(result["trials"]) == 4
     assert result["found"] == sum(t["right"] for t in result["trials"] if t["enrolled"])
 
 

@@ -19,7 +19,7 @@ from sim.objects.shelf import CONFUSABLE, shelf
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 VIEWS = 9
-NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:12]
+NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:8]
 SMALL = f"""\
 default_bench = "sim"
 [catalog]
@@ -88,20 +88,20 @@ def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
 
 @pytest.mark.timeout(300)  # four processes in a row, on a busy machine
 def test_tray_is_enrolled_with_two_interruptions_and_identified(folder):
-    first, code, errors = enroll_until(folder, 3 * VIEWS + 3, signal.SIGINT)
+    first, code, errors = enroll_until(folder, 2 * VIEWS + 3, signal.SIGINT)
     assert code == 130
     assert "rig enroll --list tray.csv" in errors
-    second, code, _ = enroll_until(folder, 4 * VIEWS + 2, signal.SIGKILL)
+    second, code, _ = enroll_until(folder, 2 * VIEWS + 2, signal.SIGKILL)
     assert code == -signal.SIGKILL
     third, code, errors = enroll_until(folder, 0, None)
     assert code == 0, errors
 
     done_at_first = [event["name"] for event in of_kind(first, "enrolled")]
-    assert done_at_first == NAMES[:3]
+    assert done_at_first == NAMES[:2]
     again = of_kind(second, "item")
-    assert [(e["name"], e["action"]) for e in again[:4]] == [
-        *((name, "skip") for name in NAMES[:3]),
-        (NAMES[3], "resume"),
+    assert [(e["name"], e["action"]) for e in again[:3]] == [
+        *((name, "skip") for name in NAMES[:2]),
+        (NAMES[2], "resume"),
     ]
     last = of_kind(third, "item")
     assert [e["name"] for e in last] == NAMES
@@ -116,7 +116,7 @@ def test_tray_is_enrolled_with_two_interruptions_and_identified(folder):
         assert {(s.name, s.label, s.views, s.unfinished_views) for s in catalog.objects()} == {
             (name, "tray 1", VIEWS, None) for name in NAMES
         }
-        for name in NAMES[3], killed["name"]:
+        for name in NAMES[2], killed["name"]:
             details = catalog.object(name)
             assert [view.record.index for view in details.views] == list(range(VIEWS))
             assert len({view.session.id for view in details.views}) == 2
@@ -137,7 +137,7 @@ def test_tray_is_enrolled_with_two_interruptions_and_identified(folder):
 
     runs = sorted((folder / "runs").iterdir())
     assert [path.name for path in runs[: len(NAMES)]] == [f"{number:04d}" for number in range(1, len(NAMES) + 1)]
-    for path in runs[: len(NAMES) : 6]:
+    for path in runs[: len(NAMES) : 4]:
         found = check(load_run(path))
         assert found.differences == []
         assert found.decisions == found.views >= 1  # one decision after each view; one view can be enough
