@@ -16,6 +16,12 @@ from tests.rig.doctor.doctor_parts import unopened
 PING, READ = 0x01, 0x02
 
 
+@pytest.fixture
+def bench():
+    with unopened() as bench:
+        yield bench
+
+
 def heard(bench, *bauds: int, protocol: int = 2) -> list[BaudScan]:
     return list(
         scan_servos(bench.devices.adapter, bench.context.computer.clock, bauds or BAUD_RATES, protocol=protocol)
@@ -53,49 +59,38 @@ def test_duplicate_id_is_found_at_any_rate(bus_id, baud):
         assert bus_id not in {servo.bus_id for servo in said.servos}
 
 
-def test_duplicate_id_is_found_beside_another_servo():
-    with unopened() as bench:
-        bench.add_servo(1, 57_600)
-        bench.add_servo(7, 57_600)
-        (said,) = heard(bench, 57_600)
-        assert said.duplicate_ids == (1,)
-        assert [servo.bus_id for servo in said.servos] == [7]
+def test_duplicate_id_is_found_beside_another_servo(bench):
+    bench.add_servo(1, 57_600)
+    bench.add_servo(7, 57_600)
+    (said,) = heard(bench, 57_600)
+    assert said.duplicate_ids == (1,)
+    assert [servo.bus_id for servo in said.servos] == [7]
 
 
-def test_babbling_bus_is_noise():
-    with unopened() as bench:
-        faults = Faults(bench.devices)
-        faults.schedule(*read_faults(["babble"]))
-        (said,) = heard(bench, 57_600)
-        faults.clear()
-        assert said.noise
-        assert not said.duplicate_ids
+@pytest.mark.parametrize(("fault", "ids", "noise"), [("babble", [], True), ("echo", [1], False)])
+def test_babbling_bus_is_noise_and_an_echo_changes_nothing(fault, ids, noise, bench):
+    faults = Faults(bench.devices)
+    faults.schedule(*read_faults([fault]))
+    (said,) = heard(bench, 57_600)
+    faults.clear()
+    assert [servo.bus_id for servo in said.servos] == ids
+    assert bool(said.noise) is noise
+    assert not said.duplicate_ids
 
 
-def test_servo_with_a_corrupt_answer_is_asked_again():
-    with unopened() as bench:
-        spoiled = []
+def test_servo_with_a_corrupt_answer_is_asked_again(bench):
+    spoiled = []
 
-        def spoil(frame):
-            if spoiled:
-                return frame
-            spoiled.append(frame)
-            return replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
+    def spoil(frame):
+        if spoiled:
+            return frame
+        spoiled.append(frame)
+        return replace(frame, data=frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
 
-        bench.devices.servo_bus.filters.append(spoil)
-        (said,) = heard(bench, 57_600)
-        assert [servo.bus_id for servo in said.servos] == [1]
-        assert not said.duplicate_ids
-
-
-def test_echoing_adapter_changes_nothing():
-    with unopened() as bench:
-        faults = Faults(bench.devices)
-        faults.schedule(*read_faults(["echo"]))
-        (said,) = heard(bench, 57_600)
-        faults.clear()
-        assert [servo.bus_id for servo in said.servos] == [1]
-        assert not said.duplicate_ids
+    bench.devices.servo_bus.filters.append(spoil)
+    (said,) = heard(bench, 57_600)
+    assert [servo.bus_id for servo in said.servos] == [1]
+    assert not said.duplicate_ids
 
 
 def test_port_without_a_baud_rate_has_one_servo():
@@ -147,13 +142,12 @@ def test_ax_12a_is_found_by_protocol_1():
         assert not said.duplicate_ids
 
 
-def test_unknown_model_is_named_by_its_number():
-    with unopened() as bench:
-        bench.devices.servo.memory["Model Number"] = 4711
-        assert 4711 not in model_numbers()
-        ((servo,),) = (said.servos for said in heard(bench, 57_600))
-        assert servo.model is None
-        assert "unknown model 4711" in str(servo)
+def test_unknown_model_is_named_by_its_number(bench):
+    bench.devices.servo.memory["Model Number"] = 4711
+    assert 4711 not in model_numbers()
+    ((servo,),) = (said.servos for said in heard(bench, 57_600))
+    assert servo.model is None
+    assert "unknown model 4711" in str(servo)
 
 
 # -- I2C --------------------------------------------------------------------------------------------------------------
@@ -192,20 +186,18 @@ def test_each_imu_is_identified_at_each_address(chip):
             assert all(len(data) == 1 for data in device.written)  # a register's number, never a value
 
 
-def test_unknown_chip_is_reported_and_other_addresses_are_not_asked():
-    with unopened() as bench:
-        bench.devices.i2c.detach(0x68)
-        clock, memory = RegisterFile({0x00: 0x37}), RegisterFile({})
-        bench.devices.i2c.attach(0x68, clock)
-        bench.devices.i2c.attach(0x50, memory)
-        (found,) = scan_imus(bench.context.computer, 1)
-        assert found.driver is None
-        assert "register 0x00 is 0x37" in str(found)
-        assert not memory.written
+def test_unknown_chip_is_reported_and_other_addresses_are_not_asked(bench):
+    bench.devices.i2c.detach(0x68)
+    clock, memory = RegisterFile({0x00: 0x37}), RegisterFile({})
+    bench.devices.i2c.attach(0x68, clock)
+    bench.devices.i2c.attach(0x50, memory)
+    (found,) = scan_imus(bench.context.computer, 1)
+    assert found.driver is None
+    assert "register 0x00 is 0x37" in str(found)
+    assert not memory.written
 
 
-def test_stuck_bus_is_an_os_error():
-    with unopened() as bench:
-        bench.devices.i2c.stuck = True
-        with pytest.raises(TimeoutError):
-            scan_imus(bench.context.computer, 1)
+def test_stuck_bus_is_an_os_error(bench):
+    bench.devices.i2c.stuck = True
+    with pytest.raises(TimeoutError):
+        scan_imus(bench.context.computer, 1)

@@ -15,6 +15,12 @@ from tests.rig.doctor.doctor_parts import unopened
 WRITE = 0x03
 
 
+@pytest.fixture
+def bench():
+    with unopened() as bench:
+        yield bench
+
+
 @fuzz_settings(0.02)
 @given(
     at=st.tuples(st.integers(0, 252), st.sampled_from([57_600, 1_000_000, 9_600])),
@@ -38,14 +44,13 @@ def test_servo_at_any_id_and_rate_can_be_changed(at, new_id, new_baud):
 
 
 @pytest.mark.parametrize("place", [(2, 57_600), (2, 1_000_000), (1, 57_600), (1, 115_200)])
-def test_second_servo_at_any_rate_prevents_changes(place):
-    with unopened() as bench:
-        bench.add_servo(*place)
-        with pytest.raises(SeveralServos) as caught, single_servo(bench.context):
-            pass
-        assert "Unplug" in caught.value.next_step
-        assert caught.value.exit_code == 4
-        assert WRITE not in bench.instructions
+def test_second_servo_at_any_rate_prevents_changes(place, bench):
+    bench.add_servo(*place)
+    with pytest.raises(SeveralServos) as caught, single_servo(bench.context):
+        pass
+    assert "Unplug" in caught.value.next_step
+    assert caught.value.exit_code == 4
+    assert WRITE not in bench.instructions
 
 
 def test_missing_servo_unknown_model_and_busy_bench_are_errors(monkeypatch):
@@ -89,12 +94,11 @@ def test_servo_that_keeps_its_rate_is_still_reached(monkeypatch):
         assert servo.read()["Baud Rate"] == 3  # what it was told; it answers at the rate that it has
 
 
-def test_servo_that_answers_only_reads_can_be_changed():
-    with unopened() as bench:
-        bench.devices.servo.memory["Status Return Level"] = 1
-        with single_servo(bench.context) as servo:
-            servo.set_id(5)
-        assert bench.devices.servo.memory["ID"] == 5
+def test_servo_that_answers_only_reads_can_be_changed(bench):
+    bench.devices.servo.memory["Status Return Level"] = 1
+    with single_servo(bench.context) as servo:
+        servo.set_id(5)
+    assert bench.devices.servo.memory["ID"] == 5
 
 
 def test_ax_12a_is_changed_by_protocol_1(monkeypatch):

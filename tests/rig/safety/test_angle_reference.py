@@ -94,17 +94,12 @@ def test_interrupted_motion_is_certain_on_its_path_with_supply_only(position_deg
         ({"model_number": 1020}, AngleFinding.OTHER_SERVO),
         ({"bus_id": 2}, AngleFinding.OTHER_SERVO),
         ({"firmware": 45}, AngleFinding.OTHER_FIRMWARE),
+        (None, AngleFinding.NEVER_REFERENCED),
     ],
 )
-def test_another_servo_makes_the_angle_uncertain(values, finding):
-    check = check_saved_angle(saved(200.0, **values), IDENTITY, 200.0, KEPT)
+def test_another_servo_or_a_new_bench_makes_the_angle_uncertain(values, finding):
+    check = check_saved_angle(None if values is None else saved(200.0, **values), IDENTITY, 200.0, KEPT)
     assert check.finding is finding
-    assert not check.certain
-
-
-def test_new_bench_is_uncertain():
-    check = check_saved_angle(None, IDENTITY, 180.0, KEPT)
-    assert check.finding is AngleFinding.NEVER_REFERENCED
     assert not check.certain
 
 

@@ -50,6 +50,16 @@ def changed(wires: Wires, tmp_path, setting: str):
     return program(wires, wires.i2c, FileStore(tmp_path / "state"), setting, **gear)
 
 
+@pytest.fixture
+def start(bench_of):
+    return bench_of[0]
+
+
+@pytest.fixture
+def wires(bench_of):
+    return bench_of[1]
+
+
 def after(wires: Wires, seconds: float, happens) -> None:
     wires.world.clock.call_at(wires.world.clock.now_ns() + round(seconds * 1e9), happens)
 
@@ -84,8 +94,7 @@ def killed_in_motion(bench: Bench, wires: Wires, target_deg: float, after_s: flo
     kill(wires, plan)
 
 
-def test_servo_stops_after_sigkill_and_the_next_program_reports_it(bench_of):
-    start, wires = bench_of
+def test_servo_stops_after_sigkill_and_the_next_program_reports_it(start, wires):
     with start() as bench:
         killed_in_motion(bench, wires, 300.0, after_s=1.2)
         watchdog_s = bench.config.table.watchdog_s
@@ -110,8 +119,7 @@ def test_servo_stops_after_sigkill_and_the_next_program_reports_it(bench_of):
     assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_sigkill_and_power_cut_need_a_new_reference(bench_of):
-    start, wires = bench_of
+def test_sigkill_and_power_cut_need_a_new_reference(start, wires):
     with start() as bench:
         killed_in_motion(bench, wires, 380.0, after_s=4.0)
     wires.world.clock.sleep(1.0)
@@ -132,8 +140,7 @@ def test_sigkill_and_power_cut_need_a_new_reference(bench_of):
         assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
 
 
-def test_power_cut_between_programs_loses_no_revolution(bench_of):
-    start, wires = bench_of
+def test_power_cut_between_programs_loses_no_revolution(start, wires):
     with start() as bench, Turntable(bench) as table:
         table.goto(-370.0)
     wires.device.power_cycle()
@@ -150,8 +157,7 @@ def test_power_cut_between_programs_loses_no_revolution(bench_of):
         assert bench.safety.state is TableState.READY
 
 
-def test_restored_revolutions_survive_a_kill_at_rest(bench_of):
-    start, wires = bench_of
+def test_restored_revolutions_survive_a_kill_at_rest(start, wires):
     with start() as bench, Turntable(bench) as table:
         table.goto(-370.0)
     wires.device.power_cycle()
@@ -167,19 +173,7 @@ def test_restored_revolutions_survive_a_kill_at_rest(bench_of):
         )
 
 
-def test_rotation_without_supply_needs_a_new_reference(bench_of):
-    start, wires = bench_of
-    with start() as bench, Turntable(bench) as table:
-        table.goto(90.0)
-    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
-    wires.device.power_cycle()
-    wires.world.clock.sleep(1.0)
-    with start() as bench, pytest.raises(Unreferenced, match="rotated while the servo had no supply"), Turntable(bench):
-        pass
-
-
-def test_rotation_by_hand_with_supply_is_counted(bench_of):
-    start, wires = bench_of
+def test_rotation_by_hand_is_counted_with_supply_and_needs_a_new_reference_without(start, wires):
     with start() as bench, Turntable(bench) as table:
         table.goto(90.0)
     wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
@@ -187,10 +181,14 @@ def test_rotation_by_hand_with_supply_is_counted(bench_of):
         assert "by hand" in bench.findings[0]
         with Turntable(bench) as table:
             assert table.rest_deg == pytest.approx(60.0, abs=0.3)
+    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
+    wires.device.power_cycle()
+    wires.world.clock.sleep(1.0)
+    with start() as bench, pytest.raises(Unreferenced, match="rotated while the servo had no supply"), Turntable(bench):
+        pass
 
 
-def test_supply_loss_in_a_motion_needs_a_new_reference(bench_of):
-    start, wires = bench_of
+def test_supply_loss_in_a_motion_needs_a_new_reference(start, wires):
     with start() as bench:
         with pytest.raises((SupplyLost, DeviceSilent)), Turntable(bench) as table:
             table.goto(300.0)
@@ -204,8 +202,7 @@ def test_supply_loss_in_a_motion_needs_a_new_reference(bench_of):
         assert bench.safety.state is TableState.UNREFERENCED
 
 
-def test_unplugged_cable_ends_the_motion_and_nothing_moves_afterwards(bench_of):
-    start, wires = bench_of
+def test_unplugged_cable_ends_the_motion_and_nothing_moves_afterwards(start, wires):
     with start() as bench:
         with pytest.raises(DeviceSilent), Turntable(bench) as table:
             after(wires, 1.2, lambda: wires.bus.detach(wires.device))
@@ -225,8 +222,7 @@ def test_unplugged_cable_ends_the_motion_and_nothing_moves_afterwards(bench_of):
 
 
 @pytest.mark.parametrize("other", [{"model": "xm430_w350"}, {"firmware": 44}])
-def test_different_servo_is_rejected(bench_of, other):
-    start, wires = bench_of
+def test_different_servo_is_rejected(other, start, wires):
     with start() as bench:
         with pytest.raises(DeviceSilent), Turntable(bench) as table:
             after(wires, 0.7, lambda: wires.bus.detach(wires.device))
@@ -237,8 +233,7 @@ def test_different_servo_is_rejected(bench_of, other):
         assert bench.safety.state is TableState.DISCONNECTED
 
 
-def test_watchdog_of_a_running_program_leaves_no_fault(bench_of):
-    start, wires = bench_of
+def test_watchdog_of_a_running_program_leaves_no_fault(start, wires):
     with start() as bench:
         with pytest.raises(WatchdogTripped) as caught, Turntable(bench) as table:
             after(wires, 0.7, wires.device.trip_watchdog)
@@ -250,8 +245,7 @@ def test_watchdog_of_a_running_program_leaves_no_fault(bench_of):
             assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
 
 
-def test_fault_survives_the_program_until_it_is_acknowledged(bench_of):
-    start, wires = bench_of
+def test_fault_survives_the_program_until_it_is_acknowledged(start, wires):
     with start() as bench, pytest.raises(Stalled), Turntable(bench) as table:
         table.goto(10.0)
         wires.device.jam()
@@ -268,8 +262,7 @@ def test_fault_survives_the_program_until_it_is_acknowledged(bench_of):
         assert table.goto(60.0).agrees
 
 
-def test_hardware_error_needs_a_reboot_that_loses_no_revolution(bench_of):
-    start, wires = bench_of
+def test_hardware_error_needs_a_reboot_that_loses_no_revolution(start, wires):
     with start() as bench:
         with pytest.raises(DeviceFault), Turntable(bench) as table:
             after(wires, 1.5, lambda: wires.device.fail(0x20))
@@ -290,8 +283,7 @@ def test_hardware_error_needs_a_reboot_that_loses_no_revolution(bench_of):
         assert wires.world.shaft()[0] == pytest.approx(0.0, abs=0.3)
 
 
-def test_reboot_with_changed_settings_keeps_the_fault(bench_of):
-    start, wires = bench_of
+def test_reboot_with_changed_settings_keeps_the_fault(start, wires):
     with start() as bench:
         with pytest.raises(Stalled), Turntable(bench) as table:
             wires.device.jam()
@@ -303,8 +295,7 @@ def test_reboot_with_changed_settings_keeps_the_fault(bench_of):
         assert bench.safety.state is TableState.FAULT
 
 
-def test_old_goal_of_a_killed_program_is_not_continued(bench_of):
-    start, wires = bench_of
+def test_old_goal_of_a_killed_program_is_not_continued(start, wires):
     with start() as bench:
         killed_in_motion(bench, wires, 300.0, after_s=1.0)
     wires.world.clock.sleep(0.2)  # armed still, and turning
@@ -317,8 +308,7 @@ def test_old_goal_of_a_killed_program_is_not_continued(bench_of):
             assert wires.world.shaft()[1] == 0
 
 
-def test_damaged_state_is_reported_and_needs_a_new_reference(bench_of, tmp_path):
-    start, _wires = bench_of
+def test_damaged_state_is_reported_and_needs_a_new_reference(tmp_path, start):
     (tmp_path / "state" / "state.json").write_bytes(b'{"version": 1, "tab')
     with start() as bench:
         assert "is damaged" in bench.findings[0]
@@ -331,8 +321,7 @@ def test_damaged_state_is_reported_and_needs_a_new_reference(bench_of, tmp_path)
 
 
 @pytest.mark.parametrize("change", ["table.zero_deg=360", "table.direction=-1", "servo.gear_ratio=1.5"])
-def test_changed_settings_of_the_table_need_home_here(bench_of, change, tmp_path):
-    start, wires = bench_of
+def test_changed_settings_of_the_table_need_home_here(change, tmp_path, start, wires):
     with start() as bench, Turntable(bench) as table:
         table.goto(390.0)
     with changed(wires, tmp_path, change) as bench:
@@ -349,8 +338,7 @@ def test_changed_settings_of_the_table_need_home_here(bench_of, change, tmp_path
         assert bench.safety.state is TableState.READY
 
 
-def test_position_beyond_the_limits_is_never_ready(bench_of):
-    start, wires = bench_of
+def test_position_beyond_the_limits_is_never_ready(start, wires):
     with start() as bench, Turntable(bench) as table:
         table.goto(390.0)
     wires.world.clock.sleep(wires.device.turn_by_hand(30.0) + 0.1)
@@ -366,16 +354,14 @@ def test_position_beyond_the_limits_is_never_ready(bench_of):
 
 
 @pytest.mark.parametrize("turns", [-3, 2, 3, 99_999_999])
-def test_revolutions_beyond_the_limits_are_rejected_and_not_stored(bench_of, tmp_path, turns):
-    start, _wires = bench_of
+def test_revolutions_beyond_the_limits_are_rejected_and_not_stored(tmp_path, turns, start, wires):
     before = (tmp_path / "state" / "state.json").read_bytes()
     with start() as bench, pytest.raises(UsageError, match="cable budget"):
         bench.safety.set_revolutions(turns)
     assert (tmp_path / "state" / "state.json").read_bytes() == before
 
 
-def test_full_disk_does_not_lose_the_fault_of_a_motion(bench_of):
-    start, wires = bench_of
+def test_full_disk_does_not_lose_the_fault_of_a_motion(start, wires):
 
     def jam_on_full_disk() -> None:
         nonlocal free
@@ -397,8 +383,7 @@ def test_full_disk_does_not_lose_the_fault_of_a_motion(bench_of):
             pass
 
 
-def test_stop_request_ends_the_motion_with_torque_off(bench_of, tmp_path):
-    start, wires = bench_of
+def test_stop_request_ends_the_motion_with_torque_off(tmp_path, start, wires):
     with start() as bench:
         with pytest.raises(RigError, match="rig stop") as stopped, Turntable(bench) as table:
             after(wires, 1.2, FileStore(tmp_path / "state").request_stop)
@@ -436,17 +421,12 @@ def test_replugged_adapter_is_opened_again_and_checked(simulated, when):
     with Turntable(s.bench) as table:
         assert s.world.shaft() == stands
         assert table.goto(0.0).encoder_deg == pytest.approx(0.0, abs=0.3)
-
-
-def test_different_servo_after_replugging_is_rejected(simulated):
-    s = simulated()
-    parts = s.operator.devices
     with pytest.raises(DeviceSilent), Turntable(s.bench) as table:
-        parts.adapter.unplug()
+        adapter.unplug()
         table.goto(60.0)
-    parts.servo_bus.detach(parts.servo)
-    parts.servo_bus.attach(XSeriesServo(s.world, "xl330_m288"))
-    parts.adapter.replug()
+    s.operator.devices.servo_bus.detach(s.operator.devices.servo)
+    s.operator.devices.servo_bus.attach(XSeriesServo(s.world, "xl330_m288"))
+    adapter.replug()
     with pytest.raises(DeviceMismatch) as caught, Turntable(s.bench):
         pass
     assert caught.value.evidence["got"].startswith("xl330_m288")

@@ -202,6 +202,7 @@ def test_killed_program_releases_the_bench(tmp_path, other_program):
     other_program.wait()
     assert str(other_program.pid) in (tmp_path / "lock").read_text()
     assert holder(tmp_path) is None
+    assert holder(tmp_path / "never") is None
     BenchLock(tmp_path, SystemClock()).close()
     assert holder(tmp_path) is None
 
@@ -211,10 +212,6 @@ def test_holder_without_readable_name_still_counts(tmp_path, other_program):
     assert holder(tmp_path) == Holder(pid=0, command="", since_utc="")
     with pytest.raises(BenchBusy, match="another process"):
         BenchLock(tmp_path, SystemClock())
-
-
-def test_unused_bench_has_no_holder(tmp_path):
-    assert holder(tmp_path / "never") is None
 
 
 def test_old_stop_request_does_not_stop_the_next_program(tmp_path):
