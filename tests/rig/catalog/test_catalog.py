@@ -103,6 +103,10 @@ def test_view_is_read_as_it_was_stored(
 
 
 def test_views_are_ordered_by_object_and_index(catalog: Catalog) -> None:
+    model, view_ids = catalog.views()
+    assert (len(model), len(view_ids), catalog.objects()) == (0, 0, [])
+    with pytest.raises(CatalogError, match="no view 5"):
+        catalog.view(5)
     fill(catalog, "tin", 3)
     begin(catalog, "unfinished").add(record(0), image(0))
     mug = begin(catalog, "mug", 4)
@@ -115,11 +119,6 @@ def test_views_are_ordered_by_object_and_index(catalog: Catalog) -> None:
     assert model.azimuth_deg.tolist() == [0, 5, 10, 0, 5, 10, 15]
     assert [catalog.view(view_id).record.index for view_id in view_ids] == [0, 1, 2, 0, 1, 2, 3]
     assert {catalog.view(view_id).object_name for view_id in view_ids[3:]} == {"mug"}
-
-
-def test_empty_catalog_has_no_views(catalog: Catalog) -> None:
-    model, view_ids = catalog.views()
-    assert (len(model), len(view_ids), catalog.objects()) == (0, 0, [])
 
 
 def test_times_come_from_the_injected_clock(catalog: Catalog, clock: VirtualClock) -> None:
@@ -135,13 +134,10 @@ def test_times_come_from_the_injected_clock(catalog: Catalog, clock: VirtualCloc
     assert details.summary.enrolled_utc == EPOCH + timedelta(seconds=3.25)
     assert details.views[0].captured_utc == EPOCH + timedelta(seconds=2)
     assert details.views[0].captured_utc.tzinfo is UTC
-
-
-def test_times_of_other_zones_are_stored_as_utc(tmp_path: Path) -> None:
     noon = datetime(2026, 7, 1, 12, tzinfo=timezone(timedelta(hours=2)))
-    with Catalog.open(tmp_path, clock=VirtualClock(noon)) as catalog:
-        begin(catalog, "mug")
-        assert catalog.objects()[0].created_utc == datetime(2026, 7, 1, 10, tzinfo=UTC)
+    with Catalog.open(catalog.path, clock=VirtualClock(noon)) as elsewhere:
+        begin(elsewhere, "tin")
+        assert elsewhere.object("tin").summary.created_utc == datetime(2026, 7, 1, 10, tzinfo=UTC)
 
 
 def test_replacement_keeps_the_old_views_until_it_is_complete(catalog: Catalog) -> None:
@@ -168,6 +164,8 @@ def test_abandoned_replacement_keeps_the_old_views(catalog: Catalog) -> None:
     assert len(catalog.views().views) == 2
     with pytest.raises(CatalogError, match="abandoned"):
         again.add(record(1), image(1))
+    with pytest.raises(CatalogError, match="no unfinished"):
+        catalog.resume("mug", provenance=PROVENANCE)
     begin(catalog, "mug", replace=True)
 
 
@@ -186,6 +184,10 @@ def test_unfinished_enrollment_is_resumed_on_another_bench(tmp_path: Path, clock
         assert catalog.objects()[0].unfinished_views == 2
         elsewhere = Provenance("bench-2", {"servo": {"model": "XM430", "id": 7}})
         enrollment = catalog.resume("mug", provenance=elsewhere)
+        with pytest.raises(CatalogError, match="2 of the 4") as error:
+            enrollment.finish()
+        assert error.value.evidence == {"missing_views": [1, 3]}
+        assert len(catalog.views().views) == 0
         assert enrollment.planned_azimuth_deg == tuple(plan(4))
         for index in enrollment.missing():
             enrollment.add(record(index), image(index))
@@ -193,21 +195,6 @@ def test_unfinished_enrollment_is_resumed_on_another_bench(tmp_path: Path, clock
         assert catalog.resumable("mug") is None
         benches = [view.session.provenance.bench for view in catalog.object("mug").views]
     assert benches == ["bench-1", "bench-2", "bench-1", "bench-2"]
-
-
-def test_resume_rejects_complete_enrollment(catalog: Catalog) -> None:
-    fill(catalog, "mug", 1)
-    with pytest.raises(CatalogError, match="no unfinished"):
-        catalog.resume("mug", provenance=PROVENANCE)
-
-
-def test_finish_rejects_missing_views(catalog: Catalog) -> None:
-    enrollment = begin(catalog, "mug", 3)
-    enrollment.add(record(1), image(1))
-    with pytest.raises(CatalogError, match="2 of the 3") as error:
-        enrollment.finish()
-    assert error.value.evidence == {"missing_views": [0, 2]}
-    assert len(catalog.views().views) == 0
 
 
 def test_add_rejects_stored_view(catalog: Catalog) -> None:
@@ -229,10 +216,7 @@ def test_unknown_name_suggests_similar_names(catalog: Catalog, asked: str, known
     with pytest.raises(ObjectNotFound) as error:
         catalog.object(asked)
     assert repr(known) in error.value.next_step
-
-
-def test_names_are_composed_and_stripped(catalog: Catalog) -> None:
-    fill(catalog, " Ta\u0308sse ", 1)
+    fill(catalog, " Ta\u0308sse ", 1)  # names are composed and stripped
     assert catalog.object("T\u00e4sse").summary.views == 1
 
 
@@ -248,25 +232,20 @@ def test_any_name_gives_a_safe_file_name(catalog: Catalog, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "a\x00b", "\ud800", "x" * 101])
-def test_begin_rejects_invalid_names(catalog: Catalog, name: str) -> None:
+def test_begin_rejects_invalid_names_and_texts(catalog: Catalog, name: str) -> None:
     with pytest.raises(UsageError):
         begin(catalog, name)
+    with pytest.raises(UsageError, match="label"):
+        begin(catalog, "mug", label="\udcff")
     assert catalog.objects() == []
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"index": -1},
-        {"azimuth_deg": 360.0},
-        {"azimuth_deg": -1e-9},
-        {"azimuth_deg": np.nan},
-        {"encoder_deg": np.inf},
-        {"imu_deg": 1.0},
-        {"imu_sigma_deg": 1.0},
-        {"imu_deg": 1.0, "imu_sigma_deg": -0.1},
-        {"evidence": {"sharpness": np.nan}},
-        {"evidence": {"frame": np.zeros(3)}},
+        *({"index": -1}, {"azimuth_deg": 360.0}, {"azimuth_deg": -1e-9}, {"azimuth_deg": np.nan}),
+        *({"encoder_deg": np.inf}, {"imu_deg": 1.0}, {"imu_sigma_deg": 1.0}, {"imu_deg": 1.0, "imu_sigma_deg": -0.1}),
+        *({"evidence": {"sharpness": np.nan}}, {"evidence": {"frame": np.zeros(3)}}),
     ],
 )
 def test_view_record_rejects_invalid_values(changes: dict[str, object]) -> None:
@@ -274,32 +253,15 @@ def test_view_record_rejects_invalid_values(changes: dict[str, object]) -> None:
         record(0, **changes)
 
 
-def test_begin_rejects_invalid_text(catalog: Catalog) -> None:
-    with pytest.raises(UsageError, match="label"):
-        begin(catalog, "mug", label="\udcff")
-    assert catalog.objects() == []
-
-
 def test_view_record_accepts_numpy_scalars(catalog: Catalog) -> None:
-    given_record = record(
-        0,
-        azimuth_deg=np.float32(0.5),
-        captured_ns=np.int64(7),
-        imu_deg=np.float32(2),
-        imu_sigma_deg=np.int8(1),
-    )
+    numbers = {"azimuth_deg": np.float32(0.5), "captured_ns": np.int64(7), "imu_deg": np.float32(2)}
+    evidence = {"locked": np.bool_(True), "gain": np.float32(0.5)}
     enrollment = begin(catalog, "mug", 1)
-    enrollment.add(given_record, image(0))
+    enrollment.add(record(0, imu_sigma_deg=np.int8(1), evidence=evidence, **numbers), image(0))
     enrollment.finish()
     stored = catalog.object("mug").views[0].record
+    assert stored.evidence == {"locked": True, "gain": 0.5}
     assert (stored.azimuth_deg, stored.captured_ns, stored.imu_deg, stored.imu_sigma_deg) == (0.5, 7, 2.0, 1.0)
-
-
-def test_evidence_accepts_numpy_scalars() -> None:
-    assert record(0, evidence={"locked": np.bool_(True), "gain": np.float32(0.5)}).evidence == {
-        "locked": True,
-        "gain": 0.5,
-    }
 
 
 @pytest.mark.parametrize(
@@ -335,11 +297,6 @@ def test_read_image_rejects_changed_and_missing_images(catalog: Catalog) -> None
     catalog.image_path(second).unlink()
     with pytest.raises(CatalogError, match="missing"):
         catalog.read_image(second)
-
-
-def test_view_rejects_unknown_id(catalog: Catalog) -> None:
-    with pytest.raises(CatalogError, match="no view 5"):
-        catalog.view(5)
 
 
 class CatalogMachine(RuleBasedStateMachine):

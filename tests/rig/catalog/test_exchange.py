@@ -50,6 +50,7 @@ from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, i
 
 BOTH = ("cedd", "cedd-blurred")
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
+OpenCatalog = Callable[[str], Catalog]
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +59,7 @@ def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def open_catalog(tmp_path: Path) -> Iterator[Callable[[str], Catalog]]:
+def open_catalog(tmp_path: Path) -> Iterator[OpenCatalog]:
     opened = []
 
     def open_one(name: str) -> Catalog:
@@ -97,7 +98,7 @@ def fill_full(catalog: Catalog) -> None:
 
 
 @pytest.fixture
-def full(full_folder: Path, open_catalog: Callable[[str], Catalog], tmp_path: Path) -> Catalog:
+def full(full_folder: Path, open_catalog: OpenCatalog, tmp_path: Path) -> Catalog:
     """A copy of that catalog."""
     shutil.copytree(full_folder, tmp_path / "full")
     return open_catalog("full")
@@ -126,7 +127,7 @@ def pictures(catalog: Catalog) -> list[bytes]:
 
 class TestRoundTrips:
     def test_bundle_round_trip_gives_the_same_bytes(
-        self, full: Catalog, open_catalog: Callable[[str], Catalog], tmp_path: Path
+        self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path
     ) -> None:
         first, second = tmp_path / "a.rigcat.zip", tmp_path / "b.rigcat.zip"
         assert write_bundle(first, read_objects(full)) == 3
@@ -138,10 +139,8 @@ class TestRoundTrips:
         assert first.read_bytes() == second.read_bytes()
         assert model(copy) == model(full)
         assert pictures(copy) == pictures(full)
-        for item in full.objects():
-            assert [e.status for e in copy.object(item.name).enrollments] == [
-                e.status for e in full.object(item.name).enrollments
-            ]
+        statuses = [[[e.status for e in c.object(o.name).enrollments] for o in full.objects()] for c in (copy, full)]
+        assert statuses[0] == statuses[1]
         tin = copy.resume("tin", provenance=PROVENANCE)  # an unfinished enrollment continues in the copy
         assert tin.missing() == (1,)
 
@@ -155,7 +154,7 @@ class TestRoundTrips:
             stored = cv2.imdecode(np.frombuffer(archive.read(view["image"]), np.uint8), cv2.IMREAD_COLOR)
             assert np.array_equal(stored, image(20))
 
-    def test_catalogs_are_merged(self, full: Catalog, open_catalog: Callable[[str], Catalog], tmp_path: Path) -> None:
+    def test_catalogs_are_merged(self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path) -> None:
         copy = open_catalog("copy")
         true_fill(copy, "tin", 2, 50)
         with pytest.raises(ObjectExists) as error:
@@ -167,7 +166,7 @@ class TestRoundTrips:
         assert finished(verify(copy)).findings == ()
 
     def test_coil_folder_round_trip_keeps_views_and_images(
-        self, full: Catalog, open_catalog: Callable[[str], Catalog], tmp_path: Path
+        self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path
     ) -> None:
         assert write_folder(tmp_path / "coil", read_objects(full)) == 2
         copy = open_catalog("copy")
@@ -181,7 +180,7 @@ class TestRoundTrips:
             assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes()
 
     def test_table_round_trip_keeps_views_images_and_angles(
-        self, full: Catalog, open_catalog: Callable[[str], Catalog], tmp_path: Path
+        self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path
     ) -> None:
         write_table(tmp_path / "table", read_objects(full, ["mug-white", "Tässe =2+2"]))
         copy = open_catalog("copy")
@@ -243,7 +242,7 @@ def photograph(path: Path, seed: int, size: tuple[int, int] = (12, 16)) -> None:
 
 
 class TestFolders:
-    def test_file_names_give_object_and_angle(self, tmp_path: Path, open_catalog: Callable[[str], Catalog]) -> None:
+    def test_file_names_give_object_and_angle(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
         for seed, name in enumerate(
             ["obj10__0.png", "obj10__90.5.png", "obj2__355.jpg", "obj2__360.PNG", "mug__10.png"]
         ):
@@ -301,18 +300,13 @@ class TestFolders:
             for angle in range(0, 360, 30):
                 if angle not in lacking:
                     photograph(tmp_path / f"{name}__{angle}.png", angle)
+        rng = np.random.default_rng(0)
+        for angle in range(0, 360, 30):  # scatter is not a gap
+            photograph(tmp_path / f"d__{(angle + rng.uniform(-2, 2)) % 360:.4f}.png", angle)
         gaps = read_folder(tmp_path, now=NOW).gaps
         assert [(gap.object_name, gap.azimuth_deg) for gap in gaps] == [("b", 90.0), ("b", 270.0), ("c", 0.0)]
 
-    def test_scatter_of_azimuths_is_not_a_gap(self, tmp_path: Path) -> None:
-        rng = np.random.default_rng(0)
-        for angle in range(0, 360, 30):
-            photograph(tmp_path / f"a__{(angle + rng.uniform(-2, 2)) % 360:.4f}.png", angle)
-        assert read_folder(tmp_path, now=NOW).gaps == ()
-
-    def test_unusable_files_are_rejected_one_by_one(
-        self, tmp_path: Path, open_catalog: Callable[[str], Catalog]
-    ) -> None:
+    def test_unusable_files_are_rejected_one_by_one(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
         folder = tmp_path / "in"
         for angle in (0, 90, 180, 270):
             photograph(folder / f"mug__{angle}.png", angle)
@@ -341,9 +335,7 @@ class TestFolders:
         assert catalog.views().views.azimuth_deg.tolist() == [0.0, 180.0, 270.0]
         assert finished(verify(catalog)).findings == ()
 
-    def test_strict_import_rejects_all_for_one_file(
-        self, tmp_path: Path, open_catalog: Callable[[str], Catalog]
-    ) -> None:
+    def test_strict_import_rejects_all_for_one_file(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
         photograph(tmp_path / "in" / "mug__0.png", 0)
         (tmp_path / "in" / "mug__5.png").write_bytes(b"x")
         catalog = open_catalog("catalog")
@@ -369,9 +361,7 @@ class TestTables:
         path.write_text("object,azimuth_deg,image,operator\n" + "\n".join(rows) + "\n", encoding="utf-8-sig")
         return path
 
-    def test_unusable_rows_are_rejected_one_by_one(
-        self, tmp_path: Path, open_catalog: Callable[[str], Catalog]
-    ) -> None:
+    def test_unusable_rows_are_rejected_one_by_one(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
         photograph(tmp_path / "outside.png", 9)
         table = self.write(
             tmp_path / "in",
@@ -399,18 +389,16 @@ class TestTables:
         ]
         assert done.rejected[0].path == "views.csv, line 4"
 
-    def test_missing_columns_are_reported(self, tmp_path: Path) -> None:
-        path = tmp_path / "a.csv"
-        path.write_text("object;angle\nmug;0\n")
-        with pytest.raises(ImportRejected, match="no column object or azimuth_deg or image"):
-            read_table(path, now=NOW)
-
     @pytest.mark.parametrize(
-        "content", [b"", b"\xff\xfe\x00", b"object,azimuth_deg,image\n", b'object,azimuth_deg,image\n"']
+        ("content", "words"),
+        [
+            *((b"", None), (b"\xff\xfe\x00", None), (b"object,azimuth_deg,image\n", None)),
+            *((b'object,azimuth_deg,image\n"', None), (b"object;angle\nmug;0\n", "no column object or azimuth_deg or")),
+        ],
     )
-    def test_invalid_table_is_rejected(self, tmp_path: Path, content: bytes) -> None:
+    def test_invalid_table_is_rejected(self, tmp_path: Path, content: bytes, words: str | None) -> None:
         (tmp_path / "a.csv").write_bytes(content)
-        with pytest.raises(ImportRejected):
+        with pytest.raises(ImportRejected, match=words):
             read_table(tmp_path / "a.csv", now=NOW)
 
 
@@ -467,10 +455,10 @@ class TestImages:
         assert found.dtype == np.uint8
         assert found.ndim == 3
 
-    @pytest.mark.parametrize("progressive", [0, 1])
-    def test_size_of_jpeg_is_read(self, progressive: int) -> None:
-        content = cv2.imencode(".jpg", image(1), [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
-        assert images.decode(content).shape == (12, 16, 3)
+    def test_size_of_jpeg_is_read(self) -> None:
+        for progressive in (0, 1):
+            content = cv2.imencode(".jpg", image(1), [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
+            assert images.decode(content).shape == (12, 16, 3)
 
 
 @pytest.fixture(scope="session")
@@ -511,7 +499,7 @@ def view_of(line: dict[str, Any], place: int = 0) -> dict[str, Any]:
 
 
 class TestHostileBundles:
-    def rejection(self, open_catalog: Callable[[str], Catalog], path: Path) -> str:
+    def rejection(self, open_catalog: OpenCatalog, path: Path) -> str:
         catalog = open_catalog("victim")
         with pytest.raises(ImportRejected) as error:
             run_import(catalog, read_bundle(path))
@@ -521,16 +509,12 @@ class TestHostileBundles:
     @pytest.mark.parametrize(
         "name",
         [
-            "../evil.png",
-            "/etc/evil.png",
-            "images/../../evil.png",
-            "images\\..\\evil.png",
-            "C:/evil.png",
-            "images/a\0b.png",
+            *("../evil.png", "/etc/evil.png", "images/../../evil.png"),
+            *("images\\..\\evil.png", "C:/evil.png", "images/a\0b.png"),
         ],
     )
     def test_paths_outside_the_catalog_are_rejected(
-        self, bundle: Path, open_catalog: Callable[[str], Catalog], name: str, tmp_path: Path
+        self, bundle: Path, open_catalog: OpenCatalog, name: str, tmp_path: Path
     ) -> None:
         def move(line: dict[str, Any]) -> None:
             view_of(line)["image"] = name
@@ -544,42 +528,30 @@ class TestHostileBundles:
         assert not list(tmp_path.rglob("evil.png"))
 
     @pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFIFO, stat.S_IFCHR])
-    def test_links_and_devices_are_rejected(
-        self, bundle: Path, open_catalog: Callable[[str], Catalog], kind: int
-    ) -> None:
+    def test_links_and_devices_are_rejected(self, bundle: Path, open_catalog: OpenCatalog, kind: int) -> None:
         info = zipfile.ZipInfo("images/link.png")
         info.external_attr = (kind | 0o777) << 16
         with zipfile.ZipFile(bundle, "a") as archive:
             archive.writestr(info, "/etc/passwd")
         assert "link or a device" in self.rejection(open_catalog, bundle)
 
-    def test_decompression_bomb_is_rejected(self, bundle: Path, open_catalog: Callable[[str], Catalog]) -> None:
+    def test_decompression_bomb_of_any_size_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         with zipfile.ZipFile(bundle, "a", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("images/bomb.png", bytes(20_000_000))
         assert "to 20000000 bytes" in self.rejection(open_catalog, bundle)
-
-    def test_wrong_size_of_a_member_is_rejected(self, bundle: Path, open_catalog: Callable[[str], Catalog]) -> None:
-        with zipfile.ZipFile(bundle, "a", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("images/bomb.png", bytes(20_000_000))
         content = bundle.read_bytes().replace(struct.pack("<I", 20_000_000), struct.pack("<I", 900))
         bundle.write_bytes(content)
         assert "was not imported" in self.rejection(open_catalog, bundle)
 
-    def test_huge_image_is_rejected(self, bundle: Path, open_catalog: Callable[[str], Catalog]) -> None:
+    def test_huge_image_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         bomb = png_of(60_000, 60_000)
 
         def enlarge(line: dict[str, Any]) -> None:
-            view_of(line).update(image="images/bomb.png", image_bytes=len(bomb), image_sha256=images.digest(bomb))
+            view_of(line).update(image_bytes=len(bomb), image_sha256=images.digest(bomb))
 
         with zipfile.ZipFile(bundle) as archive:
             replaced = json.loads(archive.read(OBJECTS))["enrollments"][0]["views"][0]["image"]
-        path = rewritten(bundle, enlarge, **{"images/bomb.png": bomb})
-        without = path.with_name("without.zip")
-        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(without, "w") as target:
-            for info in archive.infolist():
-                if info.filename != replaced:
-                    target.writestr(info, archive.read(info))
-        assert "60000 x 60000 pixels" in self.rejection(open_catalog, without)
+        assert "60000 x 60000 pixels" in self.rejection(open_catalog, rewritten(bundle, enlarge, **{replaced: bomb}))
 
     @pytest.mark.parametrize(
         ("change", "words"),
@@ -608,16 +580,16 @@ class TestHostileBundles:
         ],
     )
     def test_invalid_lines_are_rejected(
-        self, bundle: Path, open_catalog: Callable[[str], Catalog], change: Callable[[dict[str, Any]], None], words: str
+        self, bundle: Path, open_catalog: OpenCatalog, change: Callable[[dict[str, Any]], None], words: str
     ) -> None:
         said = self.rejection(open_catalog, rewritten(bundle, change))
         assert any(word in said for word in words.split("|")), said
 
-    def test_newer_bundle_is_rejected(self, bundle: Path, open_catalog: Callable[[str], Catalog]) -> None:
+    def test_newer_bundle_and_other_zip_file_are_rejected(
+        self, bundle: Path, tmp_path: Path, open_catalog: OpenCatalog
+    ) -> None:
         manifest = json.dumps({"format": "rigcat", "version": 3}).encode()
         assert "newer program" in self.rejection(open_catalog, rewritten(bundle, None, **{MANIFEST: manifest}))
-
-    def test_other_zip_file_is_rejected(self, tmp_path: Path, open_catalog: Callable[[str], Catalog]) -> None:
         with zipfile.ZipFile(tmp_path / "holiday.zip", "w") as archive:
             archive.writestr("images/beach.png", b"x")
         assert "does not contain rigcat.json" in self.rejection(open_catalog, tmp_path / "holiday.zip")
@@ -671,7 +643,7 @@ class TestAllOrNothing:
 
     @pytest.mark.parametrize("after", [0, 1, 2])
     def test_interrupted_import_leaves_nothing(
-        self, batch: ImportBatch, open_catalog: Callable[[str], Catalog], monkeypatch: pytest.MonkeyPatch, after: int
+        self, batch: ImportBatch, open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch, after: int
     ) -> None:
         monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
         catalog = open_catalog("catalog")
@@ -687,7 +659,7 @@ class TestAllOrNothing:
     def test_import_that_fails_in_its_transaction_leaves_nothing(
         self,
         batch: ImportBatch,
-        open_catalog: Callable[[str], Catalog],
+        open_catalog: OpenCatalog,
         monkeypatch: pytest.MonkeyPatch,
         step: str,
         error: BaseException,
@@ -704,9 +676,7 @@ class TestAllOrNothing:
         assert run_import(catalog, batch).views == 6
         assert finished(verify(catalog)).findings == ()
 
-    def test_files_of_a_killed_import_are_moved_away(
-        self, batch: ImportBatch, open_catalog: Callable[[str], Catalog]
-    ) -> None:
+    def test_files_of_a_killed_import_are_moved_away(self, batch: ImportBatch, open_catalog: OpenCatalog) -> None:
         catalog = open_catalog("catalog")
         left = catalog.path / "images" / "000001-mug" / "000001" / "old.png"
         left.parent.mkdir(parents=True)
@@ -715,8 +685,8 @@ class TestAllOrNothing:
         assert finished(verify(catalog)).findings == ()
         assert (catalog.path / LOST / left.relative_to(catalog.path)).read_bytes() == b"left behind"
 
-    def test_import_notices_an_object_of_another_process(
-        self, batch: ImportBatch, open_catalog: Callable[[str], Catalog]
+    def test_import_notices_an_object_of_another_process_and_keeps_replaced_enrollments(
+        self, batch: ImportBatch, open_catalog: OpenCatalog
     ) -> None:
         catalog = open_catalog("catalog")
         job = import_objects(catalog, plan_import(catalog, batch), jobs=1)
@@ -726,19 +696,13 @@ class TestAllOrNothing:
             finished(job)
         assert catalog.object("mug").summary.views == 1
         assert finished(verify(catalog)).findings == ()
-
-    def test_replaced_object_keeps_its_old_enrollment(
-        self, batch: ImportBatch, open_catalog: Callable[[str], Catalog]
-    ) -> None:
-        catalog = open_catalog("catalog")
-        true_fill(catalog, "mug", 2, 0)
         done = run_import(catalog, batch, Conflict.REPLACE)
         assert done.replaced == ("mug",)
         assert [e.status for e in catalog.object("mug").enrollments] == ["complete", "superseded"]
         assert catalog.object("mug").summary.views == 6
 
     def test_several_processes_import_the_same(
-        self, batch: ImportBatch, open_catalog: Callable[[str], Catalog], monkeypatch: pytest.MonkeyPatch
+        self, batch: ImportBatch, open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("rig.catalog.exchange.importing.processes", lambda wanted, _: wanted)
         monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
@@ -750,9 +714,7 @@ class TestAllOrNothing:
             together.views().views.descriptors[0], hbr.describe(together.read_image(together.object("mug").views[0]))
         )
 
-    def test_read_only_catalog_rejects_an_import(
-        self, batch: ImportBatch, open_catalog: Callable[[str], Catalog]
-    ) -> None:
+    def test_read_only_catalog_rejects_an_import(self, batch: ImportBatch, open_catalog: OpenCatalog) -> None:
         path = open_catalog("catalog").path
         with Catalog.open(path, clock=VirtualClock(), read_only=True) as catalog:
             with pytest.raises(CatalogError, match="reading only"):
