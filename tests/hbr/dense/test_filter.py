@@ -77,7 +77,7 @@ def test_those_who_are_kept_are_the_strongest_and_score_as_if_all_were(seed: int
     np.testing.assert_array_equal(later.support, whole.support[strongest])
 
 
-def test_a_view_that_is_left_out_counts_no_more() -> None:
+def test_left_out_view_does_not_count() -> None:
     views = catalog(5, ragged=False)
     index = DenseIndex(views)
     query = views.descriptors[11]
@@ -108,7 +108,7 @@ def test_turning_the_zero_of_the_orientations_changes_nothing() -> None:
     np.testing.assert_allclose(one.support, other.support, atol=1e-6)
 
 
-def test_what_is_no_query_is_refused() -> None:
+def test_invalid_query_is_rejected() -> None:
     index = DenseIndex(catalog(1))
     query = np.zeros(144, np.uint8)
     assert isinstance(update_belief(query, 0.0, index), Belief)

@@ -62,7 +62,7 @@ def test_time_that_a_turn_takes_is_weighed_against_what_it_tells() -> None:
     assert abs(slow.rotation_deg) < abs(quick.rotation_deg)
 
 
-def test_where_one_was_already_nothing_new_is_expected() -> None:
+def test_visited_view_has_no_expected_gain() -> None:
     first = update_belief(looked(30.0), 0.0, INDEX)
     second = update_belief(looked(180.0), 150.0, first)
     look = next_best_view(second, beta=60.0, seconds=np.zeros(BINS - 1))
@@ -73,7 +73,7 @@ def test_where_one_was_already_nothing_new_is_expected() -> None:
 
 @settings(max_examples=10)
 @given(st.integers(0, 23), st.floats(5, 100))
-def test_the_expected_confusion_is_that_of_the_formula(start: int, sharpness: float) -> None:
+def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> None:
     """Once more from the posterior of single hypotheses that the decision keeps, written out."""
     from hbr.dense.next_view import _strongest
 
@@ -104,7 +104,7 @@ def test_one_object_alone_is_looked_at_from_a_new_side() -> None:
     assert abs(look.rotation_deg) >= 50
 
 
-def test_what_is_no_choice_is_refused() -> None:
+def test_invalid_choice_is_rejected() -> None:
     belief = update_belief(looked(0.0), 0.0, INDEX)
     with pytest.raises(ValueError, match="the cable's limits"):
         next_best_view(belief, beta=1.0, rotations_deg=[])

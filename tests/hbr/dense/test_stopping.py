@@ -104,7 +104,7 @@ def test_open_set_score_is_relative_to_the_usual_score_of_the_leader() -> None:
     )
 
 
-def test_a_fitted_rule_finds_enrolled_objects_and_calls_others_unknown() -> None:
+def test_fitted_rule_finds_enrolled_objects_and_calls_others_unknown() -> None:
     everything = catalog(40, seed=3)
     index = DenseIndex(everything.select(everything.object_index < 30))
     rule = fit_stopping_rule(leave_one_out(index, beta=BETA), error_rate=0.05, false_reject=0.05)
@@ -123,7 +123,7 @@ def test_a_fitted_rule_finds_enrolled_objects_and_calls_others_unknown() -> None
     assert [outcome for outcome, _ in ends[30:]].count(Outcome.UNKNOWN) >= 9
 
 
-def test_a_small_catalog_guarantees_nothing_and_says_how_much_data_is_needed() -> None:
+def test_small_catalog_guarantees_no_rate_and_reports_the_data_it_needs() -> None:
     index = DenseIndex(catalog(2))
     rule = fit_stopping_rule(leave_one_out(index, beta=BETA), error_rate=0.01, false_reject=0.02)
     assert rule.min_confidence == UNCALIBRATED_MIN_CONFIDENCE

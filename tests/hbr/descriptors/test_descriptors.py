@@ -26,15 +26,12 @@ def photo(seed: int = 0, size: tuple[int, int] = (120, 160)) -> np.ndarray:
     return image
 
 
-def test_attributes_fit_the_levels(one: Descriptor) -> None:
+def test_attributes_fit_the_levels_and_unpack_restores_packed_levels(one: Descriptor) -> None:
     levels = one.describe(photo())
     assert levels.shape == (one.length,)
     assert levels.dtype == np.uint8
     assert len(one.pack(levels)) == one.size_bytes <= 160
     assert descriptor(one.name) is one
-
-
-def test_unpack_restores_packed_levels(one: Descriptor) -> None:
     for seed in range(5):
         levels = one.describe(photo(seed))
         np.testing.assert_array_equal(one.unpack(one.pack(levels)), levels)
@@ -52,11 +49,6 @@ def test_similarity_is_1_to_itself_symmetric_and_between_0_and_1(one: Descriptor
     assert (similar <= 1 + 1e-12).all()
     assert similar[~np.eye(6, dtype=bool)].max() < 0.999
     np.testing.assert_allclose(one.similarity(rows[:2], rows), similar[:2], atol=1e-6)
-
-
-def test_unknown_name_is_rejected_with_the_known_names() -> None:
-    with pytest.raises(ValueError, match="'sift' is unknown; use one of cedd"):
-        descriptor("sift")
 
 
 def varint(number: int) -> bytes:
@@ -122,13 +114,15 @@ def test_unusable_model_is_rejected_with_the_reason(tmp_path: Path) -> None:
         load_model(tmp_path / "large.onnx")
 
 
-def test_name_of_a_descriptor_opens_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_name_of_a_descriptor_is_checked_and_opens_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "means.onnx"
     file.write_bytes(model())
     monkeypatch.setattr(Path, "open", None)
     for name in (f"onnx:{file}", "onnx:", f"onnx:{'0' * 64}"):
         with pytest.raises(ValueError, match="is not loaded"):
             descriptor(name)
+    with pytest.raises(ValueError, match="'sift' is unknown; use one of cedd"):
+        descriptor("sift")
 
 
 def test_blur_of_a_block_makes_cedd_robust_to_noise() -> None:

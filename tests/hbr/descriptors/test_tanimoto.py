@@ -25,31 +25,20 @@ def test_equals_exact_fractions(a: np.ndarray, b: np.ndarray) -> None:
             assert found[i, j] == (float(Fraction(dot, union)) if union else 0.0)
 
 
-def test_bytes_up_to_255_are_exact() -> None:
-    a = np.full((1, 144), 255, np.uint8)
-    b = a.copy()
-    b[0, 0] = 254
-    dot = 143 * 255**2 + 255 * 254
-    assert tanimoto(a, b)[0, 0] == dot / (144 * 255**2 + 143 * 255**2 + 254**2 - dot)
+@pytest.mark.parametrize(("length", "level"), [(144, 254), (301, 253)])
+def test_long_rows_of_bytes_up_to_255_are_exact(length: int, level: int) -> None:
+    a, b = np.full((1, length), 255, np.uint8), np.full((1, length), level, np.uint8)
+    dot = length * 255 * level
+    assert tanimoto(a, b)[0, 0] == dot / (length * 255**2 + length * level**2 - dot)
 
 
-def test_long_rows_of_bytes_are_exact() -> None:
-    a = np.full((1, 301), 255, np.uint8)
-    b = np.full((1, 301), 253, np.uint8)
-    dot = 301 * 255 * 253
-    assert tanimoto(a, b)[0, 0] == dot / (301 * 255**2 + 301 * 253**2 - dot)
-
-
-def test_equal_ratios_of_different_integers_are_equal() -> None:
+def test_equal_ratios_of_different_integers_are_equal_and_zero_rows_have_similarity_0() -> None:
     query = np.zeros(144, np.uint8)
     query[:2] = 1
     rows = np.zeros((2, 144), np.uint8)
     rows[0, 0] = 1  # 1 / (2 + 1 - 1)
     rows[1, :4] = 1  # 2 / (2 + 4 - 2)
     assert tanimoto(query, rows).tolist() == [[0.5, 0.5]]
-
-
-def test_zero_rows_have_similarity_0() -> None:
     zero, one = np.zeros(144, np.uint8), np.ones(144, np.uint8)
     assert tanimoto(np.stack([zero, one]), np.stack([zero, one])).tolist() == [[0, 0], [0, 1]]
 

@@ -29,14 +29,14 @@ def test_views_are_found_sorted_and_the_missing_counted(tmp_path: Path) -> None:
         dataset.subset(3, 4)
 
 
-def test_a_view_that_is_there_twice_is_named(tmp_path: Path) -> None:
+def test_duplicate_view_is_named(tmp_path: Path) -> None:
     for name in ("obj1__5.png", "obj1__5.0.jpg", "obj2__0.png"):
         picture(tmp_path / name)
     with pytest.raises(DatasetError, match=r"obj1__5\.0\.jpg and .*obj1__5\.png"):
         load_coil(tmp_path)
 
 
-def test_a_folder_that_is_not_there_or_holds_nothing_is_named(tmp_path: Path) -> None:
+def test_missing_or_empty_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="nowhere"):
         load_coil(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match=f"{tmp_path.name} holds no view"):
@@ -47,7 +47,7 @@ def test_a_folder_that_is_not_there_or_holds_nothing_is_named(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_files_that_are_cut_off_are_named(tmp_path: Path, suffix: str) -> None:
+def test_truncated_files_are_named(tmp_path: Path, suffix: str) -> None:
     path = picture(tmp_path / f"obj1__0{suffix}", 64)
     assert read_photograph(path).shape == (64, 64, 3)
     whole = path.read_bytes()

@@ -22,7 +22,7 @@ def run(name: str, j: int = 2, protocol: Protocol = PROTOCOL) -> Runs:
 
 @pytest.mark.parametrize("protocol", [PROTOCOL, Protocol(trials=2, max_views=4, near_deg=20)])
 @pytest.mark.parametrize("name", ["dense", "dense-90", "dense-random", "dense-coin"])
-def test_a_trial_equals_the_protocol_written_out(name: str, protocol: Protocol) -> None:
+def test_trial_equals_the_literal_protocol(name: str, protocol: Protocol) -> None:
     j = 2
     own = VIEWS.of(j)
     runs = run(name, j, protocol)
@@ -86,7 +86,7 @@ def test_absent_objects_are_searched_for_among_the_others() -> None:
         run("hbr", 1, protocol)
 
 
-def test_the_oracle_leads_at_least_as_much_as_a_fixed_step() -> None:
+def test_oracle_has_a_larger_margin_than_a_fixed_step() -> None:
     margins = {
         name: np.mean([run(name, j).margin[0, 0, :, 1].mean() for j in range(6)])
         for name in ("dense-oracle", "dense-90")

@@ -15,14 +15,14 @@ def test_motion_kernel_equals_matlab() -> None:
     np.testing.assert_allclose(motion_kernel(3, 45), expected, atol=5e-5)
 
 
-def test_a_level_motion_is_a_box_and_a_turned_one_its_transpose() -> None:
+def test_horizontal_motion_is_a_box_and_vertical_motion_its_transpose() -> None:
     np.testing.assert_allclose(motion_kernel(15, 0), np.full((1, 15), 1 / 15), atol=1e-12)
     np.testing.assert_allclose(motion_kernel(9, 90), np.full((9, 1), 1 / 9), atol=1e-12)
 
 
 @settings(max_examples=60)
 @given(st.floats(1, 40), st.floats(-720, 720))
-def test_a_motion_kernel_is_a_symmetric_mean_along_its_direction(length: float, angle: float) -> None:
+def test_motion_kernel_is_a_symmetric_mean_along_its_direction(length: float, angle: float) -> None:
     kernel = motion_kernel(length, angle)
     assert kernel.sum() == pytest.approx(1)
     np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
@@ -35,7 +35,7 @@ def test_a_motion_kernel_is_a_symmetric_mean_along_its_direction(length: float, 
         assert (kernel * across**2).sum() < 0.5  # of a pixel's triangle: 1/6
 
 
-def test_an_impulse_is_smeared_counter_clockwise_and_borders_are_replicated() -> None:
+def test_impulse_is_smeared_counter_clockwise_and_borders_are_replicated() -> None:
     image = np.zeros((31, 31, 3), np.uint8)
     image[15, 15] = 255
     smeared = Noise.parse("mb:9:30").apply(image, np.random.default_rng(0))[:, :, 0]
@@ -56,15 +56,12 @@ def test_gaussian_noise_has_the_variance_of_intensities_and_is_clipped() -> None
 @pytest.mark.parametrize("text", ["none", "gn:0.012", "mb:15:20", "gn:0.05+mb:9:45", "gn:0.012+mb:15:20"])
 def test_noise_reads_what_it_writes(text: str) -> None:
     assert str(Noise.parse(text)) == text
-
-
-def test_short_forms_are_the_paper_s() -> None:
-    assert Noise.parse("gn+mb") == Noise(0.012, 15, 20)
+    assert Noise.parse("gn+mb") == Noise(0.012, 15, 20)  # the short forms have the values of the paper
     assert str(Noise.parse("mb:7")) == "mb:7:20"
 
 
 @pytest.mark.parametrize("text", ["", "GN", "gn:x", "gn:1:2", "mb:1:2:3", "gn+gn", "gn:-1", "mb:nan", "none+gn"])
-def test_what_is_no_noise_is_refused(text: str) -> None:
+def test_invalid_noise_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r"noise|motion"):
         Noise.parse(text)
 
@@ -78,13 +75,13 @@ def ball(size: int = 64) -> np.ndarray:
     return image
 
 
-def test_the_mask_is_the_object_with_its_dark_parts() -> None:
+def test_mask_includes_the_dark_parts_of_the_object() -> None:
     y, x = np.indices((64, 64)) - 31.5
     np.testing.assert_array_equal(object_mask(ball()), np.hypot(x, y) < 64 / 3)
 
 
 @pytest.mark.parametrize("background", ["uniform", "textured"])
-def test_a_background_changes_what_is_behind_the_object_alone(background: str) -> None:
+def test_background_changes_only_pixels_behind_the_object(background: str) -> None:
     image = ball()
     query = Condition(background=background).query(image, np.random.default_rng(2)).image  # type: ignore[arg-type]
     mask = object_mask(image)
@@ -94,7 +91,7 @@ def test_a_background_changes_what_is_behind_the_object_alone(background: str) -
     assert np.abs(behind - image[~mask]).mean() > 20
 
 
-def test_a_turned_query_shows_the_object_turned() -> None:
+def test_rotated_query_shows_the_object_rotated() -> None:
     image = np.zeros((65, 65, 3), np.uint8)
     image[28:37, 10:55] = 200
     query = Condition(rotation_deg=180).query(image, np.random.default_rng(3)).image
@@ -117,21 +114,15 @@ def test_sizes_and_prefilter_are_of_both_sides_and_noise_of_queries_alone() -> N
 
 @pytest.mark.parametrize(
     "setting",
-    [
-        {"size_px": 1},
-        {"rotation_deg": 181},
-        {"background": "sea"},
-        {"prefilter_px": -1},
-        {"rotation_deg": float("nan")},
-    ],
+    [{"size_px": 1}, {"rotation_deg": 181}, {"background": "sea"}, {"prefilter_px": -1}, {"rotation_deg": np.nan}],
 )
-def test_what_is_no_condition_is_refused(setting: dict) -> None:
+def test_invalid_condition_is_rejected(setting: dict) -> None:
     with pytest.raises(ValueError, match=r"pixels|rotation|background"):
         Condition(**setting)
 
 
 @pytest.mark.parametrize(("number", "low", "high"), [(1, 0.3, 0.4), (3, 0.25, 0.35), (8, 0.2, 0.3), (26, 0.1, 0.9)])
-def test_the_dark_surroundings_of_a_photograph_are_left_out(
+def test_mask_excludes_the_dark_surroundings_of_a_photograph(
     rig_test_data: Path, number: int, low: float, high: float
 ) -> None:
     image = cv2.imread(str(rig_test_data / f"coil-100/obj{number}__0.png"))

@@ -40,7 +40,7 @@ def run(j: int, methods: tuple[Method, ...] = ALL, protocol: Protocol = PROTOCOL
 
 @pytest.mark.parametrize("name", ["hbr", "hbr-visual", "hbr-0-orient", "ahbr", "ahbr-90", "coin", "sweep-90"])
 @pytest.mark.parametrize("removal", ["near", "paper79", "queries"])
-def test_a_trial_equals_the_protocol_written_out(name: str, removal: Removal) -> None:
+def test_trial_equals_the_literal_protocol(name: str, removal: Removal) -> None:
     """Every number once more from `retrieve`, `lead` and `next_view` on a model with the views taken out."""
     method, protocol = METHODS[name], replace(PROTOCOL, removal=removal, drift_deg=1.0)
     j = 2
@@ -143,7 +143,7 @@ def test_orientation_errors_are_normal_about_the_drift() -> None:
     assert errors.std() == pytest.approx(3, rel=0.05)
 
 
-def test_a_symmetric_object_has_a_plain_error_and_hardly_one_of_looks() -> None:
+def test_symmetric_object_has_a_pose_error_but_no_error_of_appearance() -> None:
     """An object that looks the same from four sides: poses are 0, 90, 180 or 270 degrees off."""
     rng = np.random.default_rng(5)
     quarter = rng.integers(0, 8, (6, 144)) * (rng.random((6, 144)) < 0.3)
@@ -155,7 +155,7 @@ def test_a_symmetric_object_has_a_plain_error_and_hardly_one_of_looks() -> None:
     assert (runs.alike_error_deg == 0).all()
 
 
-def test_the_time_of_a_step_comes_from_the_timer() -> None:
+def test_time_of_a_step_comes_from_the_timer() -> None:
     ticks = iter(range(0, 10**9, 7))
     runs = run_object(0, QUERIES[:24], VIEWS, ALL[:2], PROTOCOL, now_ns=lambda: next(ticks))
     assert (runs.step_ns[1] == 7).all()
@@ -168,7 +168,7 @@ def test_runs_of_objects_are_joined_in_their_order() -> None:
     np.testing.assert_array_equal(joined.rank[:, 1:], run(0, ALL[:2]).rank)
 
 
-def test_what_cannot_be_run_is_refused() -> None:
+def test_impossible_runs_are_rejected() -> None:
     with pytest.raises(ValueError, match="object 0 has 24 views; for 24 queries"):
         run(0, ALL[:1], Protocol(max_views=24))
     with pytest.raises(ValueError, match="no view of object 0 is left"):
@@ -181,7 +181,7 @@ def test_what_cannot_be_run_is_refused() -> None:
     "setting",
     [{"trials": 0}, {"max_views": 0}, {"removal": "all"}, {"near_deg": 0}, {"sigma_deg": -1}, {"seed": -1}],
 )
-def test_what_is_no_protocol_is_refused(setting: dict) -> None:
+def test_invalid_protocol_is_rejected(setting: dict) -> None:
     with pytest.raises(ValueError, match=r"trials|removal|seed"):
         Protocol(**setting)
 

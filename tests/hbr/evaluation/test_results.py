@@ -18,7 +18,7 @@ def runs_of(rank: list, **arrays: list) -> Runs:
     return runs
 
 
-def test_a_curve_counts_hits_and_the_ten_best() -> None:
+def test_curve_counts_hits_and_the_ten_best() -> None:
     runs = runs_of([[[1, 1], [2, 1], [11, 10], [0, 0]]], travelled_deg=[[[0, 90], [0, 30], [0, 60], [0, 0]]])
     (result,) = method_results(runs, PAIR[:1], 0.0)
     first, second = result.curve
@@ -41,7 +41,7 @@ def test_no_hit_has_no_pose_error() -> None:
     assert point.pose_error_median_deg is point.alike_error_rmse_deg is None
 
 
-def test_a_search_ends_by_its_margin_after_min_views_or_at_the_last_view() -> None:
+def test_search_ends_by_its_margin_after_min_views_or_at_the_last_view() -> None:
     runs = runs_of(
         [[[2, 2, 1], [1, 2, 2], [1, 1, 2], [2, 2, 1]]],
         margin=[[[0.1, 0.2, 0.3], [0.9, 0.5, 0.5], [0.0, 0.49, 0.2], [0, 0.5, 0]]],
@@ -58,7 +58,7 @@ def test_a_search_ends_by_its_margin_after_min_views_or_at_the_last_view() -> No
     assert early.stopping.hit_rate == 0.5
 
 
-def test_a_method_of_one_view_has_one_point() -> None:
+def test_method_of_one_view_has_one_point() -> None:
     runs = runs_of([[[1, -1], [2, -1]]], margin=[[[0.0, np.nan]] * 2], travelled_deg=[[[0.0, np.nan]] * 2])
     (result,) = method_results(runs, PAIR[:1], 0.1)
     assert len(result.curve) == 1

@@ -25,7 +25,7 @@ def test_mcnemar_by_hand() -> None:
     assert mcnemar_exact(1, 3) == mcnemar_exact(3, 1) == 2 * 5 / 16
 
 
-def test_the_bootstrap_resamples_objects_not_trials() -> None:
+def test_bootstrap_resamples_objects_not_trials() -> None:
     rng = np.random.default_rng(0)
     of_object = np.repeat(rng.random((60, 1)) < 0.7, 20, axis=1)  # all trials of an object are one
     never = np.zeros_like(of_object)

@@ -147,12 +147,8 @@ def test_one_query_ranks_by_the_best_view() -> None:
     assert ranking.scores.tolist() == [1.0, 1.0]
     assert ranking.paths.tolist() == [[2], [3]]
     assert ranking.margin == 0.0
-
-
-def test_margin_of_a_single_candidate_is_its_score() -> None:
-    ranking = retrieve(Q1[None], [0.0], ViewIndex(HAND), list_length=1)
-    assert len(ranking) == 1
-    assert ranking.margin == 1.0
+    single = retrieve(Q1[None], [0.0], ViewIndex(HAND), list_length=1)
+    assert (len(single), single.margin) == (1, 1.0)  # the score of a single candidate
 
 
 def test_object_indices_are_independent_of_the_order_of_views() -> None:
@@ -186,10 +182,6 @@ def test_object_indices_are_independent_of_the_order_of_views() -> None:
     ],
 )
 def test_invalid_arguments_are_rejected(changed: dict[str, Any], error: type[Exception], message: str) -> None:
-    arguments: dict[str, Any] = {
-        "queries": np.stack([Q1, Q2]),
-        "orientation_deg": [0.0, 90.0],
-        "index": ViewIndex(HAND),
-    }
+    arguments = {"queries": np.stack([Q1, Q2]), "orientation_deg": [0.0, 90.0], "index": ViewIndex(HAND)}
     with pytest.raises(error, match=message):
         retrieve(**(arguments | changed))

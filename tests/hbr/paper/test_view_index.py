@@ -133,18 +133,16 @@ def test_promising_rows_are_distinct_and_enough(k: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_large_k_returns_all_views(method: Method) -> None:
+def test_large_k_returns_all_views_and_an_empty_index_none(method: Method) -> None:
     index = ViewIndex(views_of(np.eye(3, 144, dtype=np.uint8)), method)
     rows, similarities = index.search(np.eye(1, 144, 1, dtype=np.uint8)[0], 10)
     assert rows.tolist() == [1, 0, 2]
     assert similarities.tolist() == [1, 0, 0]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_an_empty_index_finds_nothing(method: Method) -> None:
-    index = ViewIndex(Views.empty(), method)
-    rows, similarities = index.search(np.ones(144, np.uint8), 10)
-    assert len(index) == len(rows) == len(similarities) == 0
+    empty = ViewIndex(Views.empty(), method)
+    rows, similarities = empty.search(np.ones(144, np.uint8), 10)
+    assert len(empty) == len(rows) == len(similarities) == 0
+    with pytest.raises(ValueError, match="auto, flat, bound, kdtree"):
+        ViewIndex(Views.empty(), "hash")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -160,8 +158,3 @@ def test_an_empty_index_finds_nothing(method: Method) -> None:
 def test_invalid_queries_are_rejected(query: np.ndarray, k: int, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         ViewIndex(views_of(np.ones((1, 144), np.uint8))).search(query, k)
-
-
-def test_unknown_method_is_rejected() -> None:
-    with pytest.raises(ValueError, match="auto, flat, bound, kdtree"):
-        ViewIndex(Views.empty(), "hash")  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ BYTE = st.integers(0, 255)
 FRAMES = st.builds(Frame, BYTE, BYTE, st.binary(max_size=protocol.MAX_BODY))
 
 
-def test_the_checksum_is_crc_16_ccitt_false():
+def test_checksum_is_crc_16_ccitt_false():
     line = encode(Frame(0x31, 0x32, b"3456789"))
     assert cobs.decode(line[:-1]) == b"123456789" + (0x29B1).to_bytes(2, "big")
 

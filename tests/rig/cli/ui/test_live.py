@@ -107,7 +107,7 @@ def test_search_in_a_pipe_is_printed_in_lines():
 
 @pytest.mark.parametrize("width", [30, 60, 120])
 @pytest.mark.parametrize("answer", ["mug-white", None])
-def test_a_dense_search_shows_probabilities_and_what_the_rules_say(width, answer):
+def test_dense_search_shows_probabilities_and_the_stopping_rule(width, answer):
     console = screen(width)
     text = shown(console, IdentifyView(console), list(searching_densely(answer)))
     flat = " ".join(text.split())
@@ -118,7 +118,7 @@ def test_a_dense_search_shows_probabilities_and_what_the_rules_say(width, answer
     assert ("Unknown object. The most similar enrolled objects are mug-white (score 0.900)" in flat) == (answer is None)
 
 
-def test_a_dense_search_in_a_pipe_reads_as_lines():
+def test_dense_search_in_a_pipe_is_printed_as_lines():
     console = screen(80, terminal=False)
     lines = shown(console, IdentifyView(console), list(searching_densely())).splitlines()
     assert lines[0].startswith("Note: 24 leave-one-out searches")

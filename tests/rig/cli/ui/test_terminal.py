@@ -85,7 +85,7 @@ def test_json_stays_json_and_is_neutral(text):
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_a_terminal_gets_the_colors_of_rich_but_no_others(attack, monkeypatch):
+def test_terminal_gets_only_the_colors_of_rich(attack, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.delenv("NO_COLOR", raising=False)
