@@ -6,13 +6,14 @@ READY  := .venv/.ready
 # With several threads small matrix products wait for each other; one is faster here.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test test-nightly test-kills lint docs wheel bench lock clean help
+.PHONY: demo test test-nightly test-kills fuzz lint docs wheel bench lock clean help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
 	@echo "make test   run the tests (about three minutes on two cores)"
 	@echo "make test-nightly  run all tests, with many more cases in each"
 	@echo "make test-kills  kill the program at a hundred points of its work, and check what is left"
+	@echo "make fuzz   attack every kind of input for about an hour (a part of test-nightly)"
 	@echo "make lint   formatting, lint, types, import contracts"
 	@echo "make docs   the documentation as a site in site/"
 	@echo "make wheel  build wheel and sdist in dist/, and try the wheel in an empty environment"
@@ -33,6 +34,9 @@ test-nightly: $(READY)
 KILLS ?= 8
 test-kills: $(READY)
 	@RIG_TEST_KILLS=$(KILLS) $(BIN)/python -m pytest -n auto --dist worksteal --timeout 3600 tests/faults/test_kill*.py
+
+fuzz: $(READY)
+	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly tests/fuzz
 
 lint: $(READY)
 	@$(BIN)/ruff format --check .

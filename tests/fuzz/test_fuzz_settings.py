@@ -34,7 +34,7 @@ FILES = st.one_of(
 )
 
 
-@fuzz_settings(0.6)
+@fuzz_settings(0.3)
 @given(FILES, st.lists(SETTINGS, max_size=2))
 @example("a=" + "[" * 40_000, [])
 @example("a={" * 3000, [])
@@ -45,7 +45,7 @@ def test_any_configuration_is_read_or_a_config_error(tmp_path_factory, text, ove
         load_config(file, overrides)
 
 
-@fuzz_settings(0.4)
+@fuzz_settings(0.2)
 @given(FILES, st.sampled_from(KEYS), VALUES)
 def test_any_edit_changes_one_key_or_is_a_config_error(text, key, value):
     path = tuple(key.split("."))
@@ -92,7 +92,7 @@ COMMANDS = [
 OPTIONS = ["--json", "--yes", "--seed", "--views", "--turns", "--config", "--list", "--check", "--set", "--dry-run"]
 
 
-@cases(14)
+@cases(10)
 @given(st.sampled_from(COMMANDS), st.lists(st.one_of(ARGUMENTS, st.sampled_from(OPTIONS)), max_size=4))
 @example("goto", ["nan"])
 @example("goto", ["--", "-1e308"])
