@@ -69,6 +69,8 @@ class LeaveOneOut:
     ----------
     objects : int
         Names in the model set.
+    searched : integer array (searches,)
+        The object of each search.
     known : Leaders
         Among all enrolled objects.
     unknown : Leaders
@@ -82,6 +84,7 @@ class LeaveOneOut:
     """
 
     objects: int
+    searched: IndexArray
     known: Leaders
     unknown: Leaders
     confidence: FloatArray
@@ -122,7 +125,7 @@ def leave_one_out(
     levels = index.views.descriptors if seen is None else seen
     if levels.shape != index.views.descriptors.shape:
         raise ValueError(f"seen has shape {levels.shape}; the catalog's views have {index.views.descriptors.shape}")
-    known, unknown, confidence, correct = [], [], [], []
+    searched, known, unknown, confidence, correct = [], [], [], [], []
     aside = 0.0
     for place, object_index in enumerate(index.object_index.tolist()):
         rows = index.views.of(object_index)
@@ -134,6 +137,7 @@ def leave_one_out(
         others = np.delete(index.object_index, place)
         for start in np.unique(np.arange(searches) * len(rows) // searches).tolist():
             chosen = _spread(azimuth_deg, start, views)
+            searched.append(object_index)
             support = np.zeros((len(index), BINS), np.float32)
             for n, i in enumerate(chosen):
                 # The query lies beside its enrolled view, towards alternating neighbours.
@@ -153,6 +157,7 @@ def leave_one_out(
     shape = -1, views
     return LeaveOneOut(
         len(index.views.object_names),
+        np.array(searched),
         Leaders.of(known, shape),
         Leaders.of(unknown, shape),
         np.reshape(confidence, shape),

@@ -30,10 +30,11 @@ MOST_SEARCHES: Final = 400
 
 
 class Outcome(StrEnum):
-    """What to do after a view."""
+    """What to do after a view: continue, or end with one of three answers."""
 
     CONTINUE = "continue"
     FOUND = "found"
+    AMBIGUOUS = "ambiguous"
     UNKNOWN = "unknown"
 
 
@@ -148,8 +149,8 @@ class StoppingRule:
         An object is found if it is confident and reaches the open-set threshold. Before the last calibrated view the
         highest of all thresholds counts: an unknown object that passes the first threshold gets another view, which
         costs an enrolled object little. From the last calibrated view on, an object below the threshold is unknown,
-        however many views are left: no false-reject rate was measured for those. After ``max_views`` the leading
-        candidate is found even if it is not confident.
+        however many views are left: no false-reject rate was measured for those. After ``max_views`` an object that is
+        not confident is ambiguous.
         """
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
@@ -168,7 +169,7 @@ class StoppingRule:
         elif belief.queries < max_views:
             outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
         else:
-            outcome, reason = Outcome.FOUND, StopReason.MAX_VIEWS
+            outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
         object_index = int(belief.index.object_index[best])
         return StopDecision(outcome, reason, object_index, confidence, self.min_confidence, score, threshold)
 
@@ -328,9 +329,7 @@ def calibrate_stopping_rule(
     known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
     ended, wrong = _ended(searches, rule.min_confidence)
     accepted = unknown >= rule.open_set_thresholds[-1]
-    # If the object was found, the leader among all is the one that was left out.
-    certain = accepted & searches.correct[:, -1]
-    pairs = np.stack([part.object_index[certain, -1] for part in (searches.known, searches.unknown)], axis=1)
+    pairs = np.stack([searches.searched, searches.unknown.object_index[:, -1]], axis=1)[accepted]
     confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     names = index.views.object_names
     return CalibratedRule(

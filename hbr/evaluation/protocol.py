@@ -28,7 +28,7 @@ from hbr.paper.next_view import Side, next_view
 
 Removal = Literal["near", "paper79", "queries"]
 #: Codes of `Runs.outcome`.
-OUTCOMES: Final = (Outcome.CONTINUE, Outcome.FOUND, Outcome.UNKNOWN)
+OUTCOMES: Final = (Outcome.CONTINUE, Outcome.FOUND, Outcome.UNKNOWN, Outcome.AMBIGUOUS)
 _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr import StopDecision, StopReason
+from hbr import Outcome, StopDecision, StopReason
 from rig.views.capture import ViewEvidence
 
 SCHEMA = 2
@@ -317,6 +317,9 @@ class Failed:
 class Identified:
     """The answer: an object's name, or None for an unknown object.
 
+    ``outcome`` says whether the object was found, is ambiguous, or is unknown; ``possible`` names the objects that it
+    may be: one, several, or none. The ``name`` of an ambiguous object is the first of them.
+
     ``score`` and ``margin`` are per view. ``pose_deg`` is the azimuth the camera sees last, in the catalog's frame, and
     ``yaw_deg`` how far the object is rotated counter-clockwise against its enrollment. ``reason`` says why the search
     ended; ``note`` is the explanation of a strategy of your own, or of an earlier version. The paper's search compares
@@ -334,6 +337,8 @@ class Identified:
     travelled_deg: float
     seconds: float
     reason: StopReason
+    outcome: Outcome
+    possible: tuple[str, ...]
     note: str = ""
     min_score: float | None = None
     min_margin: float | None = None

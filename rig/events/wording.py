@@ -7,6 +7,7 @@ from typing import Any
 from hbr import Outcome, StopDecision, StopReason
 from hbr.dense.stopping import Limitation, LimitationCode
 from rig.events.events import (
+    Candidate,
     Decided,
     Identified,
     Moved,
@@ -20,6 +21,8 @@ from rig.events.events import (
 )
 from rig.views.table_problems import problem_text
 
+NAMED = 5
+"""Objects that an ambiguous answer names."""
 _NEXT_IMAGE = "to take one: rig empty-table"
 
 
@@ -185,19 +188,17 @@ def _side_words(side: str, s_left: float, s_right: float, candidates: int) -> st
 def stop_words(decision: StopDecision, views: int) -> str:
     """Return what the stopping rule decided after ``views`` views, and why."""
     confidence, least = percent_words(decision.confidence), percent_words(decision.min_confidence)
-    score, threshold = f"{decision.open_set_score:.3f}", f"{decision.open_set_threshold:.3f}"
+    above = decision.open_set_score - decision.open_set_threshold
     match decision.reason:
         case StopReason.CONFIDENT:
-            known = f", and the open-set score {score} the {threshold} of enrolled objects"
-            return (
-                f"the confidence {confidence} reaches {least}{known if isfinite(decision.open_set_threshold) else ''}"
-            )
+            known = f", and the open-set score is {abs(above):.3f} above its threshold"
+            return f"the confidence {confidence} reaches {least}{known if isfinite(above) else ''}"
         case StopReason.NOT_CONFIDENT:
             return f"not confident yet: {confidence}, and {least} ends the search"
         case StopReason.BELOW_OPEN_SET_THRESHOLD if decision.outcome is Outcome.CONTINUE:
-            return f"the open-set score {score} is still below the {threshold} of enrolled objects"
+            return f"the open-set score is still {abs(above):.3f} below its threshold"
         case StopReason.BELOW_OPEN_SET_THRESHOLD:
-            return f"the open-set score {score} is below the {threshold} of enrolled objects"
+            return f"no enrolled object is similar enough: the open-set score is {abs(above):.3f} below its threshold"
         case _:
             return f"the best candidate after {counted(views, 'view')}, with a confidence of {confidence} below {least}"
 
@@ -213,11 +214,15 @@ def reason_words(answer: Identified) -> str:
             return answer.note
         case StopReason.MAX_VIEWS if answer.confidence is None:
             return f"the search took all {counted(answer.views, 'view')} that are allowed"
-    unknown = answer.reason is StopReason.BELOW_OPEN_SET_THRESHOLD
     numbers = (answer.confidence, answer.min_confidence, answer.open_set_score, answer.open_set_threshold)
     confidence, least, score, threshold = (nan if number is None else number for number in numbers)
-    outcome = Outcome.UNKNOWN if unknown else Outcome.FOUND
-    return stop_words(StopDecision(outcome, answer.reason, 0, confidence, least, score, threshold), answer.views)
+    return stop_words(StopDecision(answer.outcome, answer.reason, 0, confidence, least, score, threshold), answer.views)
+
+
+def share_words(one: Candidate, decision: StopDecision | None) -> str:
+    """Return a candidate's probability among the enrolled objects; empty for none, or if the object is unknown."""
+    unknown = decision is not None and decision.outcome is Outcome.UNKNOWN
+    return "" if unknown or one.probability is None else percent_words(one.probability)
 
 
 def percent_words(probability: float) -> str:
@@ -258,8 +263,10 @@ def unwinding_words(unwinding: Unwinding) -> str:
 def result_words(answer: Identified) -> str:
     """Return the result alone: "mug-white, rotated 70°, 99 % confident (2 views)".
 
-    An unknown object is given with its three most similar enrolled objects.
+    An ambiguous object is given with the objects that it may be, an unknown one with its three most similar objects.
     """
+    if answer.outcome is Outcome.AMBIGUOUS:
+        return f"Ambiguous: {_one_of(answer)} ({counted(answer.views, 'view')})"
     if answer.name is None:
         similar = [f"{candidate.name} (score {candidate.score:.3f})" for candidate in answer.candidates[:3]]
         verb = "objects are" if len(similar) > 1 else "object is"
@@ -271,12 +278,28 @@ def result_words(answer: Identified) -> str:
     return f"{words} ({counted(answer.views, 'view')})"
 
 
+def outcome_words(answer: Identified) -> str:
+    """Return the answer in a few words for a heading or a table: "mug-white", "mug-white or mug-star", "unknown"."""
+    if answer.outcome is Outcome.UNKNOWN:
+        return "unknown"
+    names = list(answer.possible)
+    return joined(names, "or") if len(names) <= 2 else f"{names[0]} or {len(names) - 1} others"
+
+
+def _one_of(answer: Identified) -> str:
+    """Return the objects that an ambiguous one may be, with their probabilities if there are some."""
+    probability = {one.name: one.probability for one in answer.candidates}
+    items = [
+        name if (share := probability.get(name)) is None else f"{name} ({percent_words(share)})"
+        for name in answer.possible[:NAMED]
+    ]
+    more = len(answer.possible) - NAMED
+    return f"{', '.join(items)} or {more} more" if more > 0 else joined(items, "or")
+
+
 def answer_lines(answer: Identified) -> list[str]:
-    """Return the result, a doubt if there is one, and why the search ended."""
-    lines = [result_words(answer)]
-    if answer.name is not None and answer.margin <= 0 and len(answer.candidates) > 1:
-        lines.append(f"Not certain: {answer.candidates[1].name} is similarly likely.")
-    return [*lines, sentence(reason_words(answer))]
+    """Return the result, and why the search ended."""
+    return [result_words(answer), sentence(reason_words(answer))]
 
 
 def answer_words(answer: Identified) -> str:
@@ -342,9 +365,9 @@ def angle_words(angle_deg: float, decimals: int = 1) -> str:
     return f"{round(angle_deg, decimals) + 0.0:.{decimals}f}°".replace("-", "−")  # + 0.0 removes the sign of a zero
 
 
-def joined(items: Sequence[str]) -> str:
+def joined(items: Sequence[str], conjunction: str = "and") -> str:
     """Return items as an English list: "a, b and c"."""
-    return f"{', '.join(items[:-1])} and {items[-1]}" if len(items) > 1 else "".join(items)
+    return f"{', '.join(items[:-1])} {conjunction} {items[-1]}" if len(items) > 1 else "".join(items)
 
 
 def short(words: str, letters: int) -> str:

@@ -27,8 +27,9 @@ from rig.events.wording import (
     listed,
     move_words,
     note_words,
-    percent_words,
+    outcome_words,
     sentence,
+    share_words,
     signed,
     stop_words,
 )
@@ -188,7 +189,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         number=number,
         stamp=_data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
         truth=_truth(record),
-        answer=(answer.name or "unknown") if answer else "no answer",
+        answer=outcome_words(answer) if answer else "no answer",
         correct=record.correct,
         views=f"{answer.views if answer else len(views)}",
         travelled=f"{answer.travelled_deg:.0f}°" if answer else "–",
@@ -219,8 +220,8 @@ def _report_azimuth_deg(record: IdentificationRecord, azimuth_deg: float) -> flo
     return wrap360(azimuth_deg - (record.yaw_deg or 0.0))
 
 
-def _leading(one: Candidate) -> tuple[str, str, str]:
-    return one.name, f"{one.score:.3f}", "" if one.probability is None else percent_words(one.probability)
+def _leading(one: Candidate, ranked: Ranked) -> tuple[str, str, str]:
+    return one.name, f"{one.score:.3f}", share_words(one, ranked.decision)
 
 
 def _decision(ranked: Ranked | None) -> str:
@@ -260,7 +261,7 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
                 picture=_data_uri(view.picture_bgr),
                 where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
                 rejected=listed(view.rejected),
-                leading=[_leading(c) for c in thought.candidates[:3]] if thought else [],
+                leading=[_leading(c, thought) for c in thought.candidates[:3]] if thought else [],
                 decided=_decision(thought),
                 margin=signed(thought.margin, 3) if thought else "",
                 moved=sentence(move_words(view.move)) if view.move and view.index else "",

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from statistics import fmean, median
 from typing import NamedTuple
 
+from hbr import Outcome
 from rig.events.events import SimilarObjects
-from rig.events.wording import counted, listed, percent_words, similar_object_words
+from rig.events.wording import counted, listed, outcome_words, percent_words, similar_object_words
 from rig.report.records import EnrollmentRecord, IdentificationRecord
 
 
@@ -115,8 +116,12 @@ def _answer_items(record: IdentificationRecord) -> list[SummaryItem]:
     if answer is None:
         return []
     return [
-        SummaryItem("answer", answer.name or "unknown"),
-        *([SummaryItem("confidence", percent_words(answer.confidence))] if answer.confidence is not None else []),
+        SummaryItem("answer", outcome_words(answer)),
+        *(
+            [SummaryItem("confidence", percent_words(answer.confidence))]
+            if answer.confidence is not None and answer.outcome is not Outcome.UNKNOWN
+            else []
+        ),
         SummaryItem("score", f"{answer.score:.3f}", f"per view; margin {answer.margin:.3f}"),
         SummaryItem("views", f"{answer.views}"),
         SummaryItem("travelled", f"{answer.travelled_deg:.0f}°"),

@@ -3,14 +3,23 @@
 from collections.abc import Callable
 from typing import Any, Final
 
-from hbr import StopReason
+from hbr import Outcome, StopReason
 from rig.events.events import Decided, Identified, NoteCode, Ranked, RotationReason
 from rig.views.segmentation_evidence import upgrade_evidence
 
 NOT_SAVED: Final[dict[type, tuple[str, ...]]] = {
     Ranked: ("decision",),
     Decided: ("reason", "note"),
-    Identified: ("reason", "note", "min_score", "min_margin", "min_confidence", "open_set_threshold"),
+    Identified: (
+        "outcome",
+        "possible",
+        "reason",
+        "note",
+        "min_score",
+        "min_margin",
+        "min_confidence",
+        "open_set_threshold",
+    ),
 }
 """Fields of events that formats 1 and 2 do not have, or only in words."""
 
@@ -51,7 +60,15 @@ def _warned(event: dict[str, Any]) -> dict[str, Any]:
 
 
 def _identified(event: dict[str, Any]) -> dict[str, Any]:
+    names = [one["name"] for one in event["candidates"]]
+    outcome, possible = Outcome.FOUND, names[:1]
+    if event["name"] is None:
+        outcome, possible = Outcome.UNKNOWN, []
+    elif event["margin"] <= 0 and len(names) > 1:  # these versions reported it as "Not sure"
+        outcome, possible = Outcome.AMBIGUOUS, names[:2]
     return event | {
+        "outcome": outcome,
+        "possible": possible,
         "reason": StopReason.EARLIER_VERSION,
         "note": event["reason"],
         "confidence": event.get("probability"),

@@ -84,6 +84,8 @@ class Search(ABC):
             travelled_deg=travelled_deg,
             seconds=seconds,
             reason=end.reason,
+            outcome=hbr.Outcome.FOUND,
+            possible=(best.name,),
             note=end.note,
         )
 
@@ -137,9 +139,18 @@ class HoughSearch(Search):
 
     def answer(self, ranked: Ranked, end: Finish, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(ranked, end, travelled_deg=travelled_deg, seconds=seconds)
+        outcome, possible = hbr.Outcome.FOUND, answer.possible
+        if answer.score < self._min_score:
+            outcome, possible = hbr.Outcome.UNKNOWN, ()
+        elif answer.margin <= 0 and len(self._ranking.names) > 1:
+            # Objects that share the best score; at least the second one, which the margin says is as likely.
+            outcome, scores = hbr.Outcome.AMBIGUOUS, self._ranking.scores
+            possible = self._ranking.names[: max(2, int((scores >= scores[0]).sum()))]
         return replace(
             answer,
-            name=answer.name if answer.score >= self._min_score else None,
+            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
+            outcome=outcome,
+            possible=possible,
             min_score=self._min_score,
             min_margin=self._config.identify.margin,
         )
@@ -198,12 +209,27 @@ class DenseSearch(Search):
         threshold = decision.open_set_threshold
         return replace(
             answer,
-            name=answer.name if decision.outcome is hbr.Outcome.FOUND else None,
+            name=None if decision.outcome is hbr.Outcome.UNKNOWN else answer.name,
+            outcome=decision.outcome,
+            possible=self._possible(decision),
             confidence=decision.confidence,
             min_confidence=decision.min_confidence,
             open_set_score=decision.open_set_score,
             open_set_threshold=threshold if isfinite(threshold) else None,
         )
+
+    def _possible(self, decision: hbr.StopDecision) -> tuple[str, ...]:
+        """Return the objects that it may be: the likeliest, which together reach the confidence that ends a search."""
+        if decision.outcome is hbr.Outcome.UNKNOWN:
+            return ()
+        belief = self._session.belief
+        probability = belief.posterior(self._session.rule.beta).sum(axis=1)
+        order = np.lexsort((-belief.scores(), -probability))
+        count = 1
+        if decision.outcome is hbr.Outcome.AMBIGUOUS:
+            count += int((np.cumsum(probability[order]) < decision.min_confidence).sum())
+        names = belief.index.views.object_names
+        return tuple(names[j] for j in belief.index.object_index[order[:count]].tolist())
 
 
 def begin_search(

@@ -2,9 +2,10 @@
 
 from typing import ClassVar
 
+from hbr import StopDecision
 from rig.cli.ui.present import line
 from rig.events.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
-from rig.events.wording import azimuth_words, distinct, percent_words, signed
+from rig.events.wording import azimuth_words, distinct, share_words, signed
 
 
 class MoveLines:
@@ -25,6 +26,7 @@ class MoveLines:
         self._move: Moved | None = None
         self._azimuth_deg = 0.0
         self._leading: tuple[Candidate, ...] = ()
+        self._decision: StopDecision | None = None
 
     def add(self, event: Event) -> str:
         """Take the next event; return the line that it completes, or an empty string."""
@@ -35,7 +37,7 @@ class MoveLines:
             case Accepted():
                 self._azimuth_deg = event.azimuth_deg
             case Ranked():
-                self._leading = event.candidates[:3]
+                self._leading, self._decision = event.candidates[:3], event.decision
             case Decided():
                 text = self._line(event)
                 self._asked_deg = event.target_deg - self._rest_deg
@@ -65,10 +67,7 @@ class MoveLines:
             there = weighed[decided.weighed.rotations_deg.index(decided.rotation_deg)]
             similarity = f"{there:>11.2f}{f'{min(weighed):.2f}–{max(weighed):.2f}':>11} "
         goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
-        leading = ", ".join(
-            f"{c.name} {f'{c.score:.3f}' if c.probability is None else percent_words(c.probability)}"
-            for c in self._leading
-        )
+        leading = ", ".join(f"{c.name} {share_words(c, self._decision) or f'{c.score:.3f}'}" for c in self._leading)
         note = "" if move.agrees else "  encoder and IMU differ"
         return (
             f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{turned}{similarity}{goes:<11} {leading}{note}"

@@ -9,7 +9,7 @@ import typer
 from rig.cli.catalog.catalog import report_other_regions
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import strategy_names
-from rig.cli.ui.exit_codes import EXIT_UNKNOWN
+from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_UNKNOWN
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def identify(
         typer.Option("--watch", help="Wait for the next object after each answer. Start with an empty table."),
     ] = False,
 ) -> None:
-    """Identify the object on the table. The exit code is 8 if the object is unknown.
+    """Identify the object on the table. The exit code is 0 if it is found, 8 if it is unknown, 10 if it is ambiguous.
 
     Put the object on the table in any orientation. The default strategy, dense, rotates to the next best view and stops
     by the rule that rig catalog calibrate has measured. If the catalog has no descriptors for it, the default is ahbr.
@@ -56,6 +56,7 @@ def identify(
 
     Example: rig identify --watch --bench sim --json
     """
+    from hbr import Outcome
     from rig.bench import ObjectAlreadyPlaced, TableClearer
     from rig.cli.objects.empty_table import ensure_empty_table_image
     from rig.cli.ui.live import IdentifyView
@@ -106,8 +107,10 @@ def identify(
                             answer = event
             finally:
                 events.close()
-    if answer is None or answer.name is None:
+    if answer is None or answer.outcome is Outcome.UNKNOWN:
         raise typer.Exit(EXIT_UNKNOWN)
+    if answer.outcome is Outcome.AMBIGUOUS:
+        raise typer.Exit(EXIT_AMBIGUOUS)
 
 
 class _Model:

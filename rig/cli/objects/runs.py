@@ -71,7 +71,7 @@ def report(
 
     Example: rig report runs/1 --out run-1.html
     """
-    from rig.events.wording import answer_words
+    from rig.events.wording import answer_words, outcome_words
     from rig.report import IdentificationRecord, Meta, render_report, write_report
     from rig.search.saved_run import load_run
 
@@ -83,7 +83,7 @@ def report(
         for event in saved.events():
             record.add(event)
         answer = record.answer
-        found = "no answer" if answer is None else answer.name or "unknown object"
+        found = "no answer" if answer is None else outcome_words(answer)
         summary = answer_words(answer) if answer else "The search ended without an answer."
         meta = Meta(
             conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},

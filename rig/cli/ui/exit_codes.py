@@ -5,6 +5,7 @@ from typing import Final
 EXIT_DECLINED: Final = 1
 EXIT_QUALITY: Final = 6
 EXIT_UNKNOWN: Final = 8
+EXIT_AMBIGUOUS: Final = 10
 EXIT_INTERRUPTED: Final = 130
 
 EXIT_CODES: Final = {
@@ -18,6 +19,7 @@ EXIT_CODES: Final = {
     7: "The catalog cannot do this, or it is damaged.",
     EXIT_UNKNOWN: "The object is unknown.",
     9: "Another program uses the bench or the catalog.",
+    EXIT_AMBIGUOUS: "The object is ambiguous: it may be one of several enrolled objects.",
     EXIT_INTERRUPTED: "You pressed Ctrl+C.",
     143: "A signal ended the program: 128 plus its number (SIGTERM 15, SIGHUP 1).",
 }

@@ -36,7 +36,7 @@ from rig.events.wording import (
     decision_words,
     duration_words,
     move_words,
-    percent_words,
+    share_words,
     signed,
     similar_objects_words,
     stop_words,
@@ -305,7 +305,10 @@ class IdentifyView(LiveView):
         if self._ranked is None:
             return ""
         best = self._ranked.candidates[0]
-        return f"{best.name} {_percent(best) or signed(self._ranked.margin, 3)}"
+        return f"{best.name} {self._share(best) or signed(self._ranked.margin, 3)}"
+
+    def _share(self, one: Candidate) -> str:
+        return share_words(one, self._ranked.decision if self._ranked else None)
 
     @property
     def _decision(self) -> str:
@@ -320,13 +323,14 @@ class IdentifyView(LiveView):
         for heading in ("score", "behind", "pose"):
             table.add_column(heading, justify="right")
         candidates = self._ranked.candidates if self._ranked else ()
-        likely = any(one.probability is not None for one in candidates)
+        shares = [self._share(one) for one in candidates]
+        likely = any(shares)
         if likely:
             table.add_column("probability", justify="right")
         wide = self._console.width >= NARROW
         if wide:
             table.add_column("")
-        for place, one in enumerate(candidates, 1):
+        for place, (one, words) in enumerate(zip(candidates, shares, strict=True), 1):
             behind = "" if place == 1 else signed(one.score - candidates[0].score, 3)
             cells: list[RenderableType] = [
                 str(place),
@@ -334,10 +338,10 @@ class IdentifyView(LiveView):
                 f"{one.score:.3f}",
                 behind,
                 f"{azimuth_words(one.pose_deg)}°",
-                *([_percent(one)] if likely else []),
+                *([words] if likely else []),
             ]
             if wide:
-                share = one.score if one.probability is None else one.probability
+                share = one.score if not words or one.probability is None else one.probability
                 cells.append(
                     ProgressBar(total=1.0, completed=max(0.0, min(1.0, share)), width=24, complete_style="cyan")
                 )
@@ -350,7 +354,3 @@ class IdentifyView(LiveView):
         status.append(f"   {self._hint}", style="dim")
         decision = [Text(self._decision)] if self._decision else []
         return Group(table, *decision, status) if candidates else Group(status)
-
-
-def _percent(one: Candidate) -> str:
-    return "" if one.probability is None else percent_words(one.probability)

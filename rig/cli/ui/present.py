@@ -41,7 +41,7 @@ from rig.events.wording import (
     move_words,
     next_step_words,
     note_words,
-    percent_words,
+    share_words,
     signed,
     similar_objects_words,
     unwinding_words,
@@ -87,7 +87,7 @@ def line(event: Event) -> str:
         case Accepted():
             return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
         case Ranked():
-            leaders = ", ".join(_leader(c) for c in event.candidates[:SHOWN])
+            leaders = ", ".join(_leader(c, event) for c in event.candidates[:SHOWN])
             return f"  candidates: {leaders} (margin {signed(event.margin, 3)})"
         case Decided():
             return f"  {decision_words(event)} The table rotates to {angle_words(event.target_deg)}."
@@ -120,9 +120,9 @@ def line(event: Event) -> str:
             return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
 
 
-def _leader(one: Candidate) -> str:
-    probability = "" if one.probability is None else f" ({percent_words(one.probability)})"
-    return f"{one.name} {one.score:.3f}{probability} at {azimuth_words(one.pose_deg)}°"
+def _leader(one: Candidate, ranked: Ranked) -> str:
+    share = share_words(one, ranked.decision)
+    return f"{one.name} {one.score:.3f}{f' ({share})' if share else ''} at {azimuth_words(one.pose_deg)}°"
 
 
 def _skip_words(item: Item) -> str:

@@ -148,8 +148,8 @@ def test_small_catalog_guarantees_no_rate_and_reports_the_data_it_needs() -> Non
         ((9.0,), 0.5, 1, 8, Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD),
         ((0.0, 0.0, 0.0), 0.5, 3, 8, Outcome.FOUND, StopReason.CONFIDENT),
         ((0.0, 0.0, 0.0), 1.1, 3, 8, Outcome.CONTINUE, StopReason.NOT_CONFIDENT),
-        ((0.0, 0.0, 0.0), 1.1, 3, 3, Outcome.FOUND, StopReason.MAX_VIEWS),
-        ((-inf,), 1.1, 1, 1, Outcome.FOUND, StopReason.MAX_VIEWS),
+        ((0.0, 0.0, 0.0), 1.1, 3, 3, Outcome.AMBIGUOUS, StopReason.MAX_VIEWS),
+        ((-inf,), 1.1, 1, 1, Outcome.AMBIGUOUS, StopReason.MAX_VIEWS),
     ],
 )
 def test_decisions(thresholds, min_confidence, views, max_views, outcome, reason) -> None:

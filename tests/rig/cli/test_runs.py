@@ -14,6 +14,7 @@ from rig.bench import ObjectAlreadyPlaced
 from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.cli.objects.identify import _Model
+from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS
 from rig.core.clock import SystemClock
 from rig.events.events import SimilarObjects
 from rig.views.object_presence import TableWatcher
@@ -360,3 +361,24 @@ def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
         assert rig("enroll", "amphora", "--views", "4").exit_code == 0
         assert "amphora" not in before.views.object_names
         assert "amphora" in model().views.object_names
+
+
+def test_ambiguous_object_has_an_exit_code_of_its_own(rig):
+    assert rig("catalog", "calibrate").exit_code == 0
+    path = Path("catalog/search_rules.json")
+    before = path.read_text(encoding="utf-8")
+    try:
+        path.write_text(json.dumps(json.loads(before) | {"min_confidence": 1.5, "open_set_thresholds": [None] * 4}))
+        words = ("identify", "--strategy", "dense", "--max-views", "2", "--set", "bench.sim.object=dice")
+        done = rig(*words, "--json")
+        answer = json.loads(done.stdout.splitlines()[-1])
+        assert done.exit_code == EXIT_AMBIGUOUS
+        assert (answer["outcome"], answer["name"], answer["possible"]) == ("ambiguous", "dice", ["dice", "lamp"])
+        done = rig(*words, "--save-run", "runs/ambiguous")
+        assert done.exit_code == EXIT_AMBIGUOUS
+        assert "\nAmbiguous: dice" in done.stdout
+        assert rig("replay", "runs/ambiguous", "--check").exit_code == 0
+        assert rig("report", "runs/ambiguous").exit_code == 0
+        assert "Search: dice or lamp" in Path("runs/ambiguous/report.html").read_text(encoding="utf-8")
+    finally:
+        path.unlink()

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hbr import Outcome, StopDecision, StopReason
 from hbr.dense.stopping import Limitation, LimitationCode
 from rig.events.events import (
+    Candidate,
     Decided,
     Identified,
     Moved,
@@ -29,13 +30,15 @@ from rig.events.wording import (
     move_words,
     next_step_words,
     note_words,
+    outcome_words,
     percent_words,
     reason_words,
+    share_words,
     similar_objects_words,
     stop_words,
     wait_words,
 )
-from tests.rig.report.report_samples import NOTE, identified
+from tests.rig.report.report_samples import NAMES, NOTE, identified
 
 
 def decided(side: str, rotation_deg: float, s_left: float, s_right: float, *names: str) -> Decided:
@@ -73,11 +76,19 @@ def test_dense_decisions_name_the_two_candidates() -> None:
 @pytest.mark.parametrize(
     ("outcome", "reason", "words"),
     [
-        (Outcome.FOUND, StopReason.CONFIDENT, "the confidence 97.0 % reaches 95.0 %, and the open-set score 1.000 the"),
-        (Outcome.FOUND, StopReason.MAX_VIEWS, "the best candidate after 3 views, with a confidence of 97.0 % below 95"),
+        (
+            Outcome.FOUND,
+            StopReason.CONFIDENT,
+            "the confidence 97.0 % reaches 95.0 %, and the open-set score is 0.100",
+        ),
+        (
+            Outcome.AMBIGUOUS,
+            StopReason.MAX_VIEWS,
+            "the best candidate after 3 views, with a confidence of 97.0 %",
+        ),
         (Outcome.CONTINUE, StopReason.NOT_CONFIDENT, "not confident yet: 97.0 %, and 95.0 % ends the search"),
-        (Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD, "the open-set score 1.000 is still below the 0.900"),
-        (Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD, "the open-set score 1.000 is below the 0.900"),
+        (Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD, "the open-set score is still 0.100 below its"),
+        (Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD, "no enrolled object is similar enough: the open-set"),
     ],
 )
 def test_stop_decisions_give_their_numbers(outcome: Outcome, reason: StopReason, words: str) -> None:
@@ -94,7 +105,16 @@ def test_answers_begin_with_the_result() -> None:
     sure = replace(known, yaw_deg=359.7, confidence=0.996, views=1)
     assert answer_words(sure).startswith("mug-white, rotated 0°, 99 % confident (1 view). ")
     assert ">99.9 % confident" in answer_words(replace(known, confidence=0.9999))
-    assert "Not certain: mug-star is similarly likely." in answer_words(replace(known, margin=-0.01))
+    doubtful = replace(known, outcome=Outcome.AMBIGUOUS, possible=NAMES[:2])
+    assert answer_words(doubtful).startswith("Ambiguous: mug-white or mug-star (4 views). ")
+    assert answer_words(replace(doubtful, possible=tuple("abcdefg"))).startswith(
+        "Ambiguous: a, b, c, d, e or 2 more (4"
+    )
+    likely = tuple(replace(one, probability=0.4) for one in doubtful.candidates)
+    assert "mug-white (40.0 %) or mug-star (40.0 %)" in answer_words(replace(doubtful, candidates=likely))
+    assert outcome_words(doubtful) == "mug-white or mug-star"
+    assert outcome_words(replace(doubtful, possible=NAMES)) == "mug-white or 4 others"
+    assert (outcome_words(known), outcome_words(unknown)) == ("mug-white", "unknown")
     assert answer_words(unknown).startswith(
         "Unknown object. The most similar enrolled objects are mug-white (score 0.930), mug-star (score 0.830) and "
         "teapot (score 0.730). "
@@ -189,6 +209,14 @@ def test_different_numbers_read_differently(a: float, b: float) -> None:
     left, right = distinct(a, b)
     assert (left != right) == (a != b) or abs(a - b) < 1e-5
     assert float(left) == pytest.approx(a, abs=0.00501)
+
+
+def test_probability_of_a_candidate_is_not_given_for_an_unknown_object() -> None:
+    candidate = Candidate("mug", 0.9, 0.0, 0.9999)
+    decision = StopDecision(Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD, 0, 0.9999, 0.95, 0.9, 1.02)
+    assert share_words(candidate, decision) == ""
+    assert share_words(candidate, replace(decision, outcome=Outcome.FOUND)) == share_words(candidate, None) == ">99.9 %"
+    assert share_words(replace(candidate, probability=None), None) == ""
 
 
 def test_percentages_near_0_and_100() -> None:

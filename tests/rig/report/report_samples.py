@@ -99,6 +99,8 @@ def identifying(
         travelled_deg,
         9.5,
         StopReason.MARGIN,
+        Outcome.UNKNOWN if answer is None else Outcome.FOUND,
+        () if answer is None else (answer,),
         min_score=min_score,
         min_margin=0.05,
     )
@@ -148,6 +150,8 @@ def searching_densely(
         195.0,
         7.5,
         StopReason.CONFIDENT,
+        Outcome.UNKNOWN if answer is None else Outcome.FOUND,
+        () if answer is None else (answer,),
         confidence=probability[0],
         min_confidence=0.95,
         open_set_score=1.02,

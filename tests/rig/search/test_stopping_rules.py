@@ -1,12 +1,14 @@
 """The stopping rule of a catalog: calibrated, stored beside it, and renewed when the catalog changes."""
 
 import json
+from dataclasses import replace
 from math import isfinite, nan
 
 import numpy as np
 import pytest
 
 import hbr
+from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.stopping import UNCALIBRATED_MIN_CONFIDENCE, LimitationCode
 from rig.catalog import Catalog
 from rig.config import RigConfig
@@ -132,6 +134,14 @@ def test_confused_objects_are_named():
     twins = [views_of("one", 18, seed=1), views_of("two", 18, seed=1, changing=0.45), views_of("three", 18, seed=2)]
     found = hbr.calibrate_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate([*twins, views_of("four", 18, seed=3)])))
     assert set(found.confused) <= {("one", "two"), ("two", "one")}
+    # also if another object scores more than the searched one, which is the likeliest by its probability
+    searches = leave_one_out(hbr.DenseIndex(hbr.Views.concatenate(twins)))
+    leading = replace(searches.known, object_index=searches.unknown.object_index)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hbr.dense.stopping.leave_one_out", lambda *_, **__: replace(searches, known=leading))
+        again = hbr.calibrate_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate(twins)), false_reject=0.4)
+    assert again.confused
+    assert all(one != other for one, other in again.confused)
     assert bool(found.confused) == bool(found.accepted)
 
 
