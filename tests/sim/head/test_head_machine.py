@@ -112,6 +112,7 @@ class Head(RuleBasedStateMachine):
     def press(self):
         self.head.estop_open = True
         self.world.clock.sleep(0.0015)
+        self.head.catch_up()
         self.latched |= HeadFault.ESTOP
         assert not self.head.relay_closed
         assert self.head.light == 0
