@@ -16,7 +16,8 @@ from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
-from rig.events.events import EmptyTableImage, Warned
+from rig.events.events import EmptyTableImage, NoteCode, Warned
+from rig.events.wording import next_step_words, note_words
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
@@ -88,7 +89,7 @@ def test_round_object_is_noticed_by_the_previous_image(simulated: Open) -> None:
     s.operator.place("vase-blue")
     events = list(photograph_table(s.bench))
     assert [type(event) for event in events[-2:]] == [Warned, EmptyTableImage]
-    assert "does not look as it did" in events[-2].what
+    assert events[-2].note.code is NoteCode.TABLE_DIFFERS
 
 
 def test_dark_table_is_rejected_like_a_view(simulated: Open) -> None:
@@ -246,11 +247,12 @@ def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_
         warned = [event for event in enroll(s.bench, catalog, "toy-car", views=6) if isinstance(event, Warned)]
         views = catalog.object("toy-car").views
     assert [event.index for event in warned] == [2]
-    assert "rig empty-table" in warned[0].next_step
+    assert warned[0].note.code is NoteCode.EMPTY_TABLE_CHANGED
+    assert "rig empty-table" in next_step_words(warned[0].note)
     assert all(view.record.segmentation["issues"][0]["code"] == "empty-table-differs" for view in views)
     *_, problem = empty_table_status(s.bench).problems
     assert (problem.code, problem.parameters["frames"]) == (TableProblemCode.SURROUNDINGS, 3)
-    assert "3 frames in a row" in warned[0].what
+    assert "3 frames in a row" in note_words(warned[0].note)
     photographed(s.bench)
     assert empty_table_status(s.bench).problems == ()
 
