@@ -1,9 +1,10 @@
 """The text of events and dry runs on a terminal, and progress bars."""
 
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -53,6 +54,9 @@ from rig.views.capture import rejection_text
 SHOWN = 3
 
 
+_PIPE_COLUMNS: Final = 240
+
+
 class _Screen(Console):
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError  # `rig.cli.ui.command` handles it
@@ -65,10 +69,13 @@ class _Screen(Console):
 def console(*, stderr: bool = False, plain: bool = False) -> Console:
     """Return a console for stdout or stderr; colors and width follow the terminal, NO_COLOR and COLUMNS.
 
-    ``plain`` prints lines as into a pipe, on a terminal too.
+    Tables in a pipe or file are as wide as their content. ``plain`` prints as into a pipe, on a terminal too.
     """
     stream = unguarded(sys.stderr if stderr else sys.stdout)
-    return _Screen(file=stream, stderr=stderr, force_terminal=False if plain else None)
+    screen = _Screen(file=stream, stderr=stderr, force_terminal=False if plain else None)
+    if not screen.is_terminal and "COLUMNS" not in os.environ:
+        screen.width = _PIPE_COLUMNS
+    return screen
 
 
 def line(event: Event) -> str:
