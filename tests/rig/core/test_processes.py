@@ -2,11 +2,14 @@
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
+from hbr.descriptors import descriptor, load_model
 from rig.core.errors import RigError
 from rig.core.processes import map_in_processes
+from tests.hbr.descriptors.test_descriptors import model
 
 
 def work(item: int) -> int:
@@ -23,3 +26,13 @@ def test_killed_process_raises_an_error_with_a_next_step() -> None:
 
 def test_one_job_runs_in_this_process() -> None:
     assert list(map_in_processes(work, [1, 2], 1)) == [(1, 1), (2, 4)]
+
+
+def length(item: tuple[str, int]) -> int:
+    return descriptor(item[0]).length
+
+
+def test_processes_have_the_models_that_were_loaded(tmp_path: Path) -> None:
+    (tmp_path / "means.onnx").write_bytes(model())
+    name = load_model(tmp_path / "means.onnx").name
+    assert {found for _, found in map_in_processes(length, [(name, 1), (name, 2)], 2)} == {3}
