@@ -32,11 +32,13 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
     if state.damage:
         yield bad(
             "bench",
-            state.damage,
-            "Check how far the cable is wound up, then: " + context.rig("home --turns N"),
+            state.fault.what if state.fault else state.damage,
+            "Check how far the cable is wound up, then: "
+            f"{context.rig('acknowledge')} and {context.rig('home --turns N')}",
             exit_code=5,
+            damage=state.damage,
         )
-    if state.fault is not None:
+    elif state.fault is not None:
         fault = state.fault
         text = f"fault {fault.code} ({fault.title}) is latched since {fault.utc}: {fault.what}"
         yield bad("bench", text, context.rig("acknowledge"), exit_code=5, code=fault.code, next_step=fault.next_step)

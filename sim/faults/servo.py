@@ -117,6 +117,24 @@ def _late_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -
 
 
 @simulated_fault(
+    "duplicate_reply",
+    "Some answers arrive a second time, later, while the computer waits for another answer.",
+    rate=share(0.2, "answers"),
+    seconds=Parameter(0.04, "delay of the second one, s", 0, 10),
+)
+def _duplicate_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+    bus, clock = devices.servo_bus, devices.world.clock
+
+    def repeat(frame: Frame) -> Frame:
+        if rng.random() < values["rate"]:
+            at_ns = frame.start_ns + round(values["seconds"] * 1e9)
+            clock.call_at(max(at_ns, clock.now_ns()), lambda: bus.disturb(frame.data, frame.baudrate))
+        return frame
+
+    return _filter(devices, repeat)
+
+
+@simulated_fault(
     "babble",
     "Random bytes appear on the servo bus, as from an open wire or a second controller.",
     period=Parameter(0.004, "time between bursts of 8 bytes, s", 0.0005, 10),

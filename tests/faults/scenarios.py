@@ -158,6 +158,7 @@ SCENARIOS: dict[str, Scenario] = {
             "late_reply:rate=0.02",
             "after a timeout the bus is drained before the next request",
         ),
+        survived("duplicate_reply", "the length of the answer, and the servo's clock in it"),
         survived("babble", "bytes that are not a packet are skipped until the timeout"),
         survived("echo", "the echo is not a status packet and is skipped"),
         stopped(

@@ -25,7 +25,18 @@ from tests.faults.fault_runs import NOISE
 VOCABULARY = {
     *(f"{d}.{w}" for d in ("servo", "imu", "camera") for w in ("off", "stuck", "garbage", "wrong", "slow", "delayed")),
     *(f"{d}.intermittent" for d in ("servo", "imu", "camera")),
-    *("crc_flip", "late_reply", "babble", "echo", "unplug", "brownout", "overload", "overheat", "watchdog_trip"),
+    *(
+        "crc_flip",
+        "late_reply",
+        "duplicate_reply",
+        "babble",
+        "echo",
+        "unplug",
+        "brownout",
+        "overload",
+        "overheat",
+        "watchdog_trip",
+    ),
     *("duplicate_id", "wrong_model", "backlash", "slip", "jam", "object_falls", "i2c_nack", "i2c_stuck"),
     *("imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker", "disk_full"),
     "clock_jump",
@@ -146,7 +157,7 @@ def test_configuration_with_an_invalid_fault_is_rejected():
     with pytest.raises(ValueError, match="Did you mean"):
         SimOptions(faults=["jamm"])
     config = load_config(overrides=['bench.sim.faults=["wrong_model"]'])
-    with pytest.raises(DeviceMismatch, match="another model"):
+    with pytest.raises(DeviceMismatch, match="not the configured model"):
         SIM.open(config, SimOptions(**config.bench["sim"]), 0)
 
 
@@ -263,7 +274,7 @@ def test_clock_jump_changes_civil_time_but_not_the_monotonic_clock(devices):
 
 
 def test_fault_at_the_start_stops_the_bench_from_opening():
-    with pytest.raises(DeviceMismatch, match="another model"):
+    with pytest.raises(DeviceMismatch, match="not the configured model"):
         open_sim_bench(load_config(), ShelfOperator(World(), shelf()), faults=[Fault.parse("wrong_model")])
 
 

@@ -22,6 +22,10 @@ OWED_S = 2.0
 
 _ECHO_SIZE = 2  # in Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself
 
+READ_LENGTHS = {1: 16, 2: 4}
+"""Reads in a row have this number of different lengths, by protocol: a repeated answer to an earlier one does not fit.
+In Protocol 2.0 the servo's clock shows the age of a reading, too."""
+
 Answers = tuple[dict[int, Reply], int]
 """Replies by id, and the SDK's result for missing ones."""
 
@@ -46,8 +50,9 @@ class DynamixelBus:
     """Reads and writes registers; repeats failed transactions, and never returns a failed read as a value.
 
     The protocols have no sequence numbers, so a reply after its time-out would be taken for the next one. Here replies
-    are distinguished by their length: while a reply is still owed, no other read asks for the same number of bytes (it
-    asks for some more, below its address). A write is read back, because the replies to all writes are equal.
+    are distinguished by their length: reads in a row ask for different numbers of bytes (some more, below the address),
+    and while a reply is still owed, no other read asks for its number. A write is then read back, because the replies
+    to all writes are equal.
 
     Parameters
     ----------
@@ -68,6 +73,7 @@ class DynamixelBus:
         self._retries = retries
         self._lock = RLock()
         self._alerts: dict[int, int] = {}
+        self._reads = 0
         self._unanswered = False  # the last request, also if Ctrl+C interrupted it: its reply may still arrive
         self._owed: list[
             tuple[int, int]
@@ -222,9 +228,8 @@ class DynamixelBus:
 
     def _unambiguous(self, address: int, size: int) -> tuple[int, int]:
         """Return start and size of a read that includes ``size`` bytes at ``address`` and has an unambiguous reply."""
-        if not self._owed and self.protocol != 1:
-            return address, size
-        asked = size
+        asked = size + min(self._reads % READ_LENGTHS[self.protocol], address)
+        self._reads += 1
         while self._owes(asked) or (self.protocol == 1 and asked == _ECHO_SIZE):
             asked += 1
         return max(address - (asked - size), 0), asked

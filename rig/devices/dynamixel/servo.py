@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from rig.core.clock import seconds_between
-from rig.core.errors import UsageError
+from rig.core.errors import DeviceFault, UsageError
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import watchdog_units
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
@@ -18,6 +18,13 @@ DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # Profile Acceleration: 214.577 rev/min^2
 EXTENDED_RANGE_COUNTS = 1_048_575
 WATCHDOG_TRIPPED = 0xFF
 
+TICK_MODULUS_MS = 32768
+TICK_TOLERANCE_MS, TICK_DRIFT = 20.0, 0.03
+"""How much the servo's clock (Realtime Tick) may differ from the computer's between two readings."""
+TICK_MEMORY_S = 10.0
+"""After a longer pause, two readings must agree with each other instead."""
+_FRESH_ATTEMPTS, _RESTARTED = 8, 3
+
 _SPIN_POLL_S, _SPIN_WATCHDOG_S = 0.05, 0.5
 
 
@@ -30,6 +37,8 @@ class DynamixelServo(RegisterServo):
         super().__init__(*arguments, **options)
         self._dps_per_unit = DPS_PER_UNIT / self._gear_ratio
         self._dps2_per_unit = DPS2_PER_UNIT / self._gear_ratio
+        self._tick: tuple[int, int] | None = None  # time and Realtime Tick of the last fresh reading
+        self._unconfirmed: list[tuple[int, int]] = []  # readings that agree with each other, but not with it
         # Present Current and Current Limit have the same unit, so their ratio is independent of the model.
         self._current_limit = self._read("Current Limit") if "Present Current" in self._table else None
 
@@ -40,7 +49,7 @@ class DynamixelServo(RegisterServo):
         return -EXTENDED_RANGE_COUNTS * self.resolution_deg, EXTENDED_RANGE_COUNTS * self.resolution_deg
 
     def read_state(self) -> ServoState:
-        time_ns, values = self._read_registers("Moving", "Present Temperature")
+        time_ns, values = self._read_fresh()
         return ServoState(
             time_ns=time_ns,
             position_deg=values["Present Position"] * self.resolution_deg,
@@ -129,6 +138,33 @@ class DynamixelServo(RegisterServo):
             self._write("Bus Watchdog", 0)
             self._change_mode(self._mode)
 
+    def _read_fresh(self) -> tuple[int, dict[str, int]]:
+        """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""
+        for _ in range(_FRESH_ATTEMPTS):
+            time_ns, values = self._read_registers("Realtime Tick", "Present Temperature")
+            if self._is_fresh((time_ns, values["Realtime Tick"])):
+                return time_ns, values
+        raise DeviceFault(
+            f"The servo's readings are impossible: {_FRESH_ATTEMPTS} readings in a row do not agree with its clock.",
+            next_step="Check its cable. If this repeats, replace the servo.",
+        ).ask_to_acknowledge(reboot=True)
+
+    def _is_fresh(self, reading: tuple[int, int]) -> bool:
+        """Return whether a reading is new: its tick has advanced as the computer's clock has since the last one.
+
+        The clock of a servo that restarted is different: several readings must then agree with each other.
+        """
+        recent = self._tick is not None and seconds_between(self._tick[0], reading[0]) <= TICK_MEMORY_S
+        if not (recent and self._tick is not None and _ticks_agree(self._tick, reading)):
+            if not (self._unconfirmed and _ticks_agree(self._unconfirmed[-1], reading)):
+                self._unconfirmed.clear()
+            self._unconfirmed.append(reading)
+            if len(self._unconfirmed) < (_RESTARTED if recent else 2):
+                return False
+        self._tick = reading
+        self._unconfirmed.clear()
+        return True
+
     def _load_percent(self, values: dict[str, int]) -> float:
         if self._current_limit is not None:
             return 100.0 * values["Present Current"] / self._current_limit
@@ -145,3 +181,10 @@ class DynamixelServo(RegisterServo):
     def _change_mode(self, mode: ServoMode) -> None:
         differences = settings.compare(self.bus, self._id, self._table, mode)
         settings.write(self.bus, self._id, self._table, differences)
+
+
+def _ticks_agree(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
+    """Return whether the servo's clock and the computer's advanced equally between two readings."""
+    passed_ms = seconds_between(earlier[0], later[0]) * 1e3
+    difference_ms = (later[1] - earlier[1] - passed_ms + TICK_MODULUS_MS / 2) % TICK_MODULUS_MS - TICK_MODULUS_MS / 2
+    return abs(difference_ms) <= TICK_TOLERANCE_MS + TICK_DRIFT * passed_ms
