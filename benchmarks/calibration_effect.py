@@ -124,8 +124,8 @@ def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder
                 if name in names[:OBJECTS]:
                     figures["right"].append(answer.name == name)
                     figures["lost"].append(answer.name is None)
-                    if answer.name == name:
-                        figures["yaw"].append(abs((answer.yaw_deg - operator.yaw_deg + 180) % 360 - 180))
+                    if answer.name == name and answer.yaw_set_deg:
+                        figures["yaw"].append(abs((answer.yaw_set_deg[0] - operator.yaw_deg + 180) % 360 - 180))
                 else:
                     figures["unknown"].append(answer.name is None)
     return figures

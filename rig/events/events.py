@@ -321,10 +321,15 @@ class Identified:
     may be: one, several, or none. The ``name`` of an ambiguous object is the first of them.
 
     ``score`` and ``margin`` are per view. ``pose_deg`` is the azimuth the camera sees last, in the catalog's frame, and
-    ``yaw_deg`` how far the object is rotated counter-clockwise against its enrollment. ``reason`` says why the search
-    ended; ``note`` is the explanation of a strategy of your own, or of an earlier version. The paper's search compares
-    the score with ``min_score`` and the margin with ``min_margin``; the dense search compares the confidence with
-    ``min_confidence`` and the open-set score with ``open_set_threshold``, None if no object is called unknown.
+    ``yaw_deg`` how far the object is rotated counter-clockwise against its enrollment, with the standard uncertainty
+    ``yaw_sigma_deg``. It is None if the views do not determine it, or if the object looks the same every
+    ``period_deg``; ``yaw_set_deg`` then has all equivalent rotations. ``period_deg`` is 360 without symmetry, 0 if the
+    object looks the same from all sides, None if that is not known. The paper's search has no uncertainty.
+
+    ``reason`` says why the search ended; ``note`` is the explanation of a strategy of your own, or of an earlier
+    version. The paper's search compares the score with ``min_score`` and the margin with ``min_margin``; the dense
+    search compares the confidence with ``min_confidence`` and the open-set score with ``open_set_threshold``, None if
+    no object is called unknown.
     """
 
     name: str | None
@@ -332,13 +337,16 @@ class Identified:
     score: float
     margin: float
     pose_deg: float
-    yaw_deg: float
+    yaw_deg: float | None
     views: int
     travelled_deg: float
     seconds: float
     reason: StopReason
     outcome: Outcome
     possible: tuple[str, ...]
+    yaw_sigma_deg: float | None = None
+    yaw_set_deg: tuple[float, ...] = ()
+    period_deg: float | None = None
     note: str = ""
     min_score: float | None = None
     min_margin: float | None = None

@@ -1,7 +1,7 @@
 """What happened, in words: the same on the terminal and in the report."""
 
 from collections.abc import Iterable, Sequence
-from math import isfinite, nan
+from math import ceil, isfinite, nan
 from typing import Any
 
 from hbr import Outcome, StopDecision, StopReason
@@ -271,11 +271,24 @@ def result_words(answer: Identified) -> str:
         similar = [f"{candidate.name} (score {candidate.score:.3f})" for candidate in answer.candidates[:3]]
         verb = "objects are" if len(similar) > 1 else "object is"
         return f"Unknown object. The most similar enrolled {verb} {joined(similar)}."
-    words = f"{answer.name}, rotated {round(answer.yaw_deg) % 360}°"
+    words = f"{answer.name}{_pose_words(answer)}"
     if answer.confidence is not None:
         percent = ">99.9" if answer.confidence > 0.999 else min(round(answer.confidence * 100), 99)
         words += f", {percent} % confident"
     return f"{words} ({counted(answer.views, 'view')})"
+
+
+def _pose_words(answer: Identified) -> str:
+    """Return the rotation of a found object, as far as it is known: ", rotated 70° ± 2°"."""
+    if not answer.yaw_set_deg:
+        return " (looks the same from all sides)" if answer.period_deg == 0 else ", rotation not determined"
+    words = f", rotated {round(answer.yaw_set_deg[0]) % 360}°"
+    if answer.yaw_sigma_deg is not None:
+        words += f" ± {max(1, ceil(answer.yaw_sigma_deg))}°"
+    others = len(answer.yaw_set_deg) - 1
+    if others:
+        words += f" or one of {others + 1} equivalent poses (every {answer.period_deg:.3g}°)"
+    return words
 
 
 def outcome_words(answer: Identified) -> str:

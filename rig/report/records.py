@@ -199,16 +199,18 @@ class IdentificationRecord:
         truth, answer = self.truth, self.answer
         if truth is None or answer is None or answer.name is None or not self.correct:
             return None
-        if truth.yaw_deg is None or truth.symmetry_deg <= 0:
+        if truth.yaw_deg is None or truth.symmetry_deg <= 0 or not answer.yaw_set_deg:
             return None
         # One period of the symmetry is one turn of the circle.
         periods = 360.0 / truth.symmetry_deg
-        return abs(wrap180((answer.yaw_deg - truth.yaw_deg) * periods)) / periods
+        true_deg = truth.yaw_deg
+        return min(abs(wrap180((yaw_deg - true_deg) * periods)) / periods for yaw_deg in answer.yaw_set_deg)
 
     @property
     def yaw_deg(self) -> float | None:
-        """Rotation of the object relative to its enrollment; None if no object was found."""
-        return self.answer.yaw_deg if self.answer is not None and self.answer.name is not None else None
+        """Rotation of the object relative to its enrollment, or one of the equivalent ones; None if not known."""
+        answer = self.answer
+        return answer.yaw_set_deg[0] if answer is not None and answer.name is not None and answer.yaw_set_deg else None
 
     @property
     def steps(self) -> list[PathStep]:

@@ -13,6 +13,10 @@ NOT_SAVED: Final[dict[type, tuple[str, ...]]] = {
     Identified: (
         "outcome",
         "possible",
+        "yaw_deg",
+        "yaw_sigma_deg",
+        "yaw_set_deg",
+        "period_deg",
         "reason",
         "note",
         "min_score",
@@ -69,6 +73,7 @@ def _identified(event: dict[str, Any]) -> dict[str, Any]:
     return event | {
         "outcome": outcome,
         "possible": possible,
+        "yaw_set_deg": [event["yaw_deg"]],
         "reason": StopReason.EARLIER_VERSION,
         "note": event["reason"],
         "confidence": event.get("probability"),

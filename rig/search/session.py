@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.core.angles import wrap360
+from hbr.dense.pose import pose
+from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.events.events import Candidate, Identified, Ranked
@@ -79,7 +81,8 @@ class Search(ABC):
             score=best.score,
             margin=ranked.margin,
             pose_deg=best.pose_deg,
-            yaw_deg=float(wrap360(self._orientations[-1] - best.pose_deg)),
+            yaw_deg=(yaw_deg := float(wrap360(self._orientations[-1] - best.pose_deg))),
+            yaw_set_deg=(yaw_deg,),
             views=len(self._orientations),
             travelled_deg=travelled_deg,
             seconds=seconds,
@@ -146,9 +149,16 @@ class HoughSearch(Search):
             # Objects that share the best score; at least the second one, which the margin says is as likely.
             outcome, scores = hbr.Outcome.AMBIGUOUS, self._ranking.scores
             possible = self._ranking.names[: max(2, int((scores >= scores[0]).sum()))]
+        own = symmetry(self._index.views, int(self._ranking.object_index[0]))
+        period_deg = own.period_deg if own else None
+        poses = round(360 / period_deg) if period_deg else 1 if period_deg is None else 0
+        yaw_deg = answer.yaw_set_deg[0]
         return replace(
             answer,
             name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
+            yaw_deg=yaw_deg if poses == 1 else None,
+            yaw_set_deg=tuple(wrap360(yaw_deg + k * 360 / poses) for k in range(poses)),
+            period_deg=period_deg,
             outcome=outcome,
             possible=possible,
             min_score=self._min_score,
@@ -206,12 +216,18 @@ class DenseSearch(Search):
     def answer(self, ranked: Ranked, end: Finish, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(ranked, end, travelled_deg=travelled_deg, seconds=seconds)
         decision = self._session.end()
+        found = pose(self._session.belief, decision.object_index)
+        yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
         threshold = decision.open_set_threshold
         return replace(
             answer,
             name=None if decision.outcome is hbr.Outcome.UNKNOWN else answer.name,
             outcome=decision.outcome,
             possible=self._possible(decision),
+            yaw_deg=yaws_deg[0] if len(yaws_deg) == 1 else None,
+            yaw_sigma_deg=found.sigma_deg,
+            yaw_set_deg=yaws_deg,
+            period_deg=found.period_deg,
             confidence=decision.confidence,
             min_confidence=decision.min_confidence,
             open_set_score=decision.open_set_score,

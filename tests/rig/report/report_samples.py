@@ -101,6 +101,7 @@ def identifying(
         StopReason.MARGIN,
         Outcome.UNKNOWN if answer is None else Outcome.FOUND,
         () if answer is None else (answer,),
+        yaw_set_deg=(yaw_deg,),
         min_score=min_score,
         min_margin=0.05,
     )
@@ -152,6 +153,9 @@ def searching_densely(
         StopReason.CONFIDENT,
         Outcome.UNKNOWN if answer is None else Outcome.FOUND,
         () if answer is None else (answer,),
+        yaw_sigma_deg=2.0,
+        yaw_set_deg=(30.0,),
+        period_deg=360.0,
         confidence=probability[0],
         min_confidence=0.95,
         open_set_score=1.02,

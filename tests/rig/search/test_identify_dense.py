@@ -152,3 +152,14 @@ def test_one_object_is_found_by_similarity_to_its_own_views(simulated, tmp_path)
     events, answer = search(s, model, "toy-car")
     assert answer.name is None
     assert all(e.reason is RotationReason.NEW_SIDE for e in events if isinstance(e, Decided))
+
+
+def test_rotation_of_a_round_object_is_not_stated(simulated, shelf):
+    s = simulated(*SMALL)
+    s.operator.yaw_deg = 40.0
+    answer = search(s, shelf, "lamp")[1]
+    assert (answer.name, answer.outcome) == ("lamp", hbr.Outcome.FOUND)
+    assert (answer.yaw_deg, answer.yaw_sigma_deg, answer.yaw_set_deg, answer.period_deg) == (None, None, (), 0.0)
+    answer = search(s, shelf, "teapot")[1]
+    assert answer.period_deg == 360.0
+    assert abs(answer.yaw_deg - 40.0) <= 2 * answer.yaw_sigma_deg

@@ -1,0 +1,100 @@
+"""The pose of a found object: its uncertainty, and the poses that its views cannot tell apart.
+
+The support of the object's azimuths is turned into a posterior, p(φ) ∝ exp(κ A(φ) / √n). The standard uncertainty is a
+half-width of this posterior around the estimated azimuth; two constants, fitted on objects 1-50 of COIL-100, make 68 %
+and 95 % of the true azimuths lie within one and two of them. A posterior with n equal parts means an object that looks
+the same every 360° / n; one that is spread over most azimuths, an object that looks the same from all sides.
+
+Coverage: docs/results.md; `python -m benchmarks.pose_coverage`.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from hbr.core.angles import wrap360
+from hbr.core.arrays import FloatArray
+from hbr.dense.filter import BINS, Belief
+
+#: κ, and the share of the posterior's half-width that is the uncertainty: azimuths are estimated finer than its bins.
+SHARPNESS: Final = 120.0
+WIDTH: Final = 0.68
+#: A pose with a larger uncertainty is not determined.
+LARGEST_SIGMA_DEG: Final = 30.0
+#: The same in an n-fold symmetry, as a share of the period.
+_LARGEST_SHARE: Final = 1 / 9
+#: Each equivalent pose has at least this share of the probability of an equal one.
+_LEAST_PART: Final = 0.25
+#: An object looks the same from all sides if the likeliest azimuths, 95 % together, are such a share of all.
+_FREE_SHARE: Final = 0.5
+_ORDERS: Final = range(2, 13)
+_ONE_SIGMA, _TWO_SIGMA = 0.683, 0.954
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Orientation of the camera around an object at the last query, as far as the views determine it.
+
+    Attributes
+    ----------
+    azimuth_deg : tuple of float
+        All azimuths that are equally likely, the estimated one first: one without symmetry, n if the object looks the
+        same every 360° / n, none if no azimuth is determined.
+    sigma_deg : float, optional
+        Standard uncertainty of each; None if no azimuth is determined.
+    period_deg : float, optional
+        360 without symmetry, 360 / n, 0 if the object looks the same from all sides; None if that is not known.
+    """
+
+    azimuth_deg: tuple[float, ...]
+    sigma_deg: float | None
+    period_deg: float | None
+
+
+def pose(belief: Belief, object_index: int) -> Pose:
+    """Return the pose of an object that the filter considers."""
+    ranking = belief.ranking()
+    azimuth_deg = float(ranking.pose_deg[ranking.object_index == object_index][0])
+    (support,) = belief.support[belief.index.object_index == object_index].astype(np.float64)
+    p = np.exp(SHARPNESS * (support - support.max()) / np.sqrt(belief.queries))
+    return pose_of(p / p.sum(), azimuth_deg, azimuth_deg - belief.turned_deg)
+
+
+def pose_of(posterior: FloatArray, azimuth_deg: float, estimate_deg: float) -> Pose:
+    """Return the pose by the posterior of one object's azimuths.
+
+    Parameters
+    ----------
+    posterior : float64 array (72,)
+        Probability of the azimuths 0, 5, ... at the first query.
+    azimuth_deg
+        The estimated azimuth at the last query.
+    estimate_deg
+        The same at the first query.
+    """
+    away_deg: FloatArray = np.arange(BINS, dtype=np.float64) * (360 / BINS) - estimate_deg
+    sigma_deg = _sigma_deg(posterior, away_deg, 360.0)
+    if sigma_deg <= LARGEST_SIGMA_DEG:
+        return Pose((azimuth_deg,), sigma_deg, 360.0)
+    ordered = np.cumsum(-np.sort(-posterior))
+    if np.searchsorted(ordered, _TWO_SIGMA) >= _FREE_SHARE * BINS:
+        return Pose((), None, 0.0)
+    for order in _ORDERS:
+        period_deg = 360 / order
+        sigma_deg = _sigma_deg(posterior, away_deg, period_deg)
+        part = np.rint(away_deg / period_deg).astype(int) % order
+        least = np.bincount(part, posterior, order).min()
+        if sigma_deg <= _LARGEST_SHARE * period_deg and least >= _LEAST_PART / order:
+            poses = tuple(wrap360(azimuth_deg + k * period_deg) for k in range(order))
+            return Pose(poses, sigma_deg, period_deg)
+    return Pose((), None, None)
+
+
+def _sigma_deg(posterior: FloatArray, away_deg: FloatArray, period_deg: float) -> float:
+    """Return the uncertainty: 68 % of the posterior is within its half-width, 95 % within twice as much."""
+    away_deg = np.abs((away_deg + period_deg / 2) % period_deg - period_deg / 2)
+    order = np.argsort(away_deg, kind="stable")
+    share = np.cumsum(posterior[order])
+    one, two = np.interp([_ONE_SIGMA, _TWO_SIGMA], share, away_deg[order])
+    return float(WIDTH * max(one, two / 2))
