@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
 from rig.views.description import ViewDescriber
+
+ROUNDED: Final = 0.02
+"""Largest share of a view's levels that another computer may have rounded to the neighbouring level."""
 
 EmptyTable = tuple[str, str]
 """Path of an empty-table image relative to the catalog, and its SHA-256."""
@@ -98,3 +102,16 @@ def unpack(packed: Iterable[PackedDescriptor]) -> dict[str, NDArray[np.uint8]]:
             except ValueError as error:
                 raise damaged(f"a descriptor {one.name}", one.packed) from error
     return found
+
+
+def matches(kind: Descriptor, packed: bytes, levels: NDArray[np.uint8]) -> bool:
+    """Return whether stored levels are those of the image: equal, or for a descriptor that rounds, nearly equal.
+
+    The arithmetic of another computer may have rounded a level the other way.
+    """
+    if kind.pack(levels) == packed:
+        return True
+    if kind.name in PAPERS or len(packed) != kind.size_bytes:
+        return False
+    off = np.abs(kind.unpack(packed).astype(np.int16) - levels)
+    return int(off.max()) <= 1 and float((off > 0).mean()) <= ROUNDED

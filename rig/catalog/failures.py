@@ -24,6 +24,8 @@ def catalog_errors(root: Path, busy_timeout_s: float) -> Iterator[None]:
         if known is None:
             raise
         raise known from error
+    except UnicodeDecodeError as error:  # SQLite quotes what it cannot read in its message
+        raise _damaged(root, {"sqlite": str(error)}) from error
     except OSError as error:
         raise _of_system(error, root) from error
 
@@ -51,11 +53,7 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
                 f"{root / DATABASE_NAME} is not a catalog", next_step="give the folder of a catalog", evidence=evidence
             )
         case sqlite3.SQLITE_CORRUPT:
-            return CatalogDamaged(
-                f"the catalog {root / DATABASE_NAME} is damaged",
-                next_step="copy the folder, then restore the database from a backup",
-                evidence=evidence,
-            )
+            return _damaged(root, evidence)
         case sqlite3.SQLITE_FULL:
             return _of_system(OSError(errno.ENOSPC, str(error)), root)
         case sqlite3.SQLITE_CANTOPEN | sqlite3.SQLITE_READONLY | sqlite3.SQLITE_PERM:
@@ -63,12 +61,16 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
         case sqlite3.SQLITE_IOERR:
             return _of_system(OSError(errno.EIO, str(error)), root)
     if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.ProgrammingError):
-        return CatalogDamaged(
-            f"the catalog {root / DATABASE_NAME} is damaged",
-            next_step="use a backup of the catalog; rig catalog verify reports more",
-            evidence=evidence,
-        )
+        return _damaged(root, evidence)
     return None
+
+
+def _damaged(root: Path, evidence: dict[str, str]) -> CatalogDamaged:
+    return CatalogDamaged(
+        f"the catalog {root / DATABASE_NAME} is damaged",
+        next_step="copy the folder, then restore the database from a backup",
+        evidence=evidence,
+    )
 
 
 def _of_system(error: OSError, root: Path) -> CatalogError:

@@ -9,29 +9,26 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, delete, func, null, select, true, update
 
-from hbr.descriptors import PAPERS, Descriptor, descriptor
+from hbr.descriptors import descriptor
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import EmptyTable, is_current, region_of, stored_describer
+from rig.catalog.describing import EmptyTable, is_current, matches, region_of, stored_describer
 from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.places import LOST, file_mode, files_within, image_file, lost_file, make_folder_within
 from rig.catalog.queries import packed_descriptors
 from rig.catalog.schema import audit as audit_log
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
-from rig.catalog.seal import enrollment_digests, log_digests, object_digests
+from rig.catalog.seal import changing_enrollments, enrollment_digests, log_digests, object_digests
 from rig.core.errors import CatalogError, UsageError
 from rig.core.files import write
 from rig.core.processes import map_in_processes
 from rig.views import image_files as images
-
-ROUNDED: Final = 0.02
-"""Largest share of a view's levels that another computer may have rounded to the neighbouring level."""
 
 
 class Problem(StrEnum):
@@ -308,22 +305,9 @@ def _check(root: Path, item: _Item, quick: bool) -> _Checked:
         levels: NDArray[np.uint8] | None = None
         with suppress(UsageError, ValueError):
             levels = describe(image).levels[name]
-        if levels is None or not _matches(kind, packed, levels):
+        if levels is None or not matches(kind, packed, levels):
             different.append((name, version, None if levels is None else kind.pack(levels)))
     return _Checked(sha256, len(content), (image.shape[1], image.shape[0]), different=tuple(different))
-
-
-def _matches(kind: Descriptor, packed: bytes, levels: NDArray[np.uint8]) -> bool:
-    """Return whether stored levels are those of the image: equal, or for a descriptor that rounds, nearly equal.
-
-    The arithmetic of another computer may have rounded a level the other way.
-    """
-    if kind.pack(levels) == packed:
-        return True
-    if kind.name in PAPERS or len(packed) != kind.size_bytes:
-        return False
-    off = np.abs(kind.unpack(packed).astype(np.int16) - levels)
-    return int(off.max()) <= 1 and float((off > 0).mean()) <= ROUNDED
 
 
 def _referenced(connection: Connection) -> set[str]:
@@ -390,7 +374,8 @@ def _report_descriptors(state: _State, checked: Mapping[_Item, _Checked]) -> Non
         for name, version, packed in found.different:
             repair = None
             if state.repair and packed is not None:
-                with state.catalog.database.write() as connection:
+                transaction = state.catalog.database.write()
+                with transaction as connection, changing_enrollments(connection, [item.enrollment_id]):
                     connection.execute(
                         update(descriptors)
                         .where(
@@ -422,7 +407,7 @@ def _report_digests(state: _State) -> None:
         entry_ids = [0]
         for entry_id, sealed, found in log_digests(connection):
             entry_ids.append(entry_id)
-            if sealed != found:
+            if sealed != found or entry_id != entry_ids[-2] + 1:
                 report(Finding(Problem.LOG_CHANGED, details={"entry_id": entry_id}))
         given = {
             row[0]: row[1]

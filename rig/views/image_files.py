@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rig.core import files
 from rig.core.errors import CatalogError, UsageError
+from rig.views import jpeg_files
 
 IMAGE_FOLDER: Final = "images"
 MAX_SLUG_LENGTH: Final = 40
@@ -49,6 +50,8 @@ def encode(image_bgr: NDArray[np.uint8]) -> bytes:
             f"an image of {image_bgr.dtype} with shape {image_bgr.shape} cannot be stored",
             next_step="store BGR images as uint8 with shape (H, W, 3)",
         )
+    if max(image_bgr.shape) > MAX_SIDE or image_bgr.shape[0] * image_bgr.shape[1] > MAX_PIXELS:
+        raise UsageError(f"an image of shape {image_bgr.shape} cannot be stored", next_step="store a smaller image")
     encoded, png = cv2.imencode(".png", np.ascontiguousarray(image_bgr), PNG_SETTINGS)
     if not encoded:
         raise UsageError(
@@ -86,7 +89,7 @@ def decode(content: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]
     if content.startswith(_PNG):
         size, end = _png_size(content), b"IEND\xaeB`\x82"
     elif content.startswith(_JPEG):
-        size, end = _jpeg_size(content), b"\xff\xd9"
+        size, end = jpeg_files.size(content), b"\xff\xd9"
     else:
         raise BadImage("neither a PNG nor a JPEG file")
     if size is None or end not in content[-4096:]:  # padding after the end is legal
@@ -100,6 +103,8 @@ def decode(content: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]
         raise BadImage("damaged") from error
     if image is None:
         raise BadImage("damaged")
+    if content.startswith(_JPEG) and not jpeg_files.is_complete(content, np.asarray(image, np.uint8)):
+        raise BadImage("truncated: its last rows are missing")
     return np.asarray(image, np.uint8)
 
 
@@ -112,20 +117,6 @@ def _png_size(content: bytes) -> tuple[int, int] | None:
     if content[12:16] != b"IHDR" or len(content) < 24:
         return None
     return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
-
-
-def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Return the size in the frame header (SOF, ITU-T T.81 B.2.2)."""
-    at = 2
-    while at + 9 < len(content) and content[at] == 0xFF:
-        marker = content[at + 1]
-        if marker == 0xFF:  # fill byte
-            at += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return int.from_bytes(content[at + 7 : at + 9], "big"), int.from_bytes(content[at + 5 : at + 7], "big")
-        at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
-    return None
 
 
 def read(path: Path, sha256: str) -> NDArray[np.uint8]:

@@ -74,9 +74,23 @@ def write_bundle(path: Path, objects: Iterable[ExportedObject]) -> int:
             "views": views,
             "objects_sha256": hashlib.sha256(text).hexdigest(),
         }
-        archive.writestr(_member(OBJECTS), text, ZIP_DEFLATED)
+        compressible = len(text) > MAX_RATIO // 2 * len(zlib.compress(text))  # as a reader would not believe it
+        archive.writestr(_member(OBJECTS), text, ZIP_STORED if compressible else ZIP_DEFLATED)
         archive.writestr(_member(MANIFEST), json.dumps(manifest, indent=1) + "\n", ZIP_STORED)
+        archive.close()
+        _check_readable(path, Path(file.name))
     return count
+
+
+def _check_readable(path: Path, part: Path) -> None:
+    """Raise `ExportFailed` if an import would reject what was written."""
+    try:
+        read_bundle(part)
+    except ImportRejected as error:
+        raise ExportFailed(
+            f"{path} was not written, because no import would accept it: {error.what}",
+            next_step="check the catalog: rig catalog verify; or export fewer objects into each bundle",
+        ) from error
 
 
 @contextmanager

@@ -3,18 +3,22 @@
 import os
 import zlib
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
-from rig.catalog.describing import pack
-from rig.catalog.exchange.batch import ImageSource
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.descriptors import PAPERS, descriptor
+from rig.catalog.describing import is_current, matches, pack, region_of
+from rig.catalog.exchange.batch import ImageSource, Session
 from rig.catalog.exchange.plan import Plan
 from rig.catalog.places import file_mode, folder_mode
 from rig.catalog.records import PackedDescriptor, Region
 from rig.config import ViewConfig
-from rig.core.errors import UsageError
+from rig.core.errors import CatalogError, UsageError
 from rig.core.files import open_new
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
@@ -30,6 +34,9 @@ class Item(NamedTuple):
     stem: str
     descriptors: tuple[str, ...] = ()
     region: Region | None = None
+    given: tuple[PackedDescriptor, ...] = ()
+    """Descriptors that came with the image, to be compared with those of the image."""
+    empty_table: tuple[ImageSource, str | None] | None = None
 
 
 class StagedImage(NamedTuple):
@@ -62,11 +69,18 @@ def items_of(plan: Plan, descriptors: tuple[str, ...] = ()) -> Iterator[Item]:
                     f"{view.index:03d}",
                     () if view.descriptors else wanted,
                     batch.regions.get(view.image),
+                    tuple(one.as_packed() for one in view.descriptors if is_current(one.name, one.version)),
+                    _empty_table(plan, enrollment.sessions[view.session]),
                 )
             for k, session in enumerate(enrollment.sessions):
                 image, sha256 = session.empty_table_image, session.empty_table_image_sha256
                 if image is not None:
                     yield Item(image, batch.sources[image], sha256, folder, f"empty-{k:03d}")
+
+
+def _empty_table(plan: Plan, session: Session) -> tuple[ImageSource, str | None] | None:
+    image = session.empty_table_image
+    return None if image is None else (plan.batch.sources[image], session.empty_table_image_sha256)
 
 
 def stage(root: Path | None, portion: tuple[Item, ...]) -> list[StagedImage]:
@@ -86,6 +100,9 @@ def _stage_one(root: Path | None, item: Item, mode: int) -> StagedImage:
     sha256 = images.digest(content)
     if item.sha256 is not None and sha256 != item.sha256:
         return StagedImage("", reason="is not the stored image")
+    for given in item.given:
+        if why := _is_wrong(given, image, item.empty_table):
+            return StagedImage("", reason=why)
     if root is None:
         return StagedImage("", sha256, len(content))
     packed: list[PackedDescriptor] = []
@@ -104,6 +121,30 @@ def _stage_one(root: Path | None, item: Item, mode: int) -> StagedImage:
     with open_new(root / file, mode=mode) as staged:
         staged.write(content)
     return StagedImage(file, sha256, len(content), tuple(packed), segmentation)
+
+
+def _is_wrong(
+    given: PackedDescriptor, image: NDArray[np.uint8], empty_table: tuple[ImageSource, str | None] | None
+) -> str:
+    """Return why a descriptor cannot be that of its image; empty if it is."""
+    kind = descriptor(given.name)
+    try:
+        table = None if empty_table is None or given.name in PAPERS else _table(*empty_table)
+        config = ViewConfig(roi=region_of(given.settings))
+        levels = ViewDescriber(config, (given.name,), table)(image).levels[given.name]
+    except (CatalogError, UsageError) as error:
+        return error.what
+    except (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
+        return f"its descriptor {given.name} cannot be checked: {error}"
+    return "" if matches(kind, given.packed, levels) else f"its descriptor {given.name} is not that of the image"
+
+
+@lru_cache(maxsize=4)
+def _table(source: ImageSource, sha256: str | None) -> NDArray[np.uint8]:
+    content = _read(source)
+    if images.digest(content) != sha256:
+        raise ValueError("the empty-table image is not the stored one")
+    return images.decode(content)
 
 
 def _read(source: ImageSource) -> bytes:

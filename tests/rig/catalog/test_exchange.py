@@ -571,6 +571,13 @@ class TestHostileBundles:
             (lambda line: view_of(line).update(image_sha256="0" * 64), "not the stored image"),
             (lambda line: view_of(line).update(image_bytes=1), "size"),
             (lambda line: view_of(line)["descriptors"][0].update(packed="ff"), "descriptors"),
+            (lambda line: view_of(line)["descriptors"][0].update(packed="00" * 54), "not that of the image"),
+            (lambda line: view_of(line)["descriptors"][0].update(settings={"region": "evil"}), "settings"),
+            (lambda line: view_of(line)["descriptors"][0].update(settings={"region": [0, 0, 99, 99]}), "region"),
+            (lambda line: view_of(line)["descriptors"][0].update(version=True), "version"),
+            (lambda line: view_of(line).update(captured_utc="9999-12-31T23:59:59-14:00"), "calendar"),
+            (lambda line: line.update(created_utc="0001-01-01T00:00:00+14:00"), "calendar"),
+            (lambda line: view_of(line).update(segmentation={"issues": 5}), "segmentation"),
             (lambda line: view_of(line).update(captured_ns=2**70), "captured_ns"),
             (lambda line: view_of(line).update(captured_utc="2026-01-01T00:00:00"), "captured_utc"),
             (lambda line: line["enrollments"][0]["views"].pop(), "complete"),
@@ -584,6 +591,11 @@ class TestHostileBundles:
     ) -> None:
         said = self.rejection(open_catalog, rewritten(bundle, change))
         assert any(word in said for word in words.split("|")), said
+
+    @pytest.mark.parametrize("version", [0, -1, True, "2", 2.0, None])
+    def test_impossible_version_is_rejected(self, bundle: Path, open_catalog: OpenCatalog, version: object) -> None:
+        manifest = json.dumps({"format": "rigcat", "version": version}).encode()
+        assert "has version" in self.rejection(open_catalog, rewritten(bundle, None, **{MANIFEST: manifest}))
 
     def test_newer_bundle_and_other_zip_file_are_rejected(
         self, bundle: Path, tmp_path: Path, open_catalog: OpenCatalog
