@@ -227,6 +227,13 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.read() as connection:
             return object_summaries(connection, objects.c.deleted_utc.is_(None))
 
+    def summary(self, name: str) -> ObjectSummary:
+        """Return an object without its enrollments and views, whatever their state; errors as for `object`."""
+        with self.database.read() as connection:
+            object_id, _ = find(connection, name)
+            (summary,) = object_summaries(connection, objects.c.id == object_id)
+            return summary
+
     def object(self, name: str) -> ObjectDetails:
         """Return an object with its enrollments and views.
 

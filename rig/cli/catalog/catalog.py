@@ -184,7 +184,7 @@ def delete_(
     from rig.events.wording import counted
 
     with settings.open_catalog() as catalog:
-        found = [catalog.object(name).summary for name in dict.fromkeys(names)]
+        found = [catalog.summary(name) for name in dict.fromkeys(names)]
         views = sum(item.views for item in found)
         confirm(
             f"Delete {', '.join(item.name for item in found)} with {counted(views, 'view')}?",
