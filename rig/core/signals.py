@@ -1,4 +1,7 @@
-"""Signals that end the program: they unwind the stack once, and do not interrupt a clean-up that has begun."""
+"""Signals that end the program: they unwind the stack once, and do not interrupt a clean-up that has begun.
+
+Decision: docs/decisions/0033.
+"""
 
 import signal
 import threading

@@ -58,7 +58,7 @@ class Guardian:
 
     def _tell(self, word: bytes) -> None:
         if self._process is not None and self._process.stdin is not None:
-            with suppress(OSError):  # somebody ended it: the servo's watchdog remains
+            with suppress(OSError):  # the process was ended: the servo's watchdog remains
                 self._process.stdin.write(word)
 
 
