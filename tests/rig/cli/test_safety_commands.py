@@ -76,7 +76,7 @@ def test_table_angle_survives_the_program(rig):
     done = rig("home", "--json")
     unwinding, moved = (json.loads(line) for line in done.stdout.splitlines())
     assert unwinding["event"] == "unwinding"
-    assert unwinding["turns"] == 1
+    assert unwinding["revolutions"] == 1
     assert moved["encoder_deg"] == pytest.approx(0, abs=0.3)
 
 

@@ -35,7 +35,7 @@ def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, cat
     for event, following in pairwise(events):
         if isinstance(event, Unwinding):
             assert abs(event.to_deg) < abs(event.from_deg)
-            assert event.turns == 1
+            assert event.revolutions == 1
             assert event.limits_deg == (low, high)
             if isinstance(following, Moved):
                 assert following.commanded_deg == event.to_deg
