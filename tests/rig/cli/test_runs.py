@@ -190,14 +190,17 @@ def test_stopping_rule_is_calibrated_stored_and_used(rig, enrolled):
 
 def test_catalog_without_dense_descriptors_is_searched_by_ahbr_with_a_note(enrolled, tmp_path, monkeypatch):
     import shutil
-    import sqlite3
-    from contextlib import closing
+
+    from rig.catalog import Catalog
+    from rig.catalog.seal import seal_enrollments
+    from rig.core.clock import SystemClock
 
     shutil.copytree(enrolled[0] / "catalog", tmp_path / "catalog")
     (tmp_path / "rig.toml").write_text(SMALL, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    with closing(sqlite3.connect("catalog/catalog.sqlite")) as database, database:
-        database.execute("DELETE FROM descriptors WHERE name != 'cedd'")
+    with Catalog.open("catalog", clock=SystemClock()) as catalog, catalog.database.write() as connection:
+        connection.exec_driver_sql("DELETE FROM descriptors WHERE name != 'cedd'")
+        seal_enrollments(connection, None)
     run = CliRunner().invoke
     done = run(app, ["identify", "--set", "bench.sim.object=lamp"])
     assert done.exit_code == 0, done.output
