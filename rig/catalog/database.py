@@ -142,7 +142,7 @@ class Database:
 
 
 def connect(uri: str, busy_timeout_s: float) -> sqlite3.Connection:
-    """Open a database that may come from somebody else.
+    """Open a database that may come from an untrusted sender.
 
     Nothing in its schema may call functions with side effects. Where Python can (from 3.12), SQLite's defensive mode
     also rejects statements that could damage the file.

@@ -1,6 +1,6 @@
 """Places of files in the folder of a catalog. Nothing outside of it is read, written or removed.
 
-A catalog may come from somebody else: its records and its folder can contain paths and links that lead out.
+A catalog may come from an untrusted sender: its records and its folder can contain paths and links that lead out.
 """
 
 import os

@@ -2,7 +2,9 @@
 
 An enrollment has a digest over its own row and all its sessions, views and descriptors, an object over its own row,
 and an entry of the audit log over its own row and the digest before it. A change by the program seals a row again only
-if the digest was right before: damage stays noticed. Digests show accidents: whoever means harm can compute them, too.
+if the digest was right before: damage stays noticed. Digests show accidents: an attacker can compute them, too.
+
+Decision: docs/decisions/0034.
 """
 
 import hashlib

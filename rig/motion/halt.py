@@ -19,18 +19,18 @@ STALE_S = 0.05
 READINGS = 8
 """How many readings are taken to find two that agree."""
 AGREEMENTS = 3
-"""How many readings in a row must agree if the table cannot have got there since the last believed reading."""
+"""How many readings in a row must agree if the table cannot have got there since the last trusted reading."""
 STOP_ALLOWANCE_S = 0.5
 """Time for a stop in addition to its ramp; then the torque goes off in any case."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionPath:
-    """The range of the servo's positions in a motion, the highest speed, and the last reading that was believed."""
+    """The range of the servo's positions in a motion, the highest speed, and the last trusted reading."""
 
     ends_deg: tuple[float, float]
     cruise_dps: float
-    believed: ServoState | None
+    trusted: ServoState | None
 
 
 def reachable(earlier: ServoState, later: ServoState, cruise_dps: float) -> bool:
@@ -100,7 +100,7 @@ def _agreed_reading(servo: Servo, clock: Clock, path: MotionPath) -> ServoState 
         if plausible and abs(moved_deg) < noise_deg:
             return None  # it stands still
         agreeing = agreeing + 1 if plausible else 0
-        needed = 1 if path.believed is None or reachable(path.believed, later, path.cruise_dps) else AGREEMENTS
+        needed = 1 if path.trusted is None or reachable(path.trusted, later, path.cruise_dps) else AGREEMENTS
         if agreeing >= needed and seconds_between(later.time_ns, clock.now_ns()) <= STALE_S:
             return later
         earlier = later

@@ -65,7 +65,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._profile: MotionProfile | None = None
         self._rest_deg = 0.0
         self._path_deg = (0.0, 0.0)
-        self._believed: ServoState | None = None
+        self._trusted: ServoState | None = None
         self._backlash_taken_up = False
 
     def __enter__(self) -> Self:
@@ -233,7 +233,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
         else:
             ends_deg = [self._safety.angle_reference.to_servo(angle) for angle in (start_deg, *waypoints)]
-            self._path_deg, self._believed = (min(ends_deg), max(ends_deg)), None
+            self._path_deg, self._trusted = (min(ends_deg), max(ends_deg)), None
             with self._safety.motion((start_deg, *waypoints), self._stop) as motion:
                 slip = SlipMonitor(self._limits, start_deg) if self._trust_gyro else None
                 for waypoint in waypoints:
@@ -298,8 +298,8 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._clock.sleep(config.poll_s)
             self._safety.check_stop_request()
             state = self._servo.read_state()
-            if self._believed is None or reachable(self._believed, state, config.velocity_dps):
-                self._believed = state
+            if self._trusted is None or reachable(self._trusted, state, config.velocity_dps):
+                self._trusted = state
             self._gyro.update()
             angle_deg = to_table(state.position_deg)
             if monitor:
@@ -342,5 +342,5 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def _stop(self) -> bool:
         ramp_dps2 = self._profile.acceleration_dps2 if self._profile else self._config.acceleration_dps2
-        path = MotionPath(self._path_deg, self._config.velocity_dps, self._believed)
+        path = MotionPath(self._path_deg, self._config.velocity_dps, self._trusted)
         return halt(self._servo, self._clock, self._safety.set_goal, path, ramp_dps2, self._config.poll_s)

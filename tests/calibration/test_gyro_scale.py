@@ -126,7 +126,7 @@ def test_saturated_gyro_is_refused_without_estimates(simulated):
     result = run(s, during=dict.fromkeys(range(1, 5), whirl))
     assert "scale" not in result.estimates
     assert codes(result) == [RefusalCode.TOO_FEW_REVOLUTIONS]
-    assert "beyond the gyro's range" in str(result.refusals[0])
+    assert "exceeded the gyro's range" in str(result.refusals[0])
 
 
 def test_one_lost_leg_is_left_out_and_too_few_legs_are_refused():

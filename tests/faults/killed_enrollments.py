@@ -24,6 +24,7 @@ VIEWS = 8
 def main() -> None:
     folder, kills, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     with new_rig(folder / "bench") as rig:
+        _enroll(rig, folder / "warm-up", lambda _index: None)  # the first run stores byte code
         counted = partial(_enroll, rig, folder / "counted", lambda _index: None)
         for number, (point, delay_s) in enumerate(points(counted, kills, seed)):
             reported = killed_child(partial(_enroll, rig, folder / str(number)), point, delay_s)

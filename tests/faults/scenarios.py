@@ -131,7 +131,7 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         stopped(
             "imu.delayed@move3",
-            404,
+            502,
             "the gyro reports rotation, the encoder does not",
             "restart the sensor",
             answer=502,

@@ -1,4 +1,4 @@
-"""A catalog from somebody else cannot reach outside its folder, and every change of its database is noticed."""
+"""A catalog from an untrusted sender cannot reach outside its folder, and every change of its database is noticed."""
 
 import os
 import random
@@ -85,7 +85,7 @@ def opened(root: Path) -> Catalog:
 
 
 def seal_as_the_sender(root: Path) -> None:
-    """Compute the digests again, as somebody who means harm would do."""
+    """Compute the digests again, as an attacker would do."""
     with opened(root) as catalog, catalog.database.write() as connection:
         seal_enrollments(connection, None)
         seal_objects(connection, None)
@@ -277,7 +277,7 @@ def test_damage_stays_noticed_after_later_changes(root: Path) -> None:
     [
         "DELETE FROM audit WHERE id = 2",
         "DELETE FROM audit WHERE id = (SELECT max(id) FROM audit)",
-        "UPDATE audit SET user = 'nobody' WHERE id = 3",
+        "UPDATE audit SET user = 'intruder' WHERE id = 3",
         "UPDATE audit SET time_utc = '2031-01-01 00:00:00.000000' WHERE id = 1",
         "UPDATE audit SET digest = lower(hex(zeroblob(32))) WHERE id = 4",
     ],

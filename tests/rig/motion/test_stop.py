@@ -1,4 +1,4 @@
-"""A stop stays within the limits, believes only readings that agree, and ends with the torque off and read back."""
+"""A stop stays within the limits, uses only readings that agree, and ends with the torque off and read back."""
 
 import ast
 from dataclasses import replace

@@ -156,11 +156,19 @@ def test_unplugged_servo_ends_the_plan_with_all_views_stored(simulated, catalog)
         s.bench.close()  # reports that the torque is still on, and closes the other devices
 
 
-def test_torque_that_stays_on_is_noted_on_the_first_error(simulated):
+def test_torque_that_cannot_be_switched_off_is_an_error_after_an_interruption(simulated):
     s = simulated()
-    with pytest.raises(KeyboardInterrupt) as caught, s.bench:
+    with pytest.raises(DeviceSilent, match="Torque Enable = 0") as caught, s.bench:
         s.bench.servo.bus.port.ser.unplug()
         raise KeyboardInterrupt
+    assert isinstance(caught.value.__context__, KeyboardInterrupt)
+
+
+def test_torque_that_cannot_be_switched_off_is_noted_on_an_earlier_error(simulated):
+    s = simulated()
+    with pytest.raises(ValueError, match="first") as caught, s.bench:
+        s.bench.servo.bus.port.ser.unplug()
+        raise ValueError("first")
     assert any("does not answer" in note for note in caught.value.__notes__)
 
 
@@ -282,7 +290,8 @@ def test_object_in_any_orientation_is_found_with_the_right_pose(shelf_of_three):
     answer = events[-1]
     assert isinstance(answer, Identified)
     assert answer.name == "toy-car"
-    assert abs(wrap180(answer.yaw_deg - 77.0)) < 2 * 360 / VIEWS
+    # by CEDD of a few views its front and back look the same: the answer has both poses
+    assert min(abs(wrap180(yaw_deg - 77.0)) for yaw_deg in answer.yaw_set_deg) < 2 * 360 / VIEWS
     moves = [e for e in events if isinstance(e, Moved)]
     decisions = [e for e in events if isinstance(e, Decided)]
     assert len(moves) == answer.views == len(decisions) + 1

@@ -327,9 +327,7 @@ def test_objects_without_the_descriptor_are_searched_by_the_paper(sim_catalog_of
 @pytest.fixture
 def sim_catalog_of_both(tmp_path, simulated):
     """Return a catalog of two objects by both descriptors, and what takes the bench's own from one view."""
-    import sqlite3
-    from contextlib import closing
-
+    from rig.catalog.seal import seal_enrollments
     from rig.plans.enroll import enroll
 
     s = simulated("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
@@ -338,8 +336,9 @@ def sim_catalog_of_both(tmp_path, simulated):
             list(enroll(s.bench, catalog, name, views=6))
 
         def lacking() -> None:
-            with closing(sqlite3.connect(tmp_path / "catalog" / "catalog.sqlite")) as database, database:
-                database.execute("DELETE FROM descriptors WHERE name != 'cedd' AND view_id = 1")
+            with catalog.database.write() as connection:
+                connection.exec_driver_sql("DELETE FROM descriptors WHERE name != 'cedd' AND view_id = 1")
+                seal_enrollments(connection, None)
 
         yield catalog, lacking
 
