@@ -30,7 +30,7 @@ test: $(READY)
 test-nightly: $(READY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly
 
-# A hundred kills of the program at different points of eleven kinds of work; a thousand with KILLS=60.
+# A hundred kills of the program at different points of eleven kinds of work; a thousand with KILLS=90.
 KILLS ?= 8
 test-kills: $(READY)
 	@RIG_TEST_KILLS=$(KILLS) $(BIN)/python -m pytest -n auto --dist worksteal --timeout 3600 tests/faults/test_kill*.py
