@@ -58,8 +58,9 @@ class HardwareBench:
                 state=FileStore(state_path),
                 head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
-            bench.connections = connections.pop_all()
+            # If the guardian cannot start, the connections close with this block.
             bench.guardian = Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id)
+            bench.connections = connections.pop_all()
             return bench
 
     @contextmanager
