@@ -3,6 +3,7 @@
 Decision: docs/decisions/0033.
 """
 
+import atexit
 import signal
 import threading
 from collections.abc import Iterator
@@ -47,6 +48,7 @@ def handle_signals() -> None:
     reach a moving table anyway. Other ignored signals stay ignored: SIGHUP is what `nohup` ignores.
     """
     _state.raised_ns = None
+    atexit.register(_ignore_signals)  # registered twice, it runs twice, to the same effect
     for number in ENDING:
         found = signal.getsignal(number)
         if found is signal.SIG_DFL or (number is signal.SIGINT and found in (signal.SIG_IGN, _python_default)):
@@ -80,6 +82,13 @@ def uninterrupted() -> Iterator[None]:
 
 
 _python_default = signal.default_int_handler
+
+
+def _ignore_signals() -> None:
+    """Ignore more signals while the interpreter ends: they would replace the exit code of the first one."""
+    for number in ENDING:
+        if signal.getsignal(number) is _end:
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _end(number: int, _frame: object) -> None:

@@ -93,3 +93,18 @@ def test_burst_of_signals_does_not_stop_the_cleanup(numbers):
     output, _ = process.communicate(timeout=20)
     assert output == b"torque off\n"
     assert process.returncode in {128 + number for number in numbers} | {-signal.SIGINT}
+
+
+def test_signal_at_the_end_of_the_interpreter_keeps_the_exit_code():
+    program = """
+import os, signal
+from rig.core.signals import handle_signals
+class Late:  # cleared after the interpreter has restored the default handlers
+    def __init__(self): self.kill, self.pid, self.number = os.kill, os.getpid(), signal.SIGUSR1
+    def __del__(self): self.kill(self.pid, self.number)
+late = Late()
+handle_signals()
+signal.raise_signal(signal.SIGTERM)
+"""
+    done = subprocess.run([sys.executable, "-c", program], timeout=20)
+    assert done.returncode == 128 + signal.SIGTERM
