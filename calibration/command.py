@@ -357,8 +357,8 @@ def _results(settings: Settings, bench: "Bench", procedure: "Procedure") -> "Ite
 
     from calibration.procedure import Ask, Progress
     from rig.calibrations import CalibrationResult
-    from rig.cli.ui.present import line
     from rig.events.events import event_dict
+    from rig.events.lines import line
 
     required = [_in_force(bench, name) for name in procedure.requires]
     with closing(procedure.live(bench, *required)) as events:

@@ -3,8 +3,8 @@
 from typing import ClassVar
 
 from hbr import StopDecision
-from rig.cli.ui.present import line
 from rig.events.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
+from rig.events.lines import line
 from rig.events.wording import azimuth_words, distinct, share_words, signed
 
 

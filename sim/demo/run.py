@@ -16,12 +16,13 @@ from rich.table import Table
 
 from rig.bench import Bench
 from rig.catalog import Catalog
-from rig.cli.ui.present import Progress, console, line
+from rig.cli.ui.present import Progress, console
 from rig.cli.ui.settings import Settings
 from rig.config.values import validate
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import UsageError, os_errors_as
 from rig.events.events import Accepted, Started
+from rig.events.lines import line
 from rig.events.wording import duration_words, signed
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify

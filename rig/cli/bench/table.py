@@ -81,9 +81,9 @@ def home(
 
 def _rotate(settings: Settings, table: "Turntable", angle_deg: float) -> None:
     """Rotate the table, and report the events of the rotation."""
-    from rig.cli.ui.present import line
     from rig.core.errors import RigError
     from rig.events.events import Event, event_dict
+    from rig.events.lines import line
     from rig.plans.capture import announced, moved
 
     def steps() -> Iterator[Event]:

@@ -134,8 +134,8 @@ def _answer(question: str) -> str | None:
 
 def _take(settings: Settings, bench: "Bench", *, anyway: bool = False, within_plan: bool = False) -> None:
     """Take the image; ``within_plan`` prints to stderr, because stdout belongs to the events of another plan."""
-    from rig.cli.ui.present import line
     from rig.events.events import event_dict
+    from rig.events.lines import line
     from rig.plans.photograph_table import photograph_table
 
     for event in photograph_table(bench, anyway=anyway):

@@ -13,7 +13,6 @@ from rich.table import Table
 from rich.text import Text
 
 from rig.cli.ui.keys import HINT, Pause
-from rig.cli.ui.present import line
 from rig.config import RigConfig
 from rig.events.events import (
     Accepted,
@@ -29,6 +28,7 @@ from rig.events.events import (
     SimilarObjects,
     Started,
 )
+from rig.events.lines import line
 from rig.events.wording import (
     angle_words,
     azimuth_words,

@@ -1,0 +1,106 @@
+"""One line of text for each event: for terminals, web pages and logs."""
+
+from rig.events.events import (
+    Accepted,
+    Candidate,
+    Decided,
+    EmptyTableImage,
+    Enrolled,
+    Event,
+    Failed,
+    Identified,
+    Item,
+    Moved,
+    Ranked,
+    Rejected,
+    SimilarObjects,
+    SkipReason,
+    Started,
+    Unwinding,
+    Waiting,
+    Warned,
+)
+from rig.events.wording import (
+    angle_words,
+    answer_lines,
+    azimuth_words,
+    counted,
+    decision_words,
+    duration_words,
+    move_words,
+    next_step_words,
+    note_words,
+    share_words,
+    signed,
+    similar_objects_words,
+    unwinding_words,
+    wait_words,
+)
+from rig.views.capture import rejection_text
+
+SHOWN = 3
+"""Candidates in the line of a ranking."""
+
+
+def line(event: Event) -> str:
+    """Return the text of an event for the operator; empty if it has none."""
+    match event:
+        case Started():
+            return "\n".join(f"Note: {note_words(note)}." for note in event.notes)
+        case Moved():
+            encoder, asked = (angle_words(angle, 2) for angle in (event.encoder_deg, event.commanded_deg))
+            return f"  table at {encoder} (asked {asked}): {move_words(event)}"
+        case Unwinding():
+            return f"  {unwinding_words(event)}"
+        case Rejected():
+            texts = "; ".join(rejection_text(reason, event.evidence) for reason in event.reasons)
+            return f"view {event.index + 1}, attempt {event.attempt}: rejected, {texts}"
+        case Accepted():
+            return f"view {event.index + 1}, azimuth {azimuth_words(event.azimuth_deg)}°"
+        case Ranked():
+            leaders = ", ".join(_leader(c, event) for c in event.candidates[:SHOWN])
+            return f"  candidates: {leaders} (margin {signed(event.margin, 3)})"
+        case Decided():
+            return f"  {decision_words(event)} The table rotates to {angle_words(event.target_deg)}."
+        case Enrolled():
+            retakes = f", {counted(event.retakes, 'rejected image')}" if event.retakes else ""
+            took = duration_words(event.seconds)
+            return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
+        case Identified():
+            least = "" if event.min_score is None else f" (unknown below {event.min_score:.3f})"
+            numbers = (
+                f"Score {event.score:.3f} per view{least}, "
+                f"margin {signed(event.margin, 3)}, {event.travelled_deg:.0f}° of rotation, "
+                f"{duration_words(event.seconds)}."
+            )
+            return "\n  ".join([*answer_lines(event), numbers])
+        case Item(action="skip"):
+            return f"{event.number} of {event.of}  {event.name}: skipped, {_skip_words(event)}"
+        case Item():
+            return ""
+        case SimilarObjects():
+            return "\n".join(f"  {words}" for words in similar_objects_words(event))
+        case EmptyTableImage():
+            share = "" if event.turning_share is None else f", {event.turning_share * 100:.1f} % rotates with the table"
+            return f"Empty-table image: {event.width} × {event.height} pixels{share}"
+        case Warned():
+            return f"Warning: {note_words(event.note)}.\nNext step: {next_step_words(event.note)}"
+        case Waiting():
+            return f"Waiting for {wait_words(event.reason)}; Ctrl+C ends."
+        case Failed():
+            return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
+
+
+def _leader(one: Candidate, ranked: Ranked) -> str:
+    share = share_words(one, ranked.decision)
+    return f"{one.name} {one.score:.3f}{f' ({share})' if share else ''} at {azimuth_words(one.pose_deg)}°"
+
+
+def _skip_words(item: Item) -> str:
+    match item.reason:
+        case SkipReason.OPERATOR:
+            return "as the operator asked"
+        case SkipReason.ERROR:
+            return f"because of error {item.error_code}"
+        case _:
+            return "it is already enrolled"
