@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, select, update
+from sqlalchemy import Connection, Row, select, update
 
 import hbr
 from rig.catalog import audit
@@ -113,6 +113,24 @@ class Catalog(AbstractContextManager["Catalog"]):
         """The catalog's folder."""
         return self.database.root
 
+    def check_enrollable(
+        self,
+        name: str,
+        *,
+        label: str | None = None,
+        note: str | None = None,
+        resume: bool = False,
+        replace: bool = False,
+    ) -> None:
+        """Raise what `begin`, or with ``resume`` `resume`, would raise for this object now; change nothing."""
+        name = clean_name(name)
+        checked_texts(label, note)
+        with self.database.read() as connection:
+            if resume:
+                _unfinished(connection, *find(connection, name))
+            elif not replace and (object_id := connection.scalar(select(objects.c.id).where(in_use(name)))) is not None:
+                _check_not_enrolled(connection, object_id, name)
+
     def begin(
         self,
         name: str,
@@ -213,11 +231,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         with self.database.write() as connection:
             object_id, name = find(connection, name)
-            unfinished = connection.execute(
-                select(enrollments).where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))
-            ).first()
-            if unfinished is None:
-                raise CatalogError(f"{name!r} has no unfinished enrollment", next_step="enroll it without --resume")
+            unfinished = _unfinished(connection, object_id, name)
             plan = tuple(unfinished.planned_azimuth_deg)
             audit.append(connection, self.clock, "enrollment resumed", name, enrollment_id=unfinished.id)
             return self._start_session(connection, unfinished.id, object_id, name, plan, provenance)
@@ -331,6 +345,13 @@ def checked_texts(label: str | None, note: str | None) -> dict[str, str]:
     for key, text in given.items():
         check_text(text, key)
     return given
+
+
+def _unfinished(connection: Connection, object_id: int, name: str) -> Row[Any]:
+    found = connection.execute(select(enrollments).where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))).first()
+    if found is None:
+        raise CatalogError(f"{name!r} has no unfinished enrollment", next_step="enroll it without --resume")
+    return found
 
 
 def _check_not_enrolled(connection: Connection, object_id: int, name: str) -> None:

@@ -1,5 +1,6 @@
 """An enrollment in progress: add views, then finish or abandon it."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -182,6 +183,9 @@ class Enrollment:
             if connection.scalar(others) is None:
                 connection.execute(delete(objects).where(objects.c.id == self.object_id))
             audit.append(connection, self._clock, "enrollment discarded", self.object_name, enrollment_id=self.id)
+        for folder in (self.folder, self.folder.parent):
+            with suppress(OSError):  # it has images of other enrollments
+                image_file(self._database.root, folder.as_posix()).rmdir()
 
     def _write_image(self, name: str, png: bytes) -> ImageFile:
         path = self.folder / name

@@ -40,6 +40,10 @@ _TYPER_USAGE_ERROR: Any = typer.BadParameter.__base__
 class _Commands(TyperGroup):
     """All commands. With ``--json`` an error in the arguments is also printed as JSON, as other errors are."""
 
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        _escape_help(self)
+
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         wants_json = "--json" in args
         with _usage_error(json=wants_json):
@@ -50,6 +54,17 @@ class _Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with _usage_error(json=ctx.meta[_WANTS_JSON]):
             return super().invoke(ctx)
+
+
+def _escape_help(command: Any) -> None:
+    """Escape brackets in the help of a command and its subcommands, or Rich takes a word such as [servo] for markup."""
+    for text_of in (command, *command.params):
+        if "[" in (getattr(text_of, "help", None) or ""):
+            from rich.markup import escape
+
+            text_of.help = escape(text_of.help)
+    for inner in getattr(command, "commands", {}).values():
+        _escape_help(inner)
 
 
 @contextmanager

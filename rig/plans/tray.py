@@ -127,6 +127,12 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
     return tuple(items)
 
 
+def left_to_enroll(catalog: Catalog, items: Sequence[TrayItem]) -> list[TrayItem]:
+    """Return the objects of a tray that are not enrolled, or whose enrollment was interrupted."""
+    enrolled = {known.name for known in catalog.objects() if known.views and known.unfinished_views is None}
+    return [item for item in items if item.name not in enrolled]
+
+
 def enroll_tray(
     bench: Bench,
     catalog: Catalog,

@@ -4,13 +4,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from statistics import median
 from typing import Any, Final, NamedTuple
+from urllib.parse import quote
 
 import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rig.catalog.exchange.batch import Enrollment, ExportedObject, Object, Session, region_of_view
-from rig.catalog.exchange.bundle import read_stored
+from rig.catalog.exchange.bundle import new_file, read_stored
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus
 from rig.core.errors import ExportFailed
@@ -42,36 +43,48 @@ def write_sheets(folder: Path, objects: Iterable[ExportedObject]) -> int:
         The folder is not empty or cannot be written, or an image is not the one that was stored.
     """
     with new_folder(folder) as made:
-        return sum(1 for _ in _shown(made, made, objects))
+        return sum(1 for _ in _shown(made, None, objects))
 
 
-def write_catalog_page(folder: Path, objects: Iterable[ExportedObject]) -> int:
-    """Write ``index.html`` and the contact sheets, and return the number of objects.
+def write_catalog_page(target: Path, objects: Iterable[ExportedObject]) -> int:
+    """Write an HTML page with the contact sheets, and return the number of objects.
+
+    ``target`` is the file (suffix ``.html``; the sheets are in a folder beside it), or a folder for ``index.html``.
 
     Raises
     ------
     ExportFailed
         As `write_sheets`.
     """
-    with new_folder(folder) as made:
-        (made / SHEETS).mkdir()
-        shown = list(_shown(made / SHEETS, made, objects))
-        environment = Environment(
-            loader=PackageLoader("rig.report", "."),
-            autoescape=True,
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-            keep_trailing_newline=True,
-        )
-        page = environment.get_template("catalog.html.j2").render(
-            objects=shown, views=sum(one.views for one in shown), labels=sorted({o.item.label for o in shown} - {""})
-        )
-        (made / "index.html").write_text(page, encoding="utf-8", newline="\n")
+    if target.suffix.lower() == ".html":
+        sheets = target.with_name(f"{target.stem}-{SHEETS}")
+        with new_file(target) as file, new_folder(sheets) as made:
+            shown = list(_shown(made, sheets.name, objects))
+            file.write(_page(shown))
+    else:
+        with new_folder(target) as made:
+            (made / SHEETS).mkdir()
+            shown = list(_shown(made / SHEETS, SHEETS, objects))
+            (made / "index.html").write_bytes(_page(shown))
     return len(shown)
 
 
-def _shown(folder: Path, above: Path, objects: Iterable[ExportedObject]) -> Iterator[_Shown]:
+def _page(shown: list[_Shown]) -> bytes:
+    environment = Environment(
+        loader=PackageLoader("rig.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    template = environment.get_template("catalog.html.j2")
+    labels = sorted({one.item.label for one in shown} - {""})
+    return template.render(objects=shown, views=sum(one.views for one in shown), labels=labels).encode()
+
+
+def _shown(folder: Path, link: str | None, objects: Iterable[ExportedObject]) -> Iterator[_Shown]:
+    """Write the sheets into ``folder``; ``link`` is its path from the page, None without a page."""
     for number, (item, files) in enumerate(objects, start=1):
         complete = [e for e in item.enrollments if e.status == EnrollmentStatus.COMPLETE]
         if not complete:
@@ -79,20 +92,13 @@ def _shown(folder: Path, above: Path, objects: Iterable[ExportedObject]) -> Iter
         (enrollment,) = complete
         pictures = list(_pictures(enrollment, files))
         slug = Path(enrollment.views[0].image).parts[1].split("-", 1)[-1]
-        sheet = folder / f"{number:04d}-{slug}.jpg"
-        stamp = folder / f"{number:04d}-{slug}-small.jpg"
-        _write(sheet, contact_sheet(pictures, [view.azimuth_deg for view in enrollment.views], tile=TILE))
-        if folder != above:
-            _write(stamp, thumbnail(pictures[0], _STAMP))
+        sheet, stamp = f"{number:04d}-{slug}.jpg", f"{number:04d}-{slug}-small.jpg"
+        _write(folder / sheet, contact_sheet(pictures, [view.azimuth_deg for view in enrollment.views], tile=TILE))
+        if link is not None:
+            _write(folder / stamp, thumbnail(pictures[0], _STAMP))
         enrolled = f"{enrollment.finished_utc:%Y-%m-%d %H:%M} UTC" if enrollment.finished_utc else "–"
-        yield _Shown(
-            item,
-            sheet.relative_to(above).as_posix(),
-            stamp.relative_to(above).as_posix(),
-            len(enrollment.views),
-            enrolled,
-            list(_items(item, enrollment)),
-        )
+        items = list(_items(item, enrollment))
+        yield _Shown(item, quote(f"{link}/{sheet}"), quote(f"{link}/{stamp}"), len(enrollment.views), enrolled, items)
 
 
 def _pictures(enrollment: Enrollment, files: dict[str, Path]) -> Iterator[Image]:

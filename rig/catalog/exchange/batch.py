@@ -348,31 +348,25 @@ def region_of_view(view: View) -> Region | None:
 
 
 def gaps(objects: Sequence[Object]) -> list[Gap]:
-    """Return the missing views of objects that are seen all around at the usual step between views."""
-    rings = {item.name: sorted(item.enrollments[-1].planned_azimuth_deg) for item in objects}
-    steps = sorted(
-        step
-        for ring in rings.values()
-        if len(ring) > 1
-        for step in ((after - before) % 360 for before, after in zip(ring, [*ring[1:], ring[0]], strict=True))
-    )
-    if not steps:
+    """Return the missing views of objects that are seen from most sides at even steps; each has its own step."""
+    return [Gap(item.name, azimuth_deg) for item in objects for azimuth_deg in _gaps(item)]
+
+
+def _gaps(item: Object) -> list[float]:
+    ring = sorted(item.enrollments[-1].planned_azimuth_deg)
+    if len(ring) < 2:
         return []
-    step_deg = steps[len(steps) // 2]
-    slots = round(360 / step_deg)
+    steps = sorted((after - before) % 360 for before, after in zip(ring, [*ring[1:], ring[0]], strict=True))
+    step_deg = steps[(len(steps) - 1) // 2]
+    slots = round(360 / step_deg) if step_deg else 0
     if slots < 4 or abs(360 / slots - step_deg) > 0.1 * step_deg:
-        return []  # no even spacing
+        return []  # no even steps
     step_deg = 360 / slots
-    missing = []
-    for name, ring in rings.items():
-        if len(ring) < 2:
-            continue
-        start_deg = ring[0] % step_deg
-        seen = {round((azimuth_deg - start_deg) / step_deg) % slots for azimuth_deg in ring}
-        missing += [
-            Gap(name, math.fmod(start_deg + slot * step_deg, 360.0)) for slot in range(slots) if slot not in seen
-        ]
-    return missing
+    start_deg = ring[0] % step_deg
+    seen = {round((azimuth_deg - start_deg) / step_deg) % slots for azimuth_deg in ring}
+    if 2 * len(seen) <= slots:
+        return []  # seen from one side only, for example within the limits of a table that pans
+    return [math.fmod(start_deg + slot * step_deg, 360.0) for slot in range(slots) if slot not in seen]
 
 
 def region_text(region: Region | None) -> str:

@@ -4,8 +4,9 @@ import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 from hbr.core.angles import wrap360
 from hbr.descriptors import descriptor
@@ -28,6 +29,7 @@ from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.core.errors import ExportFailed, ImportRejected
 from rig.views.description import PAPER_DESCRIPTOR
+from rig.views.image_files import IMAGE_FOLDER
 
 TABLE: Final = "views.csv"
 _NUMBERS: Final = ("commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
@@ -79,25 +81,40 @@ def read_table(path: Path, *, now: datetime) -> ImportBatch:
     return assemble(str(path), photographs, rejected, now, this_software())
 
 
-def write_table(folder: Path, objects: Iterable[ExportedObject]) -> int:
-    """Write the views that searches use as ``views.csv``, with copies of their images beside it.
+def write_table(target: Path, objects: Iterable[ExportedObject]) -> int:
+    """Write the views that searches use as a CSV file, with copies of their images.
+
+    ``target`` is the file (suffix ``.csv``; the images are in a folder beside it), or a folder for ``views.csv`` and
+    the images.
 
     Raises
     ------
     ExportFailed
-        The folder is not empty or cannot be written, or an image is not the stored one.
+        The target exists or cannot be written, or an image is not the stored one.
     """
+    if target.suffix.lower() == ".csv":
+        images = target.with_name(f"{target.stem}-{IMAGE_FOLDER}")
+        with new_file(target) as file, new_folder(images) as made:
+            return _write_table(file, made, images.name, objects)
+    with new_folder(target) as made, (made / TABLE).open("wb") as file:
+        return _write_table(file, made / IMAGE_FOLDER, IMAGE_FOLDER, objects)
+
+
+def _write_table(file: IO[bytes], images: Path, link: str, objects: Iterable[ExportedObject]) -> int:
+    """Write the table to ``file`` and the images into ``images``; ``link`` is its path from the table."""
     count = 0
-    with new_folder(folder) as made, (made / TABLE).open("w", encoding="utf-8", newline="") as file:
-        rows = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
-        rows.writeheader()
-        for item, files in objects:
-            count += 1
-            for row, view in _rows(item):
-                target = made / view.image
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(read_stored(files[view.image], view.image_sha256))
-                rows.writerow({key: "" if value is None else value for key, value in row.items() if key in _COLUMNS})
+    text = TextIOWrapper(file, encoding="utf-8", newline="")
+    rows = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+    rows.writeheader()
+    for item, files in objects:
+        count += 1
+        for row, view in _rows(item):
+            within = Path(view.image).relative_to(IMAGE_FOLDER)
+            (images / within).parent.mkdir(parents=True, exist_ok=True)
+            (images / within).write_bytes(read_stored(files[view.image], view.image_sha256))
+            row["image"] = Path(link, within).as_posix()
+            rows.writerow({key: "" if value is None else value for key, value in row.items() if key in _COLUMNS})
+    text.detach()  # flushes; the caller closes the file
     return count
 
 

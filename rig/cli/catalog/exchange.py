@@ -235,9 +235,17 @@ def _format(target: Path) -> Format:
     from rig.core.errors import UsageError
 
     suffix = target.suffix.lower()
-    known = {".zip": Format.BUNDLE, ".parquet": Format.PARQUET, "": Format.COIL}
+    known = {
+        "": Format.COIL,
+        ".zip": Format.BUNDLE,
+        ".csv": Format.CSV,
+        ".parquet": Format.PARQUET,
+        ".html": Format.HTML,
+    }
     if suffix not in known:
+        suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in known.items())
         raise UsageError(
-            f"the format of {target} is not clear from its name", next_step=f"give --format, one of {', '.join(Format)}"
+            f"The suffix of {target} does not name a format.",
+            next_step=f"Use one of these suffixes: {suffixes}. Or give --format.",
         )
     return known[suffix]

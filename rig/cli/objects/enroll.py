@@ -78,6 +78,7 @@ def enroll(
     from rig.plans.tray import read_tray
 
     # Reject wrong options before a device is opened.
+    given = {"--views": views, "--step": step, "--label": label, "--note": note, "--report": report, "--yes": yes}
     views = _views(views, step)
     _check(name, tray, label=label, note=note, resume=resume, replace=replace)
     if report is not None:
@@ -94,30 +95,41 @@ def enroll(
         from rig.cli.objects.empty_table import ensure_empty_table_image
         from rig.cli.ui.operator_prompts import OperatorPrompts
         from rig.plans.enroll import enroll as enroll_one
-        from rig.plans.tray import AutomaticOperator, enroll_tray
+        from rig.plans.tray import AutomaticOperator, enroll_tray, left_to_enroll
 
+        labels = ", ".join(label) if label else None
+        if name is not None:  # reject it before the operator clears the table
+            catalog.check_enrollable(name, label=labels, note=note, resume=resume, replace=replace)
         report_other_regions(settings, catalog, bench)
-        ensure_empty_table_image(settings, bench, ask=not yes, then=name)
+        if name is not None or left_to_enroll(catalog, items):
+            ensure_empty_table_image(settings, bench, ask=not yes, then=name)
         job = _Job(settings, bench, catalog)
         if name is not None:
-            labels = ", ".join(label) if label else None
             events = enroll_one(
                 bench, catalog, name, views=views, label=labels, note=note, resume=resume, replace=replace
             )
-            job.run(events, ["To continue:", _command(settings, name, "--resume")], report)
+            job.run(events, ["To continue:", _command(settings, given, name, "--resume")], report)
         else:
             asks = isinstance(bench.operator, ObjectAlreadyPlaced)
             operator = OperatorPrompts(job.close_view) if asks else AutomaticOperator()
             job.run(
                 enroll_tray(bench, catalog, items, views=views, operator=operator),
-                ["To continue with the other objects:", _command(settings, "--list", str(tray))],
+                ["To continue with the other objects:", _command(settings, given, "--list", str(tray))],
                 report,
             )
             job.print_total(len(items))
 
 
-def _command(settings: Settings, *arguments: str) -> str:
-    return f"  {shlex.join(['rig', 'enroll', *arguments, *settings.arguments()])}"
+def _command(settings: Settings, given: "Mapping[str, Any]", *arguments: str) -> str:
+    """Return the command that continues, with the options that were given, quoted for the shell."""
+    options: list[str] = []
+    for option, value in given.items():
+        for one in value if isinstance(value, list) else [value]:
+            if one is True:
+                options.append(option)
+            elif one not in (None, False):
+                options += [option, f"{one:g}" if isinstance(one, float) else str(one)]
+    return f"  {shlex.join(['rig', 'enroll', *arguments, *options, *settings.arguments()])}"
 
 
 class _Job:

@@ -56,7 +56,8 @@ class Settings:
         words = [] if self.bench is None else ["--bench", self.bench]
         words += [] if self.config is None else ["--config", str(self.config)]
         words += [word for override in self.overrides for word in ("--set", override)]
-        return words if self.seed is None else [*words, "--seed", str(self.seed)]
+        words += [] if self.seed is None else ["--seed", str(self.seed)]
+        return [*words, "--json"] if self.json else words
 
     @property
     def bench_name(self) -> str:

@@ -306,6 +306,18 @@ class TestFolders:
         gaps = read_folder(tmp_path, now=NOW).gaps
         assert [(gap.object_name, gap.azimuth_deg) for gap in gaps] == [("b", 90.0), ("b", 270.0), ("c", 0.0)]
 
+    def test_each_object_has_its_own_step(self, tmp_path: Path) -> None:
+        for name, angles in (
+            ("many", range(0, 360, 10)),
+            ("few", range(0, 360, 60)),
+            ("lacks-one", range(0, 320, 40)),
+            ("front-only", range(0, 90, 10)),
+        ):
+            for angle in angles:
+                photograph(tmp_path / f"{name}__{angle}.png", angle)
+        gaps = read_folder(tmp_path, now=NOW).gaps
+        assert [(gap.object_name, gap.azimuth_deg) for gap in gaps] == [("lacks-one", 320.0)]
+
     def test_unusable_files_are_rejected_one_by_one(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
         folder = tmp_path / "in"
         for angle in (0, 90, 180, 270):

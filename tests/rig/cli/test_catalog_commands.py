@@ -208,7 +208,13 @@ def test_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("target", "options"),
-    [("out.rigcat.zip", ()), ("out", ()), ("out", ("--format", "csv")), ("out", ("--format", "coil"))],
+    [
+        ("out.rigcat.zip", ()),
+        ("out", ()),
+        ("out.csv", ()),
+        ("out", ("--format", "csv")),
+        ("out", ("--format", "coil")),
+    ],
 )
 def test_export_can_be_imported(two: Rig, target: str, options: tuple[str, ...]) -> None:
     assert result(two("export", target, "--json", *options))["objects"] == 2
@@ -230,7 +236,9 @@ def test_export_of_some_objects_and_of_pages(two: Rig) -> None:
     assert result(two("export", "mug.rigcat.zip", "mug", "--json"))["objects"] == 1
     assert two("export", "none.rigcat.zip", "jug").exit_code == 7
     assert two("export", "none.rigcat.zip", "--label", "lab").exit_code == 7
-    assert two("export", "out.tar").exit_code == 2
+    unknown = two("export", "out.tar")
+    assert unknown.exit_code == 2
+    assert ".csv (csv)" in unknown.stderr
     assert two("export", "sheets", "--format", "sheets").exit_code == 0
     assert sorted(path.name for path in Path("sheets").iterdir()) == ["0001-mug.jpg", "0002-tin.jpg"]
     assert cv2.imread("sheets/0001-mug.jpg").shape[1] > 12 * 96
@@ -239,6 +247,9 @@ def test_export_of_some_objects_and_of_pages(two: Rig) -> None:
     page = Path("page/index.html").read_text(encoding="utf-8")
     assert "<script>" not in page
     assert all((Path("page") / f"sheets/{name}").is_file() for name in ("0001-mug.jpg", "0001-mug-small.jpg"))
+    assert two("export", "all mugs.html").exit_code == 0
+    assert 'src="all%20mugs-sheets/0001-mug.jpg"' in Path("all mugs.html").read_text(encoding="utf-8")
+    assert Path("all mugs-sheets/0001-mug.jpg").is_file()
 
 
 def test_merge_is_all_or_nothing(two: Rig) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -161,7 +162,7 @@ def test_unknown_bench_and_unknown_command_are_rejected(rig):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(rig, number, code):
     process = subprocess.Popen(
-        [*RIG, "enroll", "dice", "--views", "18", "--json"],
+        [*RIG, "enroll", "dice", "--views", "18", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"],
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -177,8 +178,10 @@ def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(
     rest, errors = process.communicate(timeout=60)
     stored += sum(json.loads(line).get("event") == "accepted" for line in rest.splitlines())
     assert process.returncode == code
-    assert "--resume" in errors
-    resumed = rig("enroll", "dice", "--resume", "--json")
+    options = ["--views", "18", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"]
+    again = shlex.split(next(line for line in errors.splitlines() if line.startswith("  rig enroll")))
+    assert again == ["rig", "enroll", "dice", "--resume", *options]
+    resumed = rig(*again[1:])
     assert resumed.exit_code == 0, resumed.stderr
     events = lines(resumed.stdout)
     assert events[0]["views"] == 18 - stored

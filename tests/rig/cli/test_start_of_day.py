@@ -10,10 +10,14 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from rig.bench import ObjectAlreadyPlaced
+from rig.bench import ObjectAlreadyPlaced, open_bench
+from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.cli.objects.empty_table import ensure_empty_table_image
 from rig.cli.ui.settings import Settings
+from rig.config import load_config
+from rig.events.events import Accepted
+from rig.plans.enroll import enroll
 from rig.views.empty_table import empty_table_status
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
@@ -55,6 +59,37 @@ def test_enrollment_takes_the_image_once_a_day(rig: Callable[..., Any]) -> None:
     told = json.loads(rig("catalog", "show", "lamp", "--json").stdout)
     assert told["segmentation"]["found"] == 4
     assert told["views"][0]["record"]["segmentation"]["agreement"] > 0.65
+
+
+def test_name_is_checked_before_the_table_is_cleared(rig: Callable[..., Any]) -> None:
+    """``dice`` is enrolled, the enrollment of ``toy-car`` is unfinished, and ``lamp`` is unknown."""
+    bench = open_bench("sim", load_config(Path("rig.toml"), SMALL))
+    with bench, Catalog.open("catalog", clock=bench.clock) as catalog:
+        for _ in enroll(bench, catalog, "dice", views=4):
+            pass
+        unfinished = enroll(bench, catalog, "toy-car", views=4)
+        next(event for event in unfinished if isinstance(event, Accepted))
+        unfinished.close()
+    Path("tray.csv").write_text("name\ndice\n")
+    before = Path("state/sim/state.json").read_bytes()
+    small = [word for setting in SMALL for word in ("--set", setting)]
+    for arguments, code in (
+        (("dice",), 7),
+        (("toy-car",), 7),
+        (("lamp", "--resume"), 7),
+        (("dice", "--resume"), 7),
+        (("a\nb",), 2),
+        (("--list", "tray.csv"), 0),
+    ):
+        done = rig("enroll", *arguments, *small)
+        assert done.exit_code == code, arguments
+        assert "Empty-table image" not in done.stderr
+    assert Path("state/sim/state.json").read_bytes() == before
+
+
+def test_rejected_enrollment_leaves_no_folder(rig: Callable[..., Any]) -> None:
+    assert rig("enroll", "unicorn", "--views", "4").exit_code == 7
+    assert list(Path("catalog/images").iterdir()) == []
 
 
 class Answers(io.StringIO):
