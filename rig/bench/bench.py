@@ -20,7 +20,6 @@ from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError, TorqueStaysOn
 from rig.core.signals import uninterrupted
 from rig.devices.camera import Camera
-from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
 from rig.devices.servo import Servo
@@ -70,8 +69,6 @@ class Bench(AbstractContextManager["Bench"]):
         The rig head that `imu` is connected to; None if `imu` is on the computer's own I2C bus.
     connections
         What must be closed after the devices.
-    guardian
-        Switches the torque off if this program is killed; None if the servo is simulated in this program.
     """
 
     name: str
@@ -87,7 +84,6 @@ class Bench(AbstractContextManager["Bench"]):
     state: StateStore = field(default_factory=MemoryStore, repr=False)
     head: RigHead | None = None
     connections: ExitStack = field(default_factory=ExitStack, repr=False)
-    guardian: Guardian | None = None
     safety: Safety = field(init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)
     _as_opened: tuple[RigConfig, tuple[str, ...]] | None = field(default=None, init=False, repr=False)
@@ -115,27 +111,21 @@ class Bench(AbstractContextManager["Bench"]):
     def _close(self) -> None:
         failures: list[Exception] = []
         for step in (
-            self._torque_off,
+            self.servo.torque_off,
             self.servo.close,
             self.imu.close,
             self.camera.close,
             self.connections.close,
-            *((self.guardian.close,) if self.guardian else ()),
         ):
             try:
                 step()
             except (RigError, OSError) as failure:
                 if isinstance(failure, TorqueStaysOn):
                     self.safety.latch(failure)
-                if not (step == self._torque_off and self._unpowered()):
+                if not (step == self.servo.torque_off and self._unpowered()):
                     failures.append(failure)
         if failures:
             raise failures[0]
-
-    def _torque_off(self) -> None:
-        self.servo.torque_off()
-        if self.guardian:
-            self.guardian.disarm()
 
     def _unpowered(self) -> bool:
         """Return whether the rig head's relay cuts the servo's supply: then it has no torque either."""

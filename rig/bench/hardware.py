@@ -52,14 +52,13 @@ class HardwareBench:
                 clock,
                 connection=connection,
                 reopen_serial=lambda: open_serial(config.servo.port, config.servo.baud),
+                guardian=Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id),
                 i2c_bus=config.imu.bus,
                 capture=capture,
                 reopen_camera=lambda: open_capture(config.camera.source),
                 state=FileStore(state_path),
                 head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
-            # If the guardian cannot start, the connections close with this block.
-            bench.guardian = Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id)
             bench.connections = connections.pop_all()
             return bench
 
@@ -83,6 +82,7 @@ def assemble(
     *,
     connection: SerialConnection,
     reopen_serial: Callable[[], SerialConnection] | None = None,
+    guardian: Guardian | None = None,
     i2c_bus: int | str,
     capture: Capture,
     reopen_camera: Callable[[], Capture] | None = None,
@@ -107,7 +107,7 @@ def assemble(
             head = open_head(config, head_port, clock)
             opened.callback(head.close)
             fault = switch_on(head, config.head, clock)  # first, because the servo's supply may go through it
-        servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial)
+        servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial, guardian)
         findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
         _check_reach(config, servo)
         imu: Imu = head or open_imu(config.imu, i2c_bus, clock)

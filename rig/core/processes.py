@@ -40,7 +40,8 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
             yield item, work(item)
         return
     # there is a process for each core, so further threads in a process only slow it down
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    # and none may import from the working directory (PYTHONSAFEPATH)
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONSAFEPATH"):
         os.environ.setdefault(variable, "1")
     from hbr.descriptors import loaded_models
 

@@ -56,7 +56,6 @@ class Turntable(AbstractContextManager["Turntable"]):
         self._servo = bench.servo
         self._clock = bench.clock
         self._safety = bench.safety
-        self._guardian = bench.guardian
         self._trust_gyro = trust_gyro
         imu = bench.config.imu
         self._gyro = GyroRotationMeter(
@@ -71,8 +70,6 @@ class Turntable(AbstractContextManager["Turntable"]):
     def __enter__(self) -> Self:
         self._safety.prepare()
         try:
-            if self._guardian is not None:
-                self._guardian.arm()
             self._servo.torque_on()
             # After torque on, which clears the watchdog: a watchdog that trips resets the profile to unlimited.
             self._profile = self._servo.set_profile(
@@ -90,8 +87,6 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._profile = None
             try:
                 self._servo.torque_off()
-                if self._guardian is not None:
-                    self._guardian.disarm()
                 self._safety.released()
             except TorqueStaysOn as stays_on:
                 self._safety.latch(stays_on)

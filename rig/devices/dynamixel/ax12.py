@@ -77,7 +77,7 @@ class Ax12Servo(RegisterServo):
         self._write("Moving Speed", velocity)
         return MotionProfile(velocity * self._dps_per_unit, _STEEPEST_DPS2 / self._gear_ratio)
 
-    def torque_on(self) -> None:
+    def _switch_torque_on(self) -> None:
         position = self._read("Present Position")
         self._reject_errors(hardware_errors(self.bus.alert(self._id)))
         self._write("Goal Position", position)  # this also switches the torque on

@@ -2,7 +2,7 @@
 
 The program holds one end of a pipe. When the program dies, the system closes that end, and the guardian opens the
 servo's port. It has a session of its own, so Ctrl+C at the terminal does not end it. A simulated servo in the memory of
-the program dies with it and needs no guardian.
+the program dies with it and needs no guardian. With `-P`, Python imports nothing from the working directory.
 """
 
 import os
@@ -35,7 +35,7 @@ class Guardian:
         """Have the torque switched off if this program dies from now on; call it before the torque goes on."""
         if self._process is None or self._process.poll() is not None:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", __name__, *self._arguments],
+                [sys.executable, "-P", "-m", __name__, *self._arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

@@ -6,6 +6,7 @@ from rig.config import ServoConfig
 from rig.core.clock import Clock
 from rig.devices.dynamixel.ax12 import Ax12Servo
 from rig.devices.dynamixel.bus import DynamixelBus
+from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import protocol_of
@@ -19,10 +20,12 @@ def open_servo(
     clock: Clock,
     mode: str = "turntable",
     reopen: Callable[[], SerialConnection] | None = None,
+    guardian: Guardian | None = None,
 ) -> RegisterServo:
     """Return the configured servo on ``connection``, for ``mode`` (`table.mode`); write nothing.
 
-    ``reopen`` opens the connection again after its adapter was unplugged.
+    ``reopen`` opens the connection again after its adapter was unplugged. ``guardian`` switches the torque off if this
+    program is killed.
 
     Raises
     ------
@@ -40,4 +43,5 @@ def open_servo(
         clock=clock,
         mode=ServoMode(mode),
         gear_ratio=config.gear_ratio,
+        guardian=guardian,
     )

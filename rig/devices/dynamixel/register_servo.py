@@ -7,6 +7,7 @@ from rig.core.clock import Clock
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
+from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_numbers
 from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
@@ -36,6 +37,8 @@ class RegisterServo(ABC):
     gear_ratio
         Revolutions of the servo for one revolution of the table. All angles and rates of this class are on the table's
         side of the gear. If the gears reverse the direction, set `table.direction`.
+    guardian
+        Switches the torque off if this program is killed; None if the servo is simulated in this program.
 
     Raises
     ------
@@ -57,12 +60,14 @@ class RegisterServo(ABC):
         clock: Clock,
         mode: ServoMode = ServoMode.TURNTABLE,
         gear_ratio: float = 1.0,
+        guardian: Guardian | None = None,
     ) -> None:
         self.bus = bus
         self._clock = clock
         self._id = bus_id
         self._mode = mode
         self._gear_ratio = gear_ratio
+        self._guardian = guardian
         self.resolution_deg = self.deg_per_count / gear_ratio
         self._blocks: dict[tuple[str, str], Block] = {}
         try:
@@ -108,6 +113,8 @@ class RegisterServo(ABC):
 
     def close(self) -> None:
         self.bus.close()
+        if self._guardian:
+            self._guardian.close()  # after the port: it needs it if the torque is on
 
     # -- differences between models ---------------------------------------------------------------------------
 
@@ -121,16 +128,22 @@ class RegisterServo(ABC):
     @abstractmethod
     def set_profile(self, profile: MotionProfile) -> MotionProfile: ...
     @abstractmethod
-    def torque_on(self) -> None: ...
+    def _switch_torque_on(self) -> None: ...
     @abstractmethod
     def arm_watchdog(self, timeout_s: float) -> None: ...
     @abstractmethod
     def disarm_watchdog(self) -> None: ...
 
+    def torque_on(self) -> None:
+        self._arm_guardian()
+        self._switch_torque_on()
+
     def torque_off(self) -> None:
         for _ in range(TORQUE_OFF_ATTEMPTS):
             self._write("Torque Enable", 0)
             if not self._read("Torque Enable"):
+                if self._guardian:
+                    self._guardian.disarm()
                 return
         raise TorqueStaysOn(
             f"Servo {self._id} accepts the instruction to switch its torque off, but its torque stays on.",
@@ -179,6 +192,10 @@ class RegisterServo(ABC):
                 return
 
     # -- for the models -------------------------------------------------------------------------------------------
+
+    def _arm_guardian(self) -> None:
+        if self._guardian:
+            self._guardian.arm()
 
     def _read(self, name: str) -> int:
         return self.bus.read(self._id, self._table[name])

@@ -83,7 +83,7 @@ class DynamixelServo(RegisterServo):
         self._write("Profile Velocity", velocity)
         return MotionProfile(velocity * self._dps_per_unit, acceleration * self._dps2_per_unit)
 
-    def torque_on(self) -> None:
+    def _switch_torque_on(self) -> None:
         self._reject_errors(self._hardware_errors())
         # After a killed program the torque may be on: the old goal must not continue when the watchdog is cleared.
         self._write("Torque Enable", 0)
@@ -123,6 +123,7 @@ class DynamixelServo(RegisterServo):
         try:
             self._write("Bus Watchdog", 0)
             self._write("Profile Acceleration", max(round(acceleration_dps2 / self._dps2_per_unit), 1))
+            self._arm_guardian()
             self._write("Torque Enable", 1)  # goal velocity is 0 after a change of mode
             self.arm_watchdog(_SPIN_WATCHDOG_S)
             self._write("Goal Velocity", units)

@@ -32,7 +32,13 @@ def length(item: tuple[str, int]) -> int:
     return descriptor(item[0]).length
 
 
-def test_processes_have_the_models_that_were_loaded(tmp_path: Path) -> None:
+def test_processes_have_the_loaded_models_and_nothing_of_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "means.onnx").write_bytes(model())
     name = load_model(tmp_path / "means.onnx").name
+    for module in ("multiprocessing", "runpy", "selectors"):
+        (tmp_path / f"{module}.py").write_text("open('imported', 'w')")
+    monkeypatch.chdir(tmp_path)
     assert {found for _, found in map_in_processes(length, [(name, 1), (name, 2)], 2)} == {3}
+    assert not (tmp_path / "imported").exists()
