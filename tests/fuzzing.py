@@ -1,4 +1,11 @@
-"""How hard parsers of bytes from devices are fuzzed: hundreds of cases in CI, thousands in the nightly profile."""
+"""How hard inputs are fuzzed: hundreds of cases in CI, thousands in the nightly profile, each with limits."""
+
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
 
 from hypothesis import HealthCheck, settings
 
@@ -12,3 +19,32 @@ def fuzz_settings(share: float = 1.0) -> settings:
     return settings(
         max_examples=cases, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
     )
+
+
+MAX_MEMORY = 1 << 30
+MAX_CPU_S = 10
+
+
+class LimitExceeded(BaseException):
+    """A case takes too long; no code under test handles it."""
+
+
+@contextmanager
+def limited(cpu_s: float = MAX_CPU_S, memory: int = MAX_MEMORY) -> Iterator[None]:
+    """Limit the processor time, and what this process may allocate in addition, in a ``with`` block (MemoryError)."""
+
+    def too_long(*_: object) -> NoReturn:
+        raise LimitExceeded
+
+    status = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    used = next(int(line.split()[1]) * 1024 for line in status if line.startswith("VmData"))
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    handler = signal.signal(signal.SIGPROF, too_long)
+    resource.setrlimit(resource.RLIMIT_DATA, (used + memory, before[1]))
+    signal.setitimer(signal.ITIMER_PROF, cpu_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+        signal.signal(signal.SIGPROF, handler)

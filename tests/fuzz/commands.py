@@ -18,7 +18,7 @@ from typing import Any, Self
 from hypothesis import HealthCheck, settings
 
 from rig.cli.ui.exit_codes import EXIT_CODES
-from tests.fuzz.worker import MAX_MEMORY
+from tests.fuzzing import MAX_MEMORY
 
 CONFIG = (
     'default_bench = "sim"\n[camera]\nwidth = 320\nheight = 240\n[view]\nroi = [40, 0, 240, 240]\n'

@@ -9,21 +9,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from rig.catalog import Catalog, migrate
+from rig.catalog import Catalog
 from rig.catalog.edit import set_texts
 from rig.catalog.exchange import import_objects, plan_import, read_bundle, read_objects, write_bundle
 from rig.catalog.exchange.bundle import MANIFEST, OBJECTS
-from rig.catalog.schema import APPEND_ONLY, METADATA
-from rig.catalog.upkeep import collect_garbage, statistics
+from rig.catalog.failures import DATABASE_NAME
+from rig.catalog.schema import SCHEMA_VERSION
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected, RigError
 from rig.views import image_files as images
 from sim.clock import VirtualClock
-from tests.fuzzing import fuzz_settings
+from tests.fuzz.commands import Commands, cases
+from tests.fuzzing import fuzz_settings, limited
 from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, image, plan, true_fill, without_waiting
+from tests.rig.catalog.test_migration import DUMPS, catalog_of_version
+
+pytestmark = pytest.mark.timeout(7200)
 
 HOSTILE = st.one_of(
     st.none(),
@@ -36,7 +40,6 @@ HOSTILE = st.one_of(
     ),
     st.sampled_from([[], {}, [[]], {"region": "evil"}, {"issues": 5}, {"view": 7}, 2**63, -(2**70), [None]]),
 )
-CELLS = [(table.name, column.name) for table in METADATA.sorted_tables for column in table.columns]
 
 
 @pytest.fixture(scope="module")
@@ -65,42 +68,85 @@ def in_sql(value: Any) -> Any:
     return str(value) if isinstance(value, int) and not -(2**63) <= value < 2**63 else value
 
 
-@given(data=st.data())
-@fuzz_settings(0.04)
-def test_catalog_with_any_value_is_read_or_rejected(
-    sample: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    table, column = data.draw(st.sampled_from(CELLS))
-    value = in_sql(data.draw(HOSTILE))
-    folder = tmp_path_factory.mktemp("victim")
-    root = Path(shutil.copytree(sample / "catalog", folder / "catalog"))
-    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
+@pytest.fixture(scope="module")
+def catalogs(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, Path]]:
+    """Return catalogs of each version of the tables, with their versions."""
+    folder = tmp_path_factory.mktemp("versions")
+    old = [(version, catalog_of_version(version, folder / f"v{version}")) for version in DUMPS]
+    return [*old, (SCHEMA_VERSION, sample / "catalog")]
+
+
+def spoil(file: Path, kind: str, data: st.DataObject) -> None:
+    """Damage a database."""
+    if kind == "bytes":
+        content = bytearray(file.read_bytes())
+        for _ in range(data.draw(st.integers(1, 4))):
+            content[data.draw(st.integers(0, len(content) - 1))] ^= data.draw(st.integers(1, 255))
+        file.write_bytes(content)
+        return
+    with closing(sqlite3.connect(file, isolation_level=None)) as connection:
         connection.execute("PRAGMA ignore_check_constraints = ON")
-        connection.execute("DROP TRIGGER audit_no_update")
+        connection.execute("PRAGMA foreign_keys = OFF")
+        triggers = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()
+        tables = [
+            name
+            for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+            if not name.startswith("sqlite_")
+        ]
+        table = data.draw(st.sampled_from(sorted(tables)))
+        columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
         try:
-            connection.execute(f"UPDATE {table} SET {column} = ?", (value,))
+            if kind == "value":
+                for name, _ in triggers:
+                    connection.execute(f"DROP TRIGGER {name}")
+                value = in_sql(data.draw(HOSTILE))
+                connection.execute(f"UPDATE {table} SET {data.draw(st.sampled_from(columns))} = ?", (value,))
+                for _, statement in triggers:
+                    connection.execute(statement)
+            elif kind == "schema":
+                connection.execute(data.draw(st.sampled_from(SCHEMAS)).format(table=table, column=columns[-1]))
+            else:
+                version = data.draw(st.sampled_from([-5, -1, 0, 1, 2, SCHEMA_VERSION, SCHEMA_VERSION + 1, 2**31 - 1]))
+                connection.execute(f"PRAGMA user_version = {version}")
         except (sqlite3.Error, UnicodeEncodeError):
-            return
-        finally:
-            connection.execute(APPEND_ONLY[0])
-    for read in (
-        lambda catalog: [catalog.object(item.name) for item in catalog.objects()],
-        lambda catalog: catalog.views(),
-        lambda catalog: catalog.log(),
-        statistics,
-        lambda catalog: list(read_objects(catalog)),
-        lambda catalog: finished(verify(catalog, jobs=1)),
-        lambda catalog: finished(verify(catalog, repair=True, jobs=1)),
-        lambda catalog: collect_garbage(catalog, old=True),
-    ):
-        try:
-            with Catalog.open(root, clock=VirtualClock(), create=False) as catalog:
-                read(catalog)
-        except RigError:
-            pass
-    migrate(root, clock=VirtualClock())
-    assert [path.name for path in folder.iterdir()] == ["catalog"]
-    shutil.rmtree(folder)
+            assume(False)
+
+
+SCHEMAS = [
+    "CREATE TRIGGER evil AFTER UPDATE ON {table} BEGIN DELETE FROM {table}; END",
+    "CREATE VIEW evil AS SELECT * FROM {table}",
+    "CREATE TABLE new_objects (x)",
+    "CREATE INDEX evil ON {table} ({column})",
+    "ALTER TABLE {table} ADD COLUMN evil",
+    "ALTER TABLE {table} RENAME COLUMN {column} TO evil",
+]
+READ = ["show mug", "show mug-white", "list", "verify --jobs 1", "verify --repair --jobs 1", "stats", "gc --yes"]
+
+
+@given(
+    st.integers(0, 2),
+    st.sampled_from(["value", "value", "value", "bytes", "bytes", "schema", "version"]),
+    st.sampled_from(["log", "export a.zip", "catalog migrate", *(f"catalog {words}" for words in READ)]),
+    st.data(),
+)
+@cases(9)
+def test_any_catalog_ends_in_order(
+    commands: Commands, catalogs: list[tuple[int, Path]], number: int, kind: str, command: str, data: st.DataObject
+) -> None:
+    version, folder = catalogs[number]
+    root = Path(shutil.copytree(folder, commands.fresh() / "catalog"))
+    spoil(root / DATABASE_NAME, kind, data)
+    before = (root / DATABASE_NAME).read_bytes()
+    if version < SCHEMA_VERSION:
+        done = commands.run("catalog", "migrate", "--bench", "sim")
+        if done.exit_code:
+            assert (root / DATABASE_NAME).read_bytes() == before
+        elif kind != "version":
+            (backup,) = root.glob("catalog-v*.sqlite")
+            with closing(sqlite3.connect(backup)) as kept, closing(sqlite3.connect(":memory:")) as original:
+                original.deserialize(before[:18] + b"\1\1" + before[20:])  # in memory there is no write-ahead log
+                assert list(kept.iterdump()) == list(original.iterdump())
+    commands.run(*command.split(), "--bench", "sim")
 
 
 def _leaves(value: Any) -> list[tuple[Any, Any]]:
@@ -128,7 +174,7 @@ def test_bundle_with_any_value_is_imported_or_rejected(
     with zipfile.ZipFile(folder / "a.zip", "w") as target:
         for name, content in members.items():
             target.writestr(name, content)
-    with Catalog.open(folder / "catalog", clock=VirtualClock()) as catalog:
+    with limited(), Catalog.open(folder / "catalog", clock=VirtualClock()) as catalog:
         try:
             finished(import_objects(catalog, plan_import(catalog, read_bundle(folder / "a.zip")), jobs=1))
         except ImportRejected:
@@ -162,7 +208,11 @@ def test_whatever_the_catalog_accepts_survives_export_and_import(
 ) -> None:
     folder = tmp_path_factory.mktemp("round")
     clock = VirtualClock()
-    with Catalog.open(folder / "catalog", clock=clock) as catalog, Catalog.open(folder / "copy", clock=clock) as copy:
+    with (
+        limited(),
+        Catalog.open(folder / "catalog", clock=clock) as catalog,
+        Catalog.open(folder / "copy", clock=clock) as copy,
+    ):
         try:
             begun = catalog.begin(name, planned_azimuth_deg=[azimuth_deg], provenance=PROVENANCE)
             within = region if region and min(region) >= 0 and min(region[2:]) else None

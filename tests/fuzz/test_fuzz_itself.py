@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from tests.fuzz.commands import Done, check, tree
-from tests.fuzz.worker import MAX_MEMORY
+from tests.fuzzing import MAX_MEMORY, LimitExceeded, limited
 
 GOOD = Done(0, '{"a": 1}\n', "", 1, 0.1)
 
@@ -52,3 +52,12 @@ def test_hangs_and_memory_are_limited(limit, code, exit_code, tmp_path):
     (tmp_path / "inside").mkdir()
     done = subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False)
     assert done.returncode in (exit_code, -signal.SIGXCPU)
+
+
+def test_hangs_and_memory_are_limited_in_this_process():
+    with pytest.raises(LimitExceeded), limited(cpu_s=0.05):
+        while True:
+            pass
+    with pytest.raises(MemoryError), limited(memory=1 << 24):
+        bytearray(1 << 25)
+    bytearray(1 << 25)

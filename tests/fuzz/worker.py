@@ -10,8 +10,8 @@ import signal
 import sys
 from pathlib import Path
 
-MAX_MEMORY = 1 << 30
-MAX_CPU_S = 10
+from tests.fuzzing import MAX_CPU_S, MAX_MEMORY
+
 MAX_WAIT_S = 40
 """A command that computes nothing waits for something. The limit leaves room for a computer that does other things."""
 MAX_OUTPUT = 1 << 20
