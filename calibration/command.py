@@ -252,14 +252,14 @@ def show(settings: Settings) -> None:
         store = CalibrationStore(bench.config.calibration_path(bench.name))
         standings = store.standings(bench.apparatus(), bench.clock.utc())
         if settings.json:
-            rows = [{"state": s.status, "words": s.text, **_json(s.result)} for s in standings]
+            rows = [{"state": s.status, "words": str(s), **_json(s.result)} for s in standings]
             settings.print_json({"folder": str(store.folder), "calibrations": plain(rows)})
             return
         for finding in bench.findings:
             print(f"! {finding}")
         for standing in standings:
             if standing.status is CalibrationStatus.IN_FORCE:
-                print(f"✓ {standing.text}")
+                print(f"✓ {standing}")
                 print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.result.estimates.items()))
                 for key, value in standing.result.settings.items():
                     print(f"    sets {key} = {_plain(value)}")

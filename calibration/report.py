@@ -95,7 +95,7 @@ def _shown(standing: CalibrationStanding, history: Sequence[CalibrationResult]) 
         result,
         standing.status is CalibrationStatus.IN_FORCE,
         str(standing.status),
-        standing.text,
+        str(standing),
         standing.command,
         [f"Refused on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {refusal}" for refusal in latest.refusals],
         # Trusted markup: the SVG escapes its texts.

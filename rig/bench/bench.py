@@ -234,7 +234,7 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
         *notes,
         *(error.what for error in store.unreadable),
         *(
-            f"{standing.text}; calibrate again with `{standing.command}`"
+            f"{standing}; calibrate again with `{standing.command}`"
             for standing in standings
             if standing.status is not CalibrationStatus.IN_FORCE
         ),

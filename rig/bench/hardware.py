@@ -108,7 +108,8 @@ def assemble(
             opened.callback(head.close)
             fault = switch_on(head, config.head, clock)  # first, because the servo's supply may go through it
         servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial, guardian)
-        findings = prepare_servo(servo, write=config.servo.write_settings) + servo.remarks
+        findings = prepare_servo(servo, write=config.servo.write_settings)
+        findings += tuple(f"servo: {one}" for one in servo.remarks)
         _check_reach(config, servo)
         imu: Imu = head or open_imu(config.imu, i2c_bus, clock)
         opened.callback(imu.close)

@@ -38,9 +38,8 @@ class CalibrationStanding:
     age_days: float = 0.0
     changes: tuple[str, ...] = ()
 
-    @property
-    def text(self) -> str:
-        """The status in words."""
+    def __str__(self) -> str:
+        """Return the status in words."""
         name, age = self.result.name, f"{self.result.name} was calibrated {self.age_days:.0f} days ago"
         match self.status:
             case CalibrationStatus.FAILED:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from rig.core.errors import DeviceNotFound
 from rig.devices.camera import Camera
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
 from rig.views.capture import ImageQuality, rejection_text
 
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
@@ -24,7 +25,7 @@ MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
 def camera(context: DoctorContext) -> Iterator[Finding]:
     """Open the camera, lock its settings, and take some frames."""
     if context.holder is not None:
-        yield warning("camera", "not opened: the bench is in use", context.rig("stop"))
+        yield warning("camera", FindingCode.NOT_CHECKED, context.rig("stop"))
         return
     config = context.config.camera
     try:
@@ -38,21 +39,19 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
         source = OpenCvCamera(capture, clock=context.computer.clock, settings=settings, name=f"camera {config.source}")
         identity = source.identity
         context.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
-        text = f"{identity.name}: {identity.width}x{identity.height} at {identity.fps:.3g} frames/s"
-        yield fine("camera", f"{text}, frames timed by {source.time_base.value} exposure")
+        mode = {"name": identity.name, "width": identity.width, "height": identity.height, "fps": identity.fps}
+        yield fine("camera", FindingCode.CAMERA, **mode)
+        yield fine("camera", FindingCode.TIME_BASE, time_base=source.time_base.value)
         yield from _locks(context, source)
         yield from _frames(context, source)
 
 
 def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     locks = source.read_locks()
-    device = f" -d {context.config.camera.source}"
-    for refused in source.rejected_settings:
-        yield warning(
-            "camera",
-            f"{refused.setting}: requested {refused.asked:g}, the camera reports {refused.reported:g}",
-            "v4l2-ctl --list-ctrls-menus" + device,
-        )
+    fix = f"v4l2-ctl --list-ctrls-menus -d {context.config.camera.source}"
+    for one in source.rejected_settings:
+        found = {"setting": one.setting, "requested": one.asked, "reported": one.reported}
+        yield warning("camera", FindingCode.SETTING_REJECTED, fix, **found)
     automatic = [
         name
         for name, value, wanted in (
@@ -62,12 +61,10 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         if value or (value is None and wanted is not None)
     ]
     if automatic:
-        text = f"{' and '.join(automatic)} not locked: views of one object may differ"
-        yield warning("camera", text, "v4l2-ctl --list-ctrls-menus" + device)
+        yield warning("camera", FindingCode.NOT_LOCKED, fix, settings=automatic)
     elif not source.rejected_settings:
-        exposure = "?" if locks.exposure_us is None else f"{locks.exposure_us / 1e3:.3g} ms"
-        balance = "?" if locks.white_balance_k is None else f"{locks.white_balance_k:.0f} K"
-        yield fine("camera", f"locked and read back: exposure {exposure}, white balance {balance}")
+        exposure_ms = None if locks.exposure_us is None else locks.exposure_us / 1e3
+        yield fine("camera", FindingCode.LOCKED, exposure_ms=exposure_ms, white_balance_k=locks.white_balance_k)
 
 
 def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
@@ -86,30 +83,29 @@ def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
     seen = [ImageQuality.of(frame, context.config.view) for frame in frames]
     levels = [each.mean_level for each in seen]
-    text = f"frames arrive {1e3 * max(ages):.0f} ms after exposure, {rate:.3g} a second"
-    evidence: dict[str, Any] = {"frame_age_s": max(ages), "frames_per_s": rate, "mean_levels": levels}
+    evidence: dict[str, Any] = {"frame_age_ms": 1e3 * max(ages), "frames_per_s": rate, "mean_levels": levels}
     if max(levels) < context.config.view.min_mean:
         fix = "Take the lens cap off and switch the light on, then: " + context.rig("doctor")
-        yield bad("camera", f"black: mean level {max(levels):.1f} of 255", fix, **evidence)
+        yield bad("camera", FindingCode.BLACK, fix, mean_level=max(levels), **evidence)
         return
     if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
-        yield bad("camera", f"frozen: {len(frames)} frames are identical", again, **evidence)
+        yield bad("camera", FindingCode.CAMERA_FROZEN, again, frames=len(frames), **evidence)
         return
     if max(ages) > MAX_AGE_S:
-        yield warning("camera", f"{text}: too old", "Try another USB port, or reduce camera.width", **evidence)
+        yield warning("camera", FindingCode.LATE_FRAMES, "Try another USB port, or reduce camera.width", **evidence)
     elif rate < 0.6 * source.identity.fps:
         fix = "Try another USB port, or reduce camera.exposure_us or camera.fps"
-        yield warning("camera", f"{text}, not {source.identity.fps:.3g}", fix, **evidence)
+        yield warning("camera", FindingCode.FEW_FRAMES, fix, fps=source.identity.fps, **evidence)
     else:
-        yield fine("camera", text, **evidence)
+        yield fine("camera", FindingCode.FRAMES, **evidence)
     spread = (max(levels) - min(levels)) / max(levels)
     if spread > MAX_FLICKER:
         fix = "Use a lamp that does not flicker, and keep daylight and shadows away, then: " + context.rig("doctor")
-        yield warning("camera", f"the light changes by {spread:.0%} within {SPACED * SPACING_S:.0f} s", fix, **evidence)
-    words = f"mean level {levels[-1]:.0f}, sharpness {seen[-1].sharpness:.0f}, {seen[-1].saturated_share:.1%} saturated"
+        yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
+    quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
-        texts = "; ".join(rejection_text(reason, seen[-1]) for reason in reasons)
         fix = "Check light, exposure and focus (an empty table may look blurred): " + context.rig("config show view")
-        yield warning("camera", f"a view would be rejected now: {texts}", fix)
+        texts = [rejection_text(reason, seen[-1]) for reason in reasons]
+        yield warning("camera", FindingCode.VIEW_REJECTED, fix, reasons=texts, codes=reasons, **quality)
     else:
-        yield fine("camera", f"a view would be accepted now: {words}")
+        yield fine("camera", FindingCode.VIEW_ACCEPTED, **quality)

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.clock import seconds_between
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, bad, fine, warning
+from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
 from rig.safety.saved_state import FileStore
 
 LATENCY_MS = 1  # required latency timer of an FTDI adapter; the default is 16, and each reading waits for it
@@ -26,24 +26,22 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
     path = context.config.state_path(context.bench)
     if context.holder is not None:
         who = f"process {context.holder.pid} ({context.holder.command})" if context.holder.pid else "another process"
-        text = f"in use by {who}: servo, IMU and camera are not checked"
-        yield warning("bench", text, context.rig("stop"), pid=context.holder.pid)
+        yield warning("bench", FindingCode.BENCH_IN_USE, context.rig("stop"), holder=who, pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
         yield bad(
             "bench",
-            state.fault.what if state.fault else state.damage,
+            FindingCode.STATE_DAMAGED,
             "Check how far the cable is wound up, then: "
             f"{context.rig('acknowledge')} and {context.rig('home --turns N')}",
-            exit_code=5,
+            5,
+            what=state.fault.what if state.fault else state.damage,
             damage=state.damage,
         )
     elif state.fault is not None:
-        fault = state.fault
-        text = f"fault {fault.code} ({fault.title}) is latched since {fault.utc}: {fault.what}"
-        yield bad("bench", text, context.rig("acknowledge"), exit_code=5, code=fault.code, next_step=fault.next_step)
+        yield bad("bench", FindingCode.FAULT_LATCHED, context.rig("acknowledge"), 5, **state.fault.model_dump())
     if context.holder is None and not state.damage and state.fault is None:
-        yield fine("bench", f"{context.bench}: free, no fault latched", state=str(path))
+        yield fine("bench", FindingCode.BENCH_FREE, bench=context.bench, state=path)
 
 
 def ports(context: DoctorContext) -> Iterator[Finding]:
@@ -70,9 +68,9 @@ def _i2c(context: DoctorContext) -> Iterator[Finding]:
         yield from access(context, "port", node, "i2c")
     elif buses:
         fix = context.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
-        yield bad("port", f"there is no I2C bus {bus}; there is {_names(buses)}", fix)
+        yield bad("port", FindingCode.NO_I2C_BUS, fix, wanted=bus, found=_names(buses))
     else:
-        yield bad("port", f"there is no I2C bus (configured: {bus})", i2c_command(context))
+        yield bad("port", FindingCode.NO_I2C_BUS, i2c_command(context), wanted=bus, found=[])
 
 
 def _video(context: DoctorContext) -> Iterator[Finding]:
@@ -84,16 +82,11 @@ def _video(context: DoctorContext) -> Iterator[Finding]:
     node = next((n for n in cameras if context.computer.same_file(n.path, camera)), None)
     if node is not None:
         yield from access(context, "port", node, "video")
-    elif cameras:
-        yield bad(
-            "port",
-            f"there is no camera {camera}; there is {_names(cameras)}",
-            context.set("camera.source", cameras[0].stable or cameras[0].path),
-        )
     else:
-        yield bad(
-            "port", f"there is no camera (configured: {camera})", "Connect the camera, then: " + context.rig("find")
-        )
+        fix = "Connect the camera, then: " + context.rig("find")
+        if cameras:
+            fix = context.set("camera.source", cameras[0].stable or cameras[0].path)
+        yield bad("port", FindingCode.NO_CAMERA_DEVICE, fix, wanted=camera, found=_names(cameras))
 
 
 def disk(context: DoctorContext) -> Iterator[Finding]:
@@ -101,23 +94,23 @@ def disk(context: DoctorContext) -> Iterator[Finding]:
     path = context.catalog_path
     there = context.computer.disk(path)
     views = there.free_bytes // VIEW_BYTES
-    text = f"{there.free_bytes / 1e9:.1f} GB free for {path}: about {views // context.config.enroll.views} more objects"
+    free = {"free_gb": there.free_bytes / 1e9, "path": path, "objects": views // context.config.enroll.views}
     if there.free_bytes < TOO_LITTLE_ROOM:
-        yield bad("disk", text, context.rig("catalog gc"), exit_code=7, free_bytes=there.free_bytes)
+        yield bad("disk", FindingCode.FREE_SPACE, context.rig("catalog gc"), 7, **free)
     elif there.free_bytes < LITTLE_ROOM:
-        yield warning("disk", text, context.rig("catalog gc"), free_bytes=there.free_bytes)
+        yield warning("disk", FindingCode.FREE_SPACE, context.rig("catalog gc"), **free)
     else:
-        yield fine("disk", text, free_bytes=there.free_bytes)
+        yield fine("disk", FindingCode.FREE_SPACE, **free)
     if not there.writable:
         fix = (
             f"sudo chown -R {context.computer.user.name} {path}"
             if path.exists()
             else context.set("catalog.path", "FOLDER")
         )
-        yield bad("disk", f"{context.computer.user.name} may not write to {path}", fix, exit_code=7)
+        yield bad("disk", FindingCode.NOT_WRITABLE, fix, 7, user=context.computer.user.name, path=path)
     if there.network:
         fix = context.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
-        yield warning("disk", f"{path} is on a network file system, where locks may fail", fix)
+        yield warning("disk", FindingCode.NETWORK_DISK, fix, path=path)
 
 
 def clock(context: DoctorContext) -> Iterator[Finding]:
@@ -127,27 +120,24 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
     time.sleep(_PAUSE_S)
     passed_s = seconds_between(start_ns, time.now_ns())
     civil_s = (time.utc() - start_utc).total_seconds()
+    pause = {"wanted_ms": 1e3 * _PAUSE_S, "pause_ms": 1e3 * passed_s}
     if not _PAUSE_S * 0.9 <= passed_s <= _PAUSE_S + _PAUSE_ERROR_S:
-        text = (
-            f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.0f} ms: this computer is overloaded, or suspends"
-        )
-        yield warning("clock", text, "Close other programs and switch power saving off, then: " + context.rig("doctor"))
+        fix = "Close other programs and switch power saving off, then: " + context.rig("doctor")
+        yield warning("clock", FindingCode.LONG_PAUSE, fix, **pause)
     else:
-        yield fine("clock", f"a pause of {1e3 * _PAUSE_S:.0f} ms took {1e3 * passed_s:.1f} ms", pause_s=passed_s)
+        yield fine("clock", FindingCode.PAUSE, **pause)
     now = time.utc()
     synchronised = context.computer.time_synchronised()
     fix = "sudo timedatectl set-ntp true"
     if abs(civil_s - passed_s) > _STEP_S:
-        yield warning("clock", f"the civil time jumped by {civil_s - passed_s:+.1f} s during the check", fix)
+        yield warning("clock", FindingCode.TIME_JUMPED, fix, jump_s=civil_s - passed_s)
     elif now < _OLDEST_UTC or now > _OLDEST_UTC + timedelta(days=365 * 50):
-        yield bad("clock", f"the date is wrong: {now:%Y-%m-%d %H:%M} UTC: stored data would have a wrong date", fix, 1)
-    elif synchronised is False:
-        text = f"{now:%Y-%m-%d %H:%M} UTC, but no time server has been reached since this computer started"
-        yield warning("clock", text, fix)
-    elif synchronised is None:
-        yield warning("clock", f"{now:%Y-%m-%d %H:%M} UTC, no time server that is known here", fix)
+        yield bad("clock", FindingCode.WRONG_DATE, fix, 1, utc=now)
+    elif synchronised:
+        yield fine("clock", FindingCode.SYNCHRONIZED, utc=now)
     else:
-        yield fine("clock", f"{now:%Y-%m-%d %H:%M} UTC, synchronized by a time server")
+        code = FindingCode.NO_TIME_SERVER if synchronised is None else FindingCode.NOT_SYNCHRONIZED
+        yield warning("clock", code, fix, utc=now)
 
 
 def udev_rules(ports_found: list[SerialPort]) -> str:
@@ -185,50 +175,43 @@ def i2c_command(context: DoctorContext) -> str:
 
 
 def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPort]) -> Finding:
-    usb = [port for port in found if port.usb]
-    if not usb:
-        fix = "Plug the adapter in, then: " + context.rig("find")
-        return bad("port", f"there is no serial port on USB (configured: {wanted})", fix)
-    fix = context.set(key, usb[0].stable or usb[0].path) if len(usb) == 1 else context.rig("setup")
-    return bad("port", f"there is no serial port {wanted}; there is {_names(found)}", fix)
+    match [port for port in found if port.usb]:
+        case []:
+            fix = "Plug the adapter in, then: " + context.rig("find")
+        case [one]:
+            fix = context.set(key, one.stable or one.path)
+        case _:
+            fix = context.rig("setup")
+    return bad("port", FindingCode.NO_SERIAL_PORT, fix, wanted=wanted, found=_names(found))
 
 
 def access(context: DoctorContext, topic: str, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
     """Check that a device file can be opened: no other program uses it, and the user has permission."""
-    if node.holders:
-        who = " and ".join(map(str, node.holders))
-        if not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
-            modem = "ModemManager" in node.holders[0].command
-            fix = "sudo systemctl disable --now ModemManager" if modem else f"kill {node.holders[0].pid}"
-            yield bad(topic, f"{node.path} is in use by {who}", fix, holders=who)
-            return
-    if node.usable:
-        yield fine(topic, f"{node.path}: {node.name}" + (f" ({node.stable})" if node.stable else ""))
+    if node.holders and not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
+        modem = "ModemManager" in node.holders[0].command
+        fix = "sudo systemctl disable --now ModemManager" if modem else f"kill {node.holders[0].pid}"
+        yield bad(topic, FindingCode.DEVICE_FILE_IN_USE, fix, path=node.path, holders=node.holders)
         return
-    group = node.group or usual_group
-    text = f"{context.computer.user.name} has no permission for {node.path} ({node.name})"
+    if node.usable:
+        yield fine(topic, FindingCode.DEVICE_FILE, path=node.path, name=node.name, stable=node.stable)
+        return
+    user, group = context.computer.user.name, node.group or usual_group
     if group == "root":
-        yield bad(topic, f"{text}: only root has access", udev_command(context))
+        code, fix = FindingCode.ROOT_ONLY, udev_command(context)
     elif context.computer.joined(group):
-        yield bad(
-            topic, f"{text} yet: the membership in group {group} takes effect at the next login", f"newgrp {group}"
-        )
+        code, fix = FindingCode.GROUP_AT_NEXT_LOGIN, f"newgrp {group}"
     else:
-        fix = f"sudo usermod -aG {group} {context.computer.user.name}"
-        yield bad(topic, f"{text}: the group {group} has; log in again after this", fix, group=group)
+        code, fix = FindingCode.NOT_IN_GROUP, f"sudo usermod -aG {group} {user}"
+    yield bad(topic, code, fix, user=user, path=node.path, name=node.name, group=group)
 
 
 def _latency(context: DoctorContext, port: SerialPort) -> Finding:
-    text = f"latency timer of {port.path} is {port.latency_ms} ms"
+    now = {"path": port.path, "latency_ms": port.latency_ms}
     if port.latency_ms is None or port.latency_ms <= LATENCY_MS:
-        return fine("port", text, latency_ms=port.latency_ms)
-    return warning(
-        "port",
-        f"{text}: each reading waits for it, set {LATENCY_MS} ms (permanently: {context.rig('doctor --udev')})",
-        f"echo {LATENCY_MS} | sudo tee {port.latency_file}",
-        latency_ms=port.latency_ms,
-    )
+        return fine("port", FindingCode.LATENCY, **now)
+    fix, permanently = f"echo {LATENCY_MS} | sudo tee {port.latency_file}", context.rig("doctor --udev")
+    return warning("port", FindingCode.HIGH_LATENCY, fix, permanently=permanently, **now)
 
 
-def _names(nodes: list[DeviceFile] | list[SerialPort]) -> str:
-    return ", ".join(f"{node.path} ({node.name})" for node in nodes)
+def _names(nodes: list[DeviceFile] | list[SerialPort]) -> list[str]:
+    return [f"{node.path} ({node.name})" for node in nodes]

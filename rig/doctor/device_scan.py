@@ -28,7 +28,8 @@ from rig.doctor.bus_scan import (
 from rig.doctor.computer import access, i2c_command
 from rig.doctor.context import DoctorContext
 from rig.doctor.examination import Check
-from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.doctor.servo import duplicate_id, foreign_bytes
 
 _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
 """I2C buses of memory, monitors and clock chips, which must not be scanned."""
@@ -81,8 +82,8 @@ class DeviceScan:
             known = [port for port in known if port.path in self.ports]
         asked = [p for p in known if p.usb or context.computer.same_file(p.path, context.config.servo.port)]
         if not asked:
-            text = f"no serial port on USB{'; there is ' + ', '.join(p.path for p in known) if known else ''}"
-            yield bad("servo", text, "Connect the U2D2, then: " + context.rig("find"))
+            fix = "Connect the U2D2, then: " + context.rig("find")
+            yield bad("servo", FindingCode.NO_USB_PORT, fix, found=[port.path for port in known])
         for port in asked:
             yield from self._on_port(context, port)
 
@@ -102,14 +103,12 @@ class DeviceScan:
         except DeviceNotFound as error:
             yield of_error("servo", error)
         except (serial.SerialException, OSError) as error:
-            yield bad(
-                "servo", f"{port.path} failed: {error}", "Connect the adapter again, then: " + context.rig("find")
-            )
+            fix = "Connect the adapter again, then: " + context.rig("find")
+            yield bad("servo", FindingCode.PORT_FAILED, fix, port=port.path, reason=str(error))
         else:
             if not (servos or head or self.duplicate_ids):
-                text = f"{port.path} ({port.name}): no servo and no rig head answer at any baud rate"
                 fix = "Check the servo's cable and switch on its supply, then: " + context.rig("find")
-                yield warning("servo", text, fix)
+                yield warning("servo", FindingCode.NOTHING_ON_PORT, fix, port=port.path, name=port.name)
 
     def _servos(
         self, context: DoctorContext, port: SerialPort, protocol: int, rates: Sequence[int]
@@ -137,22 +136,20 @@ class DeviceScan:
             yield of_error("imu", error)
             return True
         self.heads.append(port)
-        text = f"{port.path}: a rig head ({who.board}, firmware {who.firmware}) with {who.model}"
-        yield fine("imu", text, port=port.path)
+        parts = {"model": who.model, "board": who.board, "firmware": who.firmware}
+        yield fine("imu", FindingCode.HEAD, port=port.path, **parts)
         return True
 
     def _found(self, context: DoctorContext, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
         for found in scan.servos:
             self.servos.append((port, found))
-            yield fine("servo", f"{port.path}: {found}", port=port.path, id=found.bus_id, baud=found.baud)
+            place = {"port": port.path, "id": found.bus_id, "baud": found.baud}
+            yield fine("servo", FindingCode.SERVO_FOUND, found=found, **place)
         if scan.duplicate_ids:
             self.duplicate_ids = True
-            ids = ", ".join(map(str, scan.duplicate_ids))
-            text = f"{port.path}: two servos answer at once to id {ids} at {scan.baud} baud"
-            yield bad("servo", text, "Unplug one of the two, then: " + context.rig("servo set-id NEW"))
+            yield duplicate_id(context, port.path, scan)
         if scan.noise:
-            text = f"{port.path}: bytes at {scan.baud} baud that do not belong to a servo"
-            yield warning("servo", text, "Remove everything but servos from the bus, then: " + context.rig("find"))
+            yield foreign_bytes(context, port.path, scan)
 
     def find_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
         configured = context.computer.i2c_name(context.config.imu.bus)
@@ -170,24 +167,25 @@ class DeviceScan:
                 there = scan_imus(context.computer, node.path)
             except OSError as error:
                 fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
-                yield bad("imu", f"{node.path} is stuck: {error.strerror}", fix)
+                yield bad("imu", FindingCode.I2C_STUCK, fix, bus=node.path, reason=error.strerror)
                 continue
             for found in there:
                 if found.driver:
                     self.imus.append(found)
-                    yield fine("imu", str(found), bus=found.bus, address=found.address)
+                    yield fine("imu", FindingCode.IMU_FOUND, found=found, bus=found.bus, address=found.address)
                 else:
-                    yield warning("imu", f"{found}: the rig has no driver for it", "Use an MPU-6050 or a BNO055")
+                    fix = "Use an MPU-6050 or a BNO055"
+                    yield warning("imu", FindingCode.NO_DRIVER, fix, found=found, address=found.address)
         if not asked and not self.heads:
-            yield bad("imu", "no I2C bus", i2c_command(context))
+            yield bad("imu", FindingCode.NO_I2C, i2c_command(context))
         elif len(self.imus) == before and not self.heads:
             fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
-            yield warning("imu", "no IMU answers on any I2C bus", fix)
+            yield warning("imu", FindingCode.NO_IMU_FOUND, fix)
 
     def find_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
         nodes = context.computer.cameras()
         if not nodes:
-            yield warning("camera", "no camera", "Connect the camera, then: " + context.rig("find"))
+            yield warning("camera", FindingCode.NO_CAMERA, "Connect the camera, then: " + context.rig("find"))
         for node in nodes:
             if problems := [finding for finding in access(context, "camera", node, "video") if finding.fix]:
                 yield from problems
@@ -202,7 +200,8 @@ class DeviceScan:
             found = FoundCamera(node, width, height, capture.get(cv2.CAP_PROP_FPS))
             capture.release()
             self.cameras.append(found)
-            yield fine("camera", f"{node.path}: {node.name}, {width}x{height} at {found.fps:.3g} frames/s")
+            mode = {"path": node.path, "width": width, "height": height, "fps": found.fps}
+            yield fine("camera", FindingCode.CAMERA, name=f"{node.path}: {node.name}", **mode)
 
 
 def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:

@@ -11,7 +11,7 @@ from threading import Thread
 
 from rig.core.errors import RigError
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, bad, of_error
+from rig.doctor.finding import Finding, FindingCode, bad, of_error
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ def run_checks(
                 item = items.get(timeout=check.deadline_s)
             except Empty:
                 progress("")
-                text = f"the check did not end within {check.deadline_s:g} s and was given up"
-                yield bad(check.topic, text, check.if_it_hangs, exit_code=9)
+                code = FindingCode.CHECK_TIMED_OUT
+                yield bad(check.topic, code, check.if_it_hangs, 9, deadline_s=check.deadline_s)
                 break
             progress(item if isinstance(item, str) else "")
             if item is None:
@@ -60,10 +60,10 @@ def _run(context: DoctorContext, check: Check, put: Callable[[Finding | str | No
     except RigError as error:
         put(of_error(check.topic, error))
     except OSError as error:  # a device was unplugged, or a file cannot be read
-        put(bad(check.topic, f"the check stopped: {error}", context.rig("doctor"), error=repr(error)))
-    except Exception as error:  # a bug: report it as one, and go on with the other checks
-        text = f"the check itself failed: {type(error).__name__}: {error}"
-        put(bad(check.topic, text, "Report this with the output of `rig doctor --json`", exit_code=1))
+        put(bad(check.topic, FindingCode.CHECK_INTERRUPTED, context.rig("doctor"), reason=str(error)))
+    except Exception as error:  # a bug: report it as one, and continue with the other checks
+        fix = "Report this with the output of `rig doctor --json`"
+        put(bad(check.topic, FindingCode.CHECK_FAILED, fix, 1, error=repr(error)))
     finally:
         with suppress(RuntimeError):  # the interpreter is shutting down
             put(None)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from typing import Any
 
 from rig.config import ServoConfig
 from rig.core.clock import seconds_between
@@ -12,7 +13,7 @@ from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
 
 READS = 100
 REPEATED = 2  # number of repeated readings on a good bus
@@ -24,12 +25,11 @@ POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks o
 def servo(context: DoctorContext) -> Iterator[Finding | str]:
     """Find the configured servo and others on its bus, and check its settings, supply and temperature."""
     if context.holder is not None:
-        yield warning("servo", "not checked: the bench is in use", context.rig("stop"))
+        yield warning("servo", FindingCode.NOT_CHECKED, context.rig("stop"))
         return
     config = context.config.servo
     if context.config.imu.connection == "head" and context.config.head.power:
-        text = "not checked: the rig head's relay switches its supply on only while a program runs"
-        yield warning("servo", text, context.rig("status"))
+        yield warning("servo", FindingCode.SUPPLY_SWITCHED, context.rig("status"))
         return
     with ExitStack() as opened:
         try:
@@ -53,11 +53,10 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
         identity = found.identity
         context.identities["servo"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         name = identity.model.replace("_", "-").upper()
-        yield fine(
-            "servo", f"{name}, firmware {identity.firmware}, id {config.id} at {config.baud} baud, {config.port}"
-        )
+        yield fine("servo", FindingCode.SERVO, model=name, firmware=identity.firmware, **_place(config))
         for remark in found.remarks:
-            yield warning("servo", remark.removeprefix("servo: "), "Stay at the bench, or use a servo of the X series")
+            fix = "Stay at the bench, or use a servo of the X series"
+            yield warning("servo", FindingCode.SERVO_LIMITATION, fix, remark=remark)
         yield from _others_on_bus(context, wire)
         yield from _settings(context, found)
         yield from _condition(context, found)
@@ -74,19 +73,19 @@ def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Find
         yield f"{config.port}: no servo at id {config.id}; scanning at {rate} baud ..."
         for scan in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
             if scan.duplicate_ids:
-                yield _duplicate(context, scan)
+                yield duplicate_id(context, config.port, scan)
                 return
             answered.append(scan)
     there = [found for scan in without_echoes(answered, config.baud) for found in scan.servos]
-    wanted = f"no servo answers at id {config.id}, {config.baud} baud, {config.port}"
     if not there:
-        yield bad("servo", f"{wanted}, nor any other at any baud rate", POWER + context.rig("doctor"))
+        yield bad("servo", FindingCode.NO_SERVO, POWER + context.rig("doctor"), **_place(config))
         return
-    if len(there) > 1:
-        listed = "; ".join(map(str, there))
-        yield bad("servo", f"{wanted}; {len(there)} others do: {listed}", context.rig("setup"))
-        return
-    yield bad("servo", f"{wanted}; there is {there[0]}", _change_config(context, config, there[0]))
+    fix = context.rig("setup") if len(there) > 1 else _change_config(context, config, there[0])
+    yield bad("servo", FindingCode.OTHER_SERVOS, fix, found=there, **_place(config))
+
+
+def _place(config: ServoConfig) -> dict[str, Any]:
+    return {"id": config.id, "baud": config.baud, "port": config.port}
 
 
 def _change_config(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
@@ -108,76 +107,69 @@ def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[F
     for scan in scan_servos(wire, context.computer.clock, [config.baud]):
         others = [servo for servo in scan.servos if servo.bus_id != config.id]
         if scan.duplicate_ids:
-            yield _duplicate(context, scan)
+            yield duplicate_id(context, config.port, scan)
         elif scan.noise:
-            text = (
-                "bytes arrive that do not belong to a servo: another program or adapter on the bus, or a loose contact"
-            )
-            yield warning("servo", text, "Remove everything but the servo from the bus, then: " + context.rig("doctor"))
+            yield foreign_bytes(context, config.port, scan)
         elif others:
-            listed = "; ".join(map(str, others))
-            yield fine("servo", f"also on the bus, not checked: {listed}")
+            yield fine("servo", FindingCode.MORE_SERVOS, found=others)
         else:
-            yield fine("servo", "the only servo on its bus")
+            yield fine("servo", FindingCode.ONLY_SERVO)
 
 
-def _duplicate(context: DoctorContext, scan: BaudScan) -> Finding:
-    ids = ", ".join(map(str, scan.duplicate_ids))
+def duplicate_id(context: DoctorContext, port: str, scan: BaudScan) -> Finding:
+    """Return the finding that two servos have the same id."""
     taken = {servo.bus_id for servo in scan.servos} | set(scan.duplicate_ids)
     free_id = next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
-    return bad(
-        "servo",
-        f"two servos answer at once to id {ids} at {scan.baud} baud (or the connection is very bad)",
-        f"Unplug one of the two, then: {context.rig(f'servo set-id {free_id}')}",
-        ids=list(scan.duplicate_ids),
-        baud=scan.baud,
-    )
+    fix = f"Unplug one of the two, then: {context.rig(f'servo set-id {free_id}')}"
+    return bad("servo", FindingCode.DUPLICATE_ID, fix, port=port, ids=scan.duplicate_ids, baud=scan.baud)
+
+
+def foreign_bytes(context: DoctorContext, port: str, scan: BaudScan) -> Finding:
+    """Return the finding that bytes of no servo arrive."""
+    fix = "Remove everything but servos from the bus, then: " + context.rig("doctor")
+    return warning("servo", FindingCode.FOREIGN_BYTES, fix, port=port, baud=scan.baud)
 
 
 def _settings(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
     differences = found.setting_differences()
     if not differences:
-        yield fine("servo", "its permanent settings (EEPROM) are as required")
+        yield fine("servo", FindingCode.SETTINGS_CORRECT)
     for difference in differences:
-        yield bad(
-            "servo",
-            f"EEPROM {difference}",
-            context.rig("servo settings --write"),
-            register=difference.register,
-            found=difference.found,
-            wanted=difference.wanted,
-        )
+        values = {"register": difference.register, "found": difference.found, "wanted": difference.wanted}
+        fix = context.rig("servo settings --write")
+        yield bad("servo", FindingCode.SETTING_DIFFERS, fix, difference=difference, **values)
 
 
 def _condition(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
     state, limits, safety = found.read_state(), found.limits, context.config.safety
     condition = found.read_condition()
     if condition.hardware_errors:
-        text = f"reports a hardware error: {', '.join(condition.hardware_errors)}; torque stays off until it restarts"
-        yield bad("servo", text, context.rig("acknowledge --reboot"), hardware_errors=list(condition.hardware_errors))
+        fix = context.rig("acknowledge --reboot")
+        yield bad("servo", FindingCode.HARDWARE_ERROR, fix, hardware_errors=condition.hardware_errors)
     if condition.watchdog_tripped:
-        yield warning("servo", "its watchdog tripped: a program ended during a rotation", context.rig("status"))
+        yield warning("servo", FindingCode.WATCHDOG_TRIPPED, context.rig("status"))
     if condition.torque:
-        yield warning("servo", "its torque is on although no program uses it", context.rig("stop"))
+        yield warning("servo", FindingCode.TORQUE_ON, context.rig("stop"))
     low, high = limits.voltage_v
     if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
-        text = f"reports impossible values: {state.voltage_v:.1f} V and {state.temperature_c:.0f} °C"
-        yield bad("servo", text, "Replace the servo, or its cable if another servo reports the same")
+        fix = "Replace the servo, or its cable if another servo reports the same"
+        values = {"voltage_v": state.voltage_v, "temperature_c": state.temperature_c}
+        yield bad("servo", FindingCode.IMPOSSIBLE_VALUES, fix, **values)
         return
-    margin = safety.voltage_margin_v
-    text = f"supply {state.voltage_v:.1f} V (the servo shuts down outside {low:.1f}..{high:.1f} V)"
+    margin, fix = safety.voltage_margin_v, "Check the power supply and its plug"
+    supply = {"voltage_v": state.voltage_v, "low_v": low, "high_v": high}
     if not low <= state.voltage_v <= high:
-        yield bad("servo", text, "Check the power supply and its plug", voltage_v=state.voltage_v)
+        yield bad("servo", FindingCode.SUPPLY, fix, **supply)
     elif not low + margin <= state.voltage_v <= high - margin:
-        yield warning("servo", text, "Check the power supply and its plug", voltage_v=state.voltage_v)
+        yield warning("servo", FindingCode.SUPPLY, fix, **supply)
     else:
-        yield fine("servo", text, voltage_v=state.voltage_v)
-    text = f"temperature {state.temperature_c:.0f} °C (the servo shuts down above {limits.temperature_c:.0f} °C)"
+        yield fine("servo", FindingCode.SUPPLY, **supply)
+    temperature = {"temperature_c": state.temperature_c, "limit_c": limits.temperature_c}
     if state.temperature_c >= limits.temperature_c - safety.temperature_margin_c:
         fix = "Let it cool, and find out why the table is hard to rotate"
-        yield bad("servo", text, fix, temperature_c=state.temperature_c)
+        yield bad("servo", FindingCode.TEMPERATURE, fix, **temperature)
     else:
-        yield fine("servo", text, temperature_c=state.temperature_c)
+        yield fine("servo", FindingCode.TEMPERATURE, **temperature)
 
 
 def _bus_quality(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
@@ -190,27 +182,20 @@ def _bus_quality(context: DoctorContext, found: RegisterServo) -> Iterator[Findi
     each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
     after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
-        text = f"frozen: its own clock stood at {ticks} ms during {READS} readings, so its readings are not valid"
-        yield bad("servo", text, "Switch the servo's supply off and on, then: " + context.rig("doctor"), tick_ms=ticks)
+        fix = "Switch the servo's supply off and on, then: " + context.rig("doctor")
+        yield bad("servo", FindingCode.SERVO_FROZEN, fix, tick_ms=ticks, readings=READS)
         return
     again = after["retries"] - before["retries"]
-    text = f"{READS} readings of {each_ms:.1f} ms each, {again or 'none'} repeated"
+    quality = {"readings": READS, "reading_ms": each_ms, "retries": again}
     if again > REPEATED:
-        yield warning("servo", text, "Check the plugs of the servo's cable", retries=again, reading_ms=each_ms)
+        yield warning("servo", FindingCode.READINGS, "Check the plugs of the servo's cable", **quality)
     elif each_ms > SLOW * 1e3 * context.config.table.poll_s:
-        port = next(
-            (
-                p
-                for p in context.computer.serial_ports()
-                if context.computer.same_file(p.path, context.config.servo.port)
-            ),
-            None,
-        )
+        port = context.computer.serial_port(context.config.servo.port)
         fix = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
         fix = fix or context.rig("servo set-baud 1000000")
-        yield warning("servo", text + ": slow", fix, retries=again, reading_ms=each_ms)
+        yield warning("servo", FindingCode.SLOW_READINGS, fix, **quality)
     else:
-        yield fine("servo", text, retries=again, reading_ms=each_ms)
+        yield fine("servo", FindingCode.READINGS, **quality)
 
 
 def _ticks(found: RegisterServo) -> int | None:

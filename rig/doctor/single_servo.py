@@ -112,7 +112,7 @@ class SingleServo:
         self.bus.write(self.found.bus_id, self.table["Torque Enable"], 0, answered=self._answered())
         if self.bus.read(self.found.bus_id, self.table["Torque Enable"]):
             raise RequestRejected(
-                f"Servo {self.found.bus_id} keeps its torque on.",
+                f"Servo {self.found.bus_id} does not switch its torque off.",
                 next_step="Switch its supply off and on, then try again.",
             )
 

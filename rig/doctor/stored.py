@@ -6,7 +6,7 @@ from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus
 from rig.catalog import Catalog
 from rig.core.errors import CatalogError
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
 
 IMAGES = 24  # number of images that are verified; `rig catalog verify` verifies all
 
@@ -18,15 +18,15 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
     """Check that the catalog can be opened, and that its database and some of its images are undamaged."""
     path = context.catalog_path
     if not (path / "catalog.sqlite").exists():
-        yield fine("catalog", f"none yet in {path}; the first enrollment creates it")
+        yield fine("catalog", FindingCode.NO_CATALOG, path=path)
         return
     with Catalog.open(path, clock=context.computer.clock, read_only=True) as opened:
         with opened.database.catalog_errors(), opened.database.read() as connection:
             checked = connection.exec_driver_sql("PRAGMA quick_check(5)").scalars().all()
             orphans = len(connection.exec_driver_sql("PRAGMA foreign_key_check").all())
         if checked != ["ok"] or orphans:
-            text = f"{path}: the database is damaged: {'; '.join(map(str, checked))}, {orphans} orphaned rows"
-            yield bad("catalog", text, context.rig("catalog verify --repair"), exit_code=7)
+            fix = context.rig("catalog verify --repair")
+            yield bad("catalog", FindingCode.DATABASE_DAMAGED, fix, 7, path=path, damage=list(checked), orphans=orphans)
         objects = opened.objects()
         ids = opened.views().view_ids.tolist()
         chosen = ids[:: max(len(ids) // IMAGES, 1)][:IMAGES]
@@ -37,17 +37,15 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
             except CatalogError as error:
                 broken.append(error)
         if broken:
-            text = f"{len(broken)} of {len(chosen)} verified images are damaged: {broken[0].what}"
-            yield bad("catalog", text, context.rig("catalog verify --repair"), exit_code=7, broken=len(broken))
+            found = {"broken": len(broken), "images": len(chosen), "first": broken[0].what}
+            yield bad("catalog", FindingCode.IMAGES_DAMAGED, context.rig("catalog verify --repair"), 7, **found)
         unfinished = [item.name for item in objects if item.unfinished_views is not None]
         if unfinished:
             fix = context.rig(f"enroll {unfinished[0]} --resume")
-            yield warning("catalog", f"unfinished enrollments: {', '.join(unfinished)}", fix)
+            yield warning("catalog", FindingCode.UNFINISHED, fix, objects=unfinished)
         if checked == ["ok"] and not orphans and not broken:
-            text = (
-                f"{path}: {len(objects)} objects, {len(ids)} views; database undamaged, {len(chosen)} images verified"
-            )
-            yield fine("catalog", text, objects=len(objects), views=len(ids))
+            counts = {"objects": len(objects), "views": len(ids), "images": len(chosen)}
+            yield fine("catalog", FindingCode.CATALOG, path=path, **counts)
 
 
 def calibrations(context: DoctorContext) -> Iterator[Finding]:
@@ -58,14 +56,21 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
     for error in store.unreadable:
         yield of_error("calibration", error)
     for standing in standings:
+        found = {
+            "standing": standing,
+            "name": standing.result.name,
+            "status": standing.status,
+            "id": standing.result.id,
+        }
+        recalibrate = context.rig(f"calibrate {standing.result.name.partition('.')[0]}")
         if standing.status is CalibrationStatus.IN_FORCE:
-            yield fine("calibration", standing.text, id=standing.result.id)
+            yield fine("calibration", FindingCode.CALIBRATION, **found)
         else:
-            yield warning("calibration", standing.text, context.rig(standing.command.removeprefix("rig ")))
+            yield warning("calibration", FindingCode.CALIBRATION, recalibrate, **found)
     for name, without in WANTED.items():
         if name not in {standing.result.name for standing in standings} and not _configured(context, name):
             fix = context.rig(f"calibrate {name.partition('.')[0]}")
-            yield warning("calibration", f"{name} was never calibrated: {without}", fix)
+            yield warning("calibration", FindingCode.NEVER_CALIBRATED, fix, name=name, consequence=without)
 
 
 def _configured(context: DoctorContext, key: str) -> bool:

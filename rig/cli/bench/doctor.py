@@ -41,9 +41,10 @@ def print_findings(settings: Settings) -> int:
     """Check the bench, print the findings, and return the exit code."""
     from rig.cli.ui.present import console
     from rig.config import RigConfig
+    from rig.config.values import default_path
     from rig.doctor.checks import CHECKS
     from rig.doctor.examination import run_checks
-    from rig.doctor.finding import Severity, bad, fine, of_error
+    from rig.doctor.finding import FindingCode, Severity, bad, fine, of_error
 
     screen = console()
     findings: list[Finding] = []
@@ -55,11 +56,13 @@ def print_findings(settings: Settings) -> int:
 
     try:
         config: RigConfig | None = settings.load()
-        add(fine("config", _config_text(settings)))
+        path = settings.config or default_path()
+        add(fine("config", FindingCode.CONFIG_VALID if path else FindingCode.CONFIG_MISSING, path=path))
     except ConfigError as error:
         mistakes = error.evidence.get("mistakes") or [f"{key}: {value}" for key, value in error.evidence.items()]
         for mistake in mistakes or [error.what]:
-            add(bad("config", f"{error.what.rstrip('.')}: {mistake}", "rig config check", error.exit_code))
+            found = {"what": error.what.rstrip("."), "mistake": mistake}
+            add(bad("config", FindingCode.CONFIG_MISTAKE, "rig config check", error.exit_code, **found))
         config = None
     try:
         with doctor_context(settings, default=config is None) as context:
@@ -87,10 +90,3 @@ def print_findings(settings: Settings) -> int:
             highlight=False,
         )
     return code
-
-
-def _config_text(settings: Settings) -> str:
-    from rig.config.values import default_path
-
-    path = settings.config or default_path()
-    return f"{path}: no mistakes" if path else "no rig.toml: the defaults are used (rig setup writes a file)"

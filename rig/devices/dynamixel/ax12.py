@@ -42,8 +42,8 @@ class Ax12Servo(RegisterServo):
     @property
     def remarks(self) -> tuple[str, ...]:
         return (
-            "servo: an AX-12A has no watchdog: if the computer fails, it completes its present move",
-            "servo: an AX-12A reaches only 300°: some azimuths of an object are not visible",
+            "an AX-12A has no watchdog: if the computer fails, it completes its present move",
+            "an AX-12A reaches only 300°: some azimuths of an object are not visible",
         )
 
     def read_state(self) -> ServoState:

@@ -1,4 +1,4 @@
-"""Simulated computers with a bench's devices, for the tests of what looks at them."""
+"""Simulated computers with a bench's devices, for the tests of checks and scans."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ from rig.config import load_config
 from rig.doctor.checks import CHECKS
 from rig.doctor.context import DoctorContext
 from rig.doctor.examination import run_checks
-from rig.doctor.finding import Finding, Severity
+from rig.doctor.finding import Finding, FindingCode, Severity
 from sim.clock import VirtualClock
 from sim.computer import ComputerFiles, SimComputer
 from sim.devices import SimDevices
@@ -31,18 +31,23 @@ class Bench:
     sent: list[Frame] = field(default_factory=list)
 
     def add_servo(self, bus_id: int, baud: int, model: str = "xl430_w250") -> XSeriesServo:
-        """Plug one more servo into the line."""
+        """Connect another servo to the bus."""
         servo = XSeriesServo(World(clock=self.devices.world.clock), model, bus_id=bus_id, baudrate=baud)
         self.devices.servo_bus.attach(servo)
         return servo
 
     def findings(self, *topics: str) -> list[Finding]:
-        """Examine the bench, or some topics of it."""
+        """Check the bench, or some topics of it."""
         return list(run_checks(self.context, [check for check in CHECKS if not topics or check.topic in topics]))
 
-    def problems(self, *topics: str) -> dict[str, str]:
-        """Return what is not fine: the finding, and what fixes it."""
-        return {f.text: f.fix for f in self.findings(*topics) if f.level is not Severity.FINE}
+    def problems(self, *topics: str) -> dict[FindingCode, str]:
+        """Return the warnings and bad findings: the code and the fix of each."""
+        return {f.code: f.fix for f in self.findings(*topics) if f.level is not Severity.FINE}
+
+    def problem(self, topic: str) -> Finding:
+        """Return the only warning or bad finding of a topic."""
+        (found,) = (f for f in self.findings(topic) if f.level is not Severity.FINE)
+        return found
 
     @property
     def instructions(self) -> set[int]:
@@ -58,16 +63,16 @@ def unopened(
     plugged: bool = True,
     servo_at: tuple[int, int] | None = None,
 ) -> Iterator[Bench]:
-    """Yield a bench as from the factory on a computer of its own.
+    """Yield a bench with factory settings, on its own computer.
 
     Parameters
     ----------
     settings
         Of the configuration, as ``KEY=VALUE``.
     plugged
-        Lay out the device files; a test that wants others does it itself.
+        Create the device files.
     servo_at
-        Id and baud rate of the servo where they are not the configured ones.
+        Id and baud rate of the servo, if they are not the configured ones.
     """
     with TemporaryDirectory() as folder:
         home = Path(folder, "home")

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from rig.bench.computer import Disk, User
-from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
+from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore, Estimate
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
-from rig.core.errors import DeviceSilent
+from rig.core.errors import ConfigError, DeviceNotFound, DeviceSilent
 from rig.doctor.checks import CHECKS
 from rig.doctor.computer import udev_rules
 from rig.doctor.examination import Check, run_checks
-from rig.doctor.finding import Severity, fine
+from rig.doctor.finding import Finding, FindingCode, Severity, finding_words, fine
 from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
 from rig.safety.saved_state import BenchState as State
 from sim.clock import VirtualClock
@@ -36,12 +36,6 @@ def set_up(bench) -> None:
         bench.devices.servo.memory[name] = value
 
 
-def one(problems: dict[str, str]) -> tuple[str, str]:
-    """Return the only trouble there is."""
-    ((text, fix),) = problems.items()
-    return text, fix
-
-
 @pytest.fixture
 def bench():
     with unopened() as bench:
@@ -52,9 +46,9 @@ def test_sound_bench_lacks_only_its_calibration(bench):
     set_up(bench)
     findings = bench.findings()
     assert {f.topic for f in findings} == {check.topic for check in CHECKS}
-    (trouble,) = [f for f in findings if f.level is not Severity.FINE]
-    assert trouble.topic == "calibration"
-    assert trouble.fix == "rig calibrate imu --bench sim"
+    (problem,) = [f for f in findings if f.level is not Severity.FINE]
+    assert (problem.topic, problem.code) == ("calibration", FindingCode.NEVER_CALIBRATED)
+    assert problem.fix == "rig calibrate imu --bench sim"
     assert bench.instructions <= {PING, READ}  # nothing is written, so nothing can move
 
 
@@ -78,21 +72,27 @@ def test_latency_timer_is_fixed_by_one_command():
         bench.computer.serial_port(latency_ms=16)
         bench.computer.i2c_bus()
         bench.computer.camera()
-        text, fix = one(bench.problems("port"))
-        assert "is 16 ms" in text
-        assert fix == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+        problem = bench.problem("port")
+        assert (problem.code, problem.parameters["latency_ms"]) == (FindingCode.HIGH_LATENCY, 16)
+        assert problem.fix == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
 
 
-@pytest.mark.parametrize(("members", "command"), [((), "sudo usermod -aG dialout ada"), (("ada",), "newgrp dialout")])
-def test_missing_permission_names_the_group_or_the_new_login(members, command):
+@pytest.mark.parametrize(
+    ("members", "code", "command"),
+    [
+        ((), FindingCode.NOT_IN_GROUP, "sudo usermod -aG dialout ada"),
+        (("ada",), FindingCode.GROUP_AT_NEXT_LOGIN, "newgrp dialout"),
+    ],
+)
+def test_missing_permission_names_the_group_or_the_new_login(members, code, command):
     with unopened(plugged=False, user=ADA) as bench:
         bench.computer.group("dialout", GID, *members)
         bench.computer.serial_port(mode=0o660)
         bench.computer.i2c_bus(mode=0o666)
         bench.computer.camera(mode=0o666)
-        text, fix = one(bench.problems("port"))
-        assert "ada has no permission for /dev/ttyUSB0" in text
-        assert fix == command
+        problem = bench.problem("port")
+        assert (problem.code, problem.fix) == (code, command)
+        assert (problem.parameters["user"], problem.parameters["path"]) == ("ada", "/dev/ttyUSB0")
 
 
 def test_port_of_root_is_fixed_by_udev_rules():
@@ -101,8 +101,9 @@ def test_port_of_root_is_fixed_by_udev_rules():
         bench.computer.serial_port(mode=0o600, serial="FT3M9M97")
         bench.computer.i2c_bus(mode=0o666)
         bench.computer.camera(mode=0o666)
-        _, fix = one(bench.problems("port"))
-        assert fix.startswith("rig doctor --udev --bench sim | sudo tee /etc/udev/rules.d/")
+        problem = bench.problem("port")
+        assert problem.code is FindingCode.ROOT_ONLY
+        assert problem.fix.startswith("rig doctor --udev --bench sim | sudo tee /etc/udev/rules.d/")
         rules = udev_rules(bench.context.computer.serial_ports())
         assert 'ATTR{latency_timer}="1"' in rules
         assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT3M9M97"' in rules
@@ -116,9 +117,9 @@ def test_port_of_root_is_fixed_by_udev_rules():
 )
 def test_port_in_use_names_the_process(command, fix, bench):
     bench.computer.process(77, command, "/dev/ttyUSB0")
-    text, told = one(bench.problems("port"))
-    assert f"in use by process 77 ({command})" in text
-    assert told == fix
+    problem = bench.problem("port")
+    assert (problem.code, problem.fix) == (FindingCode.DEVICE_FILE_IN_USE, fix)
+    assert f"in use by process 77 ({command})" in finding_words(problem)
 
 
 def test_other_port_is_proposed_by_its_permanent_name():
@@ -142,10 +143,11 @@ def test_bench_in_use_is_not_touched(bench):
     bench.context.holder = holder(path)
     findings = bench.findings()
     lock.close()
-    told = {f.topic: f for f in findings if f.level is Severity.WARNING}
-    assert f"process {os.getpid()}" in told["bench"].text
-    assert {"servo", "imu", "camera"} <= set(told)
-    assert told["servo"].fix == "rig stop --bench sim"
+    warnings = {f.topic: f for f in findings if f.level is Severity.WARNING}
+    assert warnings["bench"].code is FindingCode.BENCH_IN_USE
+    assert warnings["bench"].parameters["pid"] == os.getpid()
+    assert {warnings[topic].code for topic in ("servo", "imu", "camera")} == {FindingCode.NOT_CHECKED}
+    assert warnings["servo"].fix == "rig stop --bench sim"
     assert not bench.sent
 
 
@@ -153,51 +155,51 @@ def test_latched_fault_and_damaged_state_are_reported(bench):
     store = FileStore(bench.context.config.state_path("sim"))
     utc = "2026-05-01T10:00:00+00:00"
     store.save(State(fault=LatchedFault.of(DeviceSilent("Servo 1 is gone.", next_step="Look."), utc)))
-    text, fix = one(bench.problems("bench"))
-    assert "fault 402" in text
-    assert "Servo 1 is gone." in text
-    assert fix == "rig acknowledge --bench sim"
+    problem = bench.problem("bench")
+    assert (problem.code, problem.parameters["code"]) == (FindingCode.FAULT_LATCHED, 402)
+    assert problem.parameters["what"] == "Servo 1 is gone."
+    assert problem.fix == "rig acknowledge --bench sim"
     store.latch(None)
     (store.path / "state.json").write_text("{")
-    text, fix = one(bench.problems("bench"))
-    assert "damaged" in text
-    assert "rig home --turns" in fix
+    problem = bench.problem("bench")
+    assert problem.code is FindingCode.STATE_DAMAGED
+    assert "rig home --turns" in problem.fix
 
 
 @pytest.mark.parametrize(("free", "level"), [(50e9, Severity.FINE), (1e9, Severity.WARNING), (1e8, Severity.BAD)])
 def test_free_space_is_reported_in_objects(monkeypatch, free, level, bench):
     monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: Disk(int(free), network=False))
     (finding,) = bench.findings("disk")
-    assert finding.level is level
-    assert f"about {int(free / 500_000) // 72} more objects" in finding.text
+    assert (finding.code, finding.level) == (FindingCode.FREE_SPACE, level)
+    assert finding.parameters["objects"] == int(free / 500_000) // 72
 
 
 @pytest.mark.parametrize(
-    ("disk", "words", "fixed_by"),
+    ("disk", "code", "fixed_by"),
     [
-        (Disk(10**11, network=True), "network file system", ""),
-        (Disk(10**11, network=False, writable=False), "may not write", "rig config set catalog.path FOLDER"),
+        (Disk(10**11, network=True), FindingCode.NETWORK_DISK, ""),
+        (Disk(10**11, network=False, writable=False), FindingCode.NOT_WRITABLE, "rig config set catalog.path FOLDER"),
     ],
 )
-def test_network_disk_and_read_only_folder_are_reported(monkeypatch, disk, words, fixed_by, bench):
+def test_network_disk_and_read_only_folder_are_reported(monkeypatch, disk, code, fixed_by, bench):
     monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: disk)
-    text, fix = one(bench.problems("disk"))
-    assert words in text
-    assert fixed_by in fix
+    problem = bench.problem("disk")
+    assert problem.code is code
+    assert fixed_by in problem.fix
 
 
 def test_unsynchronized_clock_is_a_warning_and_wrong_date_is_bad():
     with unopened(plugged=False) as bench:
-        assert "no time server that is known" in one(bench.problems("clock"))[0]
+        assert bench.problem("clock").code is FindingCode.NO_TIME_SERVER
         bench.computer.keeps_time(synchronised=False)
-        text, fix = one(bench.problems("clock"))
-        assert "no time server has been reached" in text
-        assert fix == "sudo timedatectl set-ntp true"
+        problem = bench.problem("clock")
+        assert problem.code is FindingCode.NOT_SYNCHRONIZED
+        assert problem.fix == "sudo timedatectl set-ntp true"
         bench.computer.keeps_time()
         assert not bench.problems("clock")
         bench.context.computer.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
         (wrong,) = [f for f in bench.findings("clock") if f.level is Severity.BAD]
-        assert "1970-01-01" in wrong.text
+        assert wrong.code is FindingCode.WRONG_DATE
 
 
 def test_time_jump_and_long_pause_are_reported():
@@ -215,9 +217,9 @@ def test_time_jump_and_long_pause_are_reported():
 
     with unopened() as bench:
         bench.context.computer.clock = Bad()
-        texts = "\n".join(bench.problems("clock"))
-        assert "took 1020 ms" in texts
-        assert "jumped by +3600.0 s" in texts
+        problems = {f.code: f.parameters for f in bench.findings("clock")}
+        assert round(problems[FindingCode.LONG_PAUSE]["pause_ms"]) == 1020
+        assert problems[FindingCode.TIME_JUMPED]["jump_s"] == pytest.approx(3600, abs=1)
 
 
 # -- the servo --------------------------------------------------------------------------------------------------------
@@ -225,14 +227,12 @@ def test_time_jump_and_long_pause_are_reported():
 
 def test_torque_watchdog_and_factory_settings_are_reported_and_not_changed(bench):
     memory = bench.devices.servo.memory
-    problems = bench.problems("servo")
-    assert set(problems.values()) == {"rig servo settings --write --bench sim"}
-    assert any(text.startswith("EEPROM Operating Mode: 3 → 4") for text in problems)
-    assert any(text.startswith("EEPROM Return Delay Time: 250 → 0") for text in problems)
+    assert bench.problems("servo") == {FindingCode.SETTING_DIFFERS: "rig servo settings --write --bench sim"}
+    differing = [f.parameters for f in bench.findings("servo") if f.code is FindingCode.SETTING_DIFFERS]
+    values = {one["register"]: (one["found"], one["wanted"]) for one in differing}
+    assert (values["Operating Mode"], values["Return Delay Time"]) == ((3, 4), (250, 0))
     memory["Torque Enable"], memory["Bus Watchdog"] = 1, 0xFF
-    texts = "\n".join(bench.problems("servo"))
-    assert "torque is on" in texts
-    assert "watchdog tripped" in texts
+    assert {FindingCode.TORQUE_ON, FindingCode.WATCHDOG_TRIPPED} < set(bench.problems("servo"))
     assert (memory["Torque Enable"], memory["Operating Mode"]) == (1, 3)
 
 
@@ -246,85 +246,84 @@ def test_torque_watchdog_and_factory_settings_are_reported_and_not_changed(bench
 )
 def test_servos_at_another_id_or_rate_are_found(place, fix):
     with unopened(servo_at=place) as bench:
-        text, told = one(bench.problems("servo"))
-        assert f"id {place[0]} at {place[1]} baud" in text
-        assert told == fix
+        problem = bench.problem("servo")
+        assert (problem.code, problem.fix) == (FindingCode.OTHER_SERVOS, fix)
+        assert [(found.bus_id, found.baud) for found in problem.parameters["found"]] == [place]
         bench.add_servo(4, 115_200)
-        text, told = one(bench.problems("servo"))
-        assert "2 others" in text
-        assert told == "rig setup --bench sim"
+        problem = bench.problem("servo")
+        assert len(problem.parameters["found"]) == 2
+        assert problem.fix == "rig setup --bench sim"
 
 
 def test_missing_servo_asks_for_power(bench):
     bench.devices.servo_bus.detach(bench.devices.servo)
-    text, fix = one(bench.problems("servo"))
-    assert "nor any other at any baud rate" in text
-    assert "12 V" in fix
+    problem = bench.problem("servo")
+    assert problem.code is FindingCode.NO_SERVO
+    assert "12 V" in problem.fix
 
 
 def test_second_servo_is_reported_and_duplicate_id_is_bad(bench):
     set_up(bench)
     bench.add_servo(7, 57_600)
     assert not bench.problems("servo")
-    assert any("also on the bus" in f.text and "id 7" in f.text for f in bench.findings("servo"))
+    (more,) = (f for f in bench.findings("servo") if f.code is FindingCode.MORE_SERVOS)
+    assert [found.bus_id for found in more.parameters["found"]] == [7]
     bench.add_servo(1, 57_600)
-    text, fix = one(bench.problems("servo"))
-    assert "two servos answer at once to id 1" in text
-    assert "rig servo set-id 2 --bench sim" in fix
+    problem = bench.problem("servo")
+    assert (problem.code, problem.parameters["ids"]) == (FindingCode.DUPLICATE_ID, (1,))
+    assert "rig servo set-id 2 --bench sim" in problem.fix
 
 
 def test_other_model_can_be_configured():
     with unopened("servo.model=xm430_w350") as bench:
         bench.devices.servo_bus.detach(bench.devices.servo)
         bench.add_servo(1, 57_600, "xl430_w250")
-        assert one(bench.problems("servo"))[1] == "rig config set servo.model xl430_w250"
+        assert bench.problem("servo").fix == "rig config set servo.model xl430_w250"
 
 
 def test_ax_12a_reports_its_missing_functions():
     with unopened("servo.model=ax_12a", "table.mode=pan", "servo.baud=1000000") as bench:
         bench.devices.servo.memory["Return Delay Time"] = 0
-        texts = "\n".join(bench.problems("servo"))
-        assert "no watchdog" in texts
-        assert "EEPROM" not in texts
+        assert set(bench.problems("servo")) == {FindingCode.SERVO_LIMITATION}
 
 
 # -- faults of the whole vocabulary -----------------------------------------------------------------------------------
 
 FOUND = {
-    "servo.off": ("servo", "no servo answers"),
-    "servo.stuck": ("servo", "frozen"),
-    "servo.garbage": ("servo", "impossible"),
-    "servo.slow": ("servo", "slow"),
-    "servo.intermittent": ("servo", "repeated"),
-    "crc_flip": ("servo", "repeated"),
-    "late_reply": ("servo", "repeated"),
-    "babble": ("servo", "do not belong to a servo"),
-    "unplug": ("servo", "Cannot open"),
-    "duplicate_id": ("servo", "two servos"),
-    "wrong_model": ("servo", "not the configured model"),
-    "brownout": ("servo", "no servo answers"),
-    "overload": ("servo", "overload"),
-    "overheat": ("servo", "overheating"),
-    "imu.off": ("imu", "no device answers"),
-    "imu.stuck": ("imu", "frozen"),
-    "imu.garbage": ("imu", "more than a table at rest"),
-    "imu.slow": ("imu", "samples in"),
-    "imu_saturated": ("imu", "saturated"),
-    "i2c_stuck": ("imu", "is stuck"),
-    "camera.off": ("camera", "no camera"),
-    "camera.stuck": ("camera", "no frame"),
-    "camera.garbage": ("camera", "noise instead of an image"),
-    "camera.wrong": ("camera", "320x240"),
-    "camera.slow": ("camera", "2 a second"),
-    "camera.delayed": ("camera", "too old"),
-    "frozen_frame": ("camera", "frozen"),
-    "black_frame": ("camera", "black"),
-    "light_flicker": ("camera", "light changes"),
+    "servo.off": ("servo", FindingCode.NO_SERVO),
+    "servo.stuck": ("servo", FindingCode.SERVO_FROZEN),
+    "servo.garbage": ("servo", 404),
+    "servo.slow": ("servo", FindingCode.SLOW_READINGS),
+    "servo.intermittent": ("servo", FindingCode.READINGS),
+    "crc_flip": ("servo", FindingCode.READINGS),
+    "late_reply": ("servo", FindingCode.READINGS),
+    "babble": ("servo", FindingCode.FOREIGN_BYTES),
+    "unplug": ("servo", 400),
+    "duplicate_id": ("servo", FindingCode.DUPLICATE_ID),
+    "wrong_model": ("servo", 401),
+    "brownout": ("servo", FindingCode.NO_SERVO),
+    "overload": ("servo", FindingCode.HARDWARE_ERROR),
+    "overheat": ("servo", FindingCode.HARDWARE_ERROR),
+    "imu.off": ("imu", FindingCode.NO_IMU),
+    "imu.stuck": ("imu", FindingCode.IMU_FROZEN),
+    "imu.garbage": ("imu", FindingCode.NOT_AT_REST),
+    "imu.slow": ("imu", FindingCode.SAMPLES_MISSING),
+    "imu_saturated": ("imu", FindingCode.SATURATED),
+    "i2c_stuck": ("imu", FindingCode.I2C_STUCK),
+    "camera.off": ("camera", 400),
+    "camera.stuck": ("camera", 402),
+    "camera.garbage": ("camera", FindingCode.VIEW_REJECTED),
+    "camera.wrong": ("camera", 404),
+    "camera.slow": ("camera", FindingCode.FEW_FRAMES),
+    "camera.delayed": ("camera", FindingCode.LATE_FRAMES),
+    "frozen_frame": ("camera", FindingCode.CAMERA_FROZEN),
+    "black_frame": ("camera", FindingCode.BLACK),
+    "light_flicker": ("camera", FindingCode.FLICKER),
 }
-"""Faults that show while nothing moves: which check finds them, and a word of what it says."""
+"""Faults that show while nothing moves: the topic and the code of the finding, or of its error."""
 
-LOOKS = {"frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker", "object_falls"}
-"""Those that a camera may see; its frames are what takes time here."""
+IN_IMAGES = {"frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker", "object_falls"}
+"""Faults that only the camera may show. The camera is not checked for other faults, because its frames take time."""
 
 
 @pytest.mark.parametrize("name", sorted(fault_kinds()))
@@ -332,15 +331,15 @@ def test_all_checks_end_under_every_fault_and_find_visible_ones(name, bench):
     set_up(bench)
     faults = Faults(bench.devices)
     faults.schedule(*read_faults([name]))
-    seen = name.startswith("camera") or name in LOOKS
+    seen = name.startswith("camera") or name in IN_IMAGES
     findings = bench.findings("port", "servo", "imu", "clock", *(["camera"] if seen else []))
     faults.clear()
     problems = [f for f in findings if f.level is not Severity.FINE]
     assert all(f.fix for f in problems)
-    assert not any("the check itself failed" in f.text or "given up" in f.text for f in findings)
+    assert not {FindingCode.CHECK_FAILED, FindingCode.CHECK_TIMED_OUT} & {f.code for f in findings}
     if name in FOUND:
-        topic, word = FOUND[name]
-        assert any(f.topic == topic and word.lower() in f.text.lower() for f in problems), problems
+        topic, code = FOUND[name]
+        assert any(f.topic == topic and code in (f.code, f.parameters.get("error_code")) for f in problems), problems
         others = {f.topic for f in problems} - {topic}
         assert not others
 
@@ -352,15 +351,16 @@ def test_imu_of_another_address_axis_or_kind_is_found():
     with unopened("imu.address=0x69") as bench:
         device = bench.devices.i2c.detach(0x69)
         bench.devices.i2c.attach(0x68, device)
-        assert one(bench.problems("imu"))[1] == "rig config set imu.address 0x68"
+        assert bench.problem("imu").fix == "rig config set imu.address 0x68"
     with unopened("imu.model=bno055") as bench:
         bench.context.computer.clock.sleep(1.0)  # it is silent for a while after power-up
         assert not bench.problems("imu")
     with unopened("imu.axis=x") as bench:
-        assert one(bench.problems("imu"))[1] == "rig config set imu.axis z"
+        assert bench.problem("imu").fix == "rig config set imu.axis z"
     with unopened() as bench:
         bench.devices.imu.who_am_i = 0x70
-        assert "MPU-6500" in one(bench.problems("imu"))[0]
+        problem = bench.problem("imu")
+        assert (problem.code, problem.parameters["found"].name) == (FindingCode.NO_DRIVER, "MPU-6500")
 
 
 def test_imu_on_a_rig_head_is_checked():
@@ -368,18 +368,17 @@ def test_imu_on_a_rig_head_is_checked():
         set_up(bench)
         bench.computer.serial_port("ttyUSB1", serial="HEAD")
         assert not bench.problems("port", "servo", "imu")
-        assert any("rig head" in f.text for f in bench.findings("imu"))
+        assert FindingCode.HEAD in {f.code for f in bench.findings("imu")}
         bench.devices.head.unplugged = True
-        assert "No rig head" in one(bench.problems("imu"))[0]
+        assert bench.problem("imu").parameters["error_code"] == DeviceNotFound.code
 
 
 def test_servo_behind_the_relay_is_not_reported_missing():
     with unopened("imu.connection=head", "head.port=/dev/ttyUSB1", "head.power=true") as bench:
-        text, _ = one(bench.problems("servo"))
-        assert "relay" in text
+        assert bench.problem("servo").code is FindingCode.SUPPLY_SWITCHED
 
 
-# -- what is kept -----------------------------------------------------------------------------------------------------
+# -- stored data ----------------------------------------------------------------------------------------------------
 
 
 def enroll(path: Path, views: int) -> None:
@@ -388,17 +387,18 @@ def enroll(path: Path, views: int) -> None:
 
 
 def test_catalog_is_checked(bench):
-    assert "none yet" in bench.findings("catalog")[0].text
+    assert bench.findings("catalog")[0].code is FindingCode.NO_CATALOG
     path = bench.context.catalog_path
     enroll(path, 6)
     (finding,) = bench.findings("catalog")
-    assert finding.level is Severity.FINE
-    assert "1 objects, 6 views" in finding.text
+    assert (finding.level, finding.code) == (Severity.FINE, FindingCode.CATALOG)
+    assert (finding.parameters["objects"], finding.parameters["views"]) == (1, 6)
     image = next((path / "images").rglob("*.png"))
     image.write_bytes(b"no image")
-    text, fix = one(bench.problems("catalog"))
-    assert "1 of 6 verified images" in text
-    assert fix == "rig catalog verify --repair --bench sim"
+    problem = bench.problem("catalog")
+    assert problem.code is FindingCode.IMAGES_DAMAGED
+    assert (problem.parameters["broken"], problem.parameters["images"]) == (1, 6)
+    assert problem.fix == "rig catalog verify --repair --bench sim"
     image.unlink()
     (path / "catalog.sqlite").write_bytes(b"SQLite format 3\0" + b"rubbish" * 999)
     (finding,) = bench.findings("catalog")
@@ -413,7 +413,7 @@ def test_catalog_with_orphaned_rows_is_damaged(bench):
         connection.execute("PRAGMA foreign_keys = off")
         connection.execute("DELETE FROM sessions")
     connection.close()
-    assert any("damaged" in text for text in bench.problems("catalog"))
+    assert FindingCode.DATABASE_DAMAGED in bench.problems("catalog")
 
 
 def result(bench, days_ago: float, valid_days: float | None = None, **device: object) -> CalibrationResult:
@@ -434,22 +434,25 @@ def result(bench, days_ago: float, valid_days: float | None = None, **device: ob
 def test_missing_expired_and_other_device_calibrations_are_warnings(bench):
     set_up(bench)
     store = CalibrationStore(bench.context.config.calibration_path("sim"))
-    assert "never calibrated" in one(bench.problems("calibration"))[0]
+    assert bench.problem("calibration").code is FindingCode.NEVER_CALIBRATED
     store.add(result(bench, 100, valid_days=30))
-    text, fix = one(bench.problems("calibration"))
-    assert "calibrated 100 days ago; it is valid for 30 days" in text
-    assert fix == "rig calibrate imu --bench sim"
+    problem = bench.problem("calibration")
+    assert problem.parameters["status"] is CalibrationStatus.EXPIRED
+    assert problem.parameters["standing"].age_days == pytest.approx(100, abs=0.1)
+    assert problem.fix == "rig calibrate imu --bench sim"
     store.add(result(bench, 1, imu={"who_am_i": 0x99}))
-    bench.findings("servo", "imu")  # the devices are known only when they were met
-    assert "calibrated 100 days ago" in one(bench.problems("calibration"))[0]
+    bench.findings("servo", "imu")  # the devices are known only after their checks
+    assert bench.problem("calibration").parameters["status"] is CalibrationStatus.EXPIRED
     for path in store.folder.glob("*.json"):
         path.unlink()
     store.add(result(bench, 1, imu={"who_am_i": 0x99}))
-    assert "another device: imu.who_am_i was 153, is 104" in one(bench.problems("calibration"))[0]
+    problem = bench.problem("calibration")
+    assert problem.parameters["status"] is CalibrationStatus.OTHER_DEVICE
+    assert problem.parameters["standing"].changes == ("imu.who_am_i was 153, is 104",)
     store.add(result(bench, 0.5, valid_days=30))
     assert not bench.problems("calibration")
     (store.folder / "20260430T000000.000000Z-imu.scale.json").write_text("{")
-    assert "Cannot read the calibration" in one(bench.problems("calibration"))[0]
+    assert bench.problem("calibration").parameters["error_code"] == ConfigError.code
 
 
 # -- the examination itself -------------------------------------------------------------------------------------------
@@ -459,16 +462,16 @@ def test_hanging_or_failing_check_stops_no_other():
     released = threading.Event()
 
     def hangs(context):
-        yield fine("hangs", "begun")
+        yield fine("hangs", FindingCode.ONLY_SERVO)
         released.wait()
-        yield fine("hangs", "never told")
+        yield fine("hangs", FindingCode.ONLY_SERVO)
 
-    def refused(context):
+    def silent(context):
         raise DeviceSilent("No answer.", next_step="Knock.")
         yield
 
     def pulled(context):
-        yield fine("pulled", "begun")
+        yield fine("pulled", FindingCode.ONLY_SERVO)
         raise OSError(5, "Input/output error")
 
     def broken(context):
@@ -477,21 +480,30 @@ def test_hanging_or_failing_check_stops_no_other():
 
     checks = [
         Check("hangs", hangs, deadline_s=0.05, if_it_hangs="Pull the plug"),
-        Check("refused", refused),
+        Check("silent", silent),
         Check("pulled", pulled),
         Check("broken", broken),
-        Check("well", lambda _: iter([fine("well", "well")])),
+        Check("well", lambda _: iter([fine("well", FindingCode.ONLY_SERVO)])),
     ]
     with unopened() as bench:
         findings = list(run_checks(bench.context, checks))
     released.set()
-    told = [(f.topic, f.level, f.fix, f.exit_code) for f in findings]
-    assert told == [
-        ("hangs", Severity.FINE, "", 0),
-        ("hangs", Severity.BAD, "Pull the plug", 9),
-        ("refused", Severity.BAD, "Knock.", 4),
-        ("pulled", Severity.FINE, "", 0),
-        ("pulled", Severity.BAD, "rig doctor --bench sim", 4),
-        ("broken", Severity.BAD, "Report this with the output of `rig doctor --json`", 1),
-        ("well", Severity.FINE, "", 0),
+    assert [(f.topic, f.code, f.fix, f.exit_code) for f in findings] == [
+        ("hangs", FindingCode.ONLY_SERVO, "", 0),
+        ("hangs", FindingCode.CHECK_TIMED_OUT, "Pull the plug", 9),
+        ("silent", FindingCode.ERROR, "Knock.", 4),
+        ("pulled", FindingCode.ONLY_SERVO, "", 0),
+        ("pulled", FindingCode.CHECK_INTERRUPTED, "rig doctor --bench sim", 4),
+        ("broken", FindingCode.CHECK_FAILED, "Report this with the output of `rig doctor --json`", 1),
+        ("well", FindingCode.ONLY_SERVO, "", 0),
     ]
+
+
+def test_finding_is_put_into_words_with_its_parameters():
+    elsewhere = Finding(
+        "servo", Severity.BAD, FindingCode.OTHER_SERVOS, {"id": 1, "baud": 57_600, "port": "COM3", "found": ["a", "b"]}
+    )
+    assert finding_words(elsewhere) == "no servo answers at id 1, 57600 baud, COM3 (found: a, b)"
+    locked = fine("camera", FindingCode.LOCKED, exposure_ms=None, white_balance_k=4500)
+    assert finding_words(locked) == "locked and read back: exposure ? ms, white balance 4500 K"
+    assert locked.as_dict()["code"] == "locked"
