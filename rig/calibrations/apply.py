@@ -4,13 +4,16 @@ Decision: docs/decisions/0027.
 """
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Final
 
 from pydantic import BaseModel
 
 from rig.calibrations.result import CalibrationResult
 from rig.config import RigConfig
 from rig.config.values import validate
+
+_NOTHING: Final = object()
+"""Instead of a value; None is a value, too."""
 
 
 def apply_results(config: RigConfig, results: Iterable[CalibrationResult]) -> tuple[RigConfig, tuple[str, ...]]:
@@ -29,7 +32,7 @@ def apply_results(config: RigConfig, results: Iterable[CalibrationResult]) -> tu
         for key, value in result.settings.items():
             path = key.split(".")
             written = _written(config, path)
-            if written is None:
+            if written is _NOTHING:
                 here = values
                 for part in path[:-1]:
                     here = here.setdefault(part, {})
@@ -40,11 +43,11 @@ def apply_results(config: RigConfig, results: Iterable[CalibrationResult]) -> tu
 
 
 def _written(config: RigConfig, path: list[str]) -> Any:
-    """Return the value that the configuration itself gives a key, None if it gives none."""
+    """Return the value that the configuration itself gives a key, `_NOTHING` if it gives none."""
     here: Any = config
     for part in path:
         if not isinstance(here, BaseModel) or part not in here.model_fields_set:
-            return None
+            return _NOTHING
         here = getattr(here, part)
     return here
 

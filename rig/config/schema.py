@@ -1,22 +1,35 @@
 """The configuration `rig.toml`: all keys with unit, range and default."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import platformdirs
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from rig.config.toml_file import NONE
 from rig.config.values import APP, read_values, validate
+from rig.config.wording import is_optional
 
 MAX_LIMIT_DEG = 90_000.0
 """250 revolutions; extended position mode reaches 256 in each direction (e-manual, Operating Mode)."""
 
 
 class Section(BaseModel):
-    """Base of all sections: unknown keys are errors, and values cannot change."""
+    """Base of all sections: unknown keys are errors, and values cannot change.
+
+    TOML has no null: the text ``"none"`` clears an optional key.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_none(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        cleared = {key for key in values if values[key] == NONE and key in cls.model_fields}
+        return {k: None if k in cleared and is_optional(cls.model_fields[k]) else v for k, v in values.items()}
 
 
 Degrees = Annotated[float, Field(allow_inf_nan=False)]

@@ -28,6 +28,9 @@ MAX_DOTS: Final = 1000
 MAX_INTEGER: Final = 2**63
 """TOML 1.0, Integer: 64-bit signed."""
 
+NONE: Final = "none"
+"""The text that clears an optional key; TOML has no null."""
+
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -188,6 +191,8 @@ def save(path: Path, text: str) -> None:
 def toml(value: Any) -> str:
     """Return a value in TOML on one line; values of other types become strings."""
     match value:
+        case None:
+            return toml(NONE)
         case bool():
             return "true" if value else "false"
         case int() | float():

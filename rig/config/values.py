@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import platformdirs
 from pydantic import BaseModel, ValidationError
 
-from rig.config.toml_file import MAX_DEPTH, Key, line_numbers, loads, read_text
+from rig.config.toml_file import MAX_DEPTH, NONE, Key, line_numbers, loads, read_text
 from rig.config.wording import mistakes
 from rig.core.errors import ConfigError
 
@@ -114,7 +114,7 @@ def _resolve(values: dict[str, Any], key: Key, folder: Path) -> None:
     here: Any = values
     for part in key[:-1]:
         here = here.get(part) if isinstance(here, dict) else None
-    if isinstance(here, dict) and isinstance(here.get(key[-1]), str):
+    if isinstance(here, dict) and isinstance(here.get(key[-1]), str) and here[key[-1]] != NONE:
         here[key[-1]] = os.path.normpath(folder / Path(here[key[-1]]).expanduser())
 
 

@@ -29,6 +29,7 @@ _UNIT_SUFFIXES = {
     "_percent": "%",
     "_turns": "turns",
 }
+_OR_NONE = ", or none"
 _KINDS: Mapping[Any, str] = {
     int: "a whole number",
     float: "a number",
@@ -73,21 +74,22 @@ def blank_file(model: type[BaseModel]) -> str:
         if info.key[:-1] != section:
             section = info.key[:-1]
             lines += ["", f"[{'.'.join(section)}]"]
-        meaning = f"{info.description} ({info.allowed}{' ' * bool(info.unit)}{info.unit})"
+        meaning = f"{info.description} ({_with_unit(info.allowed, info.unit)})"
         lines += wrap(meaning, 100, initial_indent="# ", subsequent_indent="#   ")
-        lines.append(f"#{info.key[-1]} = {_shown(info, info.default)}".rstrip())
+        lines.append(f"#{info.key[-1]} = {stated(info.key, info.default)}")
     return "\n".join(lines) + "\n"
 
 
 def setting_line(info: KeyInfo, value: Any, origin: str) -> str:
-    """Return a key as a line of TOML (as a comment if it has no value): value, unit, origin and meaning."""
-    stated = f"{'#' * (value is None)}{info.key[-1]} = {_shown(info, value)}".rstrip()
+    """Return a key as a line of TOML: value, unit, origin and meaning."""
+    line = f"{info.key[-1]} = {stated(info.key, value)}"
     note = "; ".join(part for part in (info.unit, origin, info.description) if part)
-    return f"{stated:30s} # {note}"
+    return f"{line:30s} # {note}"
 
 
-def _shown(info: KeyInfo, value: Any) -> str:
-    return "" if value is None else stated(info.key, value)
+def _with_unit(allowed: str, unit: str) -> str:
+    """Return allowed values with their unit: ``a number from 1 to 5 s, or none``."""
+    return f"{allowed.removesuffix(_OR_NONE)} {unit}{_OR_NONE * allowed.endswith(_OR_NONE)}" if unit else allowed
 
 
 def unit(name: str) -> str:
@@ -97,7 +99,12 @@ def unit(name: str) -> str:
 
 def allowed(field: FieldInfo) -> str:
     """Return the values that a field allows: ``a whole number from 9600 to 4500000``."""
-    return _kind(field.annotation, field.metadata)
+    return _kind(field.annotation, field.metadata) + _OR_NONE * is_optional(field)
+
+
+def is_optional(field: FieldInfo) -> bool:
+    """Return whether a field can have no value."""
+    return NoneType in get_args(field.annotation)
 
 
 def mistakes(
@@ -124,7 +131,7 @@ def _mistake(model: type[BaseModel], values: Mapping[str, Any], key: Key, field:
     shown = "" if isinstance(found, Mapping | BaseModel) else f" (found {found!r})"
     if error["type"] == "value_error" or field is None:
         return str(error["msg"]).removeprefix("Value error, ") + shown
-    return f"must be {allowed(field)}{' ' * bool(unit(key[-1]))}{unit(key[-1])}{shown}"
+    return f"must be {_with_unit(allowed(field), unit(key[-1]))}{shown}"
 
 
 def _field(model: type[BaseModel], path: Sequence[Any]) -> tuple[Key, FieldInfo | None]:

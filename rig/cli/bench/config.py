@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.ui.command import command
+from rig.cli.ui.complete import config_keys
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ConfigError, UsageError
 
@@ -44,7 +45,8 @@ def check(settings: Settings) -> None:
 def show(
     settings: Settings,
     wanted: Annotated[
-        list[str] | None, typer.Argument(metavar="[KEY]...", help="Keys or sections; default: all.")
+        list[str] | None,
+        typer.Argument(metavar="[KEY]...", help="Keys or sections; default: all.", autocompletion=config_keys),
     ] = None,
     changed: Annotated[bool, typer.Option("--changed", help="Show only values that differ from the defaults.")] = False,
 ) -> None:
@@ -136,20 +138,27 @@ def init(settings: Settings) -> None:
 @command
 def set_(
     settings: Settings,
-    key: Annotated[str, typer.Argument(metavar="KEY", help="Key with its section, for example servo.port.")],
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value as in TOML; quotes are optional.")],
+    key: Annotated[
+        str,
+        typer.Argument(metavar="KEY", help="Key with its section, for example servo.port.", autocompletion=config_keys),
+    ],
+    value: Annotated[
+        str,
+        typer.Argument(metavar="VALUE", help="New value as in TOML; quotes are optional. none clears an optional key."),
+    ],
 ) -> None:
     """Change one key in the file. Comments and all other keys stay as they are.
 
     Example: rig config set servo.port /dev/ttyUSB1
     """
-    from rig.config import load_config
+    from rig.config import RigConfig, load_config
     from rig.config.toml_file import changed_lines, read_text, save, with_values
     from rig.config.values import FILE_NAME, default_path, parsed
+    from rig.config.wording import key_info
 
     target = settings.config or default_path() or Path(FILE_NAME)
     old = read_text(target) if target.exists() else ""
-    if "." not in key and key != "default_bench":
+    if "." not in key and key not in {info.name for info in key_info(RigConfig)} - {"bench"}:
         raise UsageError(
             f"{key!r} has no section.", next_step="Write SECTION.KEY, for example: rig config set servo.id 2."
         )

@@ -32,6 +32,19 @@ def bench_names(incomplete: str) -> list[str]:
     return sorted(point.name for point in entry_points(group="rig.benches") if point.name.startswith(incomplete))
 
 
+def config_keys(incomplete: str) -> list[str]:
+    """Return the keys of the configuration, and those of the installed benches."""
+    from rig.bench import bench_kind
+    from rig.config import RigConfig
+    from rig.config.wording import key_info
+
+    keys = [info.name for info in key_info(RigConfig) if info.name != "bench"]
+    for name in bench_names(""):
+        with suppress(Exception):  # a plug-in that cannot be loaded
+            keys += [info.name for info in key_info(bench_kind(name).options, ("bench", name))]
+    return [key for key in keys if key.startswith(incomplete)]
+
+
 def strategy_names(incomplete: str) -> list[str]:
     """Return the names of the search strategies."""
     plugged = [point.name for point in entry_points(group="rig.strategies")]

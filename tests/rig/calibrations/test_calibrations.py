@@ -160,6 +160,8 @@ def test_result_applies_only_settings_that_the_configuration_leaves_open():
     config, notes = apply_results(load_config(None, ["imu.scale=1.02"]), [result])
     assert (config.imu.scale, config.imu.scale_uncertainty) == (1.02, 1e-4)
     assert notes == (f"imu.scale = 1.02 of the configuration takes precedence over 1.01 of {result.id}",)
+    region = replace(RESULT, settings={"view.roi": [0, 0, 100, 100]})
+    assert apply_results(load_config(None, ["view.roi=none"]), [region])[0].view.roi is None
     with pytest.raises(ConfigError, match="calibrations in force"):
         apply_results(RigConfig(), [replace(RESULT, settings={"imu.scale": 7.0})])
 

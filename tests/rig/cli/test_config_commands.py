@@ -6,8 +6,11 @@ import tomllib
 import pytest
 from typer.testing import CliRunner
 
+from rig.bench import bench_kind, bench_names, check_config
 from rig.cli.main import app
 from rig.config import RigConfig, load_config
+from rig.config.values import read_values
+from rig.config.wording import key_info
 
 
 @pytest.fixture
@@ -36,7 +39,7 @@ def test_check_lists_all_mistakes_with_their_lines(rig, tmp_path):
         'line 6: imu.bus: must be a whole number or a text in "quotes" (found [1])',
         "line 7: imu.range_dps: must be one of 250, 500, 1000, 2000 °/s (found 300)",
         "line 9: table.limits_deg: must be [a number, a number] ° (found ['a', 3])",
-        "line 11: camera.exposure_us: must be a number from 1 to 1000000 µs (found -1)",
+        "line 11: camera.exposure_us: must be a number from 1 to 1000000 µs, or none (found -1)",
         "line 12: camera.heigth: unknown key; did you mean height?",
         "--set: identify.omega: must be a number from 0 to 100 (found -1)",
     ):
@@ -91,6 +94,52 @@ def test_show_is_toml_and_says_where_each_value_comes_from(rig, tmp_path):
     assert "id = 4" in changed
     assert "baud" not in changed
     assert "Did you mean servo.port?" in rig("config", "show", "servo.prot").stderr
+
+
+OPTIONAL = [
+    (name, key)
+    for name, model in (("", RigConfig), *((f"bench.{name}.", bench_kind(name).options) for name in bench_names()))
+    for key in key_info(model)
+    if key.allowed.endswith("or none")
+]
+"""All keys that can be none, with the prefix of their section."""
+
+
+@pytest.mark.parametrize(("above", "info"), OPTIONAL, ids=[f"{above}{info.name}" for above, info in OPTIONAL])
+def test_every_optional_key_can_be_none(rig, tmp_path, above, info):
+    name = f"{above}{info.name}"
+    section, _, key = name.rpartition(".")
+    file = tmp_path / "rig.toml"
+
+    def value(*overrides):
+        read = read_values(None, overrides)
+        config, options = check_config(read)
+        here = options[above.split(".")[1]] if above else config
+        for part in info.key:
+            here = getattr(here, part)
+        return here
+
+    assert value(f"{name}=none") is None
+    header = f"[{section}]\n" if section else ""
+    file.write_text(f'{header}{key} = "none"\n', encoding="utf-8")
+    assert value() is None
+    file.write_text("", encoding="utf-8")
+    assert rig("config", "set", name, "none").exit_code == 0
+    assert value() is None
+    shown = rig("config", "show", name).stdout
+    file.write_text(shown, encoding="utf-8")  # it can be read again
+    assert value() is None
+
+
+def test_all_keys_that_the_help_calls_optional_are_tested():
+    names = {f"{above}{info.name}" for above, info in OPTIONAL}
+    assert names >= {"camera.exposure_us", "camera.white_balance_k", "view.roi", "catalog.path", "bench.sim.object"}
+
+
+def test_none_is_an_error_for_a_key_that_needs_a_value(rig):
+    done = rig("config", "check", "--set", "servo.id=none", "--set", "camera.exposure_us=-1")
+    assert "servo.id: must be a whole number from 0 to 252 (found 'none')" in done.stderr
+    assert "camera.exposure_us: must be a number from 1 to 1000000 µs, or none (found -1)" in done.stderr
 
 
 def test_path_says_which_file_is_in_force(rig, tmp_path):

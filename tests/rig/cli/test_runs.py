@@ -296,6 +296,8 @@ def test_shell_completes_objects_benches_and_strategies(enrolled):
     assert complete("enroll", "--bench", "s") == {"sim"}
     assert complete("identify", "--strategy", "s") == {"sweep"}
     assert complete("ide") == {"identify"}
+    assert complete("config", "set", "camera.e") == {"camera.exposure_us"}
+    assert complete("config", "show", "bench.sim.y") == {"bench.sim.yaw_deg"}
     assert complete("enroll", "--config", "nonsense.toml", "l") == set()
 
 
