@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from errno import EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
-from pathlib import Path
 from typing import Any, Protocol
 
 import smbus2.smbus2 as smbus
@@ -79,9 +78,9 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self.stuck = False
         self.nack_conditions: list[Callable[[int], bool]] = []
         self.wire: deque[Message] = deque(maxlen=1000)
-        handle, self.path = tempfile.mkstemp(prefix="sim-i2c-")
-        self._key = _file_key(handle)
-        os.close(handle)
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - without a name: a program that is killed leaves nothing
+        self.path = f"/dev/fd/{self._file.fileno()}"
+        self._key = _file_key(self._file.fileno())
         _install(self._key, self)
 
     def __exit__(self, *_: object) -> None:
@@ -90,7 +89,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     def close(self) -> None:
         """Take the bus away; a second call does nothing."""
         _remove(self._key)
-        Path(self.path).unlink(missing_ok=True)
+        self._file.close()
 
     # -- world side -----------------------------------------------------------------------------------------------
 

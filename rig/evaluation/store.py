@@ -1,5 +1,6 @@
 """Runs on disk, a file an object, so that an interrupted evaluation goes on where it was."""
 
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -10,7 +11,10 @@ from zipfile import BadZipFile
 import numpy as np
 
 from hbr.evaluation.protocol import Runs
+from rig.core import files
 from rig.core.errors import UsageError
+
+_MAX_SETTINGS = 10_000_000
 
 
 class Store:
@@ -38,9 +42,9 @@ class Store:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if recorded.exists():
-                self._check(json.loads(recorded.read_text(encoding="utf-8")), wanted, resume)
+                self._check(json.loads(files.read(recorded, max_bytes=_MAX_SETTINGS)), wanted, resume)
             else:
-                _write(recorded, json.dumps(wanted, indent=1).encode())
+                files.write(recorded, json.dumps(wanted, indent=1).encode())
         except (OSError, json.JSONDecodeError) as error:
             raise UsageError(
                 f"The runs cannot be kept in {folder}.",
@@ -73,17 +77,10 @@ class Store:
 
     def save(self, name: str, runs: Runs) -> None:
         """Keep the runs of an object, whole or not at all."""
-        part = self._path(name).with_suffix(".part")
-        with part.open("wb") as file:
-            np.savez_compressed(file, **asdict(runs))
-        part.replace(self._path(name))
+        content = io.BytesIO()
+        np.savez_compressed(content, **asdict(runs))
+        files.write(self._path(name), content.getvalue())
 
     def _path(self, name: str) -> Path:
         # names of a catalog may hold what a file's name may not
         return self._folder / f"{name.encode().hex() if not name.isalnum() else name}.npz"
-
-
-def _write(path: Path, data: bytes) -> None:
-    part = path.with_suffix(".part")
-    part.write_bytes(data)
-    part.replace(path)

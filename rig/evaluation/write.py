@@ -12,6 +12,7 @@ from hbr.evaluation.protocol import Runs
 from rig.charts.evaluation_figures import figures
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError
+from rig.core.files import write
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
 
@@ -42,7 +43,7 @@ def write_json(results: Mapping[str, Any], path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1)
-        path.write_text(text + "\n", encoding="utf-8")
+        write(path, f"{text}\n".encode())
     except OSError as error:
         raise UsageError(
             f"The results cannot be written to {path}.",
@@ -72,7 +73,7 @@ def write_results(
         files |= {f"{name}.svg": figure.svg().encode(), f"{name}.png": figure.png()}
     try:
         for name, data in files.items():
-            (folder / name).write_bytes(data)
+            write(folder / name, data)
     except OSError as error:
         raise UsageError(
             f"The results cannot be written to {folder}.",

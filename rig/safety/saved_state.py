@@ -177,7 +177,8 @@ class FileStore:
     """State in the folder ``path``: ``state.json``, the file ``latch`` with the latched fault, and the file ``stop``.
 
     ``latch`` has a fixed size and is written in place, so a full disk does not lose a fault. It is filled with spaces
-    if there is no fault. `request_stop` creates ``stop``.
+    if there is no fault. `request_stop` creates ``stop``. A file beside the folder shows that the bench has been
+    used: if the folder was emptied or deleted, that is not a new bench.
     """
 
     def __init__(self, path: Path) -> None:
@@ -185,6 +186,7 @@ class FileStore:
         self._file = path / "state.json"
         self._stop = path / "stop"
         self._latch = path / "latch"
+        self._used = path.with_name(f"{path.name}.used")
 
     def load(self) -> BenchState:
         """Return the stored state.
@@ -197,7 +199,7 @@ class FileStore:
             if not 1 <= state.version <= VERSION:
                 damage = f"{self._file} has version {state.version}, but this program reads version {VERSION}"
         except FileNotFoundError:
-            if not self._latch.exists():
+            if not self._latch.exists() and not self._used.exists():
                 return state  # a new bench
             damage = f"{self._file} is missing"
         except OSError as error:
@@ -250,6 +252,10 @@ class FileStore:
             if not self._latch_is_reserved():
                 self._write_latch(state.fault)
             files.write(self._file, state.model_dump_json(indent=1, exclude={"damage"}).encode())
+            if not self._used.exists():
+                files.write(
+                    self._used, f"This bench has been used. Its state is in the folder {self.path.name}.\n".encode()
+                )
 
     def stop_requested(self) -> bool:
         return self._stop.exists()
@@ -261,7 +267,7 @@ class FileStore:
         """Request a stop from the program that uses the bench."""
         with _storing(self._stop):
             _make_folder(self.path)
-            self._stop.touch()
+            os.close(no_follow(str(self._stop), os.O_WRONLY | os.O_CREAT))
 
     def read_file(self, name: str) -> bytes | None:
         step = "Give yourself permission to read the file, or delete it."

@@ -75,7 +75,7 @@ def message(outcome: Outcome) -> str:
     if outcome.error is None:
         return "None: all views are stored."
     error = outcome.error
-    words = re.sub(r"/\S*sim-i2c-\w+", "/dev/i2c-1", error.what)
+    words = re.sub(r"/dev/fd/\d+", "/dev/i2c-1", error.what)
     words = re.sub(r"catalog /\S+?(?=[ ,;]|$)", "catalog", words)
     return f"{error.code} {error.title}: {words}{'' if words.endswith(('.', '?')) else '.'} *{error.next_step}*"
 

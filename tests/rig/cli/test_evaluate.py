@@ -149,11 +149,19 @@ def test_some_objects_are_reported_alone_though_all_are_enrolled(
     assert "Reported: objects 3 to 4." in (out / "report.html").read_text()
 
 
-def test_a_damaged_file_of_runs_is_run_again(photographs: Path, evaluated: Path, tmp_path: Path) -> None:
+def test_damaged_runs_are_run_again_and_written_through_no_link(
+    photographs: Path, evaluated: Path, tmp_path: Path
+) -> None:
     out = shutil.copytree(evaluated, tmp_path / "out")
     damaged = out / "runs/obj2.npz"
     damaged.write_bytes(damaged.read_bytes()[:100])
+    (tmp_path / "victim").write_text("mine")
+    for name in ("runs/obj2.npz.part", "runs/obj2.part", "results.csv.part"):
+        (out / name).symlink_to(tmp_path / "victim")
+    (out / "results.csv").unlink()
+    (out / "results.csv").symlink_to(tmp_path / "victim")
     assert run(photographs, *QUICK, *NOISY, "--out", out, "--resume").exit_code == 0
+    assert (tmp_path / "victim").read_text() == "mine"
     assert results(out) == results(evaluated)
 
 

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
@@ -186,6 +187,21 @@ def test_spoiled_state_counts_as_latched(tmp_path, name, spoil, fault):
     assert state.fault is not None
 
 
+@pytest.mark.parametrize("whole_folder", [False, True])
+def test_deleted_state_is_not_a_new_bench(tmp_path, whole_folder):
+    assert FileStore(tmp_path / "bench").load() == BenchState()
+    FileStore(tmp_path / "bench").save(BenchState(table=TABLE, fault=STALLED))
+    for file in (tmp_path / "bench").iterdir():
+        file.unlink()
+    if whole_folder:
+        (tmp_path / "bench").rmdir()
+    state = FileStore(tmp_path / "bench").load()
+    assert state.table is None  # the angle is in doubt
+    assert state.fault.code == StateNotStored.code
+    FileStore(tmp_path / "bench").save(state.model_copy(update={"damage": ""}))
+    assert FileStore(tmp_path / "bench").load().fault == state.fault
+
+
 def test_second_program_is_told_which_one_uses_the_bench(tmp_path, other_program):
     who = holder(tmp_path)
     assert who.pid == other_program.pid
@@ -212,6 +228,32 @@ def test_holder_without_readable_name_still_counts(tmp_path, other_program):
     assert holder(tmp_path) == Holder(pid=0, command="", since_utc="")
     with pytest.raises(BenchBusy, match="another process"):
         BenchLock(tmp_path, SystemClock())
+
+
+@pytest.mark.parametrize("name", ["lock", "latch", "stop", "state.json", "state.json.part"])
+def test_no_file_is_written_through_a_link(tmp_path, name):
+    victim, bench = tmp_path / "victim", tmp_path / "bench"
+    victim.write_bytes(b"x" * LATCH_BYTES)
+    bench.mkdir()
+    (bench / name).symlink_to(victim)
+    with suppress(StateNotStored):
+        BenchLock(bench, SystemClock()).close()
+    for write in (
+        lambda store: store.save(BenchState(table=TABLE)),
+        lambda store: store.latch(STALLED),
+        FileStore.request_stop,
+        FileStore.clear_stop,
+    ):
+        with suppress(StateNotStored):
+            write(FileStore(bench))
+    assert victim.read_bytes() == b"x" * LATCH_BYTES
+    (bench / name).unlink(missing_ok=True)
+    (bench / name).symlink_to(tmp_path / "nowhere")
+    with suppress(StateNotStored):
+        FileStore(bench).request_stop()
+    with suppress(StateNotStored):
+        BenchLock(bench, SystemClock()).close()
+    assert not (tmp_path / "nowhere").exists()
 
 
 def test_old_stop_request_does_not_stop_the_next_program(tmp_path):
