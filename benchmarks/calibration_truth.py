@@ -205,7 +205,7 @@ def main() -> None:
         for seed in range(given.first_seed, given.first_seed + given.seeds):
             result, truth = procedure(seed)
             rejected += not result.passed
-            print(f"{name}, seed {seed}: {' '.join(map(str, result.refusals)) or 'passed'}", file=sys.stderr)
+            print(f"{name}, seed {seed}: {' '.join(map(str, result.rejections)) or 'passed'}", file=sys.stderr)
             for key, (true, unit) in truth.items():
                 estimate = result.estimates[key]
                 errors[key].append((estimate.value - true, estimate.uncertainty))

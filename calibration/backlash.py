@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, refuse_slipped_leg, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg, stored_valid
 from calibration.procedure import (
     Evaluation,
     Measured,
@@ -25,7 +25,7 @@ from calibration.procedure import (
     table_settings,
 )
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.events.events import plain
 from rig.motion.turntable import Turntable
@@ -102,7 +102,9 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     found = Evaluation(name=NAME, residual_unit="°", evidence={"legs": plain(list(legs))})
     used = [leg for leg in legs if not leg.invalid]
     if len(used) < MIN_REVERSALS:
-        return found.refuse(RefusalCode.TOO_FEW_REVERSALS, used=len(used), needed=MIN_REVERSALS, reasons=reasons(legs))
+        return found.reject(
+            RejectionCode.TOO_FEW_REVERSALS, used=len(used), needed=MIN_REVERSALS, reasons=reasons(legs)
+        )
     encoder = np.array([leg.encoder_deg for leg in used])
     gyro = np.array([leg.gyro_deg for leg in used])
     fitted = fit(used, np.column_stack([gyro, np.sign(encoder)]), resolution_deg)
@@ -116,17 +118,19 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     found.proposed = {"table.backlash_deg": round(margin_deg, 3)}
 
     if ratio < 0:
-        found.refuse(RefusalCode.WRONG_DIRECTION, ratio=ratio)
+        found.reject(RejectionCode.WRONG_DIRECTION, ratio=ratio)
     else:
-        found.refuse_if(not RATIO[0] < ratio < RATIO[1], RefusalCode.WRONG_GEAR_RATIO, ratio=ratio, table_deg=1 / ratio)
-    refuse_slipped_leg(found, legs.index(used[worst]) + 1)
-    found.refuse_if(
-        backlash > MAX_BACKLASH_DEG, RefusalCode.BACKLASH_TOO_LARGE, backlash_deg=backlash, limit_deg=MAX_BACKLASH_DEG
+        found.reject_if(
+            not RATIO[0] < ratio < RATIO[1], RejectionCode.WRONG_GEAR_RATIO, ratio=ratio, table_deg=1 / ratio
+        )
+    reject_slipped_leg(found, legs.index(used[worst]) + 1)
+    found.reject_if(
+        backlash > MAX_BACKLASH_DEG, RejectionCode.BACKLASH_TOO_LARGE, backlash_deg=backlash, limit_deg=MAX_BACKLASH_DEG
     )
-    found.refuse_if(backlash < -COVERAGE * backlash_sigma, RefusalCode.BACKLASH_NEGATIVE, backlash_deg=backlash)
-    found.refuse_if(
+    found.reject_if(backlash < -COVERAGE * backlash_sigma, RejectionCode.BACKLASH_NEGATIVE, backlash_deg=backlash)
+    found.reject_if(
         backlash_sigma > MAX_UNCERTAINTY_DEG,
-        RefusalCode.BACKLASH_UNCERTAIN,
+        RejectionCode.BACKLASH_UNCERTAIN,
         uncertainty_deg=backlash_sigma,
         limit_deg=MAX_UNCERTAINTY_DEG,
     )

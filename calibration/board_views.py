@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibration import pictures
 from calibration.procedure import Ask, Evaluation, Progress
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import LIMIT, MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.events.events import Event
 from rig.motion.turntable import Turntable
@@ -61,7 +61,7 @@ def take_views(
 ) -> Generator[Event | Ask | Progress, None, list[BoardView]]:
     """Ask for the board in each of the ``stands``, rotate to each of the ``angles_deg``, and return the views.
 
-    ``stands`` maps names to descriptions, as in `STANDS`. A wrong board becomes a refusal of ``found``.
+    ``stands`` maps names to descriptions, as in `STANDS`. A wrong board becomes a rejection of ``found``.
 
     Raises ViewRejected, MotionTimeout, DeviceFault, DeviceSilent: see `rig.views.capture` and `rig.motion.turntable`.
     """
@@ -92,8 +92,8 @@ def take_views(
                 yield Progress(index / planned, _words(seen, board, views, bench))
             table.goto(angles_deg[0])
     layout = {"columns": board.columns, "rows": board.rows}
-    found.refuse_if(foreign, RefusalCode.FOREIGN_MARKERS, markers=sorted(foreign), **layout)
-    found.refuse_if(elsewhere > planned // 4, RefusalCode.WRONG_BOARD_LAYOUT, views=elsewhere, **layout)
+    found.reject_if(foreign, RejectionCode.FOREIGN_MARKERS, markers=sorted(foreign), **layout)
+    found.reject_if(elsewhere > planned // 4, RejectionCode.WRONG_BOARD_LAYOUT, views=elsewhere, **layout)
     return views
 
 
@@ -108,10 +108,10 @@ def coverage(views: Sequence[BoardView], size: tuple[int, int]) -> NDArray[np.in
     return cells
 
 
-def refuse_loose_board(
+def reject_loose_board(
     found: Evaluation, views: Sequence[BoardView], poses: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
 ) -> None:
-    """Refuse views between which board and encoder rotated by different angles.
+    """Reject views between which board and encoder rotated by different angles.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def refuse_loose_board(
         between = cv2.Rodrigues(rotation_b)[0] @ cv2.Rodrigues(rotation_a)[0].T
         seen_deg = degrees(float(np.linalg.norm(cv2.Rodrigues(between)[0])))
         worst = max(worst, abs(seen_deg - abs(b.table_deg - a.table_deg)))
-    found.refuse_if(worst > LOOSE_DEG, RefusalCode.BOARD_LOOSE, difference_deg=worst)
+    found.reject_if(worst > LOOSE_DEG, RejectionCode.BOARD_LOOSE, difference_deg=worst)
 
 
 def span_deg(views: Sequence[BoardView]) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from calibration import pictures
 from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 
 NAME = "servo.cable"
 
@@ -44,9 +44,9 @@ def evaluate(high_deg: float, low_deg: float, *, pan: bool) -> Evaluation:
     low, high = limits = [round(low_deg + MARGIN_DEG, 1), round(high_deg - MARGIN_DEG, 1)]
     found.proposed = {"table.limits_deg": limits}
     if high_deg < low_deg:
-        found.refuse(RefusalCode.CABLE_ENDS_SWAPPED, high_deg=high_deg, low_deg=low_deg)
+        found.reject(RejectionCode.CABLE_ENDS_SWAPPED, high_deg=high_deg, low_deg=low_deg)
     elif not pan and high - low < 360.0:
-        found.refuse(RefusalCode.CABLE_TOO_SHORT, margin_deg=MARGIN_DEG, span_deg=high - low)
+        found.reject(RejectionCode.CABLE_TOO_SHORT, margin_deg=MARGIN_DEG, span_deg=high - low)
     else:
-        found.refuse_if(not low <= 0.0 <= high, RefusalCode.HOME_OUTSIDE_CABLE, low_deg=low, high_deg=high)
+        found.reject_if(not low <= 0.0 <= high, RejectionCode.HOME_OUTSIDE_CABLE, low_deg=low, high_deg=high)
     return found

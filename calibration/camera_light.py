@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calibration import pictures
 from calibration.procedure import Ask, Evaluation, Measured, Procedure, Progress
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.devices.camera import CameraLocks
 from rig.events.events import plain
@@ -180,7 +180,7 @@ def photon_transfer(frames: NDArray[np.uint8]) -> Evaluation:
     mean, variance, region = mean[usable], variance[usable], _regions(green.shape[1:])[usable]
     low, high = (np.quantile(mean, [0.02, 0.98]).tolist()) if mean.size else (0.0, 0.0)
     if high - low < MIN_SPAN:
-        return found.refuse(RefusalCode.CONTRAST_TOO_LOW, span=high - low, needed=MIN_SPAN)
+        return found.reject(RejectionCode.CONTRAST_TOO_LOW, span=high - low, needed=MIN_SPAN)
     # Bin the pixels by their mean, in each region. Sums of pixels, means and variances: float64 (3, regions, bins).
     edges = np.linspace(low, high, BINS + 1)
     cell = region * BINS + np.clip(np.digitize(mean, edges) - 1, 0, BINS - 1)
@@ -204,7 +204,7 @@ def photon_transfer(frames: NDArray[np.uint8]) -> Evaluation:
     dark = max(float(floor) - 1 / 12, 0.0)
     found.evidence["mean_variance"] = np.column_stack([at, noise]).round(4).tolist()
     found.residual = float(np.max(np.abs(noise - (gain * at + floor)) / noise))
-    found.refuse_if(gain <= 0, RefusalCode.NOISE_INDEPENDENT_OF_LIGHT)
+    found.reject_if(gain <= 0, RejectionCode.NOISE_INDEPENDENT_OF_LIGHT)
     if gain > 0:
         full_well, read = 255 / float(gain), sqrt(dark) / float(gain)
         found.estimate("full_well_e", full_well, full_well / float(gain) * sqrt(covariance[0, 0]), "electrons")
@@ -220,7 +220,7 @@ def sharpness(values: Sequence[float]) -> Evaluation:
     found.evidence = {"sharpness": [round(float(value), 2) for value in values]}
     mean = float(np.mean(values))
     found.estimate("sharpness", mean, np.std(values, ddof=1), "squared levels")
-    found.refuse_if(mean < MIN_SHARPNESS, RefusalCode.NOT_SHARP, sharpness=mean, needed=MIN_SHARPNESS)
+    found.reject_if(mean < MIN_SHARPNESS, RejectionCode.NOT_SHARP, sharpness=mean, needed=MIN_SHARPNESS)
     return found
 
 
@@ -242,9 +242,9 @@ def flat_field(card: CardFrames) -> Evaluation:
     found.estimate("vignetting", loss, sigma[2], "of the light in the corners")
     found.estimate("gradient_x", float(fitted[1]) / max(level, 1e-9), sigma[0])
     found.estimate("gradient_y", float(fitted[2]) / max(level, 1e-9), sigma[1])
-    found.refuse_if(not LEVELS[0] < level < LEVELS[1], RefusalCode.CARD_EXPOSURE, level=level)
-    found.refuse_if(found.residual > MAX_UNEVEN, RefusalCode.CARD_UNEVEN, residual=found.residual)
-    found.refuse_if(loss > MAX_LOSS, RefusalCode.VIGNETTING_TOO_LARGE, loss=loss)
+    found.reject_if(not LEVELS[0] < level < LEVELS[1], RejectionCode.CARD_EXPOSURE, level=level)
+    found.reject_if(found.residual > MAX_UNEVEN, RejectionCode.CARD_UNEVEN, residual=found.residual)
+    found.reject_if(loss > MAX_LOSS, RejectionCode.VIGNETTING_TOO_LARGE, loss=loss)
     return found
 
 
@@ -257,7 +257,7 @@ def drift(card: CardFrames, before: CameraLocks, after: CameraLocks) -> Evaluati
         "locks": plain(after),
     }
     if card.levels.min() < 1.0:
-        return found.refuse(RefusalCode.CARD_BLACK)
+        return found.reject(RejectionCode.CARD_BLACK)
     grey = card.levels.mean(axis=1)
     relative = grey / grey.mean()
     minutes = card.seconds / 60
@@ -276,17 +276,17 @@ def drift(card: CardFrames, before: CameraLocks, after: CameraLocks) -> Evaluati
     span = float(minutes[-1] - minutes[0])
     drifted = 100 * abs(float(slope)) * span
     found.residual, found.limit, found.residual_unit = drifted, MAX_DRIFT_PERCENT, "% in the time of the test"
-    found.refuse_if(before != after, RefusalCode.LOCKS_CHANGED, before=plain(before), after=plain(after))
-    found.refuse_if(
+    found.reject_if(before != after, RejectionCode.LOCKS_CHANGED, before=plain(before), after=plain(after))
+    found.reject_if(
         drifted - 200 * slope_sigma * span > MAX_DRIFT_PERCENT,
-        RefusalCode.LIGHT_DRIFTED,
+        RejectionCode.LIGHT_DRIFTED,
         drift_percent=drifted,
         minutes=minutes[-1],
         limit_percent=MAX_DRIFT_PERCENT,
     )
-    found.refuse_if(flicker > MAX_FLICKER, RefusalCode.LIGHT_FLICKERS, flicker=flicker, limit=MAX_FLICKER)
+    found.reject_if(flicker > MAX_FLICKER, RejectionCode.LIGHT_FLICKERS, flicker=flicker, limit=MAX_FLICKER)
     cast = max(abs(red / green - 1), abs(blue / green - 1))
-    found.refuse_if(cast > MAX_CAST, RefusalCode.COLOUR_CAST, red=red / green, blue=blue / green)
+    found.reject_if(cast > MAX_CAST, RejectionCode.COLOUR_CAST, red=red / green, blue=blue / green)
     return found
 
 

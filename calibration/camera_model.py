@@ -17,14 +17,14 @@ from calibration.board_views import (
     by_stand,
     coverage,
     points,
-    refuse_loose_board,
+    reject_loose_board,
     span_deg,
     take_views,
 )
 from calibration.board_views import plot_views as plot_views_of
 from calibration.procedure import Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import Axis, Chart, Series
 from rig.views.charuco_board import Board
 
@@ -128,7 +128,7 @@ def evaluate(
     size
         Width and height of the frames.
     found
-        Has the refusals found while the views were taken; it is completed and returned.
+        Has the rejections found while the views were taken; it is completed and returned.
     """
     found = found or Evaluation(name=NAME)
     found.residual_unit, found.limit = "px", MAX_RMS_PX
@@ -142,7 +142,7 @@ def evaluate(
     }
     if len(views) < MIN_VIEWS:
         values = {"found": len(views), "span_deg": span_deg(views), "needed": MIN_VIEWS, "needed_deg": 0}
-        return found.refuse(RefusalCode.TOO_FEW_VIEWS, **values)
+        return found.reject(RejectionCode.TOO_FEW_VIEWS, **values)
     rms, matrix, distortion, rotations, translations, deviations, _, each = cv2.calibrateCameraExtended(
         [points(board, view).astype(np.float32) for view in views],
         [view.corners_px.astype(np.float32) for view in views],
@@ -161,22 +161,22 @@ def evaluate(
         (np.asarray(r, dtype=np.float64), np.asarray(t, dtype=np.float64))
         for r, t in zip(rotations, translations, strict=True)
     ]
-    refuse_loose_board(found, views, poses)
-    found.refuse_if(
+    reject_loose_board(found, views, poses)
+    found.reject_if(
         found.residual > MAX_RMS_PX,
-        RefusalCode.CORNERS_OFF,
+        RejectionCode.CORNERS_OFF,
         rms_px=found.residual,
         view=int(np.argmax(view_rms)) + 1,
         view_px=np.max(view_rms),
         limit_px=MAX_RMS_PX,
     )
     covered = float((cells > 0).mean())
-    found.refuse_if(covered < MIN_COVERAGE, RefusalCode.COVERAGE_TOO_SMALL, covered=covered, needed=MIN_COVERAGE)
+    found.reject_if(covered < MIN_COVERAGE, RejectionCode.COVERAGE_TOO_SMALL, covered=covered, needed=MIN_COVERAGE)
     focal = found.estimates["fx"]
     uncertainty = focal.uncertainty / focal.value
-    found.refuse_if(
+    found.reject_if(
         uncertainty > MAX_FOCAL_UNCERTAINTY,
-        RefusalCode.FOCAL_LENGTH_UNCERTAIN,
+        RejectionCode.FOCAL_LENGTH_UNCERTAIN,
         uncertainty=uncertainty,
         limit=MAX_FOCAL_UNCERTAINTY,
     )

@@ -288,7 +288,7 @@ def history(
         return
     for result in results:
         values = ", ".join(f"{key} {estimate}" for key, estimate in result.estimates.items())
-        outcome = values if result.passed else f"FAIL: {result.refusals[0]}"
+        outcome = values if result.passed else f"FAIL: {result.rejections[0]}"
         print(f"{result.when_utc:%Y-%m-%d %H:%M}  {result.name:<16} {outcome}")
     if not results:
         print(f"No calibrations{f' of {name}' if name else ''} in {store.folder}.")
@@ -382,11 +382,11 @@ def _ask(request: "Ask", *, with_picture: bool) -> None:
 
 
 def _json(result: "CalibrationResult") -> dict[str, Any]:
-    """Return a result as JSON; each refusal also in words."""
+    """Return a result as JSON; each rejection also in words."""
     from rig.events.events import plain
 
-    refusals = [{**plain(refusal), "text": str(refusal)} for refusal in result.refusals]
-    return {**plain(result), "refusals": refusals}
+    rejections = [{"code": r.code.name.lower(), "values": plain(r.values), "text": str(r)} for r in result.rejections]
+    return {**plain(result), "rejections": rejections}
 
 
 def outcome_text(result: "CalibrationResult") -> str:
@@ -398,7 +398,7 @@ def outcome_text(result: "CalibrationResult") -> str:
     lines = [f"{'PASS' if result.passed else 'FAIL'} {result.name}{residual}"]
     lines += [f"  {name} = {estimate}" for name, estimate in result.estimates.items()]
     lines += [f"  sets {key} = {_plain(value)}" for key, value in result.settings.items()]
-    return "\n".join([*lines, *(f"  {refusal}" for refusal in result.refusals)])
+    return "\n".join([*lines, *(f"  {rejection}" for rejection in result.rejections)])
 
 
 def _plain(value: Any) -> str:

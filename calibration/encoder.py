@@ -16,10 +16,10 @@ from math import ceil, floor
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, refuse_slipped_leg, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg, stored_valid
 from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.events.events import plain
 from rig.motion.turntable import Turntable
@@ -131,7 +131,7 @@ def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resoluti
     used = [step for step in steps if not step.leg.invalid]
     if len(used) < STEPS_PER_TURN:
         why = reasons([step.leg for step in steps])
-        return found.refuse(RefusalCode.TOO_FEW_STEPS, used=len(used), needed=STEPS_PER_TURN, reasons=why)
+        return found.reject(RejectionCode.TOO_FEW_STEPS, used=len(used), needed=STEPS_PER_TURN, reasons=why)
     gyro = np.array([step.leg.gyro_deg for step in used])
     basis = _basis(np.array([s.to_deg for s in used]), turn_deg) - _basis(
         np.array([s.from_deg for s in used]), turn_deg
@@ -144,13 +144,13 @@ def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resoluti
     found.proposed = {"table.encoder_harmonics_deg": [round(float(value), 4) for value in fitted.values[1:]]}
 
     largest = float(np.abs(_basis(np.linspace(0.0, turn_deg, 361), turn_deg) @ fitted.values[1:]).max())
-    refuse_slipped_leg(found, steps.index(used[fitted.worst]) + 1)
-    found.refuse_if(
-        largest > MAX_ERROR_DEG, RefusalCode.ENCODER_ERROR_TOO_LARGE, error_deg=largest, limit_deg=MAX_ERROR_DEG
+    reject_slipped_leg(found, steps.index(used[fitted.worst]) + 1)
+    found.reject_if(
+        largest > MAX_ERROR_DEG, RejectionCode.ENCODER_ERROR_TOO_LARGE, error_deg=largest, limit_deg=MAX_ERROR_DEG
     )
-    found.refuse_if(
+    found.reject_if(
         (uncertainty := float(fitted.sigma[1:].max())) > MAX_UNCERTAINTY_DEG,
-        RefusalCode.ENCODER_UNCERTAIN,
+        RejectionCode.ENCODER_UNCERTAIN,
         uncertainty_deg=uncertainty,
         limit_deg=MAX_UNCERTAINTY_DEG,
     )

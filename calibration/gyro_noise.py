@@ -20,7 +20,7 @@ from scipy.optimize import nnls
 
 from calibration.procedure import Evaluation, Measured, Procedure, Progress, require_at_least
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 
 NAME = "imu.noise"
@@ -126,7 +126,7 @@ def evaluate(rest: RestRecord, *, column: int, seed: int = 0) -> Evaluation:
     longest_s = seconds / 4
     instability = _instability(arw, walk, longest_s)
     instability_sigma = float(np.std([_instability(n, k, longest_s) for n, k in drawn.tolist()], ddof=1))
-    found.refuse_if(arw > MAX_ARW_DEG_RTS, RefusalCode.GYRO_NOISY, arw=arw, limit=MAX_ARW_DEG_RTS)
+    found.reject_if(arw > MAX_ARW_DEG_RTS, RejectionCode.GYRO_NOISY, arw=arw, limit=MAX_ARW_DEG_RTS)
     found.estimate("angle_random_walk", arw, arw_sigma, "°/√s")
     found.estimate("rate_random_walk", walk, walk_sigma, "°/s/√s")
     found.estimate("bias_instability", instability, instability_sigma, "°/s")
@@ -225,11 +225,11 @@ def _slope(
 
 
 def _check_rest(found: Evaluation, rest: RestRecord, column: int) -> None:
-    """Refuse a record with jumps of the rate, or with lost samples."""
+    """Reject a record with jumps of the rate, or with lost samples."""
     steps = np.diff(rest.gyro_dps[:, column])
     typical = 1.4826 * float(np.median(np.abs(steps)))
     jumps = np.flatnonzero(np.abs(steps) > MAX_STEP_SIGMA * max(typical, 1e-9))
     if jumps.size:
         at_s = (int(jumps[0]) + 1) * rest.block_s
-        found.refuse(RefusalCode.RATE_JUMPED, at_s=at_s, jump_dps=abs(steps[jumps[0]]))
-    found.refuse_if(rest.lost, RefusalCode.SAMPLES_LOST, lost=rest.lost)
+        found.reject(RejectionCode.RATE_JUMPED, at_s=at_s, jump_dps=abs(steps[jumps[0]]))
+    found.reject_if(rest.lost, RejectionCode.SAMPLES_LOST, lost=rest.lost)

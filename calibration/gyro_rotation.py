@@ -31,7 +31,7 @@ from calibration.procedure import (
     table_settings,
 )
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
 from rig.events.events import plain
 from rig.motion.turntable import Turntable
@@ -120,7 +120,7 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
         ways = [[m for m in used if (m.leg.encoder_deg > 0) == up] for up in (True, False)]
         if min(map(len, ways)) < MIN_REPEATS:
             why = reasons([move.leg for move in moves])
-            found.refuse(RefusalCode.TOO_FEW_MOVES, speed=speed, needed=MIN_REPEATS, reasons=why)
+            found.reject(RejectionCode.TOO_FEW_MOVES, speed=speed, needed=MIN_REPEATS, reasons=why)
             continue
         squares, stated = [], []
         for way in ways:
@@ -138,8 +138,8 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
         rows.append({**row, "freedom": freedom, "ratio_may_be": [low, high]})
         found.estimate(f"sigma_{speed}", measured_deg, measured_deg / sqrt(2 * freedom), "°")
         found.estimate(f"ratio_{speed}", ratio, ratio / sqrt(2 * freedom), "of the stated σ")
-        code = RefusalCode.SCATTER_TOO_LARGE if ratio > 1 else RefusalCode.SCATTER_TOO_SMALL
-        found.refuse_if(not low < ratio < high, code, **row, ratio=ratio)
+        code = RejectionCode.SCATTER_TOO_LARGE if ratio > 1 else RejectionCode.SCATTER_TOO_SMALL
+        found.reject_if(not low < ratio < high, code, **row, ratio=ratio)
     found.evidence = {"by_duration": rows, "moves": plain(list(moves))}
     if rows:
         worst = max(rows, key=lambda row: row["measured_deg"] / row["stated_deg"] / row["ratio_may_be"][1])

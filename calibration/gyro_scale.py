@@ -18,10 +18,10 @@ from math import ceil, floor, hypot, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, refuse_slipped_leg, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg, stored_valid
 from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.events.events import plain
 from rig.motion.turntable import Turntable
@@ -117,11 +117,11 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     up = encoder > 0
     upwards, downwards = int(up.sum()), int((~up).sum())
     if min(upwards, downwards) < MIN_LEGS:
-        return found.refuse(
-            RefusalCode.TOO_FEW_REVOLUTIONS, up=upwards, down=downwards, needed=MIN_LEGS, reasons=reasons(legs)
+        return found.reject(
+            RejectionCode.TOO_FEW_REVOLUTIONS, up=upwards, down=downwards, needed=MIN_LEGS, reasons=reasons(legs)
         )
     if not PLAUSIBLE[0] < (ratio := float(np.median(gyro / encoder))) < PLAUSIBLE[1]:
-        return found.refuse(RefusalCode.GYRO_IMPLAUSIBLE, ratio=ratio)
+        return found.reject(RejectionCode.GYRO_IMPLAUSIBLE, ratio=ratio)
     fitted = fit(used, gyro[:, None], resolution_deg)
     value, uncertainty = float(fitted.values[0]), float(fitted.sigma[0])
     residuals = np.abs(encoder - value * gyro)
@@ -132,15 +132,15 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     (value_up, sigma_up), (value_down, sigma_down) = (_ratio(encoder[way], gyro[way], sigma[way]) for way in (up, ~up))
     found.evidence |= {"scale_up": value_up, "scale_down": value_down}
 
-    refuse_slipped_leg(found, legs.index(used[worst]) + 1)
-    found.refuse_if(
+    reject_slipped_leg(found, legs.index(used[worst]) + 1)
+    found.reject_if(
         abs(value_up - value_down) > COVERAGE * hypot(sigma_up, sigma_down),
-        RefusalCode.DIRECTIONS_DIFFER,
+        RejectionCode.DIRECTIONS_DIFFER,
         up=value_up,
         down=value_down,
     )
-    found.refuse_if(
-        uncertainty > MAX_UNCERTAINTY, RefusalCode.SCALE_UNCERTAIN, uncertainty=uncertainty, limit=MAX_UNCERTAINTY
+    found.reject_if(
+        uncertainty > MAX_UNCERTAINTY, RejectionCode.SCALE_UNCERTAIN, uncertainty=uncertainty, limit=MAX_UNCERTAINTY
     )
     return found
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calibration.procedure import Evaluation, Measured, Procedure, returning, too_little_room
 from calibration.recording import Recording, recording
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate, RefusalCode
+from rig.calibrations import CalibrationResult, Estimate, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
@@ -132,7 +132,7 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
         "levels": [{"table_deg": level.table_deg, "mean_g": level.mean_g.tolist()} for level in levels],
     }
     if len(moves) < STEPS // 2:
-        return found.refuse(RefusalCode.TOO_FEW_RECORDED_MOVES, used=len(moves), planned=STEPS)
+        return found.reject(RejectionCode.TOO_FEW_RECORDED_MOVES, used=len(moves), planned=STEPS)
     total = np.sum([move.rotation_deg for move in moves], axis=0)
     length = float(np.linalg.norm(total))
     axis = total / length  # of a counter-clockwise rotation: upwards
@@ -147,12 +147,12 @@ def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *,
         nearest = int(np.argmax(np.abs(axis)))
         wrong = nearest != column or tilt_deg > 90.0
         right_sign = 1 if axis[nearest] > 0 else -1
-        found.refuse_if(wrong, RefusalCode.WRONG_AXIS, axis="xyz"[nearest], sign=right_sign)
-        found.refuse_if(not wrong, RefusalCode.TILT_TOO_LARGE, tilt_deg=tilt_deg, limit_deg=MAX_TILT_DEG)
+        found.reject_if(wrong, RejectionCode.WRONG_AXIS, axis="xyz"[nearest], sign=right_sign)
+        found.reject_if(not wrong, RejectionCode.TILT_TOO_LARGE, tilt_deg=tilt_deg, limit_deg=MAX_TILT_DEG)
     found.estimates |= _levels(levels, axis, column, tilt_sigma)
     found.estimates["delay"] = _delay(moves)
     level_deg = hypot(found.estimates["axis_x"].value, found.estimates["axis_y"].value)
-    found.refuse_if(level_deg > MAX_LEVEL_DEG, RefusalCode.NOT_LEVEL, level_deg=level_deg, limit_deg=MAX_LEVEL_DEG)
+    found.reject_if(level_deg > MAX_LEVEL_DEG, RejectionCode.NOT_LEVEL, level_deg=level_deg, limit_deg=MAX_LEVEL_DEG)
     return found
 
 

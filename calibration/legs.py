@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.procedure import Evaluation
-from rig.calibrations import RefusalCode
+from rig.calibrations import RejectionCode
 from rig.config import ImuConfig
 from rig.motion.move import Move
 
@@ -96,12 +96,12 @@ def fit(legs: Sequence[Leg], design: NDArray[np.float64], resolution_deg: float)
     return LinearFit(values, sigma, encoder - design @ values, np.sqrt(np.diag(covariance)))
 
 
-def refuse_slipped_leg(found: Evaluation, number: int) -> None:
-    """Refuse an evaluation whose largest residual, that of leg ``number`` (from 1), is above its limit."""
+def reject_slipped_leg(found: Evaluation, number: int) -> None:
+    """Reject an evaluation whose largest residual, that of leg ``number`` (from 1), is above its limit."""
     assert found.residual is not None
     assert found.limit is not None
-    code, residual_deg, limit_deg = RefusalCode.LEG_SLIPPED, found.residual, found.limit
-    found.refuse_if(residual_deg > limit_deg, code, leg=number, residual_deg=residual_deg, limit_deg=limit_deg)
+    code, residual_deg, limit_deg = RejectionCode.LEG_SLIPPED, found.residual, found.limit
+    found.reject_if(residual_deg > limit_deg, code, leg=number, residual_deg=residual_deg, limit_deg=limit_deg)
 
 
 def scatter(chi_square: float, freedom: int) -> float:

@@ -26,7 +26,7 @@ from calibration.procedure import (
     table_settings,
 )
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.devices.servo import MotionProfile
 from rig.events.events import plain
@@ -130,9 +130,9 @@ def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
     found.evidence = {"moves": plain(list(moves)), "scatter_s": scatter}
     worst = int(np.argmax(np.abs(residuals)))
     found.residual = abs(float(residuals[worst]))
-    found.refuse_if(
+    found.reject_if(
         found.residual > MAX_RESIDUAL_S,
-        RefusalCode.MOVE_HINDERED,
+        RejectionCode.MOVE_HINDERED,
         distance_deg=moves[worst].distance_deg,
         seconds=seconds[worst],
         residual_s=found.residual,

@@ -12,8 +12,8 @@ from datetime import datetime
 from typing import Any, ClassVar, Self
 
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate, Refusal, RefusalCode
-from rig.calibrations.refusal import refusal
+from rig.calibrations import CalibrationResult, Estimate, Rejection, RejectionCode
+from rig.calibrations.rejection import rejection
 from rig.charts.xy import Chart
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Event
@@ -54,25 +54,25 @@ class Evaluation:
     proposed: dict[str, Any] = field(default_factory=dict)
     """Settings to apply if the calibration passes."""
     evidence: dict[str, Any] = field(default_factory=dict)
-    refusals: list[Refusal] = field(default_factory=list)
+    rejections: list[Rejection] = field(default_factory=list)
 
     @property
     def passed(self) -> bool:
-        return not self.refusals
+        return not self.rejections
 
     @property
     def settings(self) -> dict[str, Any]:
         """The settings to apply; none unless the calibration passed."""
         return self.proposed if self.passed else {}
 
-    def refuse_if(self, condition: object, code: RefusalCode, **values: Any) -> None:
-        """Add a refusal with the numbers that its words need, if ``condition`` is true."""
+    def reject_if(self, condition: object, code: RejectionCode, **values: Any) -> None:
+        """Add a rejection with the numbers that its words need, if ``condition`` is true."""
         if condition:
-            self.refuse(code, **values)
+            self.reject(code, **values)
 
-    def refuse(self, code: RefusalCode, **values: Any) -> Self:
-        """Add a refusal with the numbers that its words need, and return the evaluation."""
-        self.refusals.append(refusal(code, values))
+    def reject(self, code: RejectionCode, **values: Any) -> Self:
+        """Add a rejection with the numbers that its words need, and return the evaluation."""
+        self.rejections.append(rejection(code, values))
         return self
 
     def estimate(self, name: str, value: Any, uncertainty: Any, unit: str = "") -> None:
@@ -87,7 +87,7 @@ class Evaluation:
             residual=self.residual,
             limit=self.limit,
             residual_unit=self.residual_unit,
-            refusals=tuple(self.refusals),
+            rejections=tuple(self.rejections),
             settings=self.settings,
             valid_days=valid_days,
             when_utc=when_utc,

@@ -24,7 +24,7 @@ import hbr
 from calibration import pictures
 from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import LIMIT, OTHER, Axis, Chart, Series
 from rig.core.errors import UsageError
 from rig.events.events import Accepted
@@ -145,9 +145,9 @@ def evaluate(
     within = np.array([_similar(s.descriptors[0], s.descriptors[1]) for s in placements])
     between = np.array([_similar(a.descriptors[0], b.descriptors[0]) for a, b in combinations(placements, 2)])
     needed = needed_placements(error_rate)
-    found.refuse_if(
+    found.reject_if(
         len(placements) < needed,
-        RefusalCode.TOO_FEW_PLACEMENTS,
+        RejectionCode.TOO_FEW_PLACEMENTS,
         placements=len(placements),
         error_rate=error_rate,
         needed=needed,
@@ -155,12 +155,12 @@ def evaluate(
     shift = round(first_step_deg * AZIMUTHS / 360.0)
     decided = np.mean([np.roll(between, -shift * view, axis=1) for view in range(views)], axis=0)
     low = float(np.median(between))
-    found.refuse_if(low < MIN_SIMILARITY, RefusalCode.SIMILARITY_TOO_LOW, similarity=low, needed=MIN_SIMILARITY)
+    found.reject_if(low < MIN_SIMILARITY, RejectionCode.SIMILARITY_TOO_LOW, similarity=low, needed=MIN_SIMILARITY)
     last = len(placements) - 1
     apart = {(i, j): row for (i, j), row in zip(combinations(range(len(placements)), 2), between, strict=True)}
     neighbours = float(np.median([apart[i, i + 1] for i in range(last)]))
     drift = neighbours - float(np.median(apart[0, last]))
-    found.refuse_if(last > 1 and drift > MAX_DRIFT, RefusalCode.LIGHT_DRIFTS_BETWEEN_PLACEMENTS, drift=drift)
+    found.reject_if(last > 1 and drift > MAX_DRIFT, RejectionCode.LIGHT_DRIFTS_BETWEEN_PLACEMENTS, drift=drift)
 
     def figures(chosen: NDArray[np.int64]) -> tuple[float, float, float, float]:
         some_within, some_between = within[:, chosen], between[:, chosen]

@@ -23,7 +23,7 @@ class _Shown(NamedTuple):
     status: str
     text: str
     command: str
-    refusals: Sequence[str]
+    rejections: Sequence[str]
     pictures: Sequence[Markup]
     devices: Sequence[tuple[str, str]]
 
@@ -42,7 +42,7 @@ def write_page(
     now_utc: datetime,
     notes: Sequence[str] = (),
 ) -> None:
-    """Write the page: the standing of each calibration, and the refusals of newer attempts.
+    """Write the page: the standing of each calibration, and the rejections of newer attempts.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def _shown(standing: CalibrationStanding, history: Sequence[CalibrationResult]) 
         str(standing.status),
         str(standing),
         standing.command,
-        [f"Refused on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {refusal}" for refusal in latest.refusals],
+        [f"Rejected on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {rejection}" for rejection in latest.rejections],
         # Trusted markup: the SVG escapes its texts.
         [Markup(figure.svg(themed=True)) for figure in plots(result)],
         [(part, _words(identity)) for part, identity in result.device.items() if part in ("servo", "imu", "camera")],

@@ -24,12 +24,12 @@ from scipy.optimize import least_squares
 
 from calibration import camera_model
 from calibration.board_views import STANDS as ALL_STANDS
-from calibration.board_views import BoardView, as_json, points, refuse_loose_board, span_deg, take_views
+from calibration.board_views import BoardView, as_json, points, reject_loose_board, span_deg, take_views
 from calibration.board_views import plot_views as plot_views_of
 from calibration.camera_model import PARAMETERS, matrix_of
 from calibration.procedure import Evaluation, Measured, Procedure, Progress
 from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate, RefusalCode
+from rig.calibrations import CalibrationResult, Estimate, RejectionCode
 from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
 from rig.views.charuco_board import Board
 
@@ -174,10 +174,10 @@ def evaluate(
     span = span_deg(views)
     if len(views) < MIN_VIEWS or span < MIN_SPAN_DEG:
         values = {"found": len(views), "span_deg": span, "needed": MIN_VIEWS, "needed_deg": MIN_SPAN_DEG}
-        return found.refuse(RefusalCode.TOO_FEW_VIEWS, **values)
+        return found.reject(RejectionCode.TOO_FEW_VIEWS, **values)
     matrix, distortion = matrix_of(intrinsics)
     poses = [_pose(board, view, matrix, distortion) for view in views]
-    refuse_loose_board(found, views, poses)
+    reject_loose_board(found, views, poses)
     axis = _Axis(views, board, intrinsics, poses)
     found.estimates, found.residual = axis.fit()
     found.evidence |= {"board_centres_mm": axis.centres_mm.round(3).tolist(), "radius_mm": axis.radii_mm}
@@ -191,9 +191,9 @@ def evaluate(
     over = np.array([-low, high - size])  # left, top; right, bottom
     sides = {"left": over[0, 0], "top": over[0, 1], "right": over[1, 0], "bottom": over[1, 1]}
     found.evidence["cut_off"] = [f"{pixels} px at the {side}" for side, pixels in sides.items() if pixels > 0]
-    found.refuse_if(
+    found.reject_if(
         (over > MAX_CUT * (high - low)).any(),
-        RefusalCode.OBJECTS_CUT_OFF,
+        RejectionCode.OBJECTS_CUT_OFF,
         **{f"{side}_px": max(int(pixels), 0) for side, pixels in sides.items()},
         radius_mm=space.radius_mm,
         height_mm=space.height_mm,
@@ -367,30 +367,30 @@ def _from_lens(estimates: Mapping[str, Estimate]) -> float:
 
 
 def _check(found: Evaluation, board: Board, space: ObjectSpace) -> None:
-    """Refuse a poor fit, a wobbling axis, and a board whose size contradicts the measured distance."""
-    found.refuse_if(
-        (found.residual or 0.0) > MAX_RMS_PX, RefusalCode.CIRCLES_OFF, rms_px=found.residual, limit_px=MAX_RMS_PX
+    """Reject a poor fit, a wobbling axis, and a board whose size contradicts the measured distance."""
+    found.reject_if(
+        (found.residual or 0.0) > MAX_RMS_PX, RejectionCode.CIRCLES_OFF, rms_px=found.residual, limit_px=MAX_RMS_PX
     )
     uncertainty = max(found.estimates["px"].uncertainty, found.estimates["py"].uncertainty)
-    found.refuse_if(
+    found.reject_if(
         uncertainty > MAX_UNCERTAINTY_PX,
-        RefusalCode.AXIS_UNCERTAIN,
+        RejectionCode.AXIS_UNCERTAIN,
         uncertainty_px=uncertainty,
         limit_px=MAX_UNCERTAINTY_PX,
     )
     wobble = found.estimates["wobble"]
-    found.refuse_if(
+    found.reject_if(
         wobble.value - 2 * wobble.uncertainty > MAX_WOBBLE_DEG,
-        RefusalCode.AXIS_WOBBLES,
+        RejectionCode.AXIS_WOBBLES,
         wobble_deg=wobble.value,
         limit_deg=MAX_WOBBLE_DEG,
     )
     # Images alone do not determine lengths: only the measured distance shows a board of another size.
     if space.lens_mm is not None:
         lens_mm = _from_lens(found.estimates)
-        found.refuse_if(
+        found.reject_if(
             abs(lens_mm - space.lens_mm) > MAX_LENS_OFF * space.lens_mm,
-            RefusalCode.BOARD_SIZE_WRONG,
+            RejectionCode.BOARD_SIZE_WRONG,
             found_mm=lens_mm,
             lens_mm=space.lens_mm,
             true_square_mm=board.square_mm * space.lens_mm / lens_mm,

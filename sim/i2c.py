@@ -48,7 +48,7 @@ def acknowledging(
 ) -> I2cDevice | None:
     """Return the device that acknowledges ``address``; None while ``nacks`` are due or a condition holds."""
     device = devices.get(address)
-    silent = nacks or not getattr(device, "answers", True) or any(refuses(address) for refuses in nack_conditions)
+    silent = nacks or not getattr(device, "answers", True) or any(rejects(address) for rejects in nack_conditions)
     return None if silent else device
 
 

@@ -225,7 +225,7 @@ static void test_a_repeated_request_is_answered_but_not_done_twice(void) {
     board_close(board);
 }
 
-static void test_unknown_and_malformed_requests_are_refused(void) {
+static void test_unknown_and_malformed_requests_are_rejected(void) {
     power_up();
     CHECK(ask(0x00, "", 0) == REJECTION_UNKNOWN_REQUEST);
     CHECK(ask(0x7F, "", 0) == REJECTION_UNKNOWN_REQUEST);
@@ -253,7 +253,7 @@ int main(void) {
     test_silence_makes_the_bench_safe();
     test_estop_acts_within_a_millisecond();
     test_a_repeated_request_is_answered_but_not_done_twice();
-    test_unknown_and_malformed_requests_are_refused();
+    test_unknown_and_malformed_requests_are_rejected();
     test_a_program_that_hangs_is_restarted();
     printf("%u checks, all well\n", checks);
 }

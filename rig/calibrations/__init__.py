@@ -1,7 +1,7 @@
 """Calibration results of a bench: their files, and how they take effect."""
 
 from rig.calibrations.apply import apply_results
-from rig.calibrations.refusal import Refusal, RefusalCode
+from rig.calibrations.rejection import Rejection, RejectionCode
 from rig.calibrations.result import CalibrationResult, Estimate
 from rig.calibrations.store import CalibrationStanding, CalibrationStatus, CalibrationStore, apparatus
 
@@ -11,8 +11,8 @@ __all__ = [
     "CalibrationStatus",
     "CalibrationStore",
     "Estimate",
-    "Refusal",
-    "RefusalCode",
+    "Rejection",
+    "RejectionCode",
     "apparatus",
     "apply_results",
 ]

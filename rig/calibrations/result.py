@@ -9,16 +9,18 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
+    AliasChoices,
     AwareDatetime,
     BeforeValidator,
     ConfigDict,
+    Field,
     FiniteFloat,
     PositiveFloat,
     TypeAdapter,
     ValidationError,
 )
 
-from rig.calibrations.refusal import Refusal, stored_refusal
+from rig.calibrations.rejection import Rejection, stored_rejection
 from rig.core.errors import ConfigError, UsageError, os_errors_as
 from rig.core.files import read, write
 
@@ -53,7 +55,7 @@ class CalibrationResult:
         The quantities by name; empty if nothing could be estimated.
     residual, limit
         The worst residual of the fit and its limit, in ``residual_unit``.
-    refusals
+    rejections
         Why the estimates must not be used; empty if the calibration passed.
     settings
         The settings that the result applies, by key of the configuration.
@@ -69,7 +71,7 @@ class CalibrationResult:
     Raises
     ------
     ValueError
-        A result without refusals has no estimate, one with refusals has settings, or ``when_utc`` has no time zone.
+        A result without rejections has no estimate, one with rejections has settings, or ``when_utc`` has no time zone.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -79,7 +81,10 @@ class CalibrationResult:
     residual: FiniteFloat | None
     limit: FiniteFloat | None
     residual_unit: str
-    refusals: tuple[Annotated[Refusal, BeforeValidator(stored_refusal)], ...]
+    rejections: Annotated[
+        tuple[Annotated[Rejection, BeforeValidator(stored_rejection)], ...],
+        Field(validation_alias=AliasChoices("rejections", "refusals")),  # the name in earlier files
+    ]
     when_utc: AwareDatetime
     device: Mapping[str, Any]
     evidence: Mapping[str, Any]
@@ -98,7 +103,7 @@ class CalibrationResult:
 
     @property
     def passed(self) -> bool:
-        return not self.refusals
+        return not self.rejections
 
     @property
     def id(self) -> str:

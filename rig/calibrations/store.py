@@ -43,7 +43,7 @@ class CalibrationStanding:
         name, age = self.result.name, f"{self.result.name} was calibrated {self.age_days:.0f} days ago"
         match self.status:
             case CalibrationStatus.FAILED:
-                return f"{name} never passed: {self.result.refusals[0]}"
+                return f"{name} never passed: {self.result.rejections[0]}"
             case CalibrationStatus.OTHER_DEVICE:
                 return f"{name} was calibrated on another device: {'; '.join(self.changes)}"
             case CalibrationStatus.EXPIRED:

@@ -226,7 +226,7 @@ class Ax12Servo(SimulatedServoBase):
             case Instruction.WRITE if len(parameters) >= 2:
                 return self._write(parameters[0], parameters[1:]), b""
             case Instruction.REG_WRITE if len(parameters) >= 2:
-                if error := self._refusal(self.memory.entries(parameters[0], parameters[1:])):
+                if error := self._rejection(self.memory.entries(parameters[0], parameters[1:])):
                     return error, b""
                 self._registered = parameters[0], parameters[1:]
                 self.memory["Registered"] = 1
@@ -248,7 +248,7 @@ class Ax12Servo(SimulatedServoBase):
 
     def _write(self, address: int, data: bytes) -> int:
         entries = self.memory.entries(address, data)
-        if error := self._refusal(entries):
+        if error := self._rejection(entries):
             return error
         assert entries is not None
         for name, value in entries:
@@ -257,7 +257,7 @@ class Ax12Servo(SimulatedServoBase):
                 hook()
         return 0
 
-    def _refusal(self, entries: list[tuple[str, int]] | None) -> int:
+    def _rejection(self, entries: list[tuple[str, int]] | None) -> int:
         if entries is None:
             return Error.RANGE
         low, high = self.memory["CW Angle Limit"], self.memory["CCW Angle Limit"]

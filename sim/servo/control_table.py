@@ -19,7 +19,7 @@ _READ_ONLY = frozenset(
 )
 
 
-class Refusal(Exception):
+class Rejection(Exception):
     """The device rejects an instruction with an error."""
 
     def __init__(self, error: StatusError) -> None:
@@ -98,13 +98,13 @@ class Memory:
 
         Raises
         ------
-        Refusal
+        Rejection
             DATA_LENGTH for no bytes at all, ACCESS where the range leaves the table.
         """
         if size == 0:
-            raise Refusal(StatusError.DATA_LENGTH)
+            raise Rejection(StatusError.DATA_LENGTH)
         if address + size > self._size:
-            raise Refusal(StatusError.ACCESS)
+            raise Rejection(StatusError.ACCESS)
         data = bytes(self._image[address : address + size])
         if address + size > RAM_START and not self._indirect.keys().isdisjoint(range(address, address + size)):
             return bytes(self._image[self._resolve(a)] for a in range(address, address + size))
@@ -115,26 +115,26 @@ class Memory:
 
         Raises
         ------
-        Refusal
+        Rejection
             ACCESS for a register that is read only or no register at all, DATA_LENGTH for a part of a register,
             DATA_RANGE for a value outside its range.
         """
         if not data:
-            raise Refusal(StatusError.DATA_LENGTH)
+            raise Rejection(StatusError.DATA_LENGTH)
         targets = [self._resolve(address + i) for i in range(len(data))]
         entries = []
         i = 0
         while i < len(data):
             register = self._at.get(targets[i])
             if register is None:
-                raise Refusal(StatusError.DATA_LENGTH if self._within_register(targets[i]) else StatusError.ACCESS)
+                raise Rejection(StatusError.DATA_LENGTH if self._within_register(targets[i]) else StatusError.ACCESS)
             if register.name in _READ_ONLY:
-                raise Refusal(StatusError.ACCESS)
+                raise Rejection(StatusError.ACCESS)
             if targets[i : i + register.size] != list(range(register.address, register.address + register.size)):
-                raise Refusal(StatusError.DATA_LENGTH)
+                raise Rejection(StatusError.DATA_LENGTH)
             value = register.decode(data[i : i + register.size])
             if not self._takes(register, value):
-                raise Refusal(StatusError.DATA_RANGE)
+                raise Rejection(StatusError.DATA_RANGE)
             entries.append((register, value))
             i += register.size
         return entries

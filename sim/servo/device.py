@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from rig.devices.dynamixel.registers import Register
 from sim.servo.base import OVERLOAD_ERROR, SimulatedServoBase
-from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, Memory, Refusal
+from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, Memory, Rejection
 from sim.servo.controller import Controller
 from sim.servo.models import BAUD_RATES, COUNTS_PER_TURN, MODELS, POSITION_MODE
 from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, Status, StatusError
@@ -23,7 +23,7 @@ _CLEAR_MULTI_TURN = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 class XSeriesServo(SimulatedServoBase):
     """A servo whose horn is the table's shaft.
 
-    A block is written as a whole or, where one of its registers refuses, not at all. Writing an id, a baud rate or a
+    A block is written as a whole or, where one of its registers rejects, not at all. Writing an id, a baud rate or a
     delay is answered with the old one.
 
     Parameters
@@ -110,8 +110,8 @@ class XSeriesServo(SimulatedServoBase):
                 ping, read = packet.instruction == Instruction.PING, packet.instruction == Instruction.READ
                 answers = (mine and level >= 2 - read) or (ping and not in_group)
                 data = self._perform(packet, everyones, in_group)
-        except Refusal as refusal:
-            return self._status(refusal.error) if answers else None
+        except Rejection as rejection:
+            return self._status(rejection.error) if answers else None
         return self._status(StatusError.NONE, data) if answers else None
 
     def _perform(self, packet: InstructionPacket, everyones: bool, in_group: bool) -> bytes:
@@ -141,10 +141,10 @@ class XSeriesServo(SimulatedServoBase):
                 self._factory_reset(parameters[0], everyones)
             case Instruction.CLEAR if parameters == _CLEAR_MULTI_TURN:
                 if self.motor.state().speed_dps:
-                    raise Refusal(StatusError.RESULT_FAIL)
+                    raise Rejection(StatusError.RESULT_FAIL)
                 self._controller.wrap_position()
             case _:
-                raise Refusal(StatusError.INSTRUCTION)
+                raise Rejection(StatusError.INSTRUCTION)
         return b""
 
     def _status(self, error: StatusError, data: bytes = b"") -> Status:
@@ -171,12 +171,12 @@ class XSeriesServo(SimulatedServoBase):
         tripped = self.memory["Bus Watchdog"] == WATCHDOG_TRIPPED
         for register, value in entries:
             if register.address < RAM_START and locked:
-                raise Refusal(StatusError.ACCESS)
+                raise Rejection(StatusError.ACCESS)
             if tripped and (register.name in _GOALS or (register.name == "Bus Watchdog" and value)):
-                raise Refusal(StatusError.DATA_RANGE)
+                raise Rejection(StatusError.DATA_RANGE)
             low, high = self._limits(register.name, value)
             if not low <= value <= high:
-                raise Refusal(StatusError.DATA_LIMIT)
+                raise Rejection(StatusError.DATA_LIMIT)
 
     def _limits(self, name: str, value: int) -> tuple[int, int]:
         """Return the limits of ``name`` from other registers; ``value`` itself if there are none."""

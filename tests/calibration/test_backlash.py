@@ -1,4 +1,4 @@
-"""The backlash of the gears: true within its uncertainty; other errors are refused."""
+"""The backlash of the gears: true within its uncertainty; other errors are rejected."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,11 @@ import pytest
 from calibration.backlash import Backlash, evaluate
 from calibration.legs import Leg
 from calibration.procedure import Evaluation
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Moved
 from sim.noise import NoiseModel
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 COUNT_DEG = 360 / 4096
 
@@ -53,7 +53,7 @@ def test_simulated_backlash_is_found_to_hundredths_of_a_degree(simulated):
     for seed, backlash_deg in enumerate([0.0, 0.1, 0.45, 1.2]):
         s = simulated("table.limits_deg=[-200, 200]", noise=NoiseModel(backlash_deg=backlash_deg), seed=seed)
         result = run(s)
-        assert result.passed, result.refusals
+        assert result.passed, result.rejections
         assert result.estimates["backlash"].value == pytest.approx(backlash_deg, abs=0.04)
         assert result.estimates["backlash"].uncertainty < 0.03
         assert result.settings["table.backlash_deg"] >= result.estimates["backlash"].value
@@ -64,33 +64,33 @@ def test_simulated_backlash_is_found_to_hundredths_of_a_degree(simulated):
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        (lambda leg: Leg(leg.encoder_deg, -leg.gyro_deg, leg.sigma_deg), RefusalCode.WRONG_DIRECTION),
-        (lambda leg: Leg(leg.encoder_deg, leg.gyro_deg / 3, leg.sigma_deg), RefusalCode.WRONG_GEAR_RATIO),
+        (lambda leg: Leg(leg.encoder_deg, -leg.gyro_deg, leg.sigma_deg), RejectionCode.WRONG_DIRECTION),
+        (lambda leg: Leg(leg.encoder_deg, leg.gyro_deg / 3, leg.sigma_deg), RejectionCode.WRONG_GEAR_RATIO),
         (
             lambda leg: Leg(leg.encoder_deg, leg.gyro_deg - np.sign(leg.encoder_deg) * 4, leg.sigma_deg),
-            RefusalCode.BACKLASH_TOO_LARGE,
+            RejectionCode.BACKLASH_TOO_LARGE,
         ),
         (
             lambda leg: Leg(leg.encoder_deg, leg.gyro_deg + np.sign(leg.encoder_deg), leg.sigma_deg),
-            RefusalCode.BACKLASH_NEGATIVE,
+            RejectionCode.BACKLASH_NEGATIVE,
         ),
-        (lambda leg: Leg(leg.encoder_deg, leg.gyro_deg, 0.3), RefusalCode.BACKLASH_UNCERTAIN),
+        (lambda leg: Leg(leg.encoder_deg, leg.gyro_deg, 0.3), RejectionCode.BACKLASH_UNCERTAIN),
         (
             lambda leg: Leg(leg.encoder_deg, leg.gyro_deg, leg.sigma_deg, "the sensor lost 3 samples"),
-            RefusalCode.TOO_FEW_REVERSALS,
+            RejectionCode.TOO_FEW_REVERSALS,
         ),
     ],
 )
-def test_wrong_legs_are_refused(change, code):
+def test_wrong_legs_are_rejected(change, code):
     result = fit([change(leg) for leg in drawn(np.random.default_rng(2))])
     assert code in codes(result)
     assert not result.settings
 
 
-def test_slipping_platter_is_refused(simulated):
+def test_slipping_platter_is_rejected(simulated):
     s = simulated(seed=3)
     result = run(s, during={9: lambda: s.world.slip(0.8, 0.2)})
-    assert RefusalCode.LEG_SLIPPED in codes(result)
+    assert RejectionCode.LEG_SLIPPED in codes(result)
 
 
 def test_short_cable_and_too_few_reversals_are_rejected_before_moving(simulated):

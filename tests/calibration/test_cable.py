@@ -4,8 +4,8 @@ import pytest
 
 from calibration.cable import MARGIN_DEG, Cable, evaluate
 from calibration.procedure import Ask
-from rig.calibrations import RefusalCode, apply_results
-from tests.calibration.refused import codes
+from rig.calibrations import RejectionCode, apply_results
+from tests.calibration.rejected import codes
 
 
 def hand(s, angle_deg: float) -> None:
@@ -22,7 +22,7 @@ def test_ends_shown_by_hand_become_the_limits(simulated):
             hand(s, next(turns))
         else:
             result = event
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     low, high = result.settings["table.limits_deg"]
     assert high == pytest.approx(500 - MARGIN_DEG, abs=2)
     assert low == pytest.approx(-600 + MARGIN_DEG, abs=2)
@@ -33,12 +33,12 @@ def test_ends_shown_by_hand_become_the_limits(simulated):
 @pytest.mark.parametrize(
     ("high", "low", "pan", "code"),
     [
-        (-200.0, 200.0, False, RefusalCode.CABLE_ENDS_SWAPPED),
-        (150.0, -150.0, False, RefusalCode.CABLE_TOO_SHORT),
-        (900.0, 60.0, False, RefusalCode.HOME_OUTSIDE_CABLE),
+        (-200.0, 200.0, False, RejectionCode.CABLE_ENDS_SWAPPED),
+        (150.0, -150.0, False, RejectionCode.CABLE_TOO_SHORT),
+        (900.0, 60.0, False, RejectionCode.HOME_OUTSIDE_CABLE),
     ],
 )
-def test_impossible_ends_are_refused(high, low, pan, code):
+def test_impossible_ends_are_rejected(high, low, pan, code):
     result = evaluate(high, low, pan=pan)
     assert codes(result) == [code]
     assert not result.settings

@@ -1,4 +1,4 @@
-"""The camera's noise, flat field, drift and sharpness: found, or refused."""
+"""The camera's noise, flat field, drift and sharpness: found, or rejected."""
 
 from dataclasses import replace
 
@@ -9,11 +9,11 @@ import pytest
 from calibration import camera_light
 from calibration.camera_light import CardFrames, drift, flat_field, photon_transfer, sharpness
 from calibration.procedure import Ask
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.devices.camera import CameraLocks
 from sim.noise import NoiseModel, from_calibration
 from sim.sensor import Sensor
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 LOCKS = CameraLocks(10_000.0, 1.0, 5000.0, auto_exposure=False, auto_white_balance=False)
 EVEN = (1.0, 1.0, 1.0)
@@ -44,7 +44,7 @@ def test_full_well_and_read_noise_lie_within_the_stated_uncertainty(seed):
     rng = np.random.default_rng(seed)
     true = NoiseModel(full_well_e=float(rng.uniform(3e3, 2e4)), read_noise_e=float(rng.uniform(8, 40)))
     result = photon_transfer(frames(true, seed=seed))
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     for name, value in (("full_well_e", true.full_well_e), ("read_noise_e", true.read_noise_e)):
         estimate = result.estimates[name]
         assert abs(estimate.value - value) < 4 * estimate.uncertainty, name
@@ -56,17 +56,17 @@ def test_full_well_and_read_noise_lie_within_the_stated_uncertainty(seed):
     [(CARD, 1.0), (SCENE, 0.03), (SCENE, 0.0), (np.where(SCENE > 100, 255, 0).astype(np.uint8), 4.0)],
     ids=["no span", "dark", "black", "saturated"],
 )
-def test_scene_with_low_contrast_is_refused(scene, exposure):
+def test_scene_with_low_contrast_is_rejected(scene, exposure):
     result = photon_transfer(frames(NoiseModel(), scene, n=4, exposure=exposure))
-    assert codes(result) == [RefusalCode.CONTRAST_TOO_LOW]
+    assert codes(result) == [RejectionCode.CONTRAST_TOO_LOW]
     assert not result.estimates
 
 
-def test_processed_frames_are_refused():
+def test_processed_frames_are_rejected():
     plain = frames(NoiseModel(full_well_e=0.0, read_noise_e=0.0), n=6).astype(np.int16)
     falling = np.random.default_rng(0).normal(0, 1, plain.shape) * (260 - plain) / 40
     result = photon_transfer(np.clip(plain + falling, 0, 255).astype(np.uint8))
-    assert codes(result) == [RefusalCode.NOISE_INDEPENDENT_OF_LIGHT]
+    assert codes(result) == [RejectionCode.NOISE_INDEPENDENT_OF_LIGHT]
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.12, 0.35])
@@ -76,7 +76,7 @@ def test_vignetting_is_found_beside_a_light_gradient(loss):
     light = 1 + 0.05 * x - loss * (x**2 + y**2) / (1 + (239.5 / 319.5) ** 2)
     blocks = (170 * light).reshape(30, 16, 40, 16).mean(axis=(1, 3))
     result = flat_field(card(mean=blocks + np.random.default_rng(3).normal(0, 0.2, blocks.shape)))
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     for name, value in (("vignetting", loss), ("gradient_x", 0.05), ("gradient_y", 0.0)):
         estimate = result.estimates[name]
         assert abs(estimate.value - value) < 4 * estimate.uncertainty, name
@@ -91,25 +91,25 @@ def _half_filled() -> np.ndarray:
 @pytest.mark.parametrize(
     ("mean", "code"),
     [
-        (_half_filled(), RefusalCode.CARD_UNEVEN),
-        (np.full((30, 40), 3.0), RefusalCode.CARD_EXPOSURE),
-        (np.full((30, 40), 255.0), RefusalCode.CARD_EXPOSURE),
-        (np.full((30, 40), 0.0), RefusalCode.CARD_EXPOSURE),
+        (_half_filled(), RejectionCode.CARD_UNEVEN),
+        (np.full((30, 40), 3.0), RejectionCode.CARD_EXPOSURE),
+        (np.full((30, 40), 255.0), RejectionCode.CARD_EXPOSURE),
+        (np.full((30, 40), 0.0), RejectionCode.CARD_EXPOSURE),
         (
             170 * (1 - 0.7 * sum(g**2 for g in np.mgrid[-0.75:0.75:30j, -1:1:40j]) / 1.5625),
-            RefusalCode.VIGNETTING_TOO_LARGE,
+            RejectionCode.VIGNETTING_TOO_LARGE,
         ),
     ],
     ids=["half filled", "dark", "saturated", "black", "vignetted"],
 )
-def test_wrong_card_is_refused(mean, code):
+def test_wrong_card_is_rejected(mean, code):
     result = flat_field(card(mean=mean))
     assert code in codes(result)
 
 
 def test_steady_light_passes_with_its_flicker():
     result = drift(card(), LOCKS, LOCKS)
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     flicker = result.estimates["flicker"]
     assert abs(flicker.value - 0.004) < 4 * flicker.uncertainty
     assert abs(result.estimates["drift"].value) < 4 * result.estimates["drift"].uncertainty
@@ -118,24 +118,24 @@ def test_steady_light_passes_with_its_flicker():
 @pytest.mark.parametrize(
     ("frames", "after", "code"),
     [
-        (card(slope=1.0), LOCKS, RefusalCode.LIGHT_DRIFTED),
-        (card(slope=-1.0), LOCKS, RefusalCode.LIGHT_DRIFTED),
-        (card(flicker=0.05), LOCKS, RefusalCode.LIGHT_FLICKERS),
-        (card((130.0, 170.0, 175.0)), LOCKS, RefusalCode.COLOUR_CAST),
-        (card((0.0, 0.0, 0.0)), LOCKS, RefusalCode.CARD_BLACK),
-        (card(), replace(LOCKS, exposure_us=8000.0), RefusalCode.LOCKS_CHANGED),
+        (card(slope=1.0), LOCKS, RejectionCode.LIGHT_DRIFTED),
+        (card(slope=-1.0), LOCKS, RejectionCode.LIGHT_DRIFTED),
+        (card(flicker=0.05), LOCKS, RejectionCode.LIGHT_FLICKERS),
+        (card((130.0, 170.0, 175.0)), LOCKS, RejectionCode.COLOUR_CAST),
+        (card((0.0, 0.0, 0.0)), LOCKS, RejectionCode.CARD_BLACK),
+        (card(), replace(LOCKS, exposure_us=8000.0), RejectionCode.LOCKS_CHANGED),
     ],
     ids=["brighter", "darker", "flicker", "colour cast", "black", "locks"],
 )
-def test_unstable_light_and_settings_are_refused(frames, after, code):
+def test_unstable_light_and_settings_are_rejected(frames, after, code):
     result = drift(frames, LOCKS, after)
     assert code in codes(result)
     assert not result.settings
 
 
-def test_lens_out_of_focus_is_refused():
+def test_lens_out_of_focus_is_rejected():
     assert sharpness([400.0, 410.0, 390.0]).passed
-    assert codes(sharpness([4.0, 4.1, 3.9])) == [RefusalCode.NOT_SHARP]
+    assert codes(sharpness([4.0, 4.1, 3.9])) == [RejectionCode.NOT_SHARP]
 
 
 def test_simulated_camera_is_found(simulated, monkeypatch):
@@ -151,7 +151,7 @@ def test_simulated_camera_is_found(simulated, monkeypatch):
         "camera.flat_field",
         "camera.drift",
     ]
-    assert all(result.passed for result in results), [result.refusals for result in results]
+    assert all(result.passed for result in results), [result.rejections for result in results]
     found = from_calibration(results)
     assert found.full_well_e == pytest.approx(true.full_well_e, rel=0.1)
     assert found.read_noise_e == pytest.approx(true.read_noise_e, rel=0.1)

@@ -72,12 +72,12 @@ def test_json_is_one_object_per_line_and_ends_with_the_result(rig, monkeypatch):
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert {event["event"] for event in events} == {"moved", "progress", "calibrated"}
     scale, noise = [event for event in events if event["event"] == "calibrated"]
-    assert (scale["passed"], scale["refusals"]) == (True, [])
+    assert (scale["passed"], scale["rejections"]) == (True, [])
     assert scale["estimates"]["scale"]["uncertainty"] < 1.5e-4
     assert noise == events[-1]
 
 
-def test_refused_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, imu_calibration):
+def test_rejected_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, imu_calibration):
     copytree(imu_calibration[0], tmp_path / "calibrations")
     done = rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
     assert done.exit_code == 6
@@ -134,10 +134,10 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
     monkeypatch.setattr(camera_light, "PAIRS", 12)
     monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::2])
     monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
-    refused = rig("calibrate", "table")
-    assert refused.exit_code == 2
-    assert "camera.intrinsics is not calibrated" in refused.stderr
-    assert "rig calibrate camera" in " ".join(refused.stderr.split())
+    rejected = rig("calibrate", "table")
+    assert rejected.exit_code == 2
+    assert "camera.intrinsics is not calibrated" in rejected.stderr
+    assert "rig calibrate camera" in " ".join(rejected.stderr.split())
     done = rig("calibrate", "all", "--minutes", "3")
     assert done.exit_code == 0, done.output
     assert "[O] camera" in done.stderr, "a picture of the request"
@@ -199,7 +199,7 @@ def store(tmp_path, days: float, **device: str) -> None:
             residual=None,
             limit=None,
             residual_unit="°",
-            refusals=(),
+            rejections=(),
             when_utc=SystemClock().utc() - timedelta(days=days),
             valid_days=30.0,
             device=device,

@@ -1,4 +1,4 @@
-"""The encoder's error over its revolution: true within its uncertainty, applied, and wrong steps refused."""
+"""The encoder's error over its revolution: true within its uncertainty, applied, and wrong steps rejected."""
 
 import numpy as np
 import pytest
@@ -7,11 +7,11 @@ from calibration.encoder import Encoder, Step, evaluate
 from calibration.legs import Leg
 from calibration.procedure import Evaluation
 from rig.bench import calibrate
-from rig.calibrations import CalibrationStore, RefusalCode
+from rig.calibrations import CalibrationStore, RejectionCode
 from rig.core.errors import LimitExceeded, UsageError
 from rig.motion.turntable import Turntable
 from sim.noise import NoiseModel
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 COUNT_DEG = 360 / 4096
 NAMES = ("cos1", "sin1", "cos2", "sin2")
@@ -63,7 +63,7 @@ def test_applied_result_corrects_the_table_angle(simulated, tmp_path):
 
     before = np.ptp(errors())
     *_, result = Encoder().live(s.bench)
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     CalibrationStore(tmp_path).add(result)
     calibrate(s.bench, CalibrationStore(tmp_path))
     after = np.ptp(errors())
@@ -80,23 +80,23 @@ def test_applied_result_corrects_the_table_angle(simulated, tmp_path):
     [
         (
             lambda step: Step(step.from_deg, step.to_deg, Leg(step.leg.encoder_deg, step.leg.gyro_deg, 0.5)),
-            RefusalCode.ENCODER_UNCERTAIN,
+            RejectionCode.ENCODER_UNCERTAIN,
         ),
         (
             lambda step: Step(step.from_deg, step.to_deg, Leg(step.leg.encoder_deg, 30.0, 0.01, "lost 3 samples")),
-            RefusalCode.TOO_FEW_STEPS,
+            RejectionCode.TOO_FEW_STEPS,
         ),
     ],
 )
-def test_noisy_and_invalid_steps_are_refused(change, code):
+def test_noisy_and_invalid_steps_are_rejected(change, code):
     result = fit([change(step) for step in drawn(np.random.default_rng(3), (0.1, 0.1, 0.0, 0.0))])
     assert code in codes(result)
     assert not result.settings
 
 
-def test_excessive_error_and_slip_are_refused():
+def test_excessive_error_and_slip_are_rejected():
     far = fit(drawn(np.random.default_rng(4), (3.0, 0.0, 0.0, 0.0)))
-    assert RefusalCode.ENCODER_ERROR_TOO_LARGE in codes(far)
+    assert RejectionCode.ENCODER_ERROR_TOO_LARGE in codes(far)
     steps = drawn(np.random.default_rng(5), (0.1, 0.0, 0.0, 0.0))
     slipped = steps[7]
     steps[7] = Step(
@@ -104,8 +104,8 @@ def test_excessive_error_and_slip_are_refused():
         slipped.to_deg,
         Leg(slipped.leg.encoder_deg, slipped.leg.gyro_deg + 1.0, slipped.leg.sigma_deg),
     )
-    refusal = fit(steps).refusals[0]
-    assert (refusal.code, refusal.values["leg"]) == (RefusalCode.LEG_SLIPPED, 8)
+    rejection = fit(steps).rejections[0]
+    assert (rejection.code, rejection.values["leg"]) == (RejectionCode.LEG_SLIPPED, 8)
 
 
 def test_short_cable_and_zero_revolutions_are_rejected_before_moving(simulated):

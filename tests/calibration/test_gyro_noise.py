@@ -1,4 +1,4 @@
-"""The gyro at rest: Allan deviation, noise and slope are true within their uncertainty; disturbances are refused."""
+"""The gyro at rest: Allan deviation, noise and slope are true within their uncertainty; disturbances are rejected."""
 
 from math import sqrt
 
@@ -7,9 +7,9 @@ import pytest
 
 from calibration.gyro_noise import GyroNoise, RestRecord, allan, evaluate
 from calibration.procedure import Evaluation
-from rig.calibrations import RefusalCode
+from rig.calibrations import RejectionCode
 from rig.core.errors import UsageError
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 ARW, WALK, SLOPE = 0.0035, 0.0003, 0.02
 
@@ -52,15 +52,15 @@ def test_constant_temperature_yields_no_slope():
     assert "angle_random_walk" in result.estimates
 
 
-def test_bump_lost_samples_and_shaking_bench_are_refused():
+def test_bump_lost_samples_and_shaking_bench_are_rejected():
     rest = drawn(np.random.default_rng(4))
     bumped = rest.gyro_dps.copy()
     bumped[600] += 0.3
-    (jump,) = fit(RestRecord(bumped, rest.temperature_c, 1.0)).refusals
-    assert (jump.code, jump.values["at_s"]) == (RefusalCode.RATE_JUMPED, 600)
-    assert codes(fit(RestRecord(rest.gyro_dps, rest.temperature_c, 1.0, lost=7))) == [RefusalCode.SAMPLES_LOST]
+    (jump,) = fit(RestRecord(bumped, rest.temperature_c, 1.0)).rejections
+    assert (jump.code, jump.values["at_s"]) == (RejectionCode.RATE_JUMPED, 600)
+    assert codes(fit(RestRecord(rest.gyro_dps, rest.temperature_c, 1.0, lost=7))) == [RejectionCode.SAMPLES_LOST]
     shaken = rest.gyro_dps + 0.05 * np.random.default_rng(5).standard_normal(rest.gyro_dps.shape)
-    assert RefusalCode.GYRO_NOISY in codes(fit(RestRecord(shaken, rest.temperature_c, 1.0)))
+    assert RejectionCode.GYRO_NOISY in codes(fit(RestRecord(shaken, rest.temperature_c, 1.0)))
 
 
 def test_simulated_noise_is_found(simulated):
@@ -68,7 +68,7 @@ def test_simulated_noise_is_found(simulated):
     *progress, result = GyroNoise(minutes=6).live(s.bench)
     assert [p.share for p in progress] == sorted(p.share for p in progress)
     assert progress[-1].share == 1.0
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     noise = s.world.noise
     for name, true in (
         ("angle_random_walk", noise.gyro_noise_dps_rthz / sqrt(2)),

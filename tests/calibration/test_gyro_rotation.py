@@ -6,10 +6,10 @@ import pytest
 from calibration.gyro_rotation import SPEEDS, GyroRotation, TimedLeg, evaluate
 from calibration.legs import Leg
 from calibration.procedure import Evaluation
-from rig.calibrations import RefusalCode
+from rig.calibrations import RejectionCode
 from rig.core.errors import LimitExceeded, UsageError
 from sim.noise import NoiseModel
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 
 def moves(
@@ -42,39 +42,39 @@ def test_true_sigma_passes_and_its_ratio_covers_one():
     assert 0.85 < np.mean(np.abs(z) < 1.96) <= 1.0
 
 
-def test_too_much_and_too_little_scatter_are_refused():
+def test_too_much_and_too_little_scatter_are_rejected():
     for seed in range(20):
-        assert codes(evaluated(moves(seed, true=2.5)))[0] is RefusalCode.SCATTER_TOO_LARGE
-        assert codes(evaluated(moves(seed, true=0.1)))[0] is RefusalCode.SCATTER_TOO_SMALL
+        assert codes(evaluated(moves(seed, true=2.5)))[0] is RejectionCode.SCATTER_TOO_LARGE
+        assert codes(evaluated(moves(seed, true=0.1)))[0] is RejectionCode.SCATTER_TOO_SMALL
 
 
-def test_refusal_names_the_speed_that_shakes_the_bench():
+def test_rejection_names_the_speed_that_shakes_the_bench():
     some = [m if m.speed != "medium" else shaken for m, shaken in zip(moves(0), moves(0, true=4.0), strict=True)]
-    (refusal,) = evaluated(some).refusals
-    assert refusal.values["speed"] == "medium"
+    (rejection,) = evaluated(some).rejections
+    assert rejection.values["speed"] == "medium"
 
 
-def test_lost_samples_are_refused():
+def test_lost_samples_are_rejected():
     result = evaluated(moves(0, invalid="samples were lost"))
-    assert result.refusals[0].code is RefusalCode.TOO_FEW_MOVES
-    assert "samples were lost" in str(result.refusals[0])
+    assert result.rejections[0].code is RejectionCode.TOO_FEW_MOVES
+    assert "samples were lost" in str(result.rejections[0])
     assert not result.estimates
 
 
 def test_simulated_sigma_is_true(simulated):
     s = simulated(seed=3)
     *_, result = GyroRotation(repeats=4).live(s.bench)
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     by_duration = result.evidence["by_duration"]
     assert [row["stated_deg"] for row in by_duration] == sorted(row["stated_deg"] for row in by_duration)
     assert by_duration[-1]["seconds"] > 5 * by_duration[0]["seconds"]
 
 
-def test_noisy_encoder_is_refused(simulated):
+def test_noisy_encoder_is_rejected(simulated):
     s = simulated(noise=NoiseModel(encoder_noise_deg=0.25), seed=3)
     speed_before = s.bench.config.table.velocity_dps
     *_, result = GyroRotation(repeats=4).live(s.bench)
-    assert RefusalCode.SCATTER_TOO_LARGE in codes(result)
+    assert RejectionCode.SCATTER_TOO_LARGE in codes(result)
     assert s.bench.config.table.velocity_dps == speed_before
 
 

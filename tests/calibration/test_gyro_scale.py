@@ -1,4 +1,4 @@
-"""The gyro's scale: true within its uncertainty, or refused."""
+"""The gyro's scale: true within its uncertainty, or rejected."""
 
 from math import sqrt
 
@@ -8,13 +8,13 @@ import pytest
 from calibration.gyro_scale import GyroScale, evaluate
 from calibration.legs import Leg
 from calibration.procedure import Evaluation
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.core.errors import DeviceSilent, LimitExceeded, UsageError
 from rig.events.events import Moved
 from rig.motion.turntable import Turntable
 from sim.imu.inertial import InertialModel
 from sim.world import World
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 COUNT_DEG = 360 / 4096
 SLIP_DELAY_NS = 4_000_000_000
@@ -61,7 +61,7 @@ def test_true_scale_lies_within_the_stated_uncertainty(simulated, benches):
     for seed in range(benches):
         s = simulated(seed=seed)
         result = run(s)
-        assert result.passed, result.refusals
+        assert result.passed, result.rejections
         assert result.estimates["scale"].value == pytest.approx(true_scale(seed), rel=0.001)
         assert result.residual < result.limit
         assert result.estimates["scale"].uncertainty < 1.5e-4
@@ -92,7 +92,7 @@ def test_scatter_beyond_the_stated_noise_widens_the_uncertainty():
     assert 0.8 < np.std(z) < 1.25
 
 
-def test_slow_bias_drift_cancels_and_strong_drift_is_refused():
+def test_slow_bias_drift_cancels_and_strong_drift_is_rejected():
     rng = np.random.default_rng(2)
 
     def drifting(by_deg: float) -> Evaluation:
@@ -103,20 +103,20 @@ def test_slow_bias_drift_cancels_and_strong_drift_is_refused():
     assert mild.estimates["scale"].value == pytest.approx(1.02, abs=3 * mild.estimates["scale"].uncertainty)
     strong = drifting(0.3)
     assert not strong.passed
-    assert RefusalCode.DIRECTIONS_DIFFER in codes(strong)
+    assert RejectionCode.DIRECTIONS_DIFFER in codes(strong)
 
 
 @pytest.mark.parametrize(("slip_deg", "leg"), [(0.6, 1), (-0.6, 2), (6.0, 3)])
-def test_slipping_platter_is_refused(simulated, slip_deg, leg):
+def test_slipping_platter_is_rejected(simulated, slip_deg, leg):
     s = simulated(seed=3)
     result = run(s, during={leg: lambda: s.world.slip(slip_deg, 0.2)})
     assert not result.passed
-    assert (result.refusals[0].code, result.refusals[0].values["leg"]) == (RefusalCode.LEG_SLIPPED, leg)
+    assert (result.rejections[0].code, result.rejections[0].values["leg"]) == (RejectionCode.LEG_SLIPPED, leg)
     assert result.residual > result.limit
     assert not result.settings
 
 
-def test_saturated_gyro_is_refused_without_estimates(simulated):
+def test_saturated_gyro_is_rejected_without_estimates(simulated):
     s = simulated(seed=3)
 
     def whirl():
@@ -125,32 +125,32 @@ def test_saturated_gyro_is_refused_without_estimates(simulated):
 
     result = run(s, during=dict.fromkeys(range(1, 5), whirl))
     assert "scale" not in result.estimates
-    assert codes(result) == [RefusalCode.TOO_FEW_REVOLUTIONS]
-    assert "exceeded the gyro's range" in str(result.refusals[0])
+    assert codes(result) == [RejectionCode.TOO_FEW_REVOLUTIONS]
+    assert "exceeded the gyro's range" in str(result.rejections[0])
 
 
-def test_one_lost_leg_is_left_out_and_too_few_legs_are_refused():
+def test_one_lost_leg_is_left_out_and_too_few_legs_are_rejected():
     legs = drawn(np.random.default_rng(4), 1.01, legs=6)
     spoiled = [Leg(legs[0].encoder_deg, 17.0, 0.03, "the sensor lost 9 samples"), *legs[1:]]
     assert fit(spoiled).passed
     assert fit(spoiled).estimates["scale"].value == pytest.approx(1.01, abs=2e-4)
     few = fit(spoiled[:4])
-    (refusal,) = few.refusals
-    assert (refusal.values["up"], refusal.values["down"]) == (1, 2)
-    assert "lost 9 samples" in str(refusal)
+    (rejection,) = few.rejections
+    assert (rejection.values["up"], rejection.values["down"]) == (1, 2)
+    assert "lost 9 samples" in str(rejection)
     assert not fit([]).passed
 
 
 @pytest.mark.parametrize("ratio", [0.0, -1.0, 0.5, 2.0])
-def test_wrong_axis_sign_range_or_gear_is_refused(ratio):
+def test_wrong_axis_sign_range_or_gear_is_rejected(ratio):
     result = fit([Leg(e, ratio * e, 0.03) for e in (360.0, -360.0) * 2])
     assert "scale" not in result.estimates
-    assert codes(result) == [RefusalCode.GYRO_IMPLAUSIBLE]
+    assert codes(result) == [RejectionCode.GYRO_IMPLAUSIBLE]
 
 
-def test_noisy_gyro_is_refused():
+def test_noisy_gyro_is_rejected():
     result = fit([Leg(e, e, 1.0) for e in (360.0, -360.0) * 2])
-    assert codes(result) == [RefusalCode.SCALE_UNCERTAIN]
+    assert codes(result) == [RejectionCode.SCALE_UNCERTAIN]
 
 
 def test_short_cable_is_rejected_before_moving(simulated):

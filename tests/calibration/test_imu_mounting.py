@@ -7,9 +7,9 @@ import pytest
 
 from calibration.imu_mounting import GravityReading, ImuMounting, RecordedMove, evaluate
 from calibration.procedure import Evaluation
-from rig.calibrations import RefusalCode
+from rig.calibrations import RejectionCode
 from rig.core.errors import LimitExceeded
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 AXIS = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
 
@@ -54,7 +54,7 @@ def test_simulated_sensor_lies_within_the_stated_uncertainty(simulated):
     for seed in range(5):
         s = simulated(seed=seed)
         *_, result = ImuMounting().live(s.bench)
-        assert result.passed, result.refusals
+        assert result.passed, result.rejections
         part, found = s.operator.devices.imu.inertial, result.estimates
         for i, name in enumerate("xyz"):
             z.append(
@@ -78,16 +78,16 @@ def test_simulated_sensor_lies_within_the_stated_uncertainty(simulated):
         ((-1.0, 0.0, 0.05), 'imu.axis = "x" and imu.sign = -1'),
     ],
 )
-def test_wrong_mounting_is_refused(axis, expected):
+def test_wrong_mounting_is_rejected(axis, expected):
     axis = np.array(axis) / np.linalg.norm(axis)
-    (refusal,) = fit(*measured(axis)).refusals
-    assert expected in str(refusal)
+    (rejection,) = fit(*measured(axis)).rejections
+    assert expected in str(rejection)
 
 
-def test_slanting_table_and_lost_samples_are_refused():
+def test_slanting_table_and_lost_samples_are_rejected():
     moves, levels = measured(table_axis_deg=(7.0, 0.0))
-    assert codes(fit(moves, levels)) == [RefusalCode.NOT_LEVEL]
-    assert codes(fit(moves[:3], levels)) == [RefusalCode.TOO_FEW_RECORDED_MOVES]
+    assert codes(fit(moves, levels)) == [RejectionCode.NOT_LEVEL]
+    assert codes(fit(moves[:3], levels)) == [RejectionCode.TOO_FEW_RECORDED_MOVES]
 
 
 def test_short_cable_is_rejected_before_moving(simulated):

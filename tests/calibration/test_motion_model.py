@@ -1,4 +1,4 @@
-"""The duration of rotations: true within its uncertainty, predicts new rotations, and refuses a hindered one."""
+"""The duration of rotations: true within its uncertainty, predicts new rotations, and rejects a hindered one."""
 
 from dataclasses import replace
 
@@ -7,11 +7,11 @@ import pytest
 
 from calibration.motion_model import DISTANCES_DEG, MotionModel, TimedMove, evaluate, predicted_s
 from calibration.procedure import Evaluation
-from rig.calibrations import RefusalCode
+from rig.calibrations import RejectionCode
 from rig.core.errors import UsageError
 from rig.devices.servo import MotionProfile
 from rig.motion.turntable import Turntable
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 
 def drawn(rng: np.random.Generator, pace: float, wind_up: float, delay: float) -> list[TimedMove]:
@@ -45,7 +45,7 @@ def test_true_values_lie_within_the_stated_uncertainty():
 def test_new_rotations_are_predicted(simulated):
     s = simulated("table.velocity_dps=60", "table.acceleration_dps2=150", seed=4)
     *_, result = MotionModel().live(s.bench)
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     assert result.estimates["pace"].value == pytest.approx(1 / 60, rel=0.05)
     assert s.bench.config.table.approach_deg == 3.0
     with Turntable(s.bench) as table:
@@ -55,11 +55,11 @@ def test_new_rotations_are_predicted(simulated):
             assert table.goto(goal_deg).seconds == pytest.approx(predicted_s(result, distance_deg), abs=0.25)
 
 
-def test_hindered_rotation_is_refused():
+def test_hindered_rotation_is_rejected():
     moves = drawn(np.random.default_rng(2), 0.012, 0.3, 0.4)
     moves[5] = replace(moves[5], seconds=moves[5].seconds + 1.0)
     result = fit(moves)
-    assert codes(result) == [RefusalCode.MOVE_HINDERED]
+    assert codes(result) == [RejectionCode.MOVE_HINDERED]
     assert not result.settings
     # One bad rotation does not change the fit.
     assert result.estimates["pace"].value == pytest.approx(0.012, rel=0.05)

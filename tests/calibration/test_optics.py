@@ -1,4 +1,4 @@
-"""The camera and the table's axis from a board on the table: found, or refused."""
+"""The camera and the table's axis from a board on the table: found, or rejected."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -12,11 +12,11 @@ from calibration import camera_model, table_axis
 from calibration.board_views import STANDS, BoardView
 from calibration.procedure import Evaluation
 from calibration.table_axis import ObjectSpace
-from rig.calibrations import CalibrationResult, RefusalCode
+from rig.calibrations import CalibrationResult, RejectionCode
 from rig.views.charuco_board import Board
 from sim.calibration_board import boards
 from tests.calibration.board_bench import blurred, optics, seen
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 WHEN = datetime(2026, 3, 1, tzinfo=UTC)
 ALL = tuple(STANDS)
@@ -38,7 +38,7 @@ def calibrated(seed: int) -> CalibrationResult:
 @pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.nightly)])
 def test_true_camera_lies_within_the_stated_uncertainty(seed):
     result, true = calibrated(seed), optics(seed)
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     truth = [*true.focal_px, *true.centre_px, *true.distortion[:4]]
     z = [
         (result.estimates[name].value - value) / result.estimates[name].uncertainty
@@ -54,7 +54,7 @@ def test_true_camera_lies_within_the_stated_uncertainty(seed):
 def test_true_axis_lies_within_the_stated_uncertainty(seed, wobble_deg):
     true = optics(seed, wobble_deg)
     result = axis(seen(true, table_axis.STANDS, table_axis.ANGLES_DEG[::2]), calibrated(seed))
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     up, origin = np.array(true.rotation).reshape(3, 3)[:, 2], np.array(true.translation_mm)
     rotation, translation = boards(true)[table_axis.STANDS[0]].pose(0.0)
     middle = rotation @ Board().points_mm().mean(axis=0) + translation
@@ -86,13 +86,13 @@ def test_region_of_interest_holds_the_rotating_object():
     assert np.allclose([x + width, y + height], drawn.max(axis=0), atol=4)
 
 
-def test_objects_cut_off_by_the_frame_are_refused():
+def test_objects_cut_off_by_the_frame_are_rejected():
     views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::2])
     room = ObjectSpace(height_mm=260.0)
     result = table_axis.evaluate(views, Board(), calibrated(0), space=room)
-    (refusal,) = result.refusals
-    assert refusal.code is RefusalCode.OBJECTS_CUT_OFF
-    assert refusal.values["top_px"] > 0
+    (rejection,) = result.rejections
+    assert rejection.code is RejectionCode.OBJECTS_CUT_OFF
+    assert rejection.values["top_px"] > 0
     assert not result.settings
 
 
@@ -105,48 +105,48 @@ def test_wrong_board_size_is_found_by_the_measured_distance():
 
     assert measured(15.0).passed
     larger = measured(18.0)
-    assert [round(r.values["true_square_mm"]) for r in larger.refusals] == [15]
+    assert [round(r.values["true_square_mm"]) for r in larger.rejections] == [15]
     assert not larger.settings
 
 
 ANGLES = camera_model.ANGLES_DEG[::2]
 
 
-def test_too_few_views_are_refused():
+def test_too_few_views_are_rejected():
     result = camera(seen(optics(1), ALL[:2], ANGLES))
-    assert codes(result) == [RefusalCode.TOO_FEW_VIEWS]
+    assert codes(result) == [RejectionCode.TOO_FEW_VIEWS]
     assert not result.estimates
 
 
-def test_blurred_frames_are_refused():
+def test_blurred_frames_are_rejected():
     result = camera(seen(optics(1), ALL, ANGLES, spoil=blurred))
-    assert {RefusalCode.CORNERS_OFF, RefusalCode.TOO_FEW_VIEWS} & set(codes(result))
+    assert {RejectionCode.CORNERS_OFF, RejectionCode.TOO_FEW_VIEWS} & set(codes(result))
 
 
-def test_loose_board_is_refused():
+def test_loose_board_is_rejected():
     views = seen(optics(1), ALL, ANGLES, change=lambda board: replace(board, loose_deg=4.0))
-    assert RefusalCode.BOARD_LOOSE in codes(camera(views))
+    assert RejectionCode.BOARD_LOOSE in codes(camera(views))
     views = seen(optics(0), table_axis.STANDS, ANGLES, change=lambda board: replace(board, loose_deg=1.0))
-    assert RefusalCode.CIRCLES_OFF in codes(axis(views, calibrated(0)))
+    assert RejectionCode.CIRCLES_OFF in codes(axis(views, calibrated(0)))
 
 
-def test_wrong_gear_ratio_is_refused():
+def test_wrong_gear_ratio_is_rejected():
     views = seen(optics(1), ALL, ANGLES, ratio=1.5)
-    assert RefusalCode.BOARD_LOOSE in codes(camera(views))
+    assert RejectionCode.BOARD_LOOSE in codes(camera(views))
 
 
-def test_wrong_board_is_refused():
+def test_wrong_board_is_rejected():
     views = seen(optics(1), ALL, ANGLES, board=Board(columns=6, rows=8))
     result = camera(views, Board(columns=6, rows=8))
     assert not result.passed
     assert not result.settings
 
 
-def test_low_coverage_is_refused():
+def test_low_coverage_is_rejected():
     views = seen(optics(1), ("calibration-board upright",) * 3, camera_model.ANGLES_DEG[::2])
-    assert RefusalCode.COVERAGE_TOO_SMALL in codes(camera(views))
+    assert RejectionCode.COVERAGE_TOO_SMALL in codes(camera(views))
 
 
 def test_axis_needs_views_from_both_sides():
     views = seen(optics(0), table_axis.STANDS, (-20.0, -10.0, 0.0, 10.0, 20.0))
-    assert RefusalCode.TOO_FEW_VIEWS in codes(axis(views, calibrated(0)))
+    assert RejectionCode.TOO_FEW_VIEWS in codes(axis(views, calibrated(0)))

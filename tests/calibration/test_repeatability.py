@@ -8,10 +8,10 @@ import pytest
 import hbr
 from calibration.procedure import Evaluation
 from calibration.repeatability import AZIMUTHS, Placement, Repeatability, evaluate, needed_placements
-from rig.calibrations import CalibrationResult, RefusalCode, apply_results
+from rig.calibrations import CalibrationResult, RejectionCode, apply_results
 from rig.core.errors import UsageError
 from rig.events.events import Accepted
-from tests.calibration.refused import codes
+from tests.calibration.rejected import codes
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 
@@ -43,7 +43,7 @@ def test_promised_share_of_later_placements_falls_below():
         placements = drawn(truth_rng, needed_placements(0.05) + 2)
         *known, late = placements
         result = fit(known, 0.05)
-        assert result.passed, result.refusals
+        assert result.passed, result.rejections
         later = np.array([np.diag(hbr.tanimoto(s.descriptors[0], late.descriptors[0])) for s in known])
         decided = (later + np.roll(later, -3, axis=1)) / 2  # the shortest decision: two views, 90° apart
         below += int((decided < result.settings["identify.repeatability"]).sum())
@@ -51,29 +51,29 @@ def test_promised_share_of_later_placements_falls_below():
     assert 0.02 < below / n < 0.08
 
 
-def test_too_few_placements_are_refused(simulated):
+def test_too_few_placements_are_rejected(simulated):
     assert needed_placements(0.02) == 4
     result = fit(drawn(np.random.default_rng(2), 3))
-    assert codes(result) == [RefusalCode.TOO_FEW_PLACEMENTS]
+    assert codes(result) == [RejectionCode.TOO_FEW_PLACEMENTS]
     assert not result.settings
     with pytest.raises(UsageError, match="too few") as caught:
         next(Repeatability("bowl", placements=2, error_rate=0.01).live(simulated().bench))
     assert "--placements 5" in caught.value.next_step
 
 
-def test_drifting_light_and_another_object_are_refused():
-    assert RefusalCode.LIGHT_DRIFTS_BETWEEN_PLACEMENTS in codes(
+def test_drifting_light_and_another_object_are_rejected():
+    assert RejectionCode.LIGHT_DRIFTS_BETWEEN_PLACEMENTS in codes(
         fit(drawn(np.random.default_rng(3), 5, flips=2, drift=3))
     )
     placements = drawn(np.random.default_rng(4), 4)
     others = [replace(s, descriptors=np.roll(s.descriptors, i, axis=2)) for i, s in enumerate(placements)]
-    assert RefusalCode.SIMILARITY_TOO_LOW in codes(fit(others))
+    assert RejectionCode.SIMILARITY_TOO_LOW in codes(fit(others))
 
 
 def test_simulated_result_is_applied(simulated):
     s = simulated(*SMALL, seed=1)
     *_, result = Repeatability("teapot", placements=3, error_rate=0.05).live(s.bench)
-    assert result.passed, result.refusals
+    assert result.passed, result.rejections
     repeat, again, low = (result.estimates[name].value for name in ("repeat", "placed_again", "repeatability"))
     assert 0.9 < low < again <= repeat + 0.005 < 1.005
     steps = [row["median"] for row in result.evidence["by_step"]]
@@ -83,7 +83,7 @@ def test_simulated_result_is_applied(simulated):
     assert 0 < config.identify.margin < 0.1
 
 
-def test_light_drifting_during_measurement_is_refused(simulated):
+def test_light_drifting_during_measurement_is_rejected(simulated):
     s = simulated(*SMALL, seed=1)
     light = 1.0
     for event in Repeatability("teapot", placements=3, error_rate=0.05).live(s.bench):

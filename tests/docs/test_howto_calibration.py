@@ -5,7 +5,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rig.calibrations import RefusalCode
+from rig.calibrations import RejectionCode
 from tests.docs.pages import blocks, run
 
 
@@ -29,5 +29,5 @@ def test_new_calibration_states_its_uncertainty_and_rejects_a_hindered_rotation(
     found = [page["evaluate"](0.9 + rng.normal(0, 0.01, 10)).estimates["duration"] for _ in range(200)]
     deviations = np.array([(estimate.value - 0.9) / estimate.uncertainty for estimate in found])
     assert 0.9 < deviations.std() < 1.4
-    (refusal,) = page["evaluate"]([0.9] * 9 + [1.9]).refusals
-    assert refusal.code is RefusalCode.MOVE_HINDERED
+    (rejection,) = page["evaluate"]([0.9] * 9 + [1.9]).rejections
+    assert rejection.code is RejectionCode.MOVE_HINDERED

@@ -1,4 +1,4 @@
-"""The noise model: what it refuses, and that the bench behind it says so."""
+"""The noise model: what it rejects, and that the bench behind it says so."""
 
 import pytest
 

@@ -46,6 +46,6 @@ def test_bootstrap_resamples_objects_not_trials() -> None:
         lambda: bootstrap_difference(np.ones((2, 3), bool), np.ones((3, 2), bool), np.random.default_rng()),
     ],
 )
-def test_impossible_counts_are_refused(call) -> None:
+def test_impossible_counts_are_rejected(call) -> None:
     with pytest.raises(ValueError, match=r"trials|confidence|hits"):
         call()

@@ -14,8 +14,8 @@ from rig.calibrations import (
     CalibrationStatus,
     CalibrationStore,
     Estimate,
-    Refusal,
-    RefusalCode,
+    Rejection,
+    RejectionCode,
     apply_results,
 )
 from rig.config import RigConfig, load_config
@@ -27,13 +27,13 @@ RESULT = CalibrationResult(
     residual=0.02,
     limit=0.1,
     residual_unit="°",
-    refusals=(),
+    rejections=(),
     when_utc=datetime(2026, 3, 1, 12, tzinfo=UTC),
     device={"bench": "sim", "imu": {"model": "MPU-6050"}},
     evidence={"legs": [{"encoder_deg": 360.0}]},
 )
 
-FEW = Refusal(RefusalCode.TOO_FEW_REVERSALS, {"used": 2, "needed": 6, "reasons": ["the sensor lost 3 samples"]})
+FEW = Rejection(RejectionCode.TOO_FEW_REVERSALS, {"used": 2, "needed": 6, "reasons": ["the sensor lost 3 samples"]})
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -43,22 +43,22 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
     value=finite,
     uncertainty=finite,
     residual=st.none() | finite,
-    refusals=st.lists(st.builds(Refusal, st.just(RefusalCode.SAMPLES_LOST), st.just({"lost": 7}))).map(tuple),
+    rejections=st.lists(st.builds(Rejection, st.just(RejectionCode.SAMPLES_LOST), st.just({"lost": 7}))).map(tuple),
     when=st.datetimes(datetime(1971, 1, 1), datetime(2200, 1, 1)),
 )
-def test_written_result_is_read_again(tmp_path, value, uncertainty, residual, refusals, when):
+def test_written_result_is_read_again(tmp_path, value, uncertainty, residual, rejections, when):
     result = replace(
         RESULT,
         estimates={"scale": Estimate(value, uncertainty, "1")},
         residual=residual,
-        refusals=refusals,
+        rejections=rejections,
         when_utc=when.replace(tzinfo=timezone(timedelta(hours=2))),
     )
     result.to_file(tmp_path / "result.json")
     again = CalibrationResult.from_file(tmp_path / "result.json")
     assert again == result
     assert again.when_utc.utcoffset() == timedelta(0)
-    assert again.passed is (not refusals)
+    assert again.passed is (not rejections)
 
 
 def test_file_is_readable_text(tmp_path):
@@ -77,7 +77,7 @@ def test_file_is_readable_text(tmp_path):
         ({"valid_days": -1}, "valid_days"),
         ({"when_utc": "2026-03-01T12:00:00"}, "when_utc"),
         ({"scale": 1.0}, "scale"),
-        ({"refusals": None}, "refusals"),
+        ({"rejections": None}, "rejections"),
     ],
 )
 def test_invalid_file_is_rejected_with_the_key(tmp_path, change, mistake):
@@ -105,8 +105,8 @@ def test_result_needs_an_estimate_and_a_time_zone():
     with pytest.raises(ValueError, match="time zone"):
         replace(RESULT, when_utc=datetime(2026, 3, 1))
     with pytest.raises(ValueError, match="applies no settings"):
-        replace(RESULT, refusals=(FEW,), settings={"imu.scale": 1.01})
-    assert not replace(RESULT, estimates={}, refusals=(FEW,)).passed
+        replace(RESULT, rejections=(FEW,), settings={"imu.scale": 1.01})
+    assert not replace(RESULT, estimates={}, rejections=(FEW,)).passed
 
 
 NOW = datetime(2026, 3, 8, tzinfo=UTC)
@@ -121,7 +121,7 @@ def test_newest_result_that_passed_on_these_devices_decides(tmp_path):
     store.add(RESULT)
     store.add(replace(RESULT, when_utc=RESULT.when_utc + days[1]))
     store.add(replace(RESULT, when_utc=RESULT.when_utc + days[2], device=elsewhere))
-    store.add(replace(RESULT, when_utc=RESULT.when_utc + days[3], refusals=(FEW,)))
+    store.add(replace(RESULT, when_utc=RESULT.when_utc + days[3], rejections=(FEW,)))
     (standing,) = store.standings(HERE, NOW)
     assert standing.status is CalibrationStatus.IN_FORCE
     assert standing.result.when_utc == RESULT.when_utc + days[1]
@@ -133,7 +133,7 @@ def test_age_other_device_and_failure_are_reported(tmp_path):
     store = CalibrationStore(tmp_path)
     store.add(replace(RESULT, name="a.old", valid_days=5))
     store.add(replace(RESULT, name="b.moved", device={"bench": "sim", "imu": {"model": "MPU-6050", "axis": "y"}}))
-    store.add(replace(RESULT, name="c.failed", refusals=(FEW,)))
+    store.add(replace(RESULT, name="c.failed", rejections=(FEW,)))
     old, moved, failed = store.standings(HERE, NOW)
     assert (old.status, old.command) == (CalibrationStatus.EXPIRED, "rig calibrate a")
     assert "6 days ago; it is valid for 5 days" in old.text
@@ -173,21 +173,20 @@ def test_results_of_version_1_are_read():
     passed = CalibrationResult.from_file(DATA / "version-1-passed.json")
     assert passed.passed
     assert list(passed.settings) == ["table.backlash_deg"]
-    refused = CalibrationResult.from_file(DATA / "version-1-refused.json")
-    assert [refusal.code for refusal in refused.refusals] == [RefusalCode.TEXT]
-    assert str(refused.refusals[0]).startswith("The gyro reads")
+    rejected = CalibrationResult.from_file(DATA / "version-1-rejected.json")
+    assert [rejection.code for rejection in rejected.rejections] == [RejectionCode.TEXT]
+    assert str(rejected.rejections[0]).startswith("The gyro reads")
 
 
-@pytest.mark.parametrize("code", RefusalCode)
-def test_every_refusal_has_words(code):
+@pytest.mark.parametrize("code", RejectionCode)
+def test_every_rejection_has_words(code):
     class Values(dict):
         def __missing__(self, key):
             return 1
 
-    assert code.value == code.name.lower()
-    assert (code.problem + code.next_step).format_map(Values())
+    assert code.value.format_map(Values())
 
 
-def test_refusal_in_words():
+def test_rejection_in_words():
     assert str(FEW) == "Only 2 reversals can be used, 6 are needed (the sensor lost 3 samples)."
-    assert str(Refusal(FEW.code, {**FEW.values, "reasons": []})) == "Only 2 reversals can be used, 6 are needed."
+    assert str(Rejection(FEW.code, {**FEW.values, "reasons": []})) == "Only 2 reversals can be used, 6 are needed."

@@ -103,7 +103,7 @@ READERS: dict[str, Callable[[Catalog, Path], Any]] = {
 
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("kind", ["absolute", "parent", "inner parent", "elsewhere", "link", "folder link"])
-def test_image_paths_that_lead_out_are_refused(root: Path, outside: Path, kind: str, reader: str) -> None:
+def test_image_paths_that_lead_out_are_rejected(root: Path, outside: Path, kind: str, reader: str) -> None:
     """Views 1 to 3 belong to the superseded enrollment, 4 and 5 to the complete one."""
     if kind.endswith("link"):
         (path,) = root.glob(f"images/*mug/{1 if reader == 'gc' else 2:06d}")
@@ -127,7 +127,7 @@ def test_image_paths_that_lead_out_are_refused(root: Path, outside: Path, kind: 
 
 
 @pytest.mark.parametrize("name", ["images", "lost+found", "incoming", "catalog.sqlite", "catalog.sqlite-wal"])
-def test_links_in_the_folder_are_refused(root: Path, tmp_path: Path, outside: Path, name: str) -> None:
+def test_links_in_the_folder_are_rejected(root: Path, tmp_path: Path, outside: Path, name: str) -> None:
     other = tmp_path / "other"
     if (root / name).exists():
         shutil.move(root / name, other)
@@ -198,7 +198,7 @@ def test_new_catalog_is_private(tmp_path: Path, umask: int) -> None:
     ],
 )
 @pytest.mark.parametrize("version", [3, 2])
-def test_foreign_schema_is_refused(root: Path, statement: str, version: int) -> None:
+def test_foreign_schema_is_rejected(root: Path, statement: str, version: int) -> None:
     sql(root, statement, f"PRAGMA user_version = {version}")
     before = content(root)
     with pytest.raises(CatalogDamaged, match="other tables"):
@@ -210,7 +210,7 @@ def test_foreign_schema_is_refused(root: Path, statement: str, version: int) -> 
 
 
 @pytest.mark.parametrize("version", [-5, 0, -(2**31)])
-def test_impossible_version_is_refused(root: Path, version: int) -> None:
+def test_impossible_version_is_rejected(root: Path, version: int) -> None:
     sql(root, f"PRAGMA user_version = {version}")
     for attempt in (lambda: opened(root), lambda: migrate(root, clock=VirtualClock())):
         with pytest.raises(CatalogDamaged, match="version"):

@@ -157,9 +157,9 @@ def test_set_changes_one_line_or_nothing(rig, tmp_path):
     assert rig("config", "set", "servo.port", "/dev/ttyACM0").exit_code == 0
     assert file.read_text(encoding="utf-8") == '[servo] # the red one\nid = 4 # sticker\nport = "/dev/ttyACM0"\n'
     before = file.read_bytes()
-    refused = rig("config", "set", "servo.id", "900")
-    assert refused.exit_code == 3
-    assert "from 0 to 252" in refused.stderr
+    rejected = rig("config", "set", "servo.id", "900")
+    assert rejected.exit_code == 3
+    assert "from 0 to 252" in rejected.stderr
     assert rig("config", "set", "servo.prot", "x").exit_code == 3
     assert rig("config", "set", "servo", "x").exit_code == 2
     assert file.read_bytes() == before

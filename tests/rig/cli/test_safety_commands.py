@@ -96,9 +96,9 @@ def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
     told = json.loads(rig("status", "--json").stdout)
     assert told["state"] == "unreferenced"
     assert told["table_deg"] is None
-    refused = rig("goto", "0")
-    assert refused.exit_code == 5
-    assert "rig home --turns 0" in refused.stderr
+    rejected = rig("goto", "0")
+    assert rejected.exit_code == 5
+    assert "rig home --turns 0" in rejected.stderr
     assert rig("home").exit_code == 5
     assert rig("home", "--turns", "0", "--here").exit_code == 2
     done = rig("home", "--turns", "0", "--json")
@@ -143,15 +143,15 @@ def test_every_command_reports_a_fault_until_it_is_acknowledged(rig):
         "The table is blocked at 7.0°.", next_step="Free it. Then `rig acknowledge`.", evidence={"load_percent": 99}
     )
     store.save(store.load().model_copy(update={"fault": LatchedFault.of(stalled, "2026-01-02T03:04:05+00:00")}))
-    for refused in (
+    for rejected in (
         rig("goto", "0"),
         rig("home"),
         rig("home", "--here"),
         rig("enroll", "dice", "--views", "4", *SMALL),
     ):
-        assert refused.exit_code == 5
-        assert "2026-01-02T03:04:05+00:00: The table is blocked at 7.0°." in refused.stderr
-        assert "Free it. Then `rig acknowledge`." in refused.stderr
+        assert rejected.exit_code == 5
+        assert "2026-01-02T03:04:05+00:00: The table is blocked at 7.0°." in rejected.stderr
+        assert "Free it. Then `rig acknowledge`." in rejected.stderr
     told = rig("status")
     assert told.exit_code == 0
     assert "fault 505" in told.stdout
@@ -171,11 +171,11 @@ def test_acknowledge_reboots_the_servo(rig):
 
 def test_running_plan_blocks_the_bench_and_stop_ends_it(rig, running):
     process = running()
-    refused = rig("goto", "0")
-    assert refused.exit_code == 9
-    assert f"process {process.pid} " in refused.stderr
-    assert "enroll dice --views 720" in refused.stderr
-    assert "rig stop" in refused.stderr
+    rejected = rig("goto", "0")
+    assert rejected.exit_code == 9
+    assert f"process {process.pid} " in rejected.stderr
+    assert "enroll dice --views 720" in rejected.stderr
+    assert "rig stop" in rejected.stderr
 
     done = rig("stop", "--json")
     assert done.exit_code == 0, done.stderr

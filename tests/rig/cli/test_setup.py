@@ -108,7 +108,7 @@ def test_setup_without_answers_is_a_usage_error(home):
     assert done.exit_code == 2
     assert "--yes" in done.stderr
     assert not (home / "rig.toml").exists()
-    assert rig("setup", "--bench", "sim", answers="\nn\n").exit_code == 0  # asked, and refused
+    assert rig("setup", "--bench", "sim", answers="\nn\n").exit_code == 0  # asked, and rejected
     assert not (home / "rig.toml").exists()
 
 

@@ -170,7 +170,7 @@ def impossible(text: str, key: tuple[str, ...]) -> bool:
 @given(documents(), st.lists(names, min_size=1, max_size=3, unique=True).map(tuple), values)
 def test_edit_keeps_all_comments_and_other_lines_of_any_document(text, key, value):
     if impossible(text, key):
-        event("refused")
+        event("rejected")
         with pytest.raises(ConfigError):
             with_values(text, {key: value})
         return

@@ -94,7 +94,7 @@ def intact(stream: bytes, protocol: int) -> list[bytes]:
 @fuzz_settings()
 @given(data=st.data(), value=st.integers(0, 0xFFFF_FFFF))
 def test_read_block_was_sent_by_the_device(protocol: int, data: st.DataObject, value: int) -> None:
-    """Four bytes, three attempts: the value of an intact packet with four parameters, a refusal, or silence."""
+    """Four bytes, three attempts: the value of an intact packet with four parameters, a rejection, or silence."""
     block = value.to_bytes(4, "little")
     # The driver asks for one byte more each time an answer is owed, from one address lower.
     sent = [b"\x55" * extra + block for extra in range(3)]

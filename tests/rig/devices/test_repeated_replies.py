@@ -29,19 +29,19 @@ def test_no_old_answer_is_taken_for_a_reading(delay_s, spread, poll_s):
 
     clock.sleep(1.0)
     wires.bus.filters.append(repeat)
-    readings = refused = 0
+    readings = rejected = 0
     for _ in range(150):
         clock.sleep(poll_s)
         begun_deg = wires.world.shaft()[0]
         try:
             state = servo.read_state()
         except RigError:
-            refused += 1
+            rejected += 1
             continue
         readings += 1
         assert begun_deg - 0.6 <= state.position_deg - 180.0 <= wires.world.shaft()[0] + 0.6
     assert readings > 140
-    assert refused < 10
+    assert rejected < 10
 
 
 def test_restarted_servo_is_read_again_although_its_clock_starts_at_zero():

@@ -423,7 +423,7 @@ def result(bench, days_ago: float, valid_days: float | None = None, **device: ob
         residual=0.1,
         limit=0.2,
         residual_unit="°",
-        refusals=(),
+        rejections=(),
         when_utc=bench.context.computer.clock.utc() - timedelta(days=days_ago),
         device=device,
         evidence={},

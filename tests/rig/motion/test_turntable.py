@@ -1,4 +1,4 @@
-"""The table with real drivers on simulated wires: where it stops, when it is at rest, and what it refuses."""
+"""The table with real drivers on simulated wires: where it stops, when it is at rest, and what it rejects."""
 
 import json
 

@@ -37,9 +37,9 @@ def bench_of(tmp_path):
         store = FileStore(tmp_path / "state")
         with program(wires, i2c, store) as bench:
             assert bench.safety.state is TableState.UNREFERENCED
-            with pytest.raises(Unreferenced) as refused, Turntable(bench):
+            with pytest.raises(Unreferenced) as rejected, Turntable(bench):
                 pass
-            assert "rig home --turns 0" in refused.value.next_step
+            assert "rig home --turns 0" in rejected.value.next_step
             bench.safety.set_revolutions(0)
         yield lambda: program(wires, i2c, FileStore(tmp_path / "state")), wires
 
@@ -252,10 +252,10 @@ def test_fault_survives_the_program_until_it_is_acknowledged(start, wires):
         table.goto(60.0)
     with start() as bench:
         assert bench.safety.state is TableState.FAULT
-        with pytest.raises(FaultLatched, match="blocked") as refused, Turntable(bench):
+        with pytest.raises(FaultLatched, match="blocked") as rejected, Turntable(bench):
             pass
-        assert refused.value.evidence["code"] == Stalled.code
-        assert "rig acknowledge" in refused.value.next_step
+        assert rejected.value.evidence["code"] == Stalled.code
+        assert "rig acknowledge" in rejected.value.next_step
         wires.device.free()
         assert bench.safety.acknowledge() is TableState.READY
     with start() as bench, Turntable(bench) as table:
@@ -327,9 +327,9 @@ def test_changed_settings_of_the_table_need_home_here(change, tmp_path, start, w
     with changed(wires, tmp_path, change) as bench:
         assert bench.safety.state is TableState.UNREFERENCED
         assert bench.safety.doubt.finding is AngleFinding.SETTINGS_CHANGED
-        with pytest.raises(Unreferenced) as refused, Turntable(bench):
+        with pytest.raises(Unreferenced) as rejected, Turntable(bench):
             pass
-        assert "rig home --here" in refused.value.next_step
+        assert "rig home --here" in rejected.value.next_step
         with pytest.raises(Unreferenced):
             bench.safety.set_revolutions(0)
         bench.safety.set_angle(0.0)
@@ -345,9 +345,9 @@ def test_position_beyond_the_limits_is_never_ready(start, wires):
     with start() as bench:
         assert bench.safety.state is TableState.UNREFERENCED
         assert bench.safety.doubt.finding is AngleFinding.BEYOND_LIMITS
-        with pytest.raises(Unreferenced, match=r"4[12]\d\.\d°, beyond its cable budget") as refused, Turntable(bench):
+        with pytest.raises(Unreferenced, match=r"4[12]\d\.\d°, beyond its cable budget") as rejected, Turntable(bench):
             pass
-        assert "by hand back into its limits" in refused.value.next_step
+        assert "by hand back into its limits" in rejected.value.next_step
     wires.world.clock.sleep(wires.device.turn_by_hand(-30.0) + 0.1)
     with start() as bench, Turntable(bench) as table:
         table.goto(300.0)

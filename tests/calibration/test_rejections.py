@@ -1,4 +1,4 @@
-"""Refused calibrations on the bench: nothing of them is in force."""
+"""Rejected calibrations on the bench: nothing of them is in force."""
 
 import json
 
@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from calibration import camera_light, camera_model
-from rig.calibrations import CalibrationStore
+from rig.calibrations import CalibrationStore, RejectionCode
 from rig.cli.main import app
 
 
@@ -27,18 +27,18 @@ def rig(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("stands", "arguments", "code"),
     [
-        (1, ("--columns", "10", "--rows", "7"), "wrong_board_layout"),
-        (1, ("--columns", "6", "--rows", "4"), "foreign_markers"),
-        (4, ("--set", 'bench.sim.faults=["slip:angle=6@move5"]'), "board_loose"),
+        (1, ("--columns", "10", "--rows", "7"), RejectionCode.WRONG_BOARD_LAYOUT),
+        (1, ("--columns", "6", "--rows", "4"), RejectionCode.FOREIGN_MARKERS),
+        (4, ("--set", 'bench.sim.faults=["slip:angle=6@move5"]'), RejectionCode.BOARD_LOOSE),
     ],
     ids=["larger board", "smaller board", "moving table"],
 )
-def test_wrong_board_and_moving_table_are_refused(rig, tmp_path, monkeypatch, stands, arguments, code):
+def test_wrong_board_and_moving_table_are_rejected(rig, tmp_path, monkeypatch, stands, arguments, code):
     monkeypatch.setattr(camera_model, "STANDS", dict(list(camera_model.STANDS.items())[:stands]))
     done = rig("calibrate", "camera", *arguments)
     assert done.exit_code == 6, done.output
     (result,) = CalibrationStore(tmp_path / "calibrations" / "sim").history()
-    assert code in [refusal.code for refusal in result.refusals]
+    assert code in [rejection.code for rejection in result.rejections]
     assert not result.settings
     (told,) = json.loads(rig("calibrate", "show", "--json").stdout)["calibrations"]
     assert told["state"] != "in force"
