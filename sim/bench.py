@@ -17,6 +17,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import ObjectNotFound, UsageError
 from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.calibration_board import calibration_targets
+from sim.camera import CAMERA_DEVICE
 from sim.change import Change
 from sim.clock import VirtualClock
 from sim.computer import simulated_computer
@@ -203,6 +204,7 @@ def open_sim_bench(
             i2c_bus=devices.i2c.path,
             capture=devices.camera,
             reopen_camera=devices.reopen_camera,
+            camera_device=CAMERA_DEVICE,
             state=operator.state,
             head_port=devices.head_port,
         )

@@ -18,6 +18,8 @@ from sim.optics import Optics
 from sim.sensor import Gains, Sensor, white_balance
 from sim.world import HISTORY_S, Activity, Scene, World
 
+CAMERA_DEVICE = "simulated camera"
+"""What identifies the camera of a simulated bench; a bench has one."""
 FPS = 30
 NOMINAL_EXPOSURE = 100  # exposure at which the frame has the scene's grey levels, in V4L2's unit of 100 µs
 READOUT_NS = 15_000_000  # time from the end of the exposure until the computer has the frame

@@ -14,6 +14,7 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.devices.opencv_capture import Capture
+from sim.camera import CAMERA_DEVICE
 from sim.devices import SimDevices
 from sim.i2c import SimI2cBus
 
@@ -77,12 +78,28 @@ class ComputerFiles:
         self.write(f"sys/class/i2c-dev/i2c-{number}/name", f"{name}\n")
         self.write(f"dev/i2c-{number}").chmod(mode)
 
-    def camera(self, number: int = 0, name: str = "HD Webcam", *, index: int = 0, mode: int = 0o660) -> None:
-        """Add a node of a camera; nodes with an index above 0 deliver no images."""
+    def camera(
+        self,
+        number: int = 0,
+        name: str = "HD Webcam",
+        *,
+        index: int = 0,
+        mode: int = 0o660,
+        serial: str | None = None,
+        usb_port: str = "",
+    ) -> None:
+        """Add a node of a camera, on a USB port such as 1-2; nodes with an index above 0 deliver no images."""
         self.write(f"sys/class/video4linux/video{number}/name", f"{name}\n")
         self.write(f"sys/class/video4linux/video{number}/index", f"{index}\n")
         self.write(f"dev/video{number}").chmod(mode)
         self.link(f"dev/v4l/by-id/usb-{name.replace(' ', '_')}-video-index{index}", self.root / f"dev/video{number}")
+        if usb_port:
+            usb = f"sys/devices/{usb_port}"
+            for key, value in {"idVendor": "046d", "idProduct": "0825", "serial": serial}.items():
+                if value:
+                    self.write(f"{usb}/{key}", f"{value}\n")
+            self.link(f"sys/class/video4linux/video{number}/device", self.root / usb)
+            self.link(f"dev/v4l/by-path/usb-{usb_port}-video-index{index}", self.root / f"dev/video{number}")
 
     def keeps_time(self, synchronised: bool = True) -> None:
         """Run a time synchronisation service."""
@@ -113,6 +130,9 @@ class SimComputer(Computer):
     def i2c_path(self, bus: int | str) -> str:
         wired = isinstance(self.devices.i2c, SimI2cBus) and self.i2c_name(bus) == self._bus
         return self.devices.i2c.path if wired else self.i2c_name(bus)
+
+    def camera_device(self, source: int | str) -> str | None:  # noqa: ARG002 - there is one camera
+        return CAMERA_DEVICE
 
     def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one camera
         return self.devices.reopen_camera()

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rig.devices.opencv_capture import Capture
 
 SERIAL_NAMES = re.compile(r"tty(USB|ACM|AMA|S)\d+")
+_CAMERAS = "sys/class/video4linux"
 _NETWORK_FILE_SYSTEMS = frozenset({"nfs", "nfs4", "cifs", "smb3", "smbfs", "sshfs", "fuse.sshfs", "9p", "afs"})
 
 
@@ -144,8 +145,27 @@ class Computer:
 
     def cameras(self) -> list[DeviceFile]:
         """Return the cameras, without the further device files of a camera that deliver no images."""
-        nodes = self._nodes("sys/class/video4linux", "dev/v4l/by-id")
-        return [n for n in nodes if self._text(f"/sys/class/video4linux/{Path(n.path).name}/index") in ("", "0")]
+        nodes = self._nodes(_CAMERAS, "dev/v4l/by-id")
+        return [n for n in nodes if self._text(f"{_CAMERAS}/{Path(n.path).name}/index") in ("", "0")]
+
+    def camera_device(self, source: int | str) -> str | None:
+        """Return what identifies the camera of a source: its USB ids and serial number, or else its place.
+
+        The number of a camera and its path can mean another camera after replugging. None for a file or a stream, and
+        if the system does not show more than the path.
+        """
+        path = f"/dev/video{source}" if str(source).isdigit() else str(source)
+        if not path.startswith("/dev/"):
+            return None
+        file = self._at(path).resolve()
+        usb = self._usb(self.root / _CAMERAS / file.name / "device")
+        kind = (
+            f"USB {usb['idVendor']}:{usb.get('idProduct', '')}" if usb else self._text(f"{_CAMERAS}/{file.name}/name")
+        )
+        if usb.get("serial"):
+            return f"{kind}, serial number {usb['serial']}"
+        place = self._link("dev/v4l/by-path", file)
+        return f"{kind} at {Path(place).name}" if place else None
 
     def same_file(self, one: str, other: str) -> bool:
         """Return whether two paths, which may be links, are the same device."""
@@ -222,7 +242,7 @@ class Computer:
 
     def _node(self, path: str, name: str, links: str) -> dict[str, Any]:
         file = self._at(path)
-        stable = next((f"/{links}/{e.name}" for e in self._entries(links) if e.resolve() == file.resolve()), None)
+        stable = self._link(links, file.resolve())
         try:
             status = file.stat()
         except OSError:
@@ -237,6 +257,10 @@ class Computer:
             "usable": usable,
             "holders": tuple(self._holders(path)),
         }
+
+    def _link(self, folder: str, file: Path) -> str | None:
+        """Return the link in a folder that leads to a file."""
+        return next((f"/{folder}/{e.name}" for e in self._entries(folder) if e.resolve() == file), None)
 
     def _may_use(self, file: Path, status: os.stat_result) -> bool:
         if self.user == User.current():

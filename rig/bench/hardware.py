@@ -10,9 +10,10 @@ from typing import Any
 from pydantic import BaseModel
 
 from rig.bench import Bench, BenchKind
+from rig.bench.computer import Computer
 from rig.config import RigConfig, Section
 from rig.core.clock import Clock, SystemClock
-from rig.core.errors import ConfigError, RigError, StateNotStored
+from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection, open_serial
@@ -46,6 +47,7 @@ class HardwareBench:
             connections.callback(connection.close)
             capture = open_capture(config.camera.source)
             connections.callback(capture.release)
+            camera_device = Computer().camera_device(config.camera.source)
             bench = assemble(
                 "hardware",
                 config,
@@ -55,7 +57,8 @@ class HardwareBench:
                 guardian=Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id),
                 i2c_bus=config.imu.bus,
                 capture=capture,
-                reopen_camera=lambda: open_capture(config.camera.source),
+                reopen_camera=lambda: _open_again(config.camera.source, camera_device),
+                camera_device=camera_device,
                 state=FileStore(state_path),
                 head_port=lambda: open_serial(config.head.port, BAUD, "head"),
             )
@@ -86,6 +89,7 @@ def assemble(
     i2c_bus: int | str,
     capture: Capture,
     reopen_camera: Callable[[], Capture] | None = None,
+    camera_device: str | None = None,
     state: StateStore,
     head_port: Callable[[], SerialConnection] | None = None,
 ) -> Bench:
@@ -118,6 +122,7 @@ def assemble(
             clock=clock,
             settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
             name=f"camera {config.camera.source}",
+            device=camera_device,
             reopen=reopen_camera,
         )
         findings += tuple(
@@ -136,6 +141,20 @@ def assemble(
         bench.findings += bench.safety.findings
         opened.pop_all()
     return bench
+
+
+def _open_again(source: int | str, device: str | None) -> Capture:
+    """Open a camera that was unplugged. Raises `DeviceMismatch` if the source is another camera now."""
+    capture = open_capture(source)
+    now = Computer().camera_device(source)
+    if now != device:
+        capture.release()
+        raise DeviceMismatch(
+            f"The camera {source} is another one after it was unplugged.",
+            next_step="Connect the first camera again, or start again with this one.",
+            evidence={"before": device, "now": now},
+        )
+    return capture
 
 
 def _check_reach(config: RigConfig, servo: Servo) -> None:

@@ -137,7 +137,12 @@ def differences(result: CalibrationResult, device: Mapping[str, Any]) -> list[st
 
 def _differences(path: str, then: Any, now: Any) -> Iterable[str]:
     if isinstance(then, Mapping) and isinstance(now, Mapping):
-        for key in then.keys() & now.keys():
+        known = then.keys() & now.keys()
+        if "device" in known and None not in (then["device"], now["device"]):
+            known -= {"name"}  # the configured source, which can change its meaning
+        elif "name" in known:
+            known -= {"device"}
+        for key in known:
             yield from _differences(f"{path}.{key}" if path else str(key), then[key], now[key])
     elif then != now:
         yield f"{path} was {then}, is {now}"

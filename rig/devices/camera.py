@@ -10,12 +10,23 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class CameraIdentity:
-    """The camera's name and its mode."""
+    """The camera's name and its mode.
+
+    ``name`` holds the configured source, which can mean another camera after replugging. ``device`` identifies the
+    camera itself (`rig.bench.computer.Computer.camera_device`); None if it is not known.
+    """
 
     name: str
     width: int
     height: int
     fps: float
+    device: str | None = None
+
+    def is_same_camera(self, other: "CameraIdentity") -> bool:
+        """Return whether both are the same camera, by their names if one of the devices is not known."""
+        if self.device is None or other.device is None:
+            return self.name == other.name
+        return self.device == other.device
 
 
 @dataclass(frozen=True, slots=True)

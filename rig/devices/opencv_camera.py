@@ -86,6 +86,8 @@ class OpenCvCamera:
         Requested settings. `rejected_settings` lists those that the camera did not accept.
     name
         The camera's name in records.
+    device
+        Identifies the camera itself, wherever it is connected; None if it is not known.
     timeout_s
         How long `capture` waits for a new frame.
     latency_s
@@ -107,6 +109,7 @@ class OpenCvCamera:
         clock: Clock,
         settings: CameraSettings | None = None,
         name: str = "camera",
+        device: str | None = None,
         timeout_s: float = 3.0,
         latency_s: float | None = None,
         reopen: Callable[[], Capture] | None = None,
@@ -124,6 +127,7 @@ class OpenCvCamera:
             round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
             round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
             capture.get(cv2.CAP_PROP_FPS),
+            device,
         )
         self._period_s = 1 / self.identity.fps if 1 <= self.identity.fps <= 1000 else 1 / 30
         self._latency_ns = round((3 * self._period_s if latency_s is None else latency_s) * 1e9)

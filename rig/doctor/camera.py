@@ -36,7 +36,13 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
     with ExitStack() as opened:
         opened.callback(capture.release)
         settings = CameraSettings(**config.model_dump(exclude={"source"}))
-        source = OpenCvCamera(capture, clock=context.computer.clock, settings=settings, name=f"camera {config.source}")
+        source = OpenCvCamera(
+            capture,
+            clock=context.computer.clock,
+            settings=settings,
+            name=f"camera {config.source}",
+            device=context.computer.camera_device(config.source),
+        )
         identity = source.identity
         context.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         mode = {"name": identity.name, "width": identity.width, "height": identity.height, "fps": identity.fps}

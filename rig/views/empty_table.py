@@ -123,8 +123,9 @@ def _unusable(table: EmptyTable, bench: Bench) -> TableProblem | None:
     if (now.height, now.width) != before[:2]:
         sizes = {"image_px": (before[1], before[0]), "frame_px": (now.width, now.height)}
         return TableProblem(TableProblemCode.OTHER_SIZE, sizes)
-    if now.name != table.camera.name:
-        return TableProblem(TableProblemCode.OTHER_CAMERA, {"image_camera": table.camera.name, "camera": now.name})
+    if not now.is_same_camera(table.camera):
+        shown = [camera.device or camera.name for camera in (table.camera, now)]
+        return TableProblem(TableProblemCode.OTHER_CAMERA, {"image_camera": shown[0], "camera": shown[1]})
     return None
 
 

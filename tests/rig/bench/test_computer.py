@@ -114,6 +114,21 @@ def test_camera_is_the_device_file_with_images(computer):
     assert camera.stable == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
 
 
+def test_camera_is_identified_wherever_it_is_connected(computer):
+    computer.camera(0, "Cam", serial="A1", usb_port="1-1")
+    computer.camera(2, "Cam two", serial="B2", usb_port="1-2")
+    computer.camera(4, "Cam three", usb_port="1-3")
+    devices = [host(computer).camera_device(source) for source in (0, 2, 4)]
+    assert devices == [
+        "USB 046d:0825, serial number A1",
+        "USB 046d:0825, serial number B2",
+        "USB 046d:0825 at usb-1-3-video-index0",  # without a serial number, its place counts
+    ]
+    assert host(computer).camera_device("/dev/v4l/by-id/usb-Cam-video-index0") == devices[0]
+    assert host(computer).camera_device("/dev/video2") == host(computer).camera_device("2") == devices[1]
+    assert host(computer).camera_device("film.mp4") is None
+
+
 def test_computer_without_devices_lists_nothing(tmp_path):
     bare = host(ComputerFiles(tmp_path))
     assert (bare.serial_ports(), bare.i2c_buses(), bare.cameras()) == ([], [], [])

@@ -129,6 +129,29 @@ def test_newest_result_that_passed_on_these_devices_decides(tmp_path):
     assert store.history("imu.bias") == []
 
 
+@pytest.mark.parametrize(
+    ("then", "now", "status"),
+    [
+        # The source has another name after replugging, or the name means another camera.
+        (("camera 0", "USB A"), ("camera /dev/v4l/by-id/a", "USB A"), CalibrationStatus.IN_FORCE),
+        (("camera 0", "USB A"), ("camera 0", "USB B"), CalibrationStatus.OTHER_DEVICE),
+        # An earlier version stored only the name.
+        (("camera 0",), ("camera 0", "USB A"), CalibrationStatus.IN_FORCE),
+        (("camera 0",), ("camera 1", "USB A"), CalibrationStatus.OTHER_DEVICE),
+        (("film.mp4", None), ("film.mp4", None), CalibrationStatus.IN_FORCE),
+        (("film.mp4", None), ("other.mp4", None), CalibrationStatus.OTHER_DEVICE),
+    ],
+)
+def test_calibration_belongs_to_the_camera_and_not_to_its_source(tmp_path, then, now, status):
+    camera = [dict(zip(("name", "device"), values, strict=False)) for values in (then, now)]
+    store = CalibrationStore(tmp_path)
+    store.add(replace(RESULT, name="camera.noise", device={"bench": "sim", "camera": {**camera[0], "width": 640}}))
+    (standing,) = store.standings({"bench": "sim", "camera": {**camera[1], "width": 640}}, NOW)
+    assert standing.status is status
+    if "USB B" in now:
+        assert standing.changes == ("camera.device was USB A, is USB B",)
+
+
 def test_age_other_device_and_failure_are_reported(tmp_path):
     store = CalibrationStore(tmp_path)
     store.add(replace(RESULT, name="a.old", valid_days=5))
@@ -136,11 +159,11 @@ def test_age_other_device_and_failure_are_reported(tmp_path):
     store.add(replace(RESULT, name="c.failed", rejections=(FEW,)))
     old, moved, failed = store.standings(HERE, NOW)
     assert (old.status, old.command) == (CalibrationStatus.EXPIRED, "rig calibrate a")
-    assert "6 days ago; it is valid for 5 days" in old.text
+    assert "6 days ago; it is valid for 5 days" in str(old)
     assert moved.status is CalibrationStatus.OTHER_DEVICE
-    assert "imu.axis was y, is z" in moved.text
+    assert "imu.axis was y, is z" in str(moved)
     assert failed.status is CalibrationStatus.FAILED
-    assert str(FEW) in failed.text
+    assert str(FEW) in str(failed)
 
 
 def test_torn_file_in_the_folder_is_reported_and_left_out(tmp_path):

@@ -52,6 +52,8 @@ def test_enrollment_takes_the_image_once_a_day(rig: Callable[..., Any]) -> None:
     first, second = (rig("enroll", name, "--views", "4", *small) for name in ("dice", "lamp"))
     assert "Empty-table image:" in first.stderr
     assert "Empty-table image:" not in second.stderr
+    source = ("--set", "camera.source=/dev/v4l/by-id/usb-HD_Webcam-video-index0")  # another name of the same camera
+    assert rig("empty-table", "--show", "empty.png", *small, *source).exit_code == 0
     assert rig("empty-table", *small).exit_code == 0
     assert "photographed the empty table" in rig("log").stdout
     shown = rig("catalog", "show", "dice")
