@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.core.control_characters import has_control_characters
 from rig.core.errors import UsageError
 
 MAX_NAME_LENGTH: Final = 100
@@ -264,11 +265,16 @@ def clean_name(name: str) -> str:
 
 
 def check_text(text: str, what: str) -> None:
-    """Raise `UsageError` for text that cannot be stored, such as bytes of another encoding from a terminal."""
+    """Raise `UsageError` for text that cannot be stored: bytes of another encoding, or control characters."""
     try:
         text.encode()
     except UnicodeEncodeError as error:
         raise UsageError(f"the {what} {text!r} is not valid text", next_step="type it in UTF-8") from error
+    if has_control_characters(text):
+        raise UsageError(
+            f"the {what} {text!r} contains control characters",
+            next_step="remove them; `rig catalog label` changes the label and the note of an object",
+        )
 
 
 def check_azimuth(azimuth_deg: float) -> None:

@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import entry_points, version
@@ -27,8 +28,9 @@ from rig.cli.ui.command import (
 )
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.cli.ui.settings import Settings
-from rig.cli.ui.terminal import checked_output, discard, neutral
-from rig.core.errors import OutputFailed, UsageError
+from rig.cli.ui.terminal import checked_output, discard
+from rig.core.control_characters import neutral
+from rig.core.errors import OutputFailed, RigError, UsageError
 from rig.core.signals import EXIT_BY_SIGNAL
 
 GROUP = "rig.commands"
@@ -143,11 +145,9 @@ app.command("eval", rich_help_panel=MORE)(evaluate.evaluate)
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
     try:
         _plugin = _point.load()
-    except (ImportError, AttributeError) as _broken:  # the other commands work without this plug-in
-        print(
-            f"The plug-in {_point.value} cannot be loaded, so there is no command {_point.name}: {_broken}",
-            file=sys.stderr,
-        )
+    except Exception as _broken:  # the other commands work without this plug-in
+        _notice = f"The plug-in {_point.value} cannot be loaded, so there is no command {_point.name}: {_broken}"
+        print(neutral(_notice), file=sys.stderr)
         continue
     if isinstance(_plugin, typer.Typer):
         app.add_typer(_plugin, name=_point.name, rich_help_panel=MORE)
@@ -174,3 +174,8 @@ def main() -> None:
         except BrokenPipeError:
             discard(sys.stdout)
             sys.exit(EXIT_BY_SIGNAL + signal.SIGPIPE)
+        except Exception:  # a mistake in this program; its text can contain anything
+            print(neutral(traceback.format_exc()), file=sys.stderr, end="")
+            step = "Report this text and the command; `rig --version` prints the version."
+            print(f"Error {RigError.code} ({RigError.title}).\nNext step: {step}", file=sys.stderr)
+            sys.exit(RigError.code // 100)

@@ -11,7 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as RichProgress
 from rich.segment import Segment
 
-from rig.cli.ui.terminal import neutral, unguarded
+from rig.cli.ui.terminal import unguarded
+from rig.core.control_characters import neutral
 from rig.events.wording import angle_words, azimuth_words, counted, duration_words
 from rig.plans.estimate import DryRun, Obstacle
 

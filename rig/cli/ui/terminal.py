@@ -1,33 +1,21 @@
 r"""What a command writes to the terminal: text from files and devices cannot control it.
 
-Labels, notes, file names and answers of devices can hold terminal escapes: to hide text, to rename the window, or to
-answer in the place of the operator. While a command runs, standard output and standard error replace such characters by
-``\u001b``. JSON stays JSON, because that is its own notation. Colors come from Rich, which writes to the unguarded
-stream; `rig.cli.ui.present.console` guards its text.
+Labels, notes, file names and answers of devices can hold terminal escapes. Standard output and standard error replace
+such characters by ``\u001b``. JSON stays JSON, because that is its own notation. Colors come from Rich, which writes to
+the unguarded stream; `rig.cli.ui.present.console` guards its text.
 
 This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
 """
 
 import io
 import os
-import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, Final, TextIO, cast
+from typing import Any, TextIO, cast
 
+from rig.core.control_characters import neutral
 from rig.core.errors import OutputFailed
-
-_UNSAFE: Final = re.compile(
-    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 except tab and line feed, DEL, C1
-    "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # direction of text, Unicode UAX #9
-    "\u2028\u2029]"  # line and paragraph separator
-)
-
-
-def neutral(text: str) -> str:
-    r"""Return a text without control characters and changes of direction: each becomes ``\u`` and its code."""
-    return _UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 class _Output:

@@ -237,6 +237,8 @@ def test_begin_rejects_invalid_names_and_texts(catalog: Catalog, name: str) -> N
         begin(catalog, name)
     with pytest.raises(UsageError, match="label"):
         begin(catalog, "mug", label="\udcff")
+    with pytest.raises(UsageError, match="control characters"):
+        begin(catalog, "mug", note="\x9b31m")
     assert catalog.objects() == []
 
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 import hbr
 from rig.catalog import Catalog
-from rig.catalog.edit import delete
+from rig.catalog.edit import delete, set_texts
 from rig.catalog.exchange import (
     Conflict,
     ImportBatch,
@@ -46,7 +46,16 @@ from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ExportFailed, ImportRejected, ObjectExists, UsageError
 from rig.views import image_files as images
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, image, plan, true_fill, without_waiting
+from tests.rig.catalog.catalog_samples import (
+    PROVENANCE,
+    described,
+    fill,
+    finished,
+    image,
+    plan,
+    true_fill,
+    without_waiting,
+)
 
 BOTH = ("cedd", "cedd-blurred")
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
@@ -217,6 +226,20 @@ class TestRoundTrips:
         with pytest.raises(ExportFailed) as error:
             write_parquet(tmp_path / "a.parquet", read_objects(full))
         assert "hbr-rig[parquet]" in error.value.next_step
+
+    def test_label_of_an_earlier_program_with_control_characters_is_exported_after_it_is_changed(
+        self, open_catalog: OpenCatalog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        catalog = open_catalog("earlier")
+        with monkeypatch.context() as patch:
+            patch.setattr("rig.catalog.catalog.check_text", lambda *_: None)  # earlier programs stored any text
+            fill(catalog, "mug", 2, label="\x1b[2J")
+        assert catalog.objects()[0].label == "\x1b[2J"
+        with pytest.raises(UsageError, match="control characters") as error:
+            write_bundle(tmp_path / "a.zip", read_objects(catalog))
+        assert "rig catalog label" in error.value.next_step
+        set_texts(catalog, "mug", label="mug")
+        assert write_bundle(tmp_path / "a.zip", read_objects(catalog)) == 1
 
     def test_export_overwrites_nothing_and_leaves_no_partial_files(self, full: Catalog, tmp_path: Path) -> None:
         (tmp_path / "a.rigcat.zip").write_bytes(b"mine")
@@ -570,6 +593,8 @@ class TestHostileBundles:
         [
             (lambda line: line.update(name="a\nb"), "cannot be printed"),
             (lambda line: line.update(name=" mug"), "outer spaces"),
+            (lambda line: line.update(label="\x1b[2Jmug"), "control characters"),
+            (lambda line: line.update(note="a\u202eb"), "control characters"),
             (lambda line: line.update(colour="red"), "colour"),
             (lambda line: view_of(line).update(azimuth_deg=360.0), "azimuth_deg"),
             (lambda line: view_of(line).update(azimuth_deg="north"), "azimuth_deg"),

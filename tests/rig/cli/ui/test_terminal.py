@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -19,7 +20,8 @@ from rig.cli.main import app
 from rig.cli.ui.command import show_error
 from rig.cli.ui.present import console
 from rig.cli.ui.settings import Settings
-from rig.cli.ui.terminal import guarded_output, neutral
+from rig.cli.ui.terminal import guarded_output
+from rig.core.control_characters import neutral
 from rig.core.errors import CatalogError
 from tests.fuzzing import fuzz_settings
 
@@ -121,6 +123,26 @@ def test_full_output_device_is_an_error_with_a_next_step(arguments, tmp_path):
     assert "Next step:" in done.stderr
     assert "Traceback" not in done.stderr
     assert "ignored" not in done.stderr
+
+
+def test_unexpected_errors_and_broken_plug_ins_are_neutral(tmp_path):
+    about = tmp_path / "plugin-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[rig.commands]\nbroken = broken_plugin:go\nraising = raising_plugin:go\n")
+    (tmp_path / "broken_plugin.py").write_text("raise RuntimeError('\\x1b[2Jbroken')")
+    (tmp_path / "raising_plugin.py").write_text(
+        "from rig.cli.ui.command import command\nfrom rig.cli.ui.settings import Settings\n\n\n"
+        "@command\ndef go(settings: Settings) -> None:\n    raise ZeroDivisionError('\\x1b]0;raised\\x07')\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run([*RIG, "raising"], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert is_safe(done.stdout + done.stderr)
+    assert "The plug-in broken_plugin:go cannot be loaded" in done.stderr
+    assert "\\u001b[2Jbroken" in done.stderr
+    assert "ZeroDivisionError: \\u001b]0;raised\\u0007" in done.stderr
+    assert "Error 100 (internal error).\nNext step: " in done.stderr
 
 
 def test_closed_output_is_no_error(tmp_path):
