@@ -2,24 +2,23 @@
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import Self
 
 import serial
 
 from rig.config import RigConfig
-from rig.core.errors import DeviceNotFound
+from rig.config.imus import imu_kind
+from rig.core.errors import ConfigError, DeviceNotFound
 from rig.devices.dynamixel.port import READ_SLICE_S
 from sim.camera import SimCapture
 from sim.head.board import PinChange, SimHead
 from sim.head.serial_port import HeadSerial
 from sim.i2c import SimI2cBus
-from sim.imu.bno055 import SimBno055
-from sim.imu.mpu6050 import SimMpu6050
+from sim.imu.inertial import SimulatedImu
 from sim.servo import ServoBus, SimSerial
 from sim.servo.configured import SimulatedServo, simulated_servo
 from sim.world import World
-
-SimulatedImu = SimMpu6050 | SimBno055
 
 
 @dataclass
@@ -45,18 +44,15 @@ class SimDevices(AbstractContextManager["SimDevices"]):
     def connected(cls, config: RigConfig, world: World) -> Self:
         """Return the devices that ``config`` describes, with factory settings.
 
-        Raises `ConfigError` if the simulator has no servo of that model, or the model does not support the baud rate.
+        Raises `ConfigError` if the simulator has no servo or IMU of that model, or the servo does not support the baud
+        rate.
         """
         servo = simulated_servo(world, config.servo)
         servo_bus = ServoBus(world.clock)
         servo_bus.attach(servo)
         head = _head(config, world, servo) if config.imu.connection == "head" else None
         around = head.world_at_board_time if head else world
-        imu: SimulatedImu
-        if config.imu.model == "bno055":
-            imu = SimBno055(around, adr=config.imu.address == 0x29)
-        else:
-            imu = SimMpu6050(around, ad0=config.imu.address == 0x69)
+        imu = _imu(config, around)
         i2c = head or SimI2cBus(world.clock)
         i2c.attach(config.imu.address, imu)
         adapter = SimSerial(servo_bus, config.servo.baud, READ_SLICE_S)
@@ -102,6 +98,19 @@ class SimDevices(AbstractContextManager["SimDevices"]):
         """
         self.camera.reopen()
         self.reopen_adapter()
+
+
+def _imu(config: RigConfig, world: World) -> SimulatedImu:
+    row = imu_kind(config.imu.model)
+    try:
+        imu: SimulatedImu = resolve_name(row.simulator)(world, address=config.imu.address)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"There is no simulated {row.name}.",
+            next_step="Set imu.model to another sensor, or fix the package that provides it.",
+            evidence={"simulator": row.simulator, "reason": str(error)},
+        ) from error
+    return imu
 
 
 def _head(config: RigConfig, world: World, servo: SimulatedServo) -> SimHead:

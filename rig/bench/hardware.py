@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from rig.bench import Bench, BenchKind
 from rig.bench.computer import Computer
 from rig.config import RigConfig, Section
+from rig.config.imus import imu_kind
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
 from rig.devices.dynamixel.guardian import Guardian
@@ -117,6 +118,8 @@ def assemble(
         _check_reach(config, servo)
         imu: Imu = head or open_imu(config.imu, i2c_bus, clock)
         opened.callback(imu.close)
+        if head is None and (note := imu_kind(config.imu.model).note):
+            findings += (f"imu: {note}",)
         camera = OpenCvCamera(
             capture,
             clock=clock,

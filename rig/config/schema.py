@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import platformdirs
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from rig.config.imus import imu_kind
 from rig.config.toml_file import NONE
 from rig.config.values import APP, read_values, validate
 from rig.config.wording import is_optional
@@ -178,32 +179,42 @@ class ImuConfig(Section):
     connection: Literal["i2c", "head"] = Field(
         "i2c", description="what the sensor is connected to: the computer's own I2C bus, or a rig head, see [head]"
     )
-    model: Literal["mpu6050", "bno055"] = Field("mpu6050", description="sensor on the platter")
+    model: str = Field(
+        "mpu6050",
+        description="sensor on the platter: mpu6050, mpu6500, mpu9250, mpu6050_clone, bno055, or one of a plug-in; "
+        "`rig find` names yours",
+    )
     bus: int | str = Field(1, description="I2C bus number, or the path of its device")
     address: int = Field(
         0x68,
         ge=0x08,
         le=0x77,
         validate_default=True,
-        description="I2C address; an MPU-6050 has 0x68, or 0x69 with AD0 high; a BNO055 0x28, or 0x29 with ADR high",
+        description="I2C address; an MPU has 0x68, or 0x69 with AD0 high; a BNO055 0x28, or 0x29 with ADR high",
     )
     axis: Literal["x", "y", "z"] = Field("z", description="the sensor's axis that is parallel to the table's axis")
     sign: Literal[1, -1] = Field(1, description="+1 if a counter-clockwise rotation reads positive")
     range_dps: Literal[250, 500, 1000, 2000] = Field(250, description="full scale of the gyro")
-    rate_hz: float = Field(200.0, ge=4, le=1000, description="samples per second (MPU-6050; a BNO055 has 100)")
+    rate_hz: float = Field(200.0, ge=4, le=1000, description="samples per second (MPU; a BNO055 has 100)")
     bandwidth_hz: Literal[188, 98, 42, 20, 10, 5] = Field(
-        42, description="bandwidth of the MPU-6050's low-pass filter; must be below half of rate_hz to avoid aliasing"
+        42, description="bandwidth of the MPU's low-pass filter; must be below half of rate_hz to avoid aliasing"
     )
     scale: float = Field(1.0, ge=0.8, le=1.25, description="true rate divided by measured rate, from calibration")
     scale_uncertainty: float = Field(
         0.012, ge=0, le=0.1, description="standard uncertainty of the scale; 0.012 without calibration"
     )
 
+    @field_validator("model")
+    @classmethod
+    def _model_with_a_driver(cls, model: str) -> str:
+        return imu_kind(model).key
+
     @field_validator("address")
     @classmethod
     def _address_of_the_model(cls, address: int, others: ValidationInfo) -> int:
-        # The default is the MPU-6050's address, which no BNO055 can have.
-        return 0x28 if others.data.get("model") == "bno055" and address == 0x68 else address
+        # The default is the MPU-6050's address, which other sensors cannot have.
+        addresses = imu_kind(others.data["model"]).addresses if "model" in others.data else (address,)
+        return addresses[0] if address == 0x68 and address not in addresses else address
 
 
 class HeadConfig(Section):

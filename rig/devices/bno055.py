@@ -12,26 +12,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.config.imus import imu_kind
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import DeviceFault, DeviceMismatch, DeviceSilent
+from rig.core.errors import DeviceFault, DeviceSilent
 from rig.devices.i2c import I2cRegisters, I2cStatistics
-from rig.devices.imu import ImuIdentity, ImuSamples
+from rig.devices.imu import ImuIdentity, ImuSamples, identified
 
 Floats = NDArray[np.float64]
 
-EXPECTED_ID = 0xA0
+KIND = imu_kind("bno055")
 NOISE_DPS_RTHZ = 0.014
 """Output noise density of the gyroscope (table 0-2)."""
 RATE_HZ, RANGE_DPS = 100.0, 2000.0
 """Rate and range of its fusion modes, in which the sensor sets them itself (3.5)."""
 LSB_PER_DPS, LSB_PER_MS2, LSB_PER_QUATERNION = 16.0, 100.0, 16384.0
-OTHERS = {
-    0x00: "no device: SDA is held low, or ground is missing",
-    0xFF: "no device: SDA is not connected",
-    0xFB: "a BNO055 whose registers are read at a wrong position: the bus loses clock pulses",
-}
-
-_CHIP_ID, _PAGE_ID, _ACC_DATA, _FIRST, _TEMP = 0x00, 0x07, 0x08, 0x14, 0x34
+_PAGE_ID, _ACC_DATA, _FIRST, _TEMP = 0x07, 0x08, 0x14, 0x34
 _UNIT_SEL, _OPR_MODE, _LAST = 0x3B, 0x3D, 0x3E
 _CONFIG_MODE, _IMU_MODE, _FUSION_RUNNING = 0x00, 0x08, 5
 _TO_CONFIG_S, _FROM_CONFIG_S = 0.02, 0.01  # mode changes take 19 and 7 ms (3.3), plus a margin
@@ -169,22 +164,13 @@ class Bno055:
         give_up_ns = self._clock.now_ns() + round(_START_S * 1e9)
         while True:
             try:
-                got = self._registers.read(_CHIP_ID, 1)[0]
+                got = self._registers.read(KIND.register, 1)[0]
                 break
             except DeviceSilent as silent:
                 if self._clock.now_ns() > give_up_ns:
                     raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent
                 self._clock.sleep(_POLL_S)
-        address, bus = self._registers.address, self._registers.name
-        if got != EXPECTED_ID:
-            likely = OTHERS.get(got, "another chip; a BNO080 or BNO085 uses another protocol at similar addresses")
-            raise DeviceMismatch(
-                f"CHIP_ID at I2C address {address:#04x} of {bus} is {got:#04x}, expected {EXPECTED_ID:#04x} (BNO055): "
-                f"probably {likely}.",
-                next_step="Check the wiring, or give the address and model of the sensor (imu.address, imu.model).",
-                evidence={"got": got, "expected": EXPECTED_ID},
-            )
-        return ImuIdentity("BNO055", address, got, NOISE_DPS_RTHZ)
+        return identified(KIND, got, self._registers.address, self._registers.name, NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
         self._registers.write(_PAGE_ID, 0)

@@ -1,10 +1,14 @@
-"""The interface of an inertial sensor on the platter."""
+"""The interface of an inertial sensor on the platter, and what its drivers share."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rig.config.imus import ImuKind, likely_device, recognised
+from rig.core.clock import Clock
+from rig.core.errors import DeviceMismatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,3 +63,31 @@ class Imu(Protocol):
 
     def temperature_c(self) -> float: ...
     def close(self) -> None: ...
+
+
+class ImuDriver(Protocol):
+    """Opens the sensor of a row of `rig.config.imus`; ``settings`` are the address and the row's settings by name."""
+
+    def __call__(self, bus: int | str, *, clock: Clock, **settings: Any) -> Imu: ...
+
+
+def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_rthz: float) -> ImuIdentity:
+    """Return the identity of a sensor whose identity register has the value ``got``.
+
+    Raises
+    ------
+    DeviceMismatch
+        It is another sensor than ``kind``.
+    """
+    if got not in kind.identities:
+        other = recognised(address, kind.register, got)
+        expected = " or ".join(f"{identity:#04x}" for identity in kind.identities)
+        raise DeviceMismatch(
+            f"The identity register {kind.register:#04x} at I2C address {address:#04x} of {bus} is {got:#04x}, "
+            f"expected {expected} ({kind.name}): probably {likely_device(kind, address, got)}.",
+            next_step=f"Run `rig config set imu.model {other.key}`."
+            if other is not None and other.driver
+            else "Check the wiring, or give the address and model of the sensor (imu.address, imu.model).",
+            evidence={"got": got, "expected": kind.identities[0]},
+        )
+    return ImuIdentity(kind.name, address, got, gyro_noise_dps_rthz)

@@ -1,30 +1,30 @@
-"""The MPU-6050 on an I2C bus of the computer, through smbus2.
+"""The MPU-6050 and the sensors with its registers, on an I2C bus of the computer, through smbus2.
 
-Registers: RM-MPU-6000A rev 4.2; noise and scales: PS-MPU-6000A rev 3.4. The sensor takes the gyro's samples by its own
-clock and stores them in its FIFO, so a late reader loses no rotation.
+Registers: RM-MPU-6000A rev 4.2; noise and scales: PS-MPU-6000A rev 3.4; MPU-6500: RM-MPU-6500A and PS-MPU-6500A;
+MPU-9250: RM-MPU-9250A and PS-MPU-9250A. The sensor takes the gyro's samples by its own clock and stores them in its
+FIFO, so a late reader loses no rotation.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.config.imus import ImuKind, imu_kind
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent
 from rig.devices.i2c import I2cRegisters, I2cStatistics
-from rig.devices.imu import ImuIdentity, ImuSamples
+from rig.devices.imu import ImuIdentity, ImuSamples, identified
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
-_USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W, _WHO_AM_I = 0x6A, 0x6B, 0x72, 0x74, 0x75
+_USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W = 0x6A, 0x6B, 0x72, 0x74
 
-EXPECTED_ID = 0x68
 _DEVICE_RESET, _ASLEEP, _CLOCK_PLL_GYRO_X = 0x80, 0x40, 0x01
 _FIFO_ENABLE, _FIFO_RESET, _FIFO_GYRO_XYZ = 0x40, 0x04, 0x70
 _RESET_S, _START_S = 0.1, 0.05
 """After DEVICE_RESET (register 107), and the gyro's start-up of 30 ms (PS 6.1) with the PLL's settling."""
 
-_FRAME, _FIFO_FULL = 6, 1018
-"""Bytes of a frame of three words, and the largest count at which another frame fits into the 1024 bytes."""
+_FRAME = 6  # bytes of a sample in the FIFO: three words
 
 NOISE_DPS_RTHZ = 0.005
 LSB_PER_G = 16384.0
@@ -32,16 +32,9 @@ LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
 _FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}
 """DLPF_CFG by the gyro's bandwidth in Hz; all run at an internal rate of 1 kHz."""
 
-OTHERS = {
-    0x70: "an MPU-6500 sold as an MPU-6050",
-    0x71: "an MPU-9250",
-    0x73: "an MPU-9255",
-    0x12: "an ICM-20602",
-    0x19: "an MPU-6886",
-    0x98: "an ICM-20689, or a clone",
-    0x00: "no device: SDA is held low, or ground is missing",
-    0xFF: "no device: SDA is not connected",
-}
+_TESTED_SAMPLES, _TESTED_S = 50, 2.0
+"""How many samples of a clone are tested, and how long at most: 50 samples fit into any of the FIFOs."""
+_WILD_DPS = 20.0  # standard deviation that no table at rest shows
 
 
 class Mpu6050:
@@ -73,6 +66,12 @@ class Mpu6050:
     DeviceFault
         The sensor does not keep its settings.
     """
+
+    KIND: ClassVar[ImuKind] = imu_kind("mpu6050")
+    FIFO_BYTES: ClassVar[int] = 1024
+    NOISE_DPS_RTHZ: ClassVar[float] = NOISE_DPS_RTHZ
+    TEMPERATURE: ClassVar[tuple[float, float]] = 340.0, 36.53
+    """LSB per °C, and the temperature at 0 LSB, °C."""
 
     def __init__(
         self,
@@ -130,7 +129,7 @@ class Mpu6050:
         before_ns = self._clock.now_ns()
         count = self._fifo_count()
         after_ns = self._clock.now_ns()
-        if count > _FIFO_FULL or (
+        if count > self.FIFO_BYTES - _FRAME or (
             self._implausible(count, after_ns) and self._implausible(count := self._fifo_count(), after_ns)
         ):
             return self._start_over()  # an incomplete frame twice: not one that is being written
@@ -159,24 +158,17 @@ class Mpu6050:
     def temperature_c(self) -> float:
         """Return the temperature of the sensor's die (register 65); raises as `read_samples` does."""
         self._check_settings()
-        return int.from_bytes(self._registers.read(_TEMP_OUT_H, 2), "big", signed=True) / 340 + 36.53
+        lsb_per_c, zero_c = self.TEMPERATURE
+        return int.from_bytes(self._registers.read(_TEMP_OUT_H, 2), "big", signed=True) / lsb_per_c + zero_c
 
     # -- setting up -----------------------------------------------------------------------------------------------
 
     def _identify(self) -> ImuIdentity:
         try:
-            got = self._registers.read(_WHO_AM_I, 1)[0]
+            got = self._registers.read(self.KIND.register, 1)[0]
         except DeviceSilent as silent:
             raise self._registers.not_found(silent, "AD0 pin (low 0x68, high 0x69)") from silent
-        if got != EXPECTED_ID:
-            likely = OTHERS.get(got, "another chip; the clocks DS1307 and DS3231 also have address 0x68")
-            raise DeviceMismatch(
-                f"WHO_AM_I at I2C address {self._address:#04x} of {self._registers.name} is {got:#04x}, "
-                f"expected {EXPECTED_ID:#04x} (MPU-6050): probably {likely}.",
-                next_step="Check the wiring, or give the address of the MPU-6050; another chip needs its own driver.",
-                evidence={"got": got, "expected": EXPECTED_ID},
-            )
-        return ImuIdentity("MPU-6050", self._address, got, NOISE_DPS_RTHZ)
+        return identified(self.KIND, got, self._address, self._registers.name, self.NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
         self._registers.write(_PWR_MGMT_1, _DEVICE_RESET)
@@ -193,13 +185,15 @@ class Mpu6050:
         got = {register: self._registers.read(register, len(values)) for register, values in self._settings.items()}
         if got == self._settings:
             return
+        # After a reset an MPU-6050 is asleep. An MPU-6500 is awake, so all its settings tell.
         asleep = got[_USER_CTRL][1] & _ASLEEP
+        reset = asleep or not any(got[register][0] for register in self._settings)
         raise DeviceFault(
-            "The MPU-6050 fell asleep: its supply was interrupted."
-            if asleep
-            else "The MPU-6050 lost its settings: another program changed them, or the bus corrupts bytes.",
+            f"The {self.KIND.name} {'fell asleep' if asleep else 'was reset'}: its supply was interrupted."
+            if reset
+            else f"The {self.KIND.name} lost its settings: another program changed them, or the bus corrupts bytes.",
             next_step="Check its supply and cable, then open the bench again."
-            if asleep
+            if reset
             else "Close other programs that use the I2C bus, shorten its cable, then open the bench again.",
             evidence={f"register_{r:#04x}": {"got": got[r].hex(), "expected": self._settings[r].hex()} for r in got},
         )
@@ -240,6 +234,60 @@ class Mpu6050:
         return self._registers.transfer(pop)
 
 
+class Mpu6500(Mpu6050):
+    """An MPU-6500, which many boards sold as GY-521 carry; its low-pass is at 184, 92, 41, 20, 10 or 5 Hz."""
+
+    KIND = imu_kind("mpu6500")
+    FIFO_BYTES = 512
+    NOISE_DPS_RTHZ = 0.01
+    TEMPERATURE = 333.87, 21.0
+
+
+class Mpu9250(Mpu6500):
+    """An MPU-9250: an MPU-6500 with a magnetometer in its package, which is not used."""
+
+    KIND = imu_kind("mpu9250")
+
+
+class Mpu6050Clone(Mpu6050):
+    """A clone of the MPU-6050 that has no datasheet. Opening it also tests how it behaves at rest.
+
+    The FIFO is used as if it had the smallest size of the family. The temperature has the MPU-6050's scale.
+
+    Raises
+    ------
+    DeviceMismatch
+        Its samples come at another rate, are all equal or wild, or gravity is not 1 g.
+    """
+
+    KIND = imu_kind("mpu6050_clone")
+    FIFO_BYTES = 512
+
+    def _set_up(self) -> None:
+        super()._set_up()
+        due = min(float(_TESTED_SAMPLES), _TESTED_S * self.rate_hz)
+        self._clock.sleep(due / self.rate_hz)
+        samples, gravity_g = self.read_samples(), float(np.linalg.norm(self.read_gravity_g()))
+        got, rates = len(samples.time_ns), samples.gyro_dps
+        noise_dps = float(rates.std(axis=0).max()) if got else 0.0
+        problems = []
+        if samples.lost or abs(got - due) > 0.1 * due + 2:
+            problems.append(f"it took {got} samples instead of {due:.0f}")
+        elif noise_dps == 0.0:
+            problems.append("all its samples are equal")
+        elif noise_dps > _WILD_DPS:
+            problems.append(f"its rates scatter by {noise_dps:.0f} °/s")
+        if not 0.8 < gravity_g < 1.2:
+            problems.append(f"gravity is {gravity_g:.2f} g")
+        if problems:
+            raise DeviceMismatch(
+                f"The clone at I2C address {self._address:#04x} of {self._registers.name} does not behave as an "
+                f"MPU-6050: {'; '.join(problems)}.",
+                next_step="Keep the table still and open the bench again. If it fails again, use another sensor.",
+                evidence={"samples": got, "expected": due, "noise_dps": noise_dps, "gravity_g": gravity_g},
+            )
+
+
 def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:
     """Return the values to write and to check, by their first register."""
     mistakes: dict[str, Any] = {}
@@ -252,8 +300,7 @@ def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, byt
         mistakes["bandwidth_hz"] = f"{bandwidth_hz}: give one of {', '.join(map(str, _FILTERS))}"
     if mistakes:
         raise ConfigError(
-            "The MPU-6050 does not have these settings: "
-            + "; ".join(f"{name} = {text}" for name, text in mistakes.items()),
+            "The IMU does not have these settings: " + "; ".join(f"{name} = {text}" for name, text in mistakes.items()),
             next_step="Correct these values of the IMU in the configuration.",
             evidence=mistakes,
         )

@@ -10,6 +10,7 @@ from dynamixel_sdk import Protocol2PacketHandler
 from smbus2 import SMBus
 
 from rig.bench.computer import Computer
+from rig.config.imus import imu_kinds
 from rig.core.clock import Clock
 from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
@@ -224,32 +225,11 @@ def _answers_corrupt(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Chip:
-    """A sensor type: its possible addresses, and the register that identifies it."""
-
-    name: str
-    driver: str | None
-    addresses: tuple[int, ...]
-    register: int
-    value: int
-
-
-CHIPS = (
-    Chip("MPU-6050", "mpu6050", (0x68, 0x69), 0x75, 0x68),
-    Chip("MPU-6500", None, (0x68, 0x69), 0x75, 0x70),
-    Chip("MPU-9250", None, (0x68, 0x69), 0x75, 0x71),
-    Chip("MPU-9255", None, (0x68, 0x69), 0x75, 0x73),
-    Chip("ICM-20948", None, (0x68, 0x69), 0x00, 0xEA),
-    Chip("BNO055", "bno055", (0x28, 0x29), 0x00, 0xA0),
-    Chip("LSM6DSOX", None, (0x6A, 0x6B), 0x0F, 0x6C),
-)
-
-
-@dataclass(frozen=True, slots=True)
 class FoundImu:
-    """A device at an IMU address; ``driver`` is None if the rig has no driver for it, or if it is unknown.
+    """A device at an IMU address; ``driver``, the ``imu.model``, is None if there is no driver, or if it is unknown.
 
-    ``note`` tells more about it: registers of an unknown chip, or a kernel driver that uses the address.
+    ``note`` tells more about it: the note of its row, registers of an unknown chip, or a kernel driver that uses the
+    address.
     """
 
     bus: str
@@ -262,6 +242,11 @@ class FoundImu:
         return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.note}" if self.note else "")
 
 
+def use_another_imu() -> str:
+    """Return the next step for a sensor without a driver."""
+    return f"Use one of these sensors: {', '.join(row.name for row in imu_kinds().values() if row.driver)}"
+
+
 def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
     """Return the devices that answer at IMU addresses; no other address is asked, and nothing is written.
 
@@ -271,12 +256,13 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
         The bus cannot be opened, or is stuck.
     """
     name = computer.i2c_name(bus)
+    rows = imu_kinds().values()
     found = []
     with SMBus(computer.i2c_path(bus)) as wire:
-        for address in sorted({address for chip in CHIPS for address in chip.addresses}):
+        for address in sorted({address for row in rows for address in row.addresses}):
             said: dict[int, int] = {}
             try:
-                for register in sorted({chip.register for chip in CHIPS if address in chip.addresses}):
+                for register in sorted({row.register for row in rows if address in row.addresses}):
                     said[register] = wire.read_byte_data(address, register)
             except OSError as error:
                 if error.errno == EBUSY:
@@ -284,9 +270,11 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
                 elif error.errno not in (ENXIO, EREMOTEIO):
                     raise
                 continue
-            chips = [c for c in CHIPS if address in c.addresses and said[c.register] == c.value]
-            if chips:
-                found.append(FoundImu(name, address, chips[0].name, chips[0].driver))
+            here = [row for row in rows if address in row.addresses and said[row.register] in row.identities]
+            if here:
+                found.append(
+                    FoundImu(name, address, here[0].name, here[0].key if here[0].driver else None, here[0].note)
+                )
             else:
                 values = ", ".join(f"register {register:#04x} is {value:#04x}" for register, value in said.items())
                 found.append(FoundImu(name, address, "unknown chip", None, values))

@@ -23,6 +23,7 @@ from rig.doctor.bus_scan import (
     FoundServo,
     scan_imus,
     scan_servos,
+    use_another_imu,
     without_echoes,
 )
 from rig.doctor.computer import access, i2c_command
@@ -174,7 +175,7 @@ class DeviceScan:
                     self.imus.append(found)
                     yield fine("imu", FindingCode.IMU_FOUND, found=found, bus=found.bus, address=found.address)
                 else:
-                    fix = "Use an MPU-6050 or a BNO055"
+                    fix = use_another_imu()
                     yield warning("imu", FindingCode.NO_DRIVER, fix, found=found, address=found.address)
         if not asked and not self.heads:
             yield bad("imu", FindingCode.NO_I2C, i2c_command(context))

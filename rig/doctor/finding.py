@@ -87,6 +87,8 @@ class FindingCode(Enum):
     HEAD = "{model} on a rig head ({board}, firmware {firmware}) at {port}"
     NO_IMU = "no device answers at {address:#04x} of {bus} (at other IMU addresses: {found})"
     NO_DRIVER = "{found}: the rig has no driver for it"
+    OTHER_IMU = "{found}, but imu.model is {model}"
+    IMU_NOTE = "{note}"
     I2C_NOT_OPENED = "{bus} cannot be opened: {reason}"
     I2C_STUCK = "{bus} is stuck: {reason}; a device blocks the bus"
     SAMPLES_MISSING = "{samples} samples in {seconds:g} s instead of {wanted:.0f}, {lost} lost"

@@ -11,9 +11,10 @@ from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, ImuSamples
 from rig.devices.open_imu import open_imu
-from rig.doctor.bus_scan import FoundImu, scan_imus
+from rig.doctor.bus_scan import FoundImu, scan_imus, use_another_imu
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.safety.gyro_rotation import DRAIN_SAMPLES
 
 SECONDS, DRAIN_S = 1.5, 0.25
 NOISY = 4.0  # multiple of the datasheet's noise that a quiet table does not exceed
@@ -44,13 +45,15 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
         yield _bus_failed(context, error)
         return
     here = next((found for found in there if found.address == config.imu.address), None)
-    if here is None or here.driver is None:
+    if here is None or here.driver != config.imu.model:
         yield _wrong(context, config.imu, here, there)
         return
     with closing(open_imu(config.imu, context.computer.i2c_path(config.imu.bus), clock)) as sensor:
         bus, identity = context.computer.i2c_name(config.imu.bus), sensor.identity
         parts = {"model": identity.model, "address": identity.bus_address, "who_am_i": identity.who_am_i}
         yield fine("imu", FindingCode.IMU, bus=bus, **parts)
+        if here.note:
+            yield fine("imu", FindingCode.IMU_NOTE, note=here.note)
         yield from _at_rest(context, sensor)
 
 
@@ -65,8 +68,9 @@ def _samples(context: DoctorContext, sensor: Imu) -> ImuSamples:
     """Return ``SECONDS`` of samples, without older ones."""
     sensor.read_samples()
     taken = []
-    for _ in range(round(SECONDS / DRAIN_S)):
-        context.computer.clock.sleep(DRAIN_S)
+    drain_s = min(DRAIN_S, DRAIN_SAMPLES / sensor.rate_hz)
+    for _ in range(round(SECONDS / drain_s)):
+        context.computer.clock.sleep(drain_s)
         taken.append(sensor.read_samples())
     return ImuSamples(
         np.concatenate([part.time_ns for part in taken]),
@@ -130,9 +134,11 @@ def _gravity(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
 
 def _wrong(context: DoctorContext, config: ImuConfig, here: FoundImu | None, there: list[FoundImu]) -> Finding:
     bus = context.computer.i2c_name(config.bus)
+    if here is not None and here.driver is None:
+        return bad("imu", FindingCode.NO_DRIVER, use_another_imu(), found=here, address=here.address)
     if here is not None:
-        fix = "Use an MPU-6050 or a BNO055, or check the wiring"
-        return bad("imu", FindingCode.NO_DRIVER, fix, found=here, address=here.address)
+        fix = context.set("imu.model", here.driver)
+        return bad("imu", FindingCode.OTHER_IMU, fix, found=here, address=here.address, model=config.model)
     usable = [found for found in there if found.driver]
     fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
     if usable:

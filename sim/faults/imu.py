@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.devices import SimDevices
 from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
-from sim.imu.mpu6050 import Words
+from sim.imu.inertial import Words
 
 Values = Mapping[str, float]
 

@@ -14,8 +14,7 @@ from math import cos, pi, radians, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.imu.inertial import InertialModel
-from sim.imu.mpu6050 import Words
+from sim.imu.inertial import InertialModel, Words
 from sim.motion import Floats
 from sim.world import World
 
@@ -60,8 +59,8 @@ class SimBno055:
     the MPU-6050, int16 (n, 7), and returns those that the fusion works with.
     """
 
-    def __init__(self, world: World, *, adr: bool = False, chip_id: int = 0xA0) -> None:
-        self.address = 0x29 if adr else 0x28
+    def __init__(self, world: World, *, address: int = 0x28, chip_id: int = 0xA0) -> None:
+        self.address = address
         self.inertial = InertialModel(world, f"imu-{self.address:02x}", gyro_noisier=GYRO_NOISIER)
         self.inertial.gyro_bias_dps *= GYRO_TRUER
         self.temperature_c = 25.0

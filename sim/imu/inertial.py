@@ -1,15 +1,20 @@
 """The signals of an inertial sensor on the platter and their errors, for any chip."""
 
+from collections.abc import Callable
 from functools import cache
 from math import cos, pi, radians, sin, sqrt, tan
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.i2c import I2cDevice
 from sim.motion import Floats
 from sim.world import World
 
 WARM_UP_S = 300.0  # time constant of the warming of a sensor on a small board in still air
+Words = np.ndarray[tuple[int, int], np.dtype[np.int16]]
+
 _NOTHING = 1e-12  # share of an input that a 16-bit register cannot show
 
 
@@ -134,3 +139,25 @@ def _steps(before: float, values: NDArray[np.int64] | Floats) -> Floats:
     steps = np.empty(len(values))
     steps[0], steps[1:] = values[0] - before, values[1:] - values[:-1]
     return steps
+
+
+class SimulatedImu(I2cDevice, Protocol):
+    """What the simulated bench and its faults need of a sensor, apart from its side on the bus.
+
+    Each of ``distortions`` receives the words of samples, int16 (n, 7): accelerometer x, y, z, temperature, gyro x, y,
+    z. It returns the words that the sensor delivers.
+    """
+
+    address: int
+    inertial: InertialModel
+    distortions: list[Callable[[Words], Words]]
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second of a true clock."""
+
+    def run_clock(self, error: float) -> None:
+        """Set the relative error of its clock from now on."""
+
+    def power_cycle(self) -> None:
+        """Lose all registers, as after a brown-out."""

@@ -1,19 +1,21 @@
-"""A register-true MPU-6050 for the simulated I2C bus.
+"""A register-true MPU-6050 for the simulated I2C bus, and the sensors with its registers.
 
-Behaviour follows the register map RM-MPU-6000A rev 4.2 and the product specification PS-MPU-6000A rev 3.4. Register
-names and numbers are written down here once more, not shared with the driver, so that an error in one does not hide in
-the other.
+Behaviour follows the register map RM-MPU-6000A rev 4.2 and the product specification PS-MPU-6000A rev 3.4; for the
+MPU-6500 and the MPU-9250, RM-MPU-6500A, PS-MPU-6500A, RM-MPU-9250A and PS-MPU-9250A. Register names and numbers are
+written down here once more, not shared with the driver, so that an error in one does not hide in the other.
 
 Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, interrupts other
 than a new sample's, the signal paths' reset, the motion processor, and start-up times. The low-pass is of second order,
-and the accelerometer follows the gyro's rate and bandwidth.
+and the accelerometer follows the gyro's rate and bandwidth. Of the MPU-6500 also the bypass of its low-pass and its
+accelerometer's own low-pass, of the MPU-9250 its magnetometer.
 """
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 
-from sim.imu.inertial import InertialModel
+from sim.imu.inertial import InertialModel, Words
 from sim.motion import Floats
 from sim.world import World
 
@@ -26,7 +28,6 @@ DATA_RDY, FIFO_OFLOW = 0x01, 0x10
 DEVICE_RESET, SLEEP = 0x80, 0x40
 FIFO_ENABLED, FIFO_RESET, SIG_COND_RESET = 0x40, 0x04, 0x01
 
-FIFO_SIZE = 1024
 LSB_PER_DPS = (131.0, 65.5, 32.8, 16.4)
 LSB_PER_G = (16384.0, 8192.0, 4096.0, 2048.0)
 BANDWIDTH_HZ = (256.0, 188.0, 98.0, 42.0, 20.0, 10.0, 5.0, 256.0)
@@ -49,9 +50,6 @@ _SAMPLING = {SMPLRT_DIV, CONFIG, PWR_MGMT_1}
 _FIFO_BITS = (0x08, 0x08, 0x08, 0x80, 0x40, 0x20, 0x10)
 
 
-Words = np.ndarray[tuple[int, int], np.dtype[np.int16]]
-
-
 class SimMpu6050:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
@@ -61,12 +59,22 @@ class SimMpu6050:
     int16 (n, 7), and returns those that are kept.
     """
 
-    def __init__(self, world: World, *, ad0: bool = False, who_am_i: int = 0x68) -> None:
-        self.address = 0x69 if ad0 else 0x68
-        self.inertial = InertialModel(world, f"imu-{self.address:02x}")
+    IDENTITY: ClassVar[int] = 0x68
+    FIFO_SIZE: ClassVar[int] = 1024
+    AFTER_RESET: ClassVar[int] = SLEEP
+    """Value of PWR_MGMT_1."""
+    BANDWIDTH_HZ: ClassVar[tuple[float, ...]] = BANDWIDTH_HZ
+    LSB_PER_C: ClassVar[float] = 340.0
+    ZERO_C: ClassVar[float] = 36.53
+    GYRO_NOISIER: ClassVar[float] = 1.0
+    """Its gyro's noise over that of the bench's noise model."""
+
+    def __init__(self, world: World, *, address: int = 0x68, who_am_i: int | None = None) -> None:
+        self.address = address
+        self.inertial = InertialModel(world, f"imu-{self.address:02x}", gyro_noisier=self.GYRO_NOISIER)
         self.temperature_c = 25.0
         self.clock_error = 0.0
-        self.who_am_i = who_am_i
+        self.who_am_i = self.IDENTITY if who_am_i is None else who_am_i
         self.distortions: list[Callable[[Words], Words]] = []
         self._clock = world.clock
         self.power_cycle()
@@ -87,7 +95,7 @@ class SimMpu6050:
     def power_cycle(self) -> None:
         """Lose all registers, as after a brown-out or DEVICE_RESET."""
         self._registers = bytearray(0x80)
-        self._registers[PWR_MGMT_1] = SLEEP
+        self._registers[PWR_MGMT_1] = self.AFTER_RESET
         self._fifo = bytearray()
         self._last_popped = 0
         self._pointer = 0
@@ -186,11 +194,11 @@ class SimMpu6050:
         due = (self._clock.now_ns() - self._epoch_ns) // (tick_ns * decimation)
         if due == self._taken:
             return
-        first = max(self._taken, due - FIFO_SIZE // 2)  # the size of the FIFO: a frame has at least one word
+        first = max(self._taken, due - self.FIFO_SIZE // 2)  # the size of the FIFO: a frame has at least one word
         self._taken = due
         ticks = np.arange(first * decimation + 1, due * decimation + 1)
         times_ns = self._epoch_ns + tick_ns * ticks
-        gyro, accel = self.inertial.sample(times_ns, internal_hz, BANDWIDTH_HZ[filter_setting])
+        gyro, accel = self.inertial.sample(times_ns, internal_hz, self.BANDWIDTH_HZ[filter_setting])
         kept = slice(decimation - 1, None, decimation)
         die_c = self.temperature_c + self.inertial.warmth_c(times_ns[kept])
         words = self._quantised(gyro[kept], accel[kept], die_c)
@@ -201,15 +209,40 @@ class SimMpu6050:
         chosen = [i for i, bit in enumerate(_FIFO_BITS) if registers[FIFO_EN] & bit]
         if chosen and registers[USER_CTRL] & FIFO_ENABLED:
             self._fifo += words[:, chosen].tobytes()
-            if len(self._fifo) > FIFO_SIZE:
-                del self._fifo[:-FIFO_SIZE]
+            if len(self._fifo) > self.FIFO_SIZE:
+                del self._fifo[: -self.FIFO_SIZE]
                 registers[INT_STATUS] |= FIFO_OFLOW
 
     def _quantised(self, gyro: Floats, accel: Floats, die_c: Floats) -> Words:
         """Return the samples (n, 7) as the big-endian words of the data registers, saturated."""
         values = np.empty((len(gyro), 7))
         values[:, :3] = accel * LSB_PER_G[self._registers[ACCEL_CONFIG] >> 3 & 3]
-        values[:, 3] = (die_c - 36.53) * 340
+        values[:, 3] = (die_c - self.ZERO_C) * self.LSB_PER_C
         values[:, 4:] = gyro * LSB_PER_DPS[self._registers[GYRO_CONFIG] >> 3 & 3]
         words: Words = np.clip(np.rint(values), -32768, 32767).astype(">i2")
         return words
+
+
+class SimMpu6500(SimMpu6050):
+    """An MPU-6500: a FIFO of 512 bytes, awake after a reset, and another scale of the temperature."""
+
+    IDENTITY = 0x70
+    FIFO_SIZE = 512
+    AFTER_RESET = 0x01
+    BANDWIDTH_HZ = (250.0, 184.0, 92.0, 41.0, 20.0, 10.0, 5.0, 3600.0)
+    LSB_PER_C, ZERO_C = 333.87, 21.0
+    GYRO_NOISIER = 2.0  # 0.01 °/s/√Hz
+
+
+class SimMpu9250(SimMpu6500):
+    """An MPU-9250, without its magnetometer."""
+
+    IDENTITY = 0x71
+
+
+class SimMpu6050Clone(SimMpu6050):
+    """A clone of the MPU-6050: it has the MPU-6050's registers and the FIFO of an MPU-6500."""
+
+    IDENTITY = 0x72
+    FIFO_SIZE = 512
+    GYRO_NOISIER = 2.0

@@ -79,7 +79,9 @@ def opened_head(
     with simulated_head(kind, noise, clock_error=clock_error) as (head, world):
         settings = sensor()
         device = (
-            SimMpu6050(head.world_at_board_time) if settings.name == "MPU-6050" else SimBno055(head.world_at_board_time)
+            SimMpu6050(head.world_at_board_time)
+            if settings.kind.key == "mpu6050"
+            else SimBno055(head.world_at_board_time)
         )
         head.attach(device.address, device)
         wire = HeadSerial(head)

@@ -12,10 +12,11 @@ from rig.core.errors import DeviceSilent
 from rig.devices.bno055 import Bno055
 from rig.devices.head.sensors import HeadSensor
 from rig.devices.imu import Imu
-from rig.devices.mpu6050 import Mpu6050
+from rig.devices.mpu6050 import Mpu6050, Mpu6500, Mpu9250
 from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055
-from sim.imu.mpu6050 import SimMpu6050
+from sim.imu.inertial import SimulatedImu
+from sim.imu.mpu6050 import SimMpu6050, SimMpu6500, SimMpu9250
 from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
 from sim.world import World
@@ -51,7 +52,7 @@ Opened = AbstractContextManager[Sensor]
 
 
 def on_i2c(
-    driver: Callable[..., Imu], device: type[SimMpu6050 | SimBno055], address: int, latency_s: float, buffer_s: float
+    driver: Callable[..., Imu], device: Callable[[World], SimulatedImu], address: int, latency_s: float, buffer_s: float
 ) -> Callable[[NoiseModel], Opened]:
     @contextmanager
     def opened(noise: NoiseModel) -> Iterator[Sensor]:
@@ -87,6 +88,8 @@ def pseudo_terminal(noise: NoiseModel) -> Iterator[Sensor]:
 
 SENSORS: dict[str, Callable[[NoiseModel], Opened]] = {
     "mpu6050": on_i2c(Mpu6050, SimMpu6050, 0x68, 0.005, 0.3),
+    "mpu6500": on_i2c(Mpu6500, SimMpu6500, 0x68, 0.005, 0.3),
+    "mpu9250": on_i2c(Mpu9250, SimMpu9250, 0x68, 0.005, 0.3),
     "bno055": on_i2c(Bno055, SimBno055, 0x28, 0.02, 0.01),
     "head": on_head("memory", heads.mpu6050, 0.007),
     "head-bno055": on_head("memory", heads.bno055, 0.02, resolution_dps=1 / 16),

@@ -101,7 +101,7 @@ def test_device_reset_restores_the_reset_values(chip: Chip) -> None:
 
 
 def test_ad0_changes_the_address_not_the_identity() -> None:
-    sensor = SimMpu6050(World(), ad0=True)
+    sensor = SimMpu6050(World(), address=0x69)
     assert sensor.address == 0x69
     sensor.start(reading=False)
     sensor.write(bytes([WHO]))

@@ -127,7 +127,7 @@ class RigHead:
     def identity(self) -> HeadIdentity:
         head, sensor, boards = self._connection.identity, self._sensor, {b.value: b.name.lower() for b in Board}
         return HeadIdentity(
-            model=sensor.name,
+            model=sensor.kind.name,
             bus_address=sensor.setup.address,
             who_am_i=self._status.who_am_i,
             gyro_noise_dps_rthz=sensor.noise_dps_rthz,

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from rig.config.imus import ImuKind
 from rig.core.errors import ConfigError
 from rig.devices import bno055, mpu6050
 from rig.devices.head.protocol import Imu, ImuModel
@@ -12,10 +13,10 @@ from rig.devices.head.protocol import Imu, ImuModel
 class HeadSensor:
     """A sensor with its settings: its scales, and the request that sets it up.
 
-    ``others`` names the likely chip for other values of ``who_am_i``; ``start_s`` is how long its start may take.
+    ``start_s`` is how long its start may take.
     """
 
-    name: str
+    kind: ImuKind
     setup: Imu
     rate_hz: float
     range_dps: float
@@ -23,8 +24,6 @@ class HeadSensor:
     lsb_per_dps: float
     lsb_per_g: float
     temperature_c: Callable[[int], float]
-    who_am_i: int
-    others: dict[int, str]
     start_s: float
 
 
@@ -38,7 +37,7 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
     """
     if kind == "bno055":
         return HeadSensor(
-            name="BNO055",
+            kind=bno055.KIND,
             setup=Imu(ImuModel.BNO055, address, divider=0, filter=1, range=0),
             rate_hz=bno055.RATE_HZ,
             range_dps=bno055.RANGE_DPS,
@@ -46,17 +45,16 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
             lsb_per_dps=bno055.LSB_PER_DPS,
             lsb_per_g=1000.0,
             temperature_c=float,
-            who_am_i=bno055.EXPECTED_ID,
-            others={},
             start_s=6.0,
         )
     if kind != "mpu6050":
         raise ConfigError(
-            f"A rig head does not support the sensor {kind!r}.", next_step="Set imu.model to mpu6050 or bno055."
+            f"A rig head does not support the sensor {kind!r}.",
+            next_step="Set imu.model to mpu6050 or bno055, or connect the sensor to the computer's own I2C bus.",
         )
     divider, dlpf, full_scale, _ = mpu6050.settings(range_dps, rate_hz, bandwidth_hz)[mpu6050.SMPLRT_DIV]
     return HeadSensor(
-        name="MPU-6050",
+        kind=mpu6050.Mpu6050.KIND,
         setup=Imu(ImuModel.MPU6050, address, divider=divider, filter=dlpf, range=full_scale >> 3),
         rate_hz=1000.0 / (divider + 1),
         range_dps=32767 / mpu6050.LSB_PER_DPS[range_dps],
@@ -64,7 +62,5 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
         lsb_per_dps=mpu6050.LSB_PER_DPS[range_dps],
         lsb_per_g=mpu6050.LSB_PER_G,
         temperature_c=lambda raw: raw / 340 + 36.53,
-        who_am_i=mpu6050.EXPECTED_ID,
-        others=mpu6050.OTHERS,
         start_s=0.6,
     )

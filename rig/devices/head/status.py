@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from rig.config.imus import likely_device
 from rig.core.errors import (
     DeviceFault,
     DeviceMismatch,
@@ -107,12 +108,13 @@ def sensor_error(status: HeadStatus, sensor: HeadSensor, port: str) -> RigError:
     evidence = {"imu_status": status.imu_status.name.lower()}
     match status.imu_status:
         case ImuStatus.WRONG_ID:
-            likely = sensor.others.get(status.who_am_i, "another chip")
+            (expected,) = sensor.kind.identities
+            likely = likely_device(sensor.kind, sensor.setup.address, status.who_am_i)
             return DeviceMismatch(
-                f"WHO_AM_I at {place} is {status.who_am_i:#04x}, expected {sensor.who_am_i:#04x} ({sensor.name}): "
+                f"WHO_AM_I at {place} is {status.who_am_i:#04x}, expected {expected:#04x} ({sensor.kind.name}): "
                 f"probably {likely}.",
-                next_step="Check the wiring, and head.sensor and imu.address.",
-                evidence={"got": status.who_am_i, "expected": sensor.who_am_i},
+                next_step="Check the wiring, imu.model and imu.address.",
+                evidence={"got": status.who_am_i, "expected": expected},
             )
         case ImuStatus.BUS_STUCK:
             return DeviceSilent(
@@ -122,13 +124,13 @@ def sensor_error(status: HeadStatus, sensor: HeadSensor, port: str) -> RigError:
             )
         case ImuStatus.SETTINGS_LOST:
             return DeviceFault(
-                f"The {sensor.name} at {place} loses its settings: its supply is interrupted.",
+                f"The {sensor.kind.name} at {place} loses its settings: its supply is interrupted.",
                 next_step="Check its supply and cable, then open the bench again.",
                 evidence=evidence,
             )
         case _:
             return DeviceSilent(
-                f"The {sensor.name} at {place} does not answer.",
+                f"The {sensor.kind.name} at {place} does not answer.",
                 next_step="Check the sensor's plug, supply, SDA and SCL, and its address (imu.address).",
                 evidence=evidence,
             )

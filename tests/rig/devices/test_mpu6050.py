@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
-from rig.devices.mpu6050 import Mpu6050
+from rig.devices.mpu6050 import Mpu6050, Mpu6050Clone, Mpu6500, Mpu9250
 from sim.clock import VirtualClock
 from sim.i2c import SimI2cBus
-from sim.imu.mpu6050 import SimMpu6050
+from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone, SimMpu6500, SimMpu9250
 from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
 from sim.world import World
@@ -25,16 +25,22 @@ AT = 0x68
 class Bench:
     """A world, the sensor in it, and the driver once it is opened."""
 
-    def __init__(self, noise: NoiseModel | None = None, seed: int = 0, who_am_i: int = 0x68) -> None:
+    def __init__(
+        self,
+        noise: NoiseModel | None = None,
+        seed: int = 0,
+        who_am_i: int | None = None,
+        device: type[SimMpu6050] = SimMpu6050,
+    ) -> None:
         self.world = World(noise=noise or NoiseModel.none(), seed=seed)
         self.clock = self.world.clock
-        self.sensor = SimMpu6050(self.world, who_am_i=who_am_i)
+        self.sensor = device(self.world, who_am_i=who_am_i)
         self.bus = SimI2cBus(self.clock)
         self.bus.attach(AT, self.sensor)
         self.imu: Mpu6050 | None = None
 
-    def open(self, **settings: Any) -> Mpu6050:
-        self.imu = Mpu6050(self.bus.path, clock=self.clock, **settings)
+    def open(self, driver: type[Mpu6050] = Mpu6050, **settings: Any) -> Mpu6050:
+        self.imu = driver(self.bus.path, clock=self.clock, **settings)
         return self.imu
 
     def __enter__(self) -> "Bench":
@@ -104,6 +110,78 @@ def test_wrong_chip_is_named(who_am_i: int, likely: str) -> None:
         assert caught.value.evidence == {"got": who_am_i, "expected": 0x68}
         assert f"{who_am_i:#04x}" in caught.value.what
         assert bench.sensor._registers[0x6B] == 0x40  # nothing was written to the unknown device
+
+
+@pytest.mark.parametrize(
+    ("who_am_i", "model"), [(0x70, "mpu6500"), (0x71, "mpu9250"), (0x72, "mpu6050_clone"), (0x98, "mpu6050_clone")]
+)
+def test_other_sensor_with_a_driver_is_the_next_step(who_am_i: int, model: str) -> None:
+    with Bench(who_am_i=who_am_i) as bench, pytest.raises(DeviceMismatch) as caught:
+        bench.open()
+    assert caught.value.next_step == f"Run `rig config set imu.model {model}`."
+
+
+# -- sensors with the registers of the MPU-6050 -----------------------------------------------------------------------
+
+PARTS = [(Mpu6500, SimMpu6500), (Mpu9250, SimMpu9250), (Mpu6050Clone, SimMpu6050Clone)]
+
+
+@pytest.mark.parametrize(("driver", "device"), PARTS)
+def test_fifo_of_512_bytes_is_read_until_it_is_full(driver: type[Mpu6050], device: type[SimMpu6050]) -> None:
+    with Bench(NoiseModel(), device=device) as bench:
+        imu = bench.open(driver)
+        imu.read_samples()
+        bench.clock.sleep(0.415)  # 84 samples of 6 bytes fit
+        full = imu.read_samples()
+        assert (len(full.time_ns), full.lost) == (pytest.approx(83, abs=1), 0)
+        bench.clock.sleep(0.44)
+        assert imu.read_samples().lost == pytest.approx(90, abs=3)  # reading 504 bytes takes 11 ms
+
+
+@pytest.mark.parametrize(("driver", "device"), PARTS[:2])
+def test_temperature_has_the_scale_of_the_part(driver: type[Mpu6050], device: type[SimMpu6050]) -> None:
+    with Bench(device=device) as bench:
+        bench.sensor.temperature_c = 31.5
+        imu = bench.open(driver)
+        bench.clock.sleep(0.1)
+        assert imu.temperature_c() == pytest.approx(31.5, abs=0.01)
+
+
+def test_mpu6500_that_is_awake_after_a_reset_is_a_fault() -> None:
+    with Bench(device=SimMpu6500) as bench:
+        imu = bench.open(Mpu6500)
+        bench.sensor.power_cycle()
+        with pytest.raises(DeviceFault, match="supply was interrupted"):
+            imu.read_gravity_g()
+
+
+@pytest.mark.parametrize("who_am_i", [0x72, 0x98])
+@pytest.mark.parametrize("rate_hz", [4.0, 200.0, 1000.0])
+@pytest.mark.parametrize("device", [SimMpu6050, SimMpu6050Clone])
+def test_clone_that_behaves_is_accepted(who_am_i: int, rate_hz: float, device: type[SimMpu6050]) -> None:
+    with Bench(NoiseModel(), who_am_i=who_am_i, device=device) as bench:
+        imu = bench.open(Mpu6050Clone, rate_hz=rate_hz)
+        assert (imu.identity.model, imu.identity.who_am_i) == ("MPU-6050 clone", who_am_i)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "problem"),
+    [
+        (lambda sensor: setattr(sensor, "clock_error", -0.5), "samples instead of 50"),
+        (
+            lambda sensor: sensor.distortions.append(lambda words: words * np.array([1, 1, 1, 1, 0, 0, 0], ">i2")),
+            "all its samples are equal",
+        ),
+        (lambda sensor: setattr(sensor.inertial, "accel_bias_g", sensor.inertial.up), "gravity is 2.0"),
+        (lambda sensor: sensor.distortions.append(lambda words: words[::-1] * np.int16(300)), "scatter"),
+    ],
+    ids=["rate", "frozen", "gravity", "noise"],
+)
+def test_clone_that_misbehaves_is_rejected(spoil: Any, problem: str) -> None:
+    with Bench(NoiseModel(), device=SimMpu6050Clone) as bench:
+        spoil(bench.sensor)
+        with pytest.raises(DeviceMismatch, match=problem):
+            bench.open(Mpu6050Clone)
 
 
 def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:

@@ -1,13 +1,15 @@
 """Scans of servo buses and I2C buses: devices are found, never disturbed, and duplicate ids are detected."""
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.config.imus import imu_kinds
 from rig.devices.dynamixel.registers import model_numbers
-from rig.doctor.bus_scan import BAUD_RATES, CHIPS, BaudScan, scan_imus, scan_servos, without_echoes
+from rig.doctor.bus_scan import BAUD_RATES, BaudScan, scan_imus, scan_servos, without_echoes
 from sim.faults import Faults
 from sim.faults.schedule import read_faults
 from tests.fuzzing import fuzz_settings
@@ -174,15 +176,15 @@ class RegisterFile:
     def stop(self) -> None: ...
 
 
-@pytest.mark.parametrize("chip", CHIPS, ids=lambda chip: chip.name)
-def test_each_imu_is_identified_at_each_address(chip):
-    for address in chip.addresses:
+@pytest.mark.parametrize("kind", imu_kinds().values(), ids=lambda kind: kind.key)
+def test_each_imu_is_identified_at_each_address(kind):
+    for address, identity in product(kind.addresses, kind.identities):
         with unopened() as bench:
             bench.devices.i2c.detach(0x68)
-            device = RegisterFile({chip.register: chip.value})
+            device = RegisterFile({kind.register: identity})
             bench.devices.i2c.attach(address, device)
             (found,) = scan_imus(bench.context.computer, 1)
-            assert (found.name, found.driver, found.address) == (chip.name, chip.driver, address)
+            assert (found.name, found.driver, found.address) == (kind.name, kind.key if kind.driver else None, address)
             assert all(len(data) == 1 for data in device.written)  # a register's number, never a value
 
 

@@ -360,7 +360,20 @@ def test_imu_of_another_address_axis_or_kind_is_found():
     with unopened() as bench:
         bench.devices.imu.who_am_i = 0x70
         problem = bench.problem("imu")
-        assert (problem.code, problem.parameters["found"].name) == (FindingCode.NO_DRIVER, "MPU-6500")
+        assert (problem.code, problem.parameters["found"].name) == (FindingCode.OTHER_IMU, "MPU-6500")
+        assert problem.fix == "rig config set imu.model mpu6500"
+        bench.devices.imu.who_am_i = 0x73
+        assert bench.problem("imu").code is FindingCode.NO_DRIVER
+
+
+@pytest.mark.parametrize("who_am_i", [0x72, 0x98])
+def test_clone_is_checked_and_named(who_am_i):
+    with unopened("imu.model=mpu6050_clone") as bench:
+        bench.devices.imu.who_am_i = who_am_i
+        assert not bench.problems("imu")
+        (named,) = (f for f in bench.findings("imu") if f.code is FindingCode.IMU)
+        assert (named.parameters["model"], named.parameters["who_am_i"]) == ("MPU-6050 clone", who_am_i)
+        assert FindingCode.IMU_NOTE in {f.code for f in bench.findings("imu")}
 
 
 def test_imu_on_a_rig_head_is_checked():
