@@ -65,6 +65,41 @@ class Imu(Protocol):
     def close(self) -> None: ...
 
 
+class FifoTimes:
+    """Dates the samples that a sensor takes by its own clock and stores in its FIFO.
+
+    The newest sample is dated whole periods after the newest of the last reading, corrected to the period before the
+    count was read. The others are evenly spaced between the two. So the times stay in order although the sensor's clock
+    may be a little fast or slow.
+    """
+
+    def __init__(self, clock: Clock, period_ns: int) -> None:
+        self.period_ns = period_ns
+        self._clock = clock
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again after the FIFO was emptied: the next sample comes within a period."""
+        self._newest_ns = self._clock.now_ns() - self.period_ns // 2
+
+    def due(self, now_ns: int) -> float:
+        """Return how many samples the sensor should have taken since the newest one."""
+        return (now_ns - self._newest_ns) / self.period_ns
+
+    def date(self, samples: int, missing: int, before_ns: int, after_ns: int) -> NDArray[np.int64]:
+        """Return the times of so many samples; so many more are missing before them.
+
+        ``before_ns`` and ``after_ns`` are the times before and after the FIFO's count was read.
+        """
+        if not (steps := samples + missing):
+            return np.empty(0, np.int64)
+        newest_ns = self._newest_ns + steps * self.period_ns
+        newest_ns = min(max(newest_ns, before_ns - self.period_ns), after_ns)
+        time_ns = newest_ns - (newest_ns - self._newest_ns) * np.arange(samples - 1, -1, -1) // steps
+        self._newest_ns = newest_ns
+        return time_ns
+
+
 class ImuDriver(Protocol):
     """Opens the sensor of a row of `rig.config.imus`; ``settings`` are the address and the row's settings by name."""
 

@@ -14,7 +14,7 @@ from rig.config.imus import ImuKind, imu_kind
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent
 from rig.devices.i2c import I2cRegisters, I2cStatistics
-from rig.devices.imu import ImuIdentity, ImuSamples, identified
+from rig.devices.imu import FifoTimes, ImuIdentity, ImuSamples, identified
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
 _USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W = 0x6A, 0x6B, 0x72, 0x74
@@ -87,8 +87,7 @@ class Mpu6050:
         self._address = address
         self._range_dps = range_dps
         self._settings = settings(range_dps, rate_hz, bandwidth_hz)
-        self._period_ns = 1_000_000 * (1 + self._settings[SMPLRT_DIV][0])
-        self._newest_ns = clock.now_ns()
+        self._times = FifoTimes(clock, 1_000_000 * (1 + self._settings[SMPLRT_DIV][0]))
         self._registers = I2cRegisters(bus, address, clock)
         try:
             self.identity = self._identify()
@@ -103,7 +102,7 @@ class Mpu6050:
 
     @property
     def rate_hz(self) -> float:
-        return 1e9 / self._period_ns
+        return 1e9 / self._times.period_ns
 
     @property
     def range_dps(self) -> float:
@@ -113,11 +112,7 @@ class Mpu6050:
         self._registers.close()
 
     def read_samples(self) -> ImuSamples:
-        """Return the samples in the FIFO.
-
-        The newest sample is dated whole periods after the newest of the last call, corrected to the period before the
-        count was read. The others are evenly spaced between the two. So the times stay in order although the sensor's
-        clock may be a little fast or slow.
+        """Return the samples in the FIFO; `FifoTimes` dates them.
 
         Raises
         ------
@@ -134,7 +129,7 @@ class Mpu6050:
         ):
             return self._start_over()  # an incomplete frame twice: not one that is being written
         samples, missing = count // _FRAME, 0
-        due = (before_ns - self._newest_ns) / self._period_ns
+        due = self._times.due(before_ns)
         if samples < 0.9 * due - 2:  # the sensor's clock is off by at most 5 % (PS 6.6): samples are missing
             self._check_settings()
             missing = round(due) - samples
@@ -142,13 +137,7 @@ class Mpu6050:
         if data is None:
             return self._start_over()
         gyro = np.frombuffer(data, ">i2").reshape(-1, 3) / LSB_PER_DPS[self._range_dps]
-        time_ns = np.empty(0, np.int64)
-        if steps := samples + missing:
-            newest_ns = self._newest_ns + steps * self._period_ns
-            newest_ns = min(max(newest_ns, before_ns - self._period_ns), after_ns)
-            time_ns = newest_ns - (newest_ns - self._newest_ns) * np.arange(samples - 1, -1, -1) // steps
-            self._newest_ns = newest_ns
-        return ImuSamples(time_ns, gyro, missing)
+        return ImuSamples(self._times.date(samples, missing, before_ns, after_ns), gyro, missing)
 
     def read_gravity_g(self) -> NDArray[np.float64]:
         """Return one accelerometer reading (3,), in g; raises as `read_samples` does."""
@@ -201,19 +190,18 @@ class Mpu6050:
     def _start_over(self) -> ImuSamples:
         """Drop the FIFO's content: it is full, or its frames are corrupt."""
         self.statistics.overflows += 1
-        lost = max(round((self._clock.now_ns() - self._newest_ns) / self._period_ns), 1)
+        lost = max(round(self._times.due(self._clock.now_ns())), 1)
         self._empty_fifo()
         return ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), lost)
 
     def _empty_fifo(self) -> None:
         self._registers.write(_USER_CTRL, _FIFO_RESET)  # works only while FIFO_EN is 0 (register 106)
         self._registers.write(_USER_CTRL, _FIFO_ENABLE)
-        self._newest_ns = self._clock.now_ns() - self._period_ns // 2  # the next sample comes within a period
+        self._times.restart()
 
     def _implausible(self, count: int, now_ns: int) -> bool:
         """Return whether a count is impossible: an incomplete frame, or more bytes than were sampled."""
-        due = (now_ns - self._newest_ns) / self._period_ns
-        return bool(count % _FRAME) or count > _FRAME * (1.1 * due + 3)
+        return bool(count % _FRAME) or count > _FRAME * (1.1 * self._times.due(now_ns) + 3)
 
     # -- the bus --------------------------------------------------------------------------------------------------
 

@@ -59,7 +59,7 @@ def on_i2c(
         world = World(noise=noise, seed=1)
         with SimI2cBus(world.clock) as bus:
             bus.attach(address, device(world))
-            with closing(driver(bus.path, clock=world.clock)) as imu:
+            with closing(driver(bus.path, clock=world.clock, address=address)) as imu:
                 yield Sensor(imu, world, lambda: bus.detach(address) and None, latency_s, buffer_s)
 
     return opened

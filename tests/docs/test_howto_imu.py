@@ -1,57 +1,112 @@
-"""docs/how-to/add-an-imu.md"""
+"""docs/how-to/add-an-imu.md: the page's package is put on the path, and the rig uses its sensor."""
 
+import importlib
 import re
-from pathlib import Path
+import tomllib
+from pkgutil import resolve_name
 
 import pytest
 
 from rig import Catalog, enroll
 from rig.config import load_config
-from rig.core.errors import DeviceMismatch
+from rig.config.imus import imu_kinds
+from rig.core.errors import ConfigError, DeviceMismatch
+from rig.devices.open_imu import open_imu
+from rig.doctor.bus_scan import scan_imus
+from rig.doctor.device_scan import imu_settings
 from rig.events.events import Moved
 from sim.bench import ShelfOperator, open_sim_bench
-from sim.devices import SimDevices
-from sim.i2c import SimI2cBus
+from sim.imu.mpu6050 import SimMpu6050
+from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
-from tests.docs.pages import DOCS, blocks, run
+from tests.contract import test_imu as contract
+from tests.docs.pages import DOCS, blocks
+from tests.rig.doctor.doctor_parts import unopened
+
+CHOSEN = "imu.model=lsm6dsox"
 
 
-@pytest.fixture(scope="module")
-def page():
-    return run("\n".join(blocks("add-an-imu")))
+def install(folder, monkeypatch, modules, toml):
+    """Put a package with the modules and the entry points of a page on the path."""
+    for name, code in modules.items():
+        (folder / f"{name}.py").write_text(code, encoding="utf-8")
+    points = tomllib.loads(toml)["project"]["entry-points"]
+    lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in rows.items()) for group, rows in points.items()]
+    info = folder / "example_plugin-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: example-plugin\nVersion: 1.0\n", encoding="utf-8")
+    (info / "entry_points.txt").write_text("".join(lines), encoding="utf-8")
+    monkeypatch.syspath_prepend(folder)
+    importlib.invalidate_caches()
 
 
-def test_new_imu_measures_the_rotations_of_an_enrollment(page, monkeypatch, tmp_path):
-    monkeypatch.setattr("rig.bench.hardware.open_imu", page["open_imu"])
-    plain = load_config()
-    config = plain.model_copy(update={"imu": plain.imu.model_copy(update={"model": "mpu6500"})})
-    world = World(seed=1)
-    with SimDevices.connected(config, world) as devices:
-        devices.i2c.detach(config.imu.address)
-        devices.imu = page["SimMpu6500"](world)
-        devices.i2c.attach(config.imu.address, devices.imu)
-        operator = ShelfOperator(world, shelf())
-        with (
-            open_sim_bench(config, operator, devices=devices) as bench,
-            Catalog.open(tmp_path, clock=bench.clock) as catalog,
-        ):
-            assert bench.imu.identity.model == "MPU-6500"
-            moves = [e for e in enroll(bench, catalog, "lamp", views=8) if isinstance(e, Moved)]
+@pytest.fixture(autouse=True)
+def package(monkeypatch, tmp_path):
+    driver, simulator = blocks("add-an-imu")
+    page = (DOCS / "how-to" / "add-an-imu.md").read_text(encoding="utf-8")
+    (toml,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    folder = tmp_path / "package"
+    folder.mkdir()
+    install(folder, monkeypatch, {"lsm6dsox": driver, "sim_lsm6dsox": simulator}, toml)
+
+
+def test_new_imu_measures_the_rotations_of_an_enrollment(tmp_path):
+    config = load_config(None, [CHOSEN])
+    assert config.imu.address == 0x6A
+    with (
+        open_sim_bench(config, ShelfOperator(World(seed=1), shelf())) as bench,
+        Catalog.open(tmp_path / "catalog", clock=bench.clock) as catalog,
+    ):
+        assert bench.imu.identity.model == "LSM6DSOX"
+        moves = [e for e in enroll(bench, catalog, "lamp", views=8) if isinstance(e, Moved)]
     assert all(move.agrees for move in moves)
 
 
-def test_new_imu_rejects_another_sensor(page):
-    from sim.imu.mpu6050 import SimMpu6050
+def test_search_and_doctor_name_the_new_imu():
+    with unopened(CHOSEN) as bench:
+        (found,) = scan_imus(bench.context.computer, 1)
+        assert imu_settings(found) == {("imu", "model"): "lsm6dsox", ("imu", "bus"): 1, ("imu", "address"): 0x6A}
+        assert not bench.problems("imu")
+        bench.devices.i2c.detach(0x6A)
+        bench.devices.i2c.attach(0x6A, SimMpu6050(bench.devices.world))
+        assert bench.problems("imu")
 
-    world = World(seed=1)
-    with SimI2cBus(world.clock) as bus:
-        bus.attach(0x68, SimMpu6050(world))
-        with pytest.raises(DeviceMismatch):
-            page["Mpu6500"](bus.path, clock=world.clock)
+
+def passes(check, *parameters):
+    row = imu_kinds()["lsm6dsox"]
+    driver, simulator = resolve_name(row.driver), resolve_name(row.simulator)
+    with contract.on_i2c(driver, simulator, 0x6A, 0.006, 0.3)(NoiseModel.none()) as sensor:
+        check(sensor, *parameters)
 
 
-def test_files_to_change_exist():
-    text = (DOCS / "how-to" / "add-an-imu.md").read_text(encoding="utf-8")
-    for path in re.findall(r"`((?:rig|sim|tests)/[a-z0-9_/]+\.py)`", text):
-        assert Path(DOCS.parent, path).is_file(), path
+def test_new_imu_passes_the_contract():
+    passes(contract.test_samples_come_once_in_order_at_the_rate_of_the_identity)
+    passes(contract.test_counter_clockwise_is_positive, -100.0)
+    passes(contract.test_integral_between_two_rests_is_the_rotation, 37.0)
+    passes(contract.test_times_tell_when_the_table_turned)
+    passes(contract.test_late_read_reports_lost_samples)
+    passes(contract.test_gravity_points_up_with_its_norm)
+    passes(contract.test_pulled_cable_is_an_error_and_closing_twice_is_harmless)
+
+
+def test_other_sensor_at_the_address_is_rejected():
+    config = load_config(None, [CHOSEN, "imu.address=0x69"])
+    with unopened("imu.address=0x69") as bench, pytest.raises(DeviceMismatch) as caught:
+        open_imu(config.imu, bench.devices.i2c.path, bench.devices.world.clock)
+    assert caught.value.evidence["expected"] == 0x6C
+
+
+def test_package_that_cannot_be_loaded_is_a_configuration_error(monkeypatch, tmp_path):
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    install(broken, monkeypatch, {}, '[project.entry-points."rig.imus"]\nbroken = "no_such_module:KIND"\n')
+    assert load_config(None, []).imu.model == "mpu6050"
+    with pytest.raises(ConfigError, match="no_such_module"):
+        load_config(None, ["imu.model=broken"])
+
+
+def test_sensor_without_a_driver_is_not_a_model():
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, ["imu.model=icm20948"])
+    assert "lsm6dsox" in str(caught.value.evidence)
