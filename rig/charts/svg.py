@@ -1,7 +1,7 @@
 """SVG elements for the charts of a search: escaped text, and equal bytes for equal numbers.
 
 Shapes carry classes; the page's style sheet sets their colours for light and dark mode. These charts stay hand-written:
-a report has some sixty of them, and Matplotlib would make them larger and slower (docs/decisions).
+a report has some sixty of them, and Matplotlib would make them larger and slower (docs/decisions/0035).
 """
 
 from collections.abc import Iterable

@@ -1,7 +1,7 @@
 """Charts over two axes, drawn by Matplotlib: SVG for pages in light and dark mode, PNG for everything else.
 
-Import this module only when a chart is written: Matplotlib takes about a second to load. The decision and its figures:
-docs/decisions.
+Import this module only when a chart is written: Matplotlib takes about a second to load. Decision:
+docs/decisions/0035.
 """
 
 import re
