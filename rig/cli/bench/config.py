@@ -11,10 +11,11 @@ from rig.cli.ui.settings import Settings
 from rig.core.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pydantic import BaseModel
 
+    from rig.calibrations import CalibrationResult, CalibrationStanding
     from rig.config import RigConfig
     from rig.config.values import Values
     from rig.config.wording import KeyInfo
@@ -50,45 +51,52 @@ def show(
     ] = None,
     changed: Annotated[bool, typer.Option("--changed", help="Show only values that differ from the defaults.")] = False,
 ) -> None:
-    """Show every key as TOML: its value, the origin of the value if it is not the default, and a description.
+    """Show every key as TOML: its value, where the value comes from, what it overrides, and a description.
+
+    A value comes from the defaults, a calibration, the file, or --set; each of them overrides those before it. The
+    bench is not opened: its calibrations are shown as in force if they belong to its present devices.
 
     Example: rig config show servo table.limits_deg
     """
+    from rig.calibrations import CalibrationStatus, apply_results
+    from rig.config.toml_file import stated
     from rig.config.wording import setting_line
 
     values, config, options = _checked(settings)
-    rows = []
-    for info, value in _keys(config, options):
-        named = not wanted or any(info.name == name or info.name.startswith(f"{name}.") for name in wanted)
-        if named and not (changed and value == info.default):
-            rows.append((info, value, values.origin(info.key)))
-    if wanted and not rows and not changed:
-        raise _unknown(wanted[0], [info.name for info, _ in _keys(config, options)])
+    standings = _standings(settings, config)
+    in_force = [standing.result for standing in standings if standing.status is CalibrationStatus.IN_FORCE]
+    applied, _ = apply_results(config, in_force)
+    layers = _Layers(values, settings, in_force)
+
+    def is_wanted(name: str) -> bool:
+        return not wanted or any(name == one or name.startswith(f"{one}.") for one in wanted)
+
+    every = list(_keys(applied, options))
+    rows = [
+        (info, value, layers.below(info))
+        for info, value in every
+        if is_wanted(info.name) and not (changed and value == info.default)
+    ]
+    standings = [one for one in standings if is_wanted(one.result.name) or any(map(is_wanted, one.result.settings))]
+    if wanted and not rows and not standings and not changed:
+        raise _unknown(wanted[0], [info.name for info, _ in every])
     if settings.json:
-        settings.print_json(
-            {
-                "path": values.path,
-                "keys": {
-                    info.name: {
-                        "value": value,
-                        "origin": origin,
-                        "default": info.default,
-                        "allowed": info.allowed,
-                        "unit": info.unit,
-                        "description": info.description,
-                    }
-                    for info, value, origin in rows
-                },
-            }
-        )
+        _print_json(settings, values, rows, standings)
         return
     print(f"# {values.path or 'no file: the defaults'}")
     section = None
-    for info, value, origin in rows:
+    for info, value, ((origin, _), *overridden) in rows:
         if info.key[:-1] != section:
             section = info.key[:-1]
             print(f"\n[{'.'.join(section)}]" if section else "")
-        print(setting_line(info, value, "" if origin == "default" else origin))
+        others = ", ".join(f"{stated(info.key, other)} ({source})" for source, other in overridden)
+        print(setting_line(info, value, f"{origin}, overrides {others}" if others else ""))
+    if standings:
+        print(f"\n# Calibrations of the bench {settings.bench_name}. With its devices: rig calibrate show")
+    for standing in standings:
+        estimates = ", ".join(f"{name} {estimate}" for name, estimate in standing.result.estimates.items())
+        is_used = standing.status is CalibrationStatus.IN_FORCE
+        print(f"#   {f'{standing.result.id}: {estimates}' if is_used else f'not in force: {standing}'}")
 
 
 @app.command("path")
@@ -184,6 +192,70 @@ def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseMode
     return values, *check_config(values)
 
 
+def _print_json(
+    settings: Settings,
+    values: "Values",
+    rows: "Sequence[tuple[KeyInfo, Any, list[tuple[str, Any]]]]",
+    standings: "Sequence[CalibrationStanding]",
+) -> None:
+    from rig.events.events import plain
+
+    settings.print_json(
+        {
+            "path": values.path,
+            "keys": {
+                info.name: {
+                    "value": value,
+                    "origin": origin,
+                    "overrides": [{"value": other, "origin": source} for source, other in overridden],
+                    "default": info.default,
+                    "allowed": info.allowed,
+                    "unit": info.unit,
+                    "description": info.description,
+                }
+                for info, value, ((origin, _), *overridden) in rows
+            },
+            "calibrations": [
+                {
+                    "id": one.result.id,
+                    "status": one.status,
+                    "estimates": plain(one.result.estimates),
+                    "settings": plain(one.result.settings),
+                }
+                for one in standings
+            ],
+        }
+    )
+
+
+def _standings(settings: Settings, config: "RigConfig") -> "list[CalibrationStanding]":
+    """Return the standing of the bench's calibrations, as far as it is known without opening the bench."""
+    from rig.calibrations import CalibrationStore, apparatus
+    from rig.core.clock import SystemClock
+
+    name = settings.bench or config.default_bench
+    mounted = apparatus(name, {part: {} for part in ("servo", "imu", "camera")}, config, {})
+    return CalibrationStore(config.calibration_path(name)).standings(mounted, SystemClock().utc())
+
+
+class _Layers:
+    """The values that a key has in the command line, the file, the calibrations and the defaults."""
+
+    def __init__(self, values: "Values", settings: Settings, in_force: "Sequence[CalibrationResult]") -> None:
+        from rig.config.values import read_values
+
+        self._files = [values, read_values(settings.config)] if settings.overrides else [values]
+        self._in_force = in_force
+
+    def below(self, info: "KeyInfo") -> list[tuple[str, Any]]:
+        """Return the source and the value in each layer that has one, the one in force first."""
+        found = {values.origin(info.key): values for values in self._files}
+        found.pop("default", None)
+        layers = [(origin, _value(values.values, info.key)) for origin, values in found.items()]
+        layers += [(r.id, r.settings[info.name]) for r in reversed(self._in_force) if info.name in r.settings]
+        return [*layers, ("default", info.default)]
+
+
 def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyInfo, Any]]":
     """Yield description and value of every key; the options of benches come last."""
     from rig.config.wording import key_info
@@ -198,7 +270,7 @@ def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[
 
 def _value(model: Any, key: tuple[str, ...]) -> Any:
     for part in key:
-        model = getattr(model, part)
+        model = model[part] if isinstance(model, dict) else getattr(model, part)
     return model
 
 

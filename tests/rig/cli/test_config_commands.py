@@ -2,15 +2,18 @@
 
 import json
 import tomllib
+from datetime import timedelta
 
 import pytest
 from typer.testing import CliRunner
 
 from rig.bench import bench_kind, bench_names, check_config
+from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.cli.main import app
 from rig.config import RigConfig, load_config
 from rig.config.values import read_values
 from rig.config.wording import key_info
+from rig.core.clock import SystemClock
 
 
 @pytest.fixture
@@ -94,6 +97,66 @@ def test_show_is_toml_and_says_where_each_value_comes_from(rig, tmp_path):
     assert "id = 4" in changed
     assert "baud" not in changed
     assert "Did you mean servo.port?" in rig("config", "show", "servo.prot").stderr
+
+
+def test_show_reports_calibrations_and_what_each_value_overrides(rig, tmp_path):
+    """The gyro's scale of a calibration is in force; the file overrides that of the backlash, and --set the file."""
+    folder = tmp_path / "calibrations"
+    (tmp_path / "rig.toml").write_text(
+        f'default_bench = "sim"\ncalibration_dir = "{folder}"\n[table]\nbacklash_deg = 0.3\n', encoding="utf-8"
+    )
+
+    def store(name, settings, estimate, **other):
+        result = CalibrationResult(
+            name=name,
+            estimates={name.partition(".")[2]: estimate},
+            residual=None,
+            limit=None,
+            residual_unit="",
+            rejections=(),
+            when_utc=SystemClock().utc() - timedelta(days=2),
+            device={"bench": "sim", "imu": {"axis": "z", "sign": 1}},
+            evidence={},
+            settings=settings,
+            **other,
+        )
+        CalibrationStore(folder / "sim").add(result)
+        return result.id
+
+    scale = store("imu.scale", {"imu.scale": 1.02}, Estimate(1.02, 0.001, ""))
+    backlash = store("servo.backlash", {"table.backlash_deg": 0.2}, Estimate(0.2, 0.01, "°"))
+    intrinsics = store("camera.intrinsics", {}, Estimate(812.0, 0.5, "px"))
+    store("table.axis", {"view.roi": [0, 0, 100, 100]}, Estimate(1.0, 0.1, "mm"), valid_days=1)
+
+    arguments = ("config", "show", "--set", "table.backlash_deg=0.4")
+    found = json.loads(rig(*arguments, "--json").stdout)
+    layers = {
+        name: [(one["origin"], one["value"]) for one in (key, *key["overrides"])] for name, key in found["keys"].items()
+    }
+    assert layers["imu.scale"] == [(scale, 1.02), ("default", 1.0)]
+    assert layers["table.backlash_deg"] == [
+        ("--set", 0.4),
+        ("rig.toml line 4", 0.3),
+        (backlash, 0.2),
+        ("default", 0.5),
+    ]
+    assert layers["view.roi"] == [("default", [80, 0, 480, 480])]
+    assert {one["id"].partition("@")[0]: one["status"] for one in found["calibrations"]} == {
+        "imu.scale": "in force",
+        "servo.backlash": "in force",
+        "camera.intrinsics": "in force",
+        "table.axis": "expired",
+    }
+    text = rig(*arguments).stdout
+    assert tomllib.loads(text)["imu"]["scale"] == 1.02
+    assert f"{scale}, overrides 1.0 (default)" in text
+    assert f"--set, overrides 0.3 (rig.toml line 4), 0.2 ({backlash}), 0.5 (default)" in text
+    assert f"#   {intrinsics}: intrinsics 812.00 ± 0.50 px" in text
+    assert "#   not in force: table.axis was calibrated 2 days ago; it is valid for 1 days" in text
+    changed = rig("config", "show", "--changed", "imu").stdout
+    assert "scale = 1.02" in changed
+    assert "intrinsics" not in changed
+    assert intrinsics in rig("config", "show", "camera.intrinsics").stdout
 
 
 OPTIONAL = [
