@@ -112,7 +112,7 @@ class SimComputer(Computer):
     """A simulated computer whose devices have the names in ``config``."""
 
     def __init__(self, root: Path, devices: SimDevices, config: RigConfig, user: User | None = None) -> None:
-        super().__init__(root, devices.world.clock, user or User.current())
+        super().__init__(root, devices.world.clock, user or User.current(), simulated=True)
         self.devices = devices
         self._port = config.servo.port
         self._head_port = config.head.port

@@ -96,12 +96,13 @@ class Disk:
 class Computer:
     """A computer with Linux, as far as its files below ``root`` tell; the one that the program runs on by default.
 
-    It finds and opens devices.
+    It finds and opens devices. ``simulated`` says whether they are simulated.
     """
 
     root: Path = Path("/")
     clock: Clock = field(default_factory=SystemClock)
     user: User = field(default_factory=User.current)
+    simulated: bool = False
 
     @property
     def model(self) -> str:

@@ -384,14 +384,16 @@ class RigConfig(Section):
         return (self.state_dir or Path(platformdirs.user_state_dir(APP))) / bench_name
 
 
-def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> RigConfig:
+def load_config(path: Path | None = None, overrides: Iterable[str] = (), *, search: bool = True) -> RigConfig:
     """Read a configuration file and apply ``overrides`` (``"section.key=value"``, values in TOML's notation).
+
+    Without ``path`` it is the file in force, if any; with ``search`` false there is no file.
 
     Raises
     ------
     ConfigError
         The file is missing, is not TOML, or has mistakes; the evidence lists all of them with their keys.
     """
-    read = read_values(path, overrides)
+    read = read_values(path, overrides, search=search)
     where = str(read.path) if read.path else "the command line"
     return validate(RigConfig, read.values, where=where, places=read.places)

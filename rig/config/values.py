@@ -51,8 +51,10 @@ class Values:
         return f"{self.path.name} {place}" if self.path and place.startswith("line") else place
 
 
-def read_values(path: Path | None = None, overrides: Iterable[str] = ()) -> Values:
-    """Read a configuration file (None: the one in force, if any) and apply ``overrides``, without checking the values.
+def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, search: bool = True) -> Values:
+    """Read a configuration file and apply ``overrides``, without checking the values.
+
+    Without ``path`` it is the file in force, if any; with ``search`` false there is no file.
 
     Raises
     ------
@@ -61,7 +63,7 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = ()) -> Valu
     """
     values: dict[str, Any] = {}
     places: dict[Key, str] = {}
-    source = path or default_path()
+    source = path or (default_path() if search else None)
     if source is not None:
         text = read_text(source)
         try:

@@ -40,23 +40,29 @@ def setup(
     """
     from rig.cli.bench.doctor import print_findings
     from rig.cli.bench.findings import doctor_context
-    from rig.config import RigConfig
+    from rig.config import RigConfig, load_config
     from rig.config.toml_file import read_text, save, stated, with_values
     from rig.config.values import FILE_NAME, default_path
     from rig.config.wording import blank_file
 
     path = settings.config or default_path() or Path(FILE_NAME)
     there = path.exists()
-    now = settings if there else replace(settings, config=None, _loaded={})
+    # A new file has no settings of the file in force: that may belong to another bench.
+    new_file = {"config": load_config(None, settings.overrides, search=False)}
+    now = settings if there else replace(settings, config=None, _loaded=new_file)
+    stored = load_config(path) if there else RigConfig()
     out = sys.stderr if settings.json else sys.stdout
     with doctor_context(now) as context:
         context.require_free()
+        print(_heading(context, settings), file=out)
         dialogue = Dialogue(context, ask_nothing=yes or settings.json, out=out)
         wanted = dialogue.run()
-        if settings.bench and settings.bench != context.config.default_bench:
-            wanted[("default_bench",)] = settings.bench
+        if context.computer.simulated:  # what the file says of devices is true of real ones
+            wanted = {key: value for key, value in wanted.items() if not _is_set(stored, key)}
+        if stored.default_bench != context.bench:
+            wanted[("default_bench",)] = context.bench
         old = read_text(path) if there else blank_file(RigConfig)
-        changes = {key: value for key, value in wanted.items() if not there or _in_force(context.config, key) != value}
+        changes = {key: value for key, value in wanted.items() if not there or _in_force(stored, key) != value}
         new = with_values(old, changes)
         write = not there or new != old
         lines = [f"{'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
@@ -66,7 +72,7 @@ def setup(
     if write:
         save(path, new)
     done = f"Wrote {path}." if write else f"{path} is unchanged."
-    after = replace(settings, config=settings.config if path.exists() else None, _loaded={})
+    after = replace(settings, _loaded={}) if path.exists() else now
     if settings.json:
         settings.print_json({"path": path, "written": write, "settings": {".".join(k): v for k, v in changes.items()}})
     else:
@@ -232,6 +238,19 @@ def _degrees(text: str) -> float:
     if not MIN_BUDGET_DEG <= value <= MAX_BUDGET_DEG:
         raise ValueError(f"Enter {MIN_BUDGET_DEG:.0f}–{MAX_BUDGET_DEG:.0f} degrees: one revolution or more.")
     return value
+
+
+def _heading(context: "DoctorContext", settings: Settings) -> str:
+    """Return which bench is set up, and how to set up a real one instead of a simulated one."""
+    if not context.computer.simulated:
+        return f"Bench {context.bench}:"
+    real = "" if settings.bench else " For the real bench: rig setup --bench hardware"
+    return f"Bench {context.bench}, with simulated devices.{real}"
+
+
+def _is_set(config: Any, key: "Key") -> bool:
+    *above, name = key
+    return name in _in_force(config, tuple(above)).model_fields_set
 
 
 def _in_force(config: Any, key: "Key") -> Any:

@@ -46,6 +46,7 @@ def parts(home, monkeypatch):
             @contextmanager
             def computer(self, config, options, seed):
                 bench.context.computer._port = config.servo.port
+                bench.context.computer.simulated = False  # it stands for a real bench
                 yield bench.context.computer
 
         monkeypatch.setattr("rig.doctor.context.bench_kind", lambda _: Kind())
@@ -76,6 +77,29 @@ def test_second_setup_changes_and_asks_nothing(home):
     assert again.exit_code == 0, again.output
     assert "is unchanged" in again.stdout
     assert (home / "rig.toml").read_bytes() == before
+
+
+def test_setup_of_the_simulated_bench_keeps_the_devices_of_the_real_one(home):
+    file = home / "rig.toml"
+    text = 'default_bench = "sim"\n[servo]\nport = "/dev/ttyUSB3"\n[camera]\nsource = 2\n'
+    file.write_text(text, encoding="utf-8")
+    done = rig("setup", "--yes")
+    assert done.exit_code == 0, done.output
+    assert "Bench sim, with simulated devices. For the real bench: rig setup --bench hardware" in done.stdout
+    assert file.read_text(encoding="utf-8").startswith(text)
+    file.write_text(text.replace('default_bench = "sim"\n', ""), encoding="utf-8")
+    assert rig("setup", "--yes", "--bench", "sim").exit_code == 0
+    config = load_config(file)
+    assert (config.default_bench, config.camera.source, config.servo.port) == ("sim", 2, "/dev/ttyUSB3")
+
+
+def test_new_file_belongs_to_the_bench_that_was_set_up(parts, home):
+    (home / "rig.toml").write_text('default_bench = "sim"\n[table]\nvelocity_dps = 45\n', encoding="utf-8")
+    rig("setup", "--yes", "--config", "real.toml")
+    assert load_config(home / "real.toml").default_bench == "hardware"
+    assert load_config(home / "real.toml").table.velocity_dps == 90
+    rig("setup", "--yes", "--config", "sim.toml", "--set", "default_bench=sim")
+    assert load_config(home / "sim.toml").default_bench == "sim"
 
 
 def test_existing_file_keeps_comments_and_settings(parts, home):
