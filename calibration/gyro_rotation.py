@@ -18,7 +18,7 @@ from math import sqrt
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from calibration.legs import Leg, reasons
 from calibration.procedure import (
@@ -130,7 +130,7 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
         square, sigma = np.concatenate(squares), np.concatenate(stated)
         freedom = len(used) - 2
         ratio = sqrt(float((square / sigma**2).sum()) / freedom)
-        low, high = (sqrt(float(chi2.ppf(p, freedom)) / freedom) for p in (CHANCE, 1 - CHANCE))
+        low, high = (sqrt(2 * float(gammaincinv(freedom / 2, p)) / freedom) for p in (CHANCE, 1 - CHANCE))
         low /= CAUTION
         seconds, measured_deg = float(np.mean([m.seconds for m in used])), sqrt(float(square.sum()) / freedom)
         stated_deg = float(np.sqrt((sigma**2).mean()))

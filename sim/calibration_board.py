@@ -73,20 +73,39 @@ class BoardOnPlatter:
         normal = rotation[:, 2]
         if float(normal @ translation) <= 0:  # the camera sees its back
             return
+        x, y = self._box(rotation, translation)
+        if x.start == x.stop or y.start == y.stop:  # out of the frame
+            return
         # A ray r meets the board's plane where the homography [r1 r2 t]⁻¹ takes it.
         to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation]))
-        rays = self.optics.rays()
+        fine = tuple(slice(each.start * SUPERSAMPLING, each.stop * SUPERSAMPLING) for each in (y, x))
+        rays = self.optics.rays().reshape(HEIGHT * SUPERSAMPLING, WIDTH * SUPERSAMPLING, 2)[fine]
         at = rays @ to_board[:, :2].T.astype(np.float32) + to_board[:, 2].astype(np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
-            places = at[:, :2] / at[:, 2:] * TEXTURE_PX_MM - 0.5
-        size = (HEIGHT * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
+            places = at[..., :2] / at[..., 2:] * TEXTURE_PX_MM - 0.5
         margin = TEXTURE_PX_MM * self.board.margin_mm
-        maps = np.nan_to_num(places + np.float32(margin), nan=-1e4, posinf=-1e4, neginf=-1e4).reshape(*size, 2)
-        maps = np.clip(maps, -1e4, 1e4).astype(np.float32)
-        fine = cv2.remap(self._texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
-        seen = cv2.resize(fine, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
+        maps = np.clip(np.nan_to_num(places + np.float32(margin), nan=-1e4), -1e4, 1e4)
+        drawn = cv2.remap(self._texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+        size = (x.stop - x.start, y.stop - y.start)
+        seen = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         cover = seen[..., 1:] / 255
-        image[:] = np.clip(seen[..., :1] + image * (1 - cover), 0, 255).astype(np.uint8)
+        image[y, x] = np.clip(seen[..., :1] + image[y, x] * (1 - cover), 0, 255).astype(np.uint8)
+
+    def _box(self, rotation: Floats, translation: Floats) -> tuple[slice, slice]:
+        """Return the columns and rows of the image that show the board."""
+        (width, height), margin = self.board.size_mm, self.board.margin_mm
+        side, zero = np.linspace(0.0, 1.0, 9), np.zeros(9)
+        outline = np.column_stack([np.r_[side, side, zero, zero + 1], np.r_[zero, zero + 1, side, side], np.zeros(36)])
+        outline = outline * (width + 2 * margin, height + 2 * margin, 0) - (margin, margin, 0)
+        if (rotation[2] @ outline.T + translation[2]).min() <= 0:  # partly behind the camera
+            return slice(0, WIDTH), slice(0, HEIGHT)
+        turn = cv2.Rodrigues(rotation)[0]
+        at = cv2.projectPoints(outline, turn, translation, self.optics.matrix, np.array(self.optics.distortion))[0]
+        low, high = at.min(axis=(0, 1)) - 2, at.max(axis=(0, 1)) + 3
+        (left, right), (top, bottom) = (
+            np.clip([low[axis], high[axis]], 0, size).astype(int).tolist() for axis, size in enumerate((WIDTH, HEIGHT))
+        )
+        return slice(left, right), slice(top, bottom)
 
     @cached_property
     def _texture(self) -> NDArray[np.uint8]:

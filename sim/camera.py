@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import ceil, cos, radians, sin
 from typing import Any
 from zlib import crc32
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.calibration_board import BoardOnPlatter
+from sim.noise import NoiseModel
 from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
@@ -100,7 +102,7 @@ class SimCapture:
         self._world = world
         self._clock = world.clock
         self._binning = 1
-        self._sensor = Sensor(world.noise, world.rng("camera"))
+        self._noise = world.noise
         self.backdrop = empty_platter()
         # A well-mounted camera sees the objects as they are drawn; calibration boards are drawn through its lens.
         self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
@@ -203,9 +205,7 @@ class SimCapture:
         now = self._controls[-1][1]
         match prop:
             case cv2.CAP_PROP_FRAME_WIDTH if value in (WIDTH, WIDTH // 2):
-                if value != self.get(prop):
-                    self._binning = round(WIDTH / value)
-                    self._sensor = Sensor(self._world.noise, self._world.rng("camera"), self._binning)
+                self._binning = round(WIDTH / value)
             case cv2.CAP_PROP_FRAME_WIDTH | cv2.CAP_PROP_FRAME_HEIGHT | cv2.CAP_PROP_FPS:
                 return value == self.get(prop)
             case cv2.CAP_PROP_BUFFERSIZE if _BUFFERS_RANGE[0] <= value <= _BUFFERS_RANGE[1]:
@@ -284,7 +284,7 @@ class SimCapture:
         blur = max(abs(controls.focus - _SHARP_AT) * 0.04, self.blur_px)
         if blur > 0.1:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
-        return self._sensor.expose(
+        return _sensor(self._noise, self._world.seed, self._binning).expose(
             seen,
             light=scene.light,
             exposure=controls.exposure / NOMINAL_EXPOSURE,
@@ -343,6 +343,12 @@ class SimCapture:
                 step = (mean[0] / mean[2]) ** 0.3
                 controls = replace(controls, kelvin=float(np.clip(controls.kelvin * step, *_KELVIN_RANGE)))
             self._change(time_ns, controls)
+
+
+@lru_cache(maxsize=4)
+def _sensor(noise: NoiseModel, seed: int, binning: int) -> Sensor:
+    """Return the sensor of a world; it is built for the first frame, and the next bench of the same world shares it."""
+    return Sensor(noise, np.random.default_rng([seed, crc32(b"camera")]), binning)
 
 
 def start_ns(frame: int) -> int:

@@ -6,8 +6,10 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 
 import pytest
+import typer.testing
 from hypothesis import settings
 
 from rig.bench import Bench
@@ -22,6 +24,9 @@ from sim.world import World
 settings.register_profile("rig", deadline=None, derandomize=True, database=None)
 settings.register_profile("nightly", deadline=None)
 settings.load_profile("rig")
+
+# Typer builds all commands for each invocation, which takes longer than most commands.
+typer.testing._get_command = cache(typer.testing._get_command)
 
 # Tests start many processes: compiled modules save a fifth of the time of each.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
-from importlib.metadata import entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel
@@ -162,7 +163,12 @@ class ServoAlone(Protocol):
 
 def bench_names() -> list[str]:
     """Return the names of the installed kinds of benches."""
-    return sorted(point.name for point in entry_points(group=GROUP))
+    return sorted(_plugins())
+
+
+@cache
+def _plugins() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
 
 
 def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Bench:
@@ -259,15 +265,14 @@ def bench_kind(name: str) -> BenchKind:
     ConfigError
         The bench does not exist.
     """
-    points = {point.name: point for point in entry_points(group=GROUP)}
-    if name in points:
-        kind: BenchKind = points[name].load()
+    if name in _plugins():
+        kind: BenchKind = _plugins()[name].load()
         return kind
-    near = get_close_matches(name, points, n=1)
+    near = get_close_matches(name, bench_names(), n=1)
     raise ConfigError(
         f"There is no bench {name!r}.",
         next_step=f"Did you mean {near[0]}?" if near else "Use one of the listed benches.",
-        evidence={"benches": sorted(points)},
+        evidence={"benches": bench_names()},
     )
 
 

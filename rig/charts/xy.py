@@ -175,9 +175,10 @@ class Chart:
                 figure.legend(loc="outside right upper")
             elif any(series.label for series in self.series):
                 figure.legend(loc="outside lower left", ncols=4)
-            # Lay the chart out once; each file would do it twice again, which takes most of its time.
-            figure.draw_without_rendering()
-            figure.set_layout_engine("none")
+            # Lay the chart out once. With a layout engine, each file would draw the chart twice.
+            if engine := figure.get_layout_engine():
+                engine.execute(figure)
+            figure.set_layout_engine(None)
         return figure
 
 

@@ -1,7 +1,7 @@
 """An object made of parts on the platter."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Protocol
 
 import cv2
@@ -64,6 +64,11 @@ class Solid:
 
 def empty_platter() -> Image:
     """Return the image without an object: a plain backdrop and the platter, uint8 (480, 640, 3)."""
+    return _empty_platter().copy()
+
+
+@cache
+def _empty_platter() -> Image:
     image = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
     image[:] = (44, 40, 38)
     x, y = CENTRE_PX
