@@ -14,7 +14,7 @@ from sqlalchemy import Connection, insert, select
 
 from rig.catalog.records import JsonObject, as_json, this_software
 from rig.catalog.schema import audit
-from rig.catalog.seal import seal_log
+from rig.catalog.seal import seal_appended
 from rig.core.clock import Clock
 
 
@@ -37,15 +37,13 @@ def append(connection: Connection, clock: Clock, action: str, object_name: str |
     connection.execute(
         insert(audit).values(
             time_utc=clock.utc(),
-            user=_user(),
-            host=socket.gethostname(),
-            software=this_software(),
+            **author(),
             action=action,
             object_name=object_name,
             details=as_json(details, "the details of the log entry"),
         )
     )
-    seal_log(connection)
+    seal_appended(connection, audit)
 
 
 def entries(connection: Connection, since: datetime | None = None, object_name: str | None = None) -> list[AuditEntry]:
@@ -58,9 +56,10 @@ def entries(connection: Connection, since: datetime | None = None, object_name: 
     return [AuditEntry(*row) for row in connection.execute(wanted)]
 
 
-def _user() -> str:
-    # the account, not LOGNAME, which any user can change
+def author() -> dict[str, str]:
+    """Return the columns that say who changes the catalog: account, computer and program."""
     try:
-        return pwd.getpwuid(os.getuid()).pw_name
+        user = pwd.getpwuid(os.getuid()).pw_name  # the account, not LOGNAME, which any user can change
     except KeyError:
-        return str(os.getuid())
+        user = str(os.getuid())
+    return {"user": user, "host": socket.gethostname(), "software": this_software()}

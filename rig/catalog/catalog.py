@@ -18,7 +18,15 @@ from rig.catalog.database import Database, insert_row
 from rig.catalog.describing import known_descriptor
 from rig.catalog.enrollment import Enrollment
 from rig.catalog.places import image_file, make_folder_within
-from rig.catalog.queries import enrollment_summaries, find, in_use, model_set, object_summaries, stored_views
+from rig.catalog.queries import (
+    enrollment_summaries,
+    find,
+    in_use,
+    model_set,
+    object_summaries,
+    searched_version,
+    stored_views,
+)
 from rig.catalog.records import (
     EnrollmentStatus,
     EnrollmentSummary,
@@ -247,6 +255,11 @@ class Catalog(AbstractContextManager["Catalog"]):
             object_id, _ = find(connection, name)
             (summary,) = object_summaries(connection, objects.c.id == object_id)
             return summary
+
+    def version(self) -> str:
+        """Return a digest of what searches compare with, SHA-256: another one after every change of the objects."""
+        with self.database.read() as connection:
+            return searched_version(connection)
 
     def object(self, name: str) -> ObjectDetails:
         """Return an object with its enrollments and views.

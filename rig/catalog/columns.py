@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Float, Integer, LargeBinary, String, Text, TypeDecorator
 from sqlalchemy.types import TypeEngine
 
-from rig.catalog.records import EnrollmentStatus
+from rig.catalog.records import EnrollmentStatus, Outcome
 from rig.core.errors import CatalogDamaged
 from rig.views.image_files import IMAGE_FOLDER
 from rig.views.segmentation_evidence import check_evidence
@@ -107,6 +107,15 @@ class Status(_Checked):
 
     def check(self, value: Any) -> None:
         EnrollmentStatus(value)
+
+
+class ResultOutcome(_Checked):
+    """An `Outcome`."""
+
+    impl = Text
+
+    def check(self, value: Any) -> None:
+        Outcome(value)
 
 
 class ImagePath(_Checked):

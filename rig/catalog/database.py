@@ -17,7 +17,16 @@ from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, ev
 from rig.catalog.columns import FIX, damaged
 from rig.catalog.failures import DATABASE_NAME, absent, catalog_errors
 from rig.catalog.places import check_folder
-from rig.catalog.schema import APPLICATION_ID, KNOWN_NAMES, METADATA, SCHEMA_VERSION, expected_schema, schema_digest
+from rig.catalog.schema import (
+    APPLICATION_ID,
+    KNOWN_NAMES,
+    METADATA,
+    READABLE_VERSION,
+    RESULTS_VERSION,
+    SCHEMA_VERSION,
+    expected_schema,
+    schema_digest,
+)
 from rig.core.errors import CatalogDamaged, CatalogError, CatalogOutdated
 from rig.core.files import make_folder, sync_folder
 
@@ -38,6 +47,11 @@ class Database:
         Write nothing.
     busy_timeout_s
         How long a writer waits for another one.
+
+    Attributes
+    ----------
+    version
+        Of the tables. A catalog of `READABLE_VERSION` or later can be read without a migration.
 
     Raises
     ------
@@ -93,8 +107,24 @@ class Database:
             self._create()
         check_folder(self.root)
         with self.read() as connection:
-            _check_up_to_date(connection, self.root)
-            check_schema(connection, self.root, SCHEMA_VERSION)
+            self.version = version_of(connection, self.root)
+            if self.version < (READABLE_VERSION if self._read_only else SCHEMA_VERSION):
+                raise self.outdated()
+            check_schema(connection, self.root, self.version)
+
+    @property
+    def has_results(self) -> bool:
+        """Whether the catalog has tables for results."""
+        return self.version >= RESULTS_VERSION
+
+    def outdated(self) -> CatalogOutdated:
+        """Return the error for a catalog that must be migrated first."""
+        return CatalogOutdated(
+            f"the catalog {self.root} was written by an earlier program: its schema has version {self.version}, "
+            f"this program works with {SCHEMA_VERSION}",
+            next_step="migrate it (a backup is made): rig catalog migrate",
+            evidence={"found": self.version, "known": SCHEMA_VERSION},
+        )
 
     def _connect(self) -> sqlite3.Connection:
         mode = "rw"
@@ -206,17 +236,6 @@ def check_schema(connection: Connection, root: Path, version: int) -> None:
             "nothing was changed",
             next_step=FIX,
             evidence={"version": version, "unknown": names[:20]},
-        )
-
-
-def _check_up_to_date(connection: Connection, root: Path) -> None:
-    version = version_of(connection, root)
-    if version < SCHEMA_VERSION:
-        raise CatalogOutdated(
-            f"the catalog {root} was written by an earlier program: its schema has version {version}, "
-            f"this program works with {SCHEMA_VERSION}",
-            next_step="migrate it (a backup is made): rig catalog migrate",
-            evidence={"found": version, "known": SCHEMA_VERSION},
         )
 
 

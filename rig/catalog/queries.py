@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from difflib import get_close_matches
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -246,6 +247,12 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
         descriptor=kind.name,
     )
     return loaded, np.array(view_ids, np.int64)
+
+
+def searched_version(connection: Connection) -> str:
+    """Return a SHA-256 over the names of the objects in use and the digests of their complete enrollments."""
+    used = select(objects.c.name, enrollments.c.digest).join(enrollments).where(retrieved()).order_by(objects.c.id)
+    return sha256(ascii([tuple(row) for row in connection.execute(used)]).encode()).hexdigest()
 
 
 def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> DescriptorOutdated:

@@ -39,6 +39,14 @@ class EnrollmentStatus(StrEnum):
     SUPERSEDED = "superseded"
 
 
+class Outcome(StrEnum):
+    """Outcome of an identification."""
+
+    FOUND = "found"
+    AMBIGUOUS = "ambiguous"
+    UNKNOWN = "unknown"
+
+
 def this_software() -> str:
     """Return the name and version of this program."""
     try:

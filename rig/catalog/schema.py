@@ -31,6 +31,7 @@ from rig.catalog.columns import (
     Name,
     Nanoseconds,
     Number,
+    ResultOutcome,
     SegmentationEvidence,
     Status,
     Utc,
@@ -41,8 +42,14 @@ from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
 
-SCHEMA_VERSION: Final = 3
+SCHEMA_VERSION: Final = 4
 """Version of the tables below (`PRAGMA user_version`). `rig.catalog.migrations` has a step for each version."""
+
+READABLE_VERSION: Final = 3
+"""The first version that can be read without a migration. Version 4 only adds the tables of `RESULTS_VERSION`."""
+
+RESULTS_VERSION: Final = 4
+"""The first version with results."""
 
 
 METADATA: Final = MetaData(
@@ -165,17 +172,73 @@ audit = Table(
     sqlite_autoincrement=True,
 )
 
-APPEND_ONLY: Final = tuple(
-    f"CREATE TRIGGER audit_no_{change.lower()} BEFORE {change} ON audit {when}"
-    "BEGIN SELECT RAISE(ABORT, 'the audit log is only appended to'); END"
-    for change, when in (("UPDATE", "WHEN old.digest IS NOT NULL "), ("DELETE", ""))
+# Answers of identifications. Names stay as they were answered, so no row refers to an object.
+results = Table(
+    "results",
+    METADATA,
+    Column("id", Integer, primary_key=True),
+    Column("time_utc", Utc, nullable=False),
+    Column("operator", Words, nullable=False),
+    Column("user", Words, nullable=False),
+    Column("host", Words, nullable=False),
+    Column("software", Words, nullable=False),
+    Column("sample", Words),
+    Column("outcome", ResultOutcome, nullable=False),
+    Column("object_name", Words),
+    Column("answer", JsonMapping, nullable=False),  # the event `identified` (docs/events.md)
+    Column("azimuths_deg", Azimuths, nullable=False),  # of the views, from any zero
+    Column("bench", Words, nullable=False),
+    Column("devices", JsonMapping, nullable=False),
+    Column("conditions", JsonMapping, nullable=False),
+    Column("catalog_version", Name(64), nullable=False),  # `Catalog.version`
+    Column("image", ImagePath),  # the first view
+    Column("image_sha256", Name(64)),
+    Column("image_bytes", Count),
+    Column("digest", Name(64)),  # of this row and of the digest before
+    sqlite_autoincrement=True,
 )
 
-for _trigger in APPEND_ONLY:
-    event.listen(audit, "after_create", DDL(_trigger))  # type: ignore[no-untyped-call]
+# The last correction of a result says what counts; the result itself does not change. A foreign key would let a repair
+# delete rows.
+corrections = Table(
+    "corrections",
+    METADATA,
+    Column("id", Integer, primary_key=True),
+    Column("result_id", Count, nullable=False),
+    Column("time_utc", Utc, nullable=False),
+    Column("operator", Words, nullable=False),
+    Column("user", Words, nullable=False),
+    Column("host", Words, nullable=False),
+    Column("software", Words, nullable=False),
+    Column("sample", Words),
+    Column("outcome", ResultOutcome, nullable=False),
+    Column("object_name", Words),
+    Column("reason", Words, nullable=False),
+    Column("digest", Name(64)),
+    sqlite_autoincrement=True,
+)
+
+APPEND_ONLY: Final = (audit, results, corrections)
+"""Tables whose rows are never changed or deleted."""
+
+
+def append_only_triggers(table: str) -> tuple[str, str]:
+    """Return the statements that create the triggers of an append-only table."""
+    what = "audit log" if table == audit.name else f"table of {table}"
+    return (
+        f"CREATE TRIGGER {table}_no_update BEFORE UPDATE ON {table} WHEN old.digest IS NOT NULL "
+        f"BEGIN SELECT RAISE(ABORT, 'the {what} is only appended to'); END",
+        f"CREATE TRIGGER {table}_no_delete BEFORE DELETE ON {table} "
+        f"BEGIN SELECT RAISE(ABORT, 'the {what} is only appended to'); END",
+    )
+
+
+for _table in APPEND_ONLY:
+    for _trigger in append_only_triggers(_table.name):
+        event.listen(_table, "after_create", DDL(_trigger))  # type: ignore[no-untyped-call]
 
 KNOWN_NAMES: Final = frozenset(
-    {"sqlite_sequence", "audit_no_update", "audit_no_delete"}
+    {"sqlite_sequence", *(f"{table.name}_no_{change}" for table in APPEND_ONLY for change in ("update", "delete"))}
     | {name for table in METADATA.tables.values() for name in (table.name, *(str(one.name) for one in table.indexes))}
 )
 """Names in a database of this version."""
@@ -183,6 +246,7 @@ KNOWN_NAMES: Final = frozenset(
 EARLIER: Final = {
     1: "5cc1e1349036d986279635bedfe0fdcd8ce6a1b65339143ae92fb792727ce570",
     2: "f50ddb136d952675dd4df7138c4cc7abed2db9bd5c56b48267cd784db6c344b6",
+    3: "a740bd0c92c14581c5a0d705b6a7b9805d870960525f32ac6b7c2d06c6d9aeb7",
 }
 """`schema_digest` of earlier versions."""
 

@@ -1,8 +1,9 @@
 """Digests over the rows of a catalog. They show every later change that this program did not make.
 
 An enrollment has a digest over its own row and all its sessions, views and descriptors, an object over its own row,
-and an entry of the audit log over its own row and the digest before it. A change by the program seals a row again only
-if the digest was right before: damage stays noticed. Digests show accidents: an attacker can compute them, too.
+and a row of an append-only table (audit log, results, corrections) over its own values and the digest before it. A
+change by the program seals a row again only if the digest was right before: damage stays noticed. Digests show
+accidents: an attacker can compute them, too.
 
 Decision: docs/decisions/0034.
 """
@@ -15,11 +16,11 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, Table
 
-from rig.catalog.schema import audit, descriptors, enrollments, objects, sessions, views
+from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.core.errors import CatalogDamaged
 
 FIRST: Final = ""
-"""The digest before the first entry of the log."""
+"""The digest before the first row of an append-only table."""
 
 
 def _columns(table: Table) -> str:
@@ -34,7 +35,6 @@ _PARTS: Final = (
     f"SELECT enrollment_id, {_columns(descriptors)} FROM views JOIN descriptors ON view_id = views.id WHERE {{}} "
     "ORDER BY enrollment_id, view_id, name, version",
 )
-_AUDIT: Final = f"SELECT digest, {_columns(audit)} FROM audit WHERE {{}} ORDER BY id"
 
 
 @contextmanager
@@ -102,26 +102,30 @@ def check_loaded(connection: Connection, object_ids: Collection[int], enrollment
     )
 
 
-def log_digests(connection: Connection) -> list[tuple[int, str | None, str]]:
-    """Return id, stored digest and expected digest of every entry of the audit log."""
+def appended_digests(connection: Connection, table: Table) -> list[tuple[int, str | None, str]]:
+    """Return id, stored digest and expected digest of every row of an append-only table."""
     found = []
     before = FIRST
-    for row in connection.exec_driver_sql(_AUDIT.format("TRUE")):
+    for row in connection.exec_driver_sql(_appended(table, "TRUE")):
         found.append((row[1], row[0], _digest(before, row[1:])))
         before = row[0] or FIRST
     return found
 
 
-def seal_log(connection: Connection) -> None:
-    """Store the digests of the entries of the audit log that have none, those at its end."""
+def seal_appended(connection: Connection, table: Table) -> None:
+    """Store the digests of the rows of an append-only table that have none, those at its end."""
     before = FIRST
-    first = connection.exec_driver_sql("SELECT min(id) FROM audit WHERE digest IS NULL").scalar()
+    first = connection.exec_driver_sql(f"SELECT min(id) FROM {table.name} WHERE digest IS NULL").scalar()
     if first is not None:
-        newest = "SELECT digest FROM audit WHERE id < ? ORDER BY id DESC LIMIT 1"
+        newest = f"SELECT digest FROM {table.name} WHERE id < ? ORDER BY id DESC LIMIT 1"
         before = connection.exec_driver_sql(newest, (first,)).scalar() or FIRST
-    for row in connection.exec_driver_sql(_AUDIT.format("id >= ?"), (first,)).all():
+    for row in connection.exec_driver_sql(_appended(table, "id >= ?"), (first,)).all():
         before = _digest(before, row[1:])
-        connection.exec_driver_sql("UPDATE audit SET digest = ? WHERE id = ?", (before, row[1]))
+        connection.exec_driver_sql(f"UPDATE {table.name} SET digest = ? WHERE id = ?", (before, row[1]))
+
+
+def _appended(table: Table, where: str) -> str:
+    return f"SELECT digest, {_columns(table)} FROM {table.name} WHERE {where} ORDER BY id"
 
 
 def _digest(before: str, row: Iterable[Any]) -> str:

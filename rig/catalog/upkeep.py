@@ -18,7 +18,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.failures import DATABASE_NAME
 from rig.catalog.places import LOST, files_within, image_file
 from rig.catalog.records import EnrollmentStatus
-from rig.catalog.schema import SCHEMA_VERSION, descriptors, enrollments, objects, sessions, views
+from rig.catalog.schema import descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import changing_enrollments
 
 _OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
@@ -50,6 +50,8 @@ class Statistics:
     benches: dict[str, int]
     descriptors: tuple[DescriptorStatistics, ...]
     log_entries: int
+    results: int
+    result_image_bytes: int
     deleted_image_bytes: int
     old_image_bytes: int
 
@@ -105,11 +107,15 @@ def statistics(catalog: Catalog) -> Statistics:
             .order_by(descriptors.c.name, descriptors.c.version)
         ).all()
         entries = len(audit.entries(connection))
+        recorded, recorded_bytes = 0, 0
+        if catalog.database.has_results:
+            stored = select(func.count(), func.sum(results.c.image_bytes)).select_from(results)
+            recorded, recorded_bytes = connection.execute(stored).one()
     counts: dict[str, int] = {}
     for (status, _), (count, _, _) in sizes.items():
         counts[status] = counts.get(status, 0) + count
     return Statistics(
-        schema_version=SCHEMA_VERSION,
+        schema_version=catalog.database.version,
         objects=in_use,
         deleted_objects=total - in_use,
         enrollments=counts,
@@ -123,6 +129,8 @@ def statistics(catalog: Catalog) -> Statistics:
             DescriptorStatistics(name, version, count, known.get(name) == version) for name, version, count in described
         ),
         log_entries=entries,
+        results=recorded,
+        result_image_bytes=recorded_bytes or 0,
         deleted_image_bytes=sum(size for (_, deleted), (_, _, size) in sizes.items() if deleted),
         old_image_bytes=sum(
             size for (status, deleted), (_, _, size) in sizes.items() if not deleted and status in _OLD

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, delete, func, null, select, true, update
+from sqlalchemy import Connection, Table, delete, func, null, select, true, update
 
 from hbr.descriptors import descriptor
 from rig.catalog import audit
@@ -23,8 +23,8 @@ from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.places import LOST, file_mode, files_within, image_file, lost_file, make_folder_within
 from rig.catalog.queries import packed_descriptors
 from rig.catalog.schema import audit as audit_log
-from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
-from rig.catalog.seal import changing_enrollments, enrollment_digests, log_digests, object_digests
+from rig.catalog.schema import corrections, descriptors, enrollments, objects, results, sessions, views
+from rig.catalog.seal import appended_digests, changing_enrollments, enrollment_digests, object_digests
 from rig.core.errors import CatalogError, UsageError
 from rig.core.files import write
 from rig.core.processes import map_in_processes
@@ -55,6 +55,8 @@ class Problem(StrEnum):
     """Something that ``enrollment_id`` says of its sessions, views or descriptors is not what was stored."""
     LOG_CHANGED = "log changed"
     """Entry ``entry_id`` of the audit log is not the one that was written, or entries before it are missing."""
+    RESULT_CHANGED = "result changed"
+    """Row ``entry_id`` of ``table`` (results or corrections) is not the one that was written, or rows are missing."""
     SETTING_CHANGED = "setting changed"
     """``setting`` of the database is ``found``, not ``stored``."""
     ORPHANED_FILE = "orphaned file"
@@ -88,6 +90,7 @@ class Verification:
 
     objects: int
     views: int
+    results: int
     image_bytes: int
     findings: tuple[Finding, ...]
 
@@ -97,7 +100,10 @@ class Verification:
 
 
 class _Item(NamedTuple):
-    """An image that must exist. ``described`` holds name, version, settings as JSON, and packed levels."""
+    """An image that must exist. ``described`` holds name, version, settings as JSON, and packed levels.
+
+    That of a result has no object, and the negative number of the result instead of an enrollment.
+    """
 
     view_id: int | None
     session_id: int | None
@@ -133,6 +139,7 @@ class _State:
     findings: list[Finding] = field(default_factory=list)
     copies: dict[str, Path] = field(default_factory=dict)
     """A file for each SHA-256."""
+    results: int = 0
 
 
 def verify(
@@ -175,7 +182,7 @@ def verify(
     checked = {item: checked[item] for item in items}  # in the order of the catalog, whichever process was faster
 
     with catalog.database.read() as connection:
-        orphans = sorted(files - _referenced(connection))
+        orphans = sorted(files - _referenced(state, connection))
     _find_copies(state, checked, orphans)
     _report_images(state, checked)
     _report_sizes(state, checked)
@@ -188,6 +195,7 @@ def verify(
     return Verification(
         object_count,
         sum(item.view_id is not None for item in items),
+        state.results,
         sum(item.file_bytes for item in items),
         tuple(state.findings),
     )
@@ -269,6 +277,10 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
                 .where(sessions.c.empty_table_image.is_not(None))
             )
         ]
+        if catalog.database.has_results:
+            image = (results.c.image, results.c.image_sha256, results.c.image_bytes)
+            recorded = select(-results.c.id, *image).where(results.c.image.is_not(None))
+            items += [_Item(None, None, "", *row) for row in connection.execute(recorded)]
     return items, count
 
 
@@ -310,8 +322,10 @@ def _check(root: Path, item: _Item, quick: bool) -> _Checked:
     return _Checked(sha256, len(content), (image.shape[1], image.shape[0]), different=tuple(different))
 
 
-def _referenced(connection: Connection) -> set[str]:
+def _referenced(state: _State, connection: Connection) -> set[str]:
+    recorded = results.c.image.is_not(None)
     return {
+        *(connection.scalars(select(results.c.image).where(recorded)) if state.catalog.database.has_results else ()),
         *connection.scalars(select(views.c.image)),
         *connection.scalars(select(sessions.c.empty_table_image).where(sessions.c.empty_table_image.is_not(None))),
     }
@@ -404,17 +418,20 @@ def _report_digests(state: _State) -> None:
             if sealed != found:
                 details = {"enrollment_id": enrollment_id}
                 report(Finding(Problem.ENROLLMENT_CHANGED, owners.get(enrollment_id), details=details))
-        entry_ids = [0]
-        for entry_id, sealed, found in log_digests(connection):
-            entry_ids.append(entry_id)
-            if sealed != found or entry_id != entry_ids[-2] + 1:
-                report(Finding(Problem.LOG_CHANGED, details={"entry_id": entry_id}))
         given = {
             row[0]: row[1]
             for row in connection.exec_driver_sql("SELECT name, CAST(seq AS INTEGER) FROM sqlite_sequence")
         }
-        if given.get(audit_log.name, 0) != entry_ids[-1]:
-            report(Finding(Problem.LOG_CHANGED, details={"entry_id": given.get(audit_log.name)}))
+        state.findings += [
+            Finding(Problem.LOG_CHANGED, details={"entry_id": entry_id})
+            for entry_id in _changed_rows(connection, audit_log, given)
+        ]
+        state.results = given.get(results.name, 0)
+        for table in (results, corrections) if state.catalog.database.has_results else ():
+            state.findings += [
+                Finding(Problem.RESULT_CHANGED, details={"table": table.name, "entry_id": entry_id})
+                for entry_id in _changed_rows(connection, table, given)
+            ]
         for table in (objects, enrollments, sessions, views):
             last = connection.scalar(select(func.max(table.c.id))) or 0
             if table.kwargs.get("sqlite_autoincrement") and last > given.get(table.name, 0):
@@ -422,6 +439,17 @@ def _report_digests(state: _State) -> None:
         journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
         if journal not in ("wal", "off"):  # off: opened without permission to write
             report(_changed("journal", journal, "wal"))
+
+
+def _changed_rows(connection: Connection, table: Table, given: Mapping[str, int]) -> list[int]:
+    """Return the ids of the rows of an append-only table that are not as they were written, or follow missing ones."""
+    changed, before = [], 0
+    for entry_id, sealed, found in appended_digests(connection, table):
+        if sealed != found or entry_id != before + 1:
+            changed.append(entry_id)
+        before = entry_id
+    last = given.get(table.name, 0)
+    return changed if last == before else [*changed, last]
 
 
 def _changed(setting: str, found: object, stored: object) -> Finding:
@@ -434,7 +462,7 @@ def _report_orphans(state: _State, orphans: Iterable[str]) -> None:
         repair = moved_to = None
         if state.repair:
             with state.catalog.database.write() as connection:
-                if name in _referenced(connection) or not os.path.lexists(root / name):
+                if name in _referenced(state, connection) or not os.path.lexists(root / name):
                     continue
                 moved_to = _set_aside(root, name)
             repair = Repair.MOVED

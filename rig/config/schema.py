@@ -307,6 +307,10 @@ class IdentifyConfig(Section):
     extension: Literal["visual", "orient", "orient_all"] = Field(
         "orient_all", description="how missing views are filled in"
     )
+    record: Literal["image", "answer", "none"] = Field(
+        "image",
+        description="what the catalog records of each answer: with the image of the first view, without, or nothing",
+    )
     margin: float = Field(
         0.02,
         ge=0,

@@ -32,6 +32,7 @@ class NoteCode(StrEnum):
     STOPPING_RULE_UNREADABLE = "stopping-rule-unreadable"
     STOPPING_RULE_OUTDATED = "stopping-rule-outdated"
     RATES_NOT_GUARANTEED = "rates-not-guaranteed"
+    NOT_RECORDED = "not-recorded"
     EARLIER_VERSION = "earlier-version"
 
 
@@ -356,6 +357,14 @@ class Identified:
     open_set_threshold: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The answer is recorded in the catalog under a number (`rig results show`), with the sample that was given."""
+
+    result: int
+    sample: str | None
+
+
 Event = (
     Started
     | Moved
@@ -372,6 +381,7 @@ Event = (
     | Warned
     | Waiting
     | Failed
+    | Recorded
 )
 
 

@@ -12,6 +12,7 @@ from rig.events.events import (
     Item,
     Moved,
     Ranked,
+    Recorded,
     Rejected,
     SimilarObjects,
     SkipReason,
@@ -87,6 +88,8 @@ def line(event: Event) -> str:
             return f"Warning: {note_words(event.note)}.\nNext step: {next_step_words(event.note)}"
         case Waiting():
             return f"Waiting for {wait_words(event.reason)}; Ctrl+C ends."
+        case Recorded():
+            return f"Recorded as result {event.result}{f', sample {event.sample}' if event.sample else ''}."
         case Failed():
             return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
 

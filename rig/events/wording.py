@@ -76,6 +76,8 @@ def note_words(note: Note) -> str:
                 f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown; for the reasons: "
                 "rig catalog calibrate"
             )
+        case NoteCode.NOT_RECORDED:
+            return f"the answer is not recorded: {v['what']}"
         case NoteCode.EARLIER_VERSION:
             return str(v["text"])
 

@@ -126,13 +126,7 @@ def write_parquet(path: Path, objects: Iterable[ExportedObject]) -> int:
     ExportFailed
         The file exists already or cannot be written, or pyarrow is not installed.
     """
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        raise ExportFailed(
-            "Parquet needs pyarrow, which is not installed", next_step="install it: pip install 'hbr-rig[parquet]'"
-        ) from error
+    pa, pq = pyarrow()
     text, number = pa.string(), pa.float64()
     schema = pa.schema(
         [
@@ -154,6 +148,18 @@ def write_parquet(path: Path, objects: Iterable[ExportedObject]) -> int:
             if rows:
                 writer.write_table(pa.Table.from_pylist([{n: row[n] for n in schema.names} for row in rows], schema))
     return count
+
+
+def pyarrow() -> tuple[Any, Any]:
+    """Return the modules pyarrow and pyarrow.parquet; `ExportFailed` if they are not installed."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as error:
+        raise ExportFailed(
+            "Parquet needs pyarrow, which is not installed", next_step="install it: pip install 'hbr-rig[parquet]'"
+        ) from error
+    return pa, pq
 
 
 def _rows(item: Object) -> Iterator[tuple[dict[str, Any], View]]:

@@ -10,8 +10,8 @@ from typing import Final
 
 from alembic import op
 
-from rig.catalog.schema import APPEND_ONLY
-from rig.catalog.seal import seal_enrollments, seal_log, seal_objects
+from rig.catalog.schema import append_only_triggers, audit
+from rig.catalog.seal import seal_appended, seal_enrollments, seal_objects
 from rig.views.segmentation_evidence import upgrade_evidence
 
 revision = "3"
@@ -50,8 +50,8 @@ def upgrade() -> None:
         connection.exec_driver_sql(f"DROP TRIGGER {trigger}")
     for table in ("objects", "enrollments", "audit"):
         connection.exec_driver_sql(f"ALTER TABLE {table} ADD COLUMN digest VARCHAR(64)")
-    for trigger in APPEND_ONLY:
+    for trigger in append_only_triggers("audit"):
         connection.exec_driver_sql(trigger)
     seal_objects(connection, None)
     seal_enrollments(connection, None)
-    seal_log(connection)
+    seal_appended(connection, audit)

@@ -246,6 +246,7 @@ def stats(settings: Settings) -> None:
         state = "" if kind.current else ", a version that this program cannot compare"
         print(f"descriptor   {kind.name} {kind.version}: {kind.views} views{state}")
     print(f"log          {found.log_entries} entries")
+    print(f"results      {found.results}, {size_words(found.result_image_bytes)} of images")
     if found.deleted_image_bytes or found.old_image_bytes:
         print(
             f"removable    {size_words(found.deleted_image_bytes)} of deleted objects (rig catalog gc), "

@@ -36,6 +36,8 @@ def _evidence(finding: "Finding") -> list[str]:
             return [f"something in enrollment {details['enrollment_id']} is not what was stored"]
         case Problem.LOG_CHANGED:
             return [f"entry {details['entry_id']} of the log is not the one that was written, or one before is missing"]
+        case Problem.RESULT_CHANGED:
+            return [f"row {details['entry_id']} of {details['table']} is not the one that was written, or is missing"]
         case Problem.SETTING_CHANGED:
             return [f"the {details['setting']} is {details['found']}, not {details['stored']}"]
         case Problem.DESCRIPTOR_DIFFERS:
@@ -50,14 +52,15 @@ def _fix(finding: "Finding") -> str:
     match finding.problem:
         case Problem.OBJECT_CHANGED | Problem.ENROLLMENT_CHANGED:
             return "restore the database from a backup, or delete the object and enroll it again"
-        case Problem.DAMAGED_DATABASE | Problem.LOG_CHANGED | Problem.SETTING_CHANGED:
+        case Problem.DAMAGED_DATABASE | Problem.LOG_CHANGED | Problem.RESULT_CHANGED | Problem.SETTING_CHANGED:
             return "restore it from a backup"
         case Problem.MISSING_IMAGE | Problem.CHANGED_IMAGE:
             if copy := finding.details["copy"]:
                 return f"to restore it from {copy}: rig catalog verify --repair"
-            return "restore it from a backup, or enroll the object again: rig enroll --replace"
+            again = "restore it from a backup, or enroll the object again: rig enroll --replace"
+            return again if finding.object_name else "restore it from a backup"
         case Problem.UNREADABLE_IMAGE | Problem.SIZES_DIFFER:
-            return "enroll the object again: rig enroll --replace"
+            return "enroll the object again: rig enroll --replace" if finding.object_name else "nothing can be done"
         case Problem.NOT_DESCRIBED:
             return "describe it: rig catalog redescribe"
         case _:

@@ -52,7 +52,10 @@ def verify(
             outcome = f"{counted(len(found.findings), 'problem')}, {repaired} repaired"
             if not repair:
                 outcome += ". To repair what can be repaired: rig catalog verify --repair"
-        checked = f"{counted(found.objects, 'object')}, {counted(found.views, 'view')}"
+        checked = ", ".join(
+            counted(number, noun)
+            for number, noun in ((found.objects, "object"), (found.views, "view"), (found.results, "result"))
+        )
         print(f"{checked}, {size_words(found.image_bytes)} of images: {outcome}")
     if found.unrepaired:
         raise typer.Exit(EXIT_CATALOG)
@@ -181,7 +184,7 @@ def log(
     """
     from rig.events.events import plain
 
-    begin = _since(since)
+    begin = parse_time(since, "--since")
     with settings.open_catalog(read_only=True) as catalog:
         entries = catalog.log(since=begin, object_name=name)
     if settings.json:
@@ -227,7 +230,8 @@ def _region(settings: Settings, text: str) -> Any:
         raise UsageError(str(error), next_step="give stored, config, whole, or X,Y,WIDTH,HEIGHT") from error
 
 
-def _since(text: str | None) -> datetime | None:
+def parse_time(text: str | None, option: str) -> datetime | None:
+    """Return the time that an option gives: a date, a time in UTC, or how long ago."""
     from datetime import UTC
 
     from rig.core.clock import SystemClock
@@ -242,7 +246,7 @@ def _since(text: str | None) -> datetime | None:
         when = datetime.fromisoformat(text)
     except (ValueError, OverflowError) as error:
         raise UsageError(
-            f"--since {text!r} is not a time", next_step="give a date such as 2026-01-31, or 12h for 12 hours ago"
+            f"{option} {text!r} is not a time", next_step="give a date such as 2026-01-31, or 12h for 12 hours ago"
         ) from error
     return when.replace(tzinfo=UTC) if when.tzinfo is None else when
 

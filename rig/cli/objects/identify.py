@@ -1,5 +1,6 @@
 """`rig identify`."""
 
+import sys
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -44,25 +45,40 @@ def identify(
         bool,
         typer.Option("--watch", help="Wait for the next object after each answer. Start with an empty table."),
     ] = False,
+    sample: Annotated[
+        str | None, typer.Option(metavar="ID", help="Sample on the table, to be recorded with the answer.")
+    ] = None,
+    scan: Annotated[
+        bool, typer.Option("--scan", help="Ask for the sample before each search: scan its barcode, or type it.")
+    ] = False,
+    operator: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Who works at the bench (default: the user's account).")
+    ] = None,
 ) -> None:
     """Identify the object on the table. The exit code is 0 if it is found, 8 if it is unknown, 10 if it is ambiguous.
 
     Put the object on the table in any orientation. The default strategy, dense, rotates to the next best view and stops
     by the rule that rig catalog calibrate has measured. If the catalog has no descriptors for it, the default is ahbr.
 
+    The catalog records each answer (rig results list).
+
     p or the space bar pauses and resumes. Ctrl+Z pauses, fg resumes. Ctrl+C stops.
 
     Example: rig identify --bench sim --seed 3 --strategy sweep --save-run runs/1
 
-    Example: rig identify --watch --bench sim --json
+    Example: rig identify --watch --scan --operator "A. Silva" --bench sim
     """
     from hbr import Outcome
     from rig.bench import ObjectAlreadyPlaced, TableClearer
     from rig.cli.objects.empty_table import ensure_empty_table_image
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
-    from rig.events.events import Identified, Waiting, event_dict
+    from rig.cli.ui.prompts import ask_sample
+    from rig.core.clock import SystemClock
+    from rig.events.events import Identified, Recorded, Waiting, event_dict
+    from rig.events.lines import line
     from rig.plans.identify import identify as identify_one
+    from rig.plans.record import ResultRecorder
     from rig.plans.watch import watch as watch_table
     from rig.search.strategies import descriptor_for
     from rig.search.strategies import strategy as strategy_named
@@ -71,7 +87,9 @@ def identify(
 
     if max_views is not None:
         settings = settings.merged(None, None, [f"identify.max_views={max_views}"], None, False)
-    name = strategy or settings.load().identify.strategy
+    config = settings.load().identify
+    sample = _checked_sample(sample, scan=scan, watch=watch, records=config.record != "none")
+    name = strategy or config.strategy
     chosen = None if name is None else strategy_named(name)
     screen = console(stderr=settings.json)
     answer = None
@@ -79,7 +97,9 @@ def identify(
     with settings.open_catalog(read_only=True) as catalog:
         model = _Model(catalog, None if chosen is None else descriptor_for(chosen))
         known = model()  # report a catalog that cannot be searched before the bench is opened
-        with settings.open_bench() as bench, IdentifyView(screen) as view:
+        if scan and not watch:
+            sample = ask_sample()
+        with settings.open_bench() as bench, IdentifyView(screen, keys=not scan) as view:
             # Prepare: notes about the catalog, the operator, the empty-table image.
             report_other_regions(settings, catalog, bench)
             seed = settings.seed or 0
@@ -93,6 +113,16 @@ def identify(
                 events = watch_table(bench, model, strategy=chosen, seed=seed, top=top)
             else:
                 events = identify_one(bench, model(), strategy=chosen, seed=seed, top=top)
+            recorder = ResultRecorder(
+                *(catalog.path, bench),
+                clock=SystemClock(),
+                catalog_version=lambda: model.version,
+                operator=operator,
+                with_image=config.record == "image",
+            )
+            recorder.sample = sample
+            if config.record != "none":
+                events = recorder.stream(events)
             saver = _RunSaver(save_run, bench, model, several=watch)
             try:
                 with saver:
@@ -101,10 +131,14 @@ def identify(
                         if settings.json:
                             settings.print_json(event_dict(event))
                         # in a pipe, the text on stderr would only repeat the JSON
-                        if not settings.json or screen.is_terminal or isinstance(event, Waiting):
+                        if isinstance(event, Recorded):
+                            print(line(event), file=sys.stderr)
+                        elif not settings.json or screen.is_terminal or isinstance(event, Waiting):
                             view.add(event)
                         if isinstance(event, Identified):
                             answer = event
+                        elif isinstance(event, Waiting) and scan:
+                            recorder.sample = ask_sample()
             finally:
                 events.close()
     if answer is None or answer.outcome is Outcome.UNKNOWN:
@@ -113,26 +147,43 @@ def identify(
         raise typer.Exit(EXIT_AMBIGUOUS)
 
 
+def _checked_sample(sample: str | None, *, scan: bool, watch: bool, records: bool) -> str | None:
+    from rig.catalog.results import clean_text
+    from rig.core.errors import UsageError
+
+    if sample is not None and (watch or scan):
+        raise UsageError(
+            "--sample names the sample of one object; --watch and --scan are for several",
+            next_step="remove --sample, and use --scan to give the sample of each object",
+        )
+    if (sample is not None or scan) and not records:
+        raise UsageError(
+            "the answer is not recorded, because identify.record is none",
+            next_step="allow it: rig config set identify.record image",
+        )
+    return None if sample is None else clean_text(sample, "sample")
+
+
 class _Model:
-    """Loads the enrolled views, and again after objects were enrolled, deleted or calibrated in the meantime."""
+    """Loads the enrolled views, and again after a change of the catalog or of its stopping rule."""
 
     def __init__(self, catalog: "Catalog", descriptor: str | None = None) -> None:
         self._catalog = catalog
         self._descriptor = descriptor
         self._loaded_state: object = None
         self._model: Model
+        self.version = ""
 
     def __call__(self) -> "Model":
         from rig.search.model import load_model
         from rig.search.stopping_rules import FILE
 
         rules = self._catalog.path / FILE
-        state = (
-            [(summary.name, summary.enrolled_utc, summary.views) for summary in self._catalog.objects()],
-            rules.stat().st_mtime_ns if rules.exists() else None,
-        )
+        version = self._catalog.version()
+        state = version, rules.stat().st_mtime_ns if rules.exists() else None
         if state != self._loaded_state:
             self._model, self._loaded_state = load_model(self._catalog, descriptor=self._descriptor), state
+            self.version = version
         return self._model
 
 

@@ -27,6 +27,7 @@ from rig.events.events import (
     Rejected,
     SimilarObjects,
     Started,
+    Waiting,
 )
 from rig.events.lines import line
 from rig.events.wording import (
@@ -58,12 +59,14 @@ class LiveView(AbstractContextManager["LiveView"]):
     ----------
     console
         The terminal or the pipe to print to; a pipe gets plain lines.
+    keys
+        Whether keys pause the plan; False if the operator types answers meanwhile.
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, *, keys: bool = True) -> None:
         self._console = console
         self._live: Live | None = None
-        self._pause = Pause(keys=console.is_terminal)
+        self._pause = Pause(keys=keys and console.is_terminal)
 
     def __enter__(self) -> Self:
         self._pause.__enter__()
@@ -250,12 +253,12 @@ class IdentifyView(LiveView):
 
     Parameters
     ----------
-    console
-        The terminal or the pipe to print to.
+    console, keys
+        As for `LiveView`.
     """
 
-    def __init__(self, console: Console) -> None:
-        super().__init__(console)
+    def __init__(self, console: Console, *, keys: bool = True) -> None:
+        super().__init__(console, keys=keys)
         self._notes: tuple[Note, ...] = ()
         self._ranked: Ranked | None = None
         self._taken = 0
@@ -294,6 +297,9 @@ class IdentifyView(LiveView):
                 self.note(f"view {self._taken}  {self._leading}  {decision}{decision_words(event)}")
             case Identified():
                 self._ended = True
+                self._stop()
+                self.note(line(event))
+            case Waiting():
                 self._stop()
                 self.note(line(event))
             case _:

@@ -9,7 +9,22 @@ from rig.core.errors import UsageError
 T = TypeVar("T")
 
 
-def ask_line(question: str) -> str:
+def ask_sample() -> str | None:
+    """Ask for the sample on the table until it is valid text; None if the operator gives none.
+
+    A barcode scanner that acts as a keyboard answers, too: it types the code and presses Enter.
+    """
+    from rig.catalog.results import clean_text
+
+    while True:
+        answer = ask_line("Sample (scan or type it; Enter for none):", otherwise="give --sample")
+        try:
+            return clean_text(answer, "sample") if answer else None
+        except UsageError as error:
+            print(f"{error.what}; {error.next_step}", file=sys.stderr)
+
+
+def ask_line(question: str, *, otherwise: str = "add --yes") -> str:
     """Print a question on stderr and return the line that answers it; Ctrl+C is passed on.
 
     Raises
@@ -24,7 +39,7 @@ def ask_line(question: str) -> str:
     if not answer:
         raise UsageError(
             "The question was not answered: standard input has ended.",
-            next_step="Run the command in a terminal, or add --yes.",
+            next_step=f"Run the command in a terminal, or {otherwise}.",
         )
     return answer.strip()
 

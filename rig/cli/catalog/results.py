@@ -1,0 +1,233 @@
+"""`rig results ...`: the recorded answers of identifications."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.catalog.upkeep import parse_time
+from rig.cli.ui.command import command
+from rig.cli.ui.complete import object_names
+from rig.cli.ui.jobs import print_table
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.catalog.results import Answer, Result
+
+app = typer.Typer(help="Show, export and correct the recorded answers of identifications.", no_args_is_help=True)
+
+SampleOption = Annotated[str | None, typer.Option("--sample", metavar="ID", help="Only this sample.")]
+ObjectOption = Annotated[
+    str | None, typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names)
+]
+OutcomeOption = Annotated[
+    str | None, typer.Option("--outcome", metavar="found|ambiguous|unknown", help="Only this outcome.")
+]
+TakenOnOption = Annotated[str | None, typer.Option("--taken-on", metavar="BENCH", help="Only answers of this bench.")]
+SinceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--since",
+        metavar="WHEN",
+        help="Only answers since 2026-01-31, 2026-01-31T14:00 (UTC), or 30m, 12h, 7d, 4w ago.",
+    ),
+]
+BeforeOption = Annotated[str | None, typer.Option("--before", metavar="WHEN", help="Only answers before this time.")]
+CorrectedOption = Annotated[bool, typer.Option("--corrected", help="Only corrected results.")]
+ResultArgument = Annotated[int, typer.Argument(metavar="RESULT", min=1, help="Number of the result.")]
+
+
+@app.command("list")
+@command
+def list_(
+    settings: Settings,
+    sample: SampleOption = None,
+    name: ObjectOption = None,
+    outcome: OutcomeOption = None,
+    taken_on: TakenOnOption = None,
+    since: SinceOption = None,
+    before: BeforeOption = None,
+    corrected: CorrectedOption = False,
+) -> None:
+    """List results, oldest first. Filters use the corrected values.
+
+    Columns: number of the result, time, operator, sample, answer (a star marks a corrected one), views, and bench.
+
+    Example: rig results list --sample S-0042 --since 7d --bench sim
+    """
+    from rig.catalog.exchange.results_table import plain_row
+
+    found = _find(settings, sample, name, outcome, taken_on, since, before, corrected)
+    if settings.json:
+        for result in found:
+            settings.print_json(plain_row(result))
+        return
+    if not found:
+        print("No results match.")
+        return
+    rows = [
+        (
+            str(result.id),
+            f"{result.time_utc:%Y-%m-%d %H:%M:%S}",
+            result.operator,
+            result.current.sample or "–",
+            f"{_words(result.current)}{' *' if result.corrections else ''}",
+            str(len(result.azimuths_deg)),
+            result.provenance.bench,
+        )
+        for result in found
+    ]
+    print_table(("result", "time (UTC)", "operator", "sample", "answer", "views", "bench"), rows, right=("result",))
+
+
+@app.command("show")
+@command
+def show(settings: Settings, result: ResultArgument) -> None:
+    """Show a result: the answer, what it is based on, and its corrections.
+
+    Example: rig results show 12 --bench sim
+    """
+    from rig.catalog.results import find_result
+    from rig.events.events import plain
+
+    with settings.open_catalog(read_only=True) as catalog:
+        found = find_result(catalog, result)
+        folder = catalog.path
+    if settings.json:
+        shown = plain(found)
+        for name in ("answered", *(("current",) if found.corrections else ())):
+            shown[name] = getattr(found, name)._asdict()
+        for correction, one in zip(shown["corrections"], found.corrections, strict=True):
+            correction["corrected"] = one.corrected._asdict()
+        settings.print_json(shown)
+        return
+    print(f"Result {found.id}: {_answer_words(found)}")
+    lines = {
+        "sample": found.answered.sample or "–",
+        "time": f"{found.time_utc:%Y-%m-%d %H:%M:%S} UTC",
+        "operator": f"{found.operator} (account {found.user} on {found.host})",
+        "views": f"{len(found.azimuths_deg)}",
+        "bench": f"{found.provenance.bench}, {found.provenance.software}",
+        "catalog": f"version {found.catalog_version[:12]}",
+        "image": str(folder / found.image) if found.image else "–",
+    }
+    for name, text in lines.items():
+        print(f"  {name:9} {text}")
+    for one in found.corrections:
+        sample = f", sample {one.corrected.sample}" if one.corrected.sample else ""
+        print(f"Corrected {one.time_utc:%Y-%m-%d %H:%M:%S} UTC by {one.operator}: {_words(one.corrected)}{sample}")
+        print(f"  reason    {one.reason}")
+
+
+@app.command("export")
+@command
+def export(
+    settings: Settings,
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="File to write: .csv, .json or .parquet.")],
+    sample: SampleOption = None,
+    name: ObjectOption = None,
+    outcome: OutcomeOption = None,
+    taken_on: TakenOnOption = None,
+    since: SinceOption = None,
+    before: BeforeOption = None,
+    corrected: CorrectedOption = False,
+) -> None:
+    """Export results as a table. The suffix of the file chooses the format.
+
+    Example: rig results export june.csv --since 2026-06-01 --before 2026-07-01 --bench sim
+    """
+    from rig.catalog.exchange.results_table import TableFormat, write_results
+    from rig.core.errors import UsageError
+    from rig.events.wording import counted
+
+    try:
+        form = TableFormat(target.suffix.lower().removeprefix("."))
+    except ValueError as error:
+        known = ", ".join(f".{one}" for one in TableFormat)
+        raise UsageError(f"the format of {target} is unknown", next_step=f"give a file with {known}") from error
+    found = _find(settings, sample, name, outcome, taken_on, since, before, corrected)
+    write_results(target, found, form)
+    settings.say(
+        f"Exported {counted(len(found), 'result')} to {target}.",
+        {"target": str(target), "format": form, "results": len(found)},
+    )
+
+
+@app.command("correct")
+@command
+def correct(
+    settings: Settings,
+    result: ResultArgument,
+    reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="Why; it is stored with the correction.")],
+    name: Annotated[
+        str | None,
+        typer.Option("--object", metavar="NAME", help="The right object.", autocompletion=object_names),
+    ] = None,
+    unknown: Annotated[bool, typer.Option("--unknown", help="The object is not in the catalog.")] = False,
+    sample: Annotated[str | None, typer.Option("--sample", metavar="ID", help="The right sample.")] = None,
+    operator: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Who corrects it (default: the user's account).")
+    ] = None,
+) -> None:
+    """Correct the object or the sample of a result. The recorded answer stays, and the log tells of the correction.
+
+    Example: rig results correct 12 --object mug-star --reason "read the label" --bench sim
+    """
+    from rig.catalog.results import correct as correct_result
+
+    with settings.open_catalog() as catalog:
+        now = correct_result(
+            *(catalog, result), reason=reason, object_name=name, unknown=unknown, sample=sample, operator=operator
+        )
+    text = f"Result {result} is now {_words(now)}{f', sample {now.sample}' if now.sample else ''}."
+    settings.say(text, {"result": result, **now._asdict()})
+
+
+def _find(
+    settings: Settings,
+    sample: str | None,
+    name: str | None,
+    outcome: str | None,
+    taken_on: str | None,
+    since: str | None,
+    before: str | None,
+    corrected: bool,
+) -> "list[Result]":
+    from rig.catalog.records import Outcome
+    from rig.catalog.results import ResultFilter, find_results
+    from rig.core.errors import UsageError
+
+    try:
+        wanted = None if outcome is None else Outcome(outcome)
+    except ValueError as error:
+        raise UsageError(f"--outcome {outcome!r} is unknown", next_step=f"give {', '.join(Outcome)}") from error
+    begin, end = parse_time(since, "--since"), parse_time(before, "--before")
+    with settings.open_catalog(read_only=True) as catalog:
+        return find_results(catalog, ResultFilter(sample, name, wanted, taken_on, begin, end, corrected))
+
+
+def _words(answer: "Answer") -> str:
+    """Return an answer for a table: "mug-white", "mug-white? (ambiguous)", "unknown"."""
+    from rig.catalog.records import Outcome
+
+    match answer.outcome:
+        case Outcome.FOUND:
+            return answer.object_name or "–"
+        case Outcome.AMBIGUOUS:
+            return f"ambiguous ({answer.object_name}?)"
+        case Outcome.UNKNOWN:
+            return "unknown"
+
+
+def _answer_words(result: "Result") -> str:
+    """Return the answer in the words that were printed after the search."""
+    from rig.events.events import Identified
+    from rig.events.wording import result_words
+    from rig.search.saved_run import built
+
+    details: Any = {name: value for name, value in result.details.items() if name != "event"}
+    try:
+        answer: Identified = built(Identified, details)
+        return result_words(answer)
+    except (LookupError, TypeError, ValueError, AttributeError):  # an event of another version
+        return _words(result.answered)

@@ -1,0 +1,96 @@
+"""Record the answers of identifications in a catalog, while their events pass."""
+
+from collections.abc import Callable, Generator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench import Bench
+from rig.catalog import Catalog, Provenance
+from rig.catalog.records import Outcome
+from rig.catalog.results import Answer, NewResult, record
+from rig.core.clock import Clock
+from rig.core.errors import RigError
+from rig.events.events import Accepted, Event, Identified, Note, NoteCode, Recorded, Started, Warned, event_dict
+
+
+class ResultRecorder:
+    """Records each answer of a stream of events, with the image of its first view.
+
+    An answer is never lost: it is yielded before it is recorded, and a catalog that cannot be written is a `Warned`.
+
+    Parameters
+    ----------
+    folder
+        Folder of the catalog.
+    bench
+        The bench that takes the views.
+    clock
+        Gives the civil time of the results.
+    catalog_version
+        Returns `Catalog.version` of the views that the search has loaded.
+    operator
+        None for the user's account.
+    with_image
+        Whether to store images.
+
+    Attributes
+    ----------
+    sample
+        The sample on the table, None if it has no name. Change it before each object.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        bench: Bench,
+        *,
+        clock: Clock,
+        catalog_version: Callable[[], str],
+        operator: str | None = None,
+        with_image: bool = True,
+    ) -> None:
+        self.sample: str | None = None
+        self._folder = folder
+        self._bench = bench
+        self._clock = clock
+        self._catalog_version = catalog_version
+        self._operator = operator
+        self._with_image = with_image
+        self._image: NDArray[np.uint8] | None = None
+        self._azimuths_deg: list[float] = []
+
+    def stream(self, events: Generator[Event, None, object]) -> Generator[Event, None, None]:
+        """Yield the events of `identify` or `watch`; after each answer also `Recorded`, or why it is not recorded."""
+        try:
+            for event in events:
+                yield event
+                match event:
+                    case Started():
+                        self._image, self._azimuths_deg = None, []
+                    case Accepted():
+                        if self._with_image and self._image is None:
+                            self._image = event.image_bgr
+                        self._azimuths_deg.append(event.azimuth_deg)
+                    case Identified():
+                        yield self._record(event)
+                    case _:
+                        pass
+        finally:
+            events.close()
+
+    def _record(self, answer: Identified) -> Recorded | Warned:
+        try:
+            new = NewResult(
+                Answer(Outcome(answer.outcome.value), next(iter(answer.possible), None), self.sample),
+                event_dict(answer),
+                tuple(self._azimuths_deg),
+                Provenance(self._bench.name, self._bench.devices(), self._bench.conditions),
+                self._catalog_version(),
+                self._operator,
+            )
+            with Catalog.open(self._folder, clock=self._clock, create=False) as catalog:
+                return Recorded(record(catalog, new, self._image), self.sample)
+        except RigError as error:
+            return Warned(None, Note(NoteCode.NOT_RECORDED, {"what": error.what, "next_step": error.next_step}))
