@@ -66,7 +66,7 @@ def test_every_command_and_option_exists():
     assert len(shown) >= 20
     for found in shown:
         words = next(filter(None, found)).split()
-        groups = ("catalog", "calibrate", "config", "servo")
+        groups = ("catalog", "results", "calibrate", "config", "servo")
         name = words[: 2 if words[0] in groups and len(words) > 1 and not words[1].startswith("-") else 1]
         done = CliRunner().invoke(app, [*name, "--help"], env={"COLUMNS": "200"})
         assert done.exit_code == 0, words

@@ -1,6 +1,6 @@
 """Results: what was answered about which sample, when and by whom, and how an operator corrected it later.
 
-Decision: docs/decisions/0035.
+Decision: docs/decisions/0036.
 """
 
 from collections import defaultdict

@@ -61,7 +61,7 @@ def test_region_follows_the_object_after_the_camera_moved(rig):
     rig("catalog", "redescribe", "--region", ",".join(map(str, follows)))
     found = rig("identify", "--set", "bench.sim.object=mug-dots", "--json")
     assert "enrolled with view.roi" not in found.stderr
-    assert json.loads(found.stdout.splitlines()[-1])["name"] == "mug-dots"
+    assert json.loads(found.stdout.splitlines()[-2])["name"] == "mug-dots"
 
     assert f"    sets view.roi = {follows}" in rig("calibrate", "show").stdout
     written = rig("identify", "--set", "bench.sim.object=mug-dots", "--set", f"view.roi={BEFORE}").stderr

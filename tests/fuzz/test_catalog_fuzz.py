@@ -17,6 +17,7 @@ from rig.catalog.edit import set_texts
 from rig.catalog.exchange import import_objects, plan_import, read_bundle, read_objects, write_bundle
 from rig.catalog.exchange.bundle import MANIFEST, OBJECTS
 from rig.catalog.failures import DATABASE_NAME
+from rig.catalog.results import correct, record
 from rig.catalog.schema import SCHEMA_VERSION
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected, RigError
@@ -24,7 +25,16 @@ from rig.views import image_files as images
 from sim.clock import VirtualClock
 from tests.fuzz.commands import Commands, cases
 from tests.fuzzing import fuzz_settings, limited
-from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, image, plan, true_fill, without_waiting
+from tests.rig.catalog.catalog_samples import (
+    PROVENANCE,
+    described,
+    finished,
+    image,
+    new_result,
+    plan,
+    true_fill,
+    without_waiting,
+)
 from tests.rig.catalog.test_migration import DUMPS, catalog_of_version
 
 pytestmark = pytest.mark.timeout(7200)
@@ -51,6 +61,8 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tin = catalog.begin("tin", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
         tin.store_empty_table(image(9))
         tin.add(described(0, 3, segmentation={"method": "none", "issues": []}), image(3))
+        record(catalog, new_result(), image(4))
+        correct(catalog, 1, object_name="tin", reason="read the label")
         write_bundle(folder / "good.zip", read_objects(catalog))
     return folder
 
@@ -120,13 +132,14 @@ SCHEMAS = [
     "ALTER TABLE {table} ADD COLUMN evil",
     "ALTER TABLE {table} RENAME COLUMN {column} TO evil",
 ]
-READ = ["show mug", "show mug-white", "list", "verify --jobs 1", "verify --repair --jobs 1", "stats", "gc --yes"]
+READ = ["log", "results list", "results show 1", "export a.zip", "catalog migrate"]
+IN_CATALOG = ["show mug", "show mug-white", "list", "verify --jobs 1", "verify --repair --jobs 1", "stats", "gc --yes"]
 
 
 @given(
-    st.integers(0, 2),
+    st.integers(0, len(DUMPS)),
     st.sampled_from(["value", "value", "value", "bytes", "bytes", "schema", "version"]),
-    st.sampled_from(["log", "export a.zip", "catalog migrate", *(f"catalog {words}" for words in READ)]),
+    st.sampled_from([*READ, *(f"catalog {words}" for words in IN_CATALOG)]),
     st.data(),
 )
 @cases(9)

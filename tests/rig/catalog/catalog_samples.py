@@ -2,7 +2,8 @@
 
     python catalog_samples.py CATALOG NAME COUNT [DIE_BEFORE]
 
-It prints the index of each stored view, and kills itself before durable step DIE_BEFORE. Steps count from 1: sync of
+It prints the index of each stored view, and kills itself before durable step DIE_BEFORE. With COUNT 0 it records two
+results, and kills itself while it records the second one. Steps count from 1: sync of
 the image, rename, sync of the folder, commit, then those of the next view.
 """
 
@@ -22,6 +23,9 @@ from sqlalchemy import Engine, event
 import hbr
 from rig.catalog import Catalog, Provenance, ViewRecord
 from rig.catalog.jobs import JobProgress
+from rig.catalog.records import Outcome
+from rig.catalog.results import Answer, NewResult
+from rig.catalog.results import record as record_result
 from rig.core.clock import SystemClock
 from rig.views.description import within
 
@@ -85,6 +89,19 @@ def true_fill(
     enrollment.finish()
 
 
+def new_result(
+    outcome: str = "found", object_name: str | None = "mug", sample: str | None = None, **changes: Any
+) -> NewResult:
+    values: dict[str, Any] = {
+        "answered": Answer(Outcome(outcome), object_name, sample),
+        "details": {"event": "identified", "yaw_deg": 70.0, "yaw_sigma_deg": 1.5, "score": 0.9},
+        "azimuths_deg": (0.0, 60.0),
+        "provenance": PROVENANCE,
+        "catalog_version": "c" * 64,
+    }
+    return NewResult(**values | changes)
+
+
 def finished(job: Generator[JobProgress, None, _T]) -> _T:
     """Run a job of the catalog and return its result."""
     while True:
@@ -97,6 +114,12 @@ def finished(job: Generator[JobProgress, None, _T]) -> _T:
 def main() -> None:
     path, name, views, die_before = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
     with Catalog.open(path, clock=SystemClock()) as catalog:
+        if not views:
+            record_result(catalog, new_result(), image(1))
+            print("answered", flush=True)
+            die_at(die_before)
+            record_result(catalog, new_result(), image(2))
+            return
         enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE)
         if die_before:
             die_at(die_before)

@@ -18,6 +18,7 @@ from rig.catalog import Catalog, migrate
 from rig.catalog.edit import delete
 from rig.catalog.exchange import import_objects, plan_import, read_bundle, read_catalog, read_objects, write_bundle
 from rig.catalog.redescribe import redescribe
+from rig.catalog.schema import SCHEMA_VERSION
 from rig.catalog.seal import seal_enrollments, seal_objects
 from rig.catalog.upkeep import collect_garbage, statistics
 from rig.catalog.verify import verify
@@ -197,12 +198,12 @@ def test_new_catalog_is_private(tmp_path: Path, umask: int) -> None:
         "ALTER TABLE views ADD COLUMN evil TEXT",
     ],
 )
-@pytest.mark.parametrize("version", [3, 2])
+@pytest.mark.parametrize("version", [SCHEMA_VERSION, 2])
 def test_foreign_schema_is_rejected(root: Path, statement: str, version: int) -> None:
     sql(root, statement, f"PRAGMA user_version = {version}")
     before = content(root)
     with pytest.raises(CatalogDamaged, match="other tables"):
-        if version == 3:
+        if version == SCHEMA_VERSION:
             opened(root)
         else:
             migrate(root, clock=VirtualClock())

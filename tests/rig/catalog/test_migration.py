@@ -14,14 +14,17 @@ import pytest
 import hbr
 from rig.catalog import Catalog, EnrollmentStatus, migrate
 from rig.catalog.exchange import import_objects, plan_import, read_bundle
+from rig.catalog.results import find_results
+from rig.catalog.results import record as record_result
 from rig.catalog.schema import SCHEMA_VERSION
+from rig.catalog.upkeep import statistics
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogOutdated
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, finished, image, record, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, finished, image, new_result, record, without_waiting
 
 DATA = Path(__file__).parent / "data"
-DUMPS = {1: DATA / "catalog-v1" / "catalog.sql", 2: DATA / "catalog-v2.sql"}
+DUMPS = {1: DATA / "catalog-v1" / "catalog.sql", 2: DATA / "catalog-v2.sql", 3: DATA / "catalog-v3.sql"}
 BUNDLE = DATA / "bundle-v1.rigcat.zip"
 """A bundle that version 0.1 wrote from the catalog of ``catalog-v2.sql``; its images are those of the catalog."""
 
@@ -46,7 +49,7 @@ def _without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     without_waiting(monkeypatch)
 
 
-@pytest.fixture(params=[1, 2])
+@pytest.fixture(params=DUMPS)
 def version(request: pytest.FixtureRequest) -> int:
     found: int = request.param
     return found
@@ -64,7 +67,7 @@ def tables(root: Path) -> dict[str, str]:
     return {name: re.sub(r"[\s\"]+", "", sql) for name, sql in rows}
 
 
-@pytest.mark.parametrize("read_only", [False, True])
+@pytest.mark.parametrize(("version", "read_only"), [(1, False), (1, True), (2, False), (2, True), (3, False)])
 def test_old_catalog_is_not_migrated_unasked(old: Path, version: int, read_only: bool) -> None:
     before = tables(old)
     with pytest.raises(CatalogOutdated) as error:
@@ -127,12 +130,27 @@ def check_objects_of_version_2(catalog: Catalog) -> None:
     tin.add(record(3), image(33)[:, :, :])
 
 
-def test_migration_of_version_2_keeps_everything(tmp_path: Path) -> None:
-    old, clock = catalog_of_version(2, tmp_path / "old"), VirtualClock()
-    assert migrate(old, clock=clock).before == 2
+@pytest.mark.parametrize("version", [2, 3])
+def test_migration_keeps_everything(old: Path, version: int) -> None:
+    clock = VirtualClock()
+    assert migrate(old, clock=clock).before == version
     with Catalog.open(old, clock=clock) as catalog:
         assert catalog.log()[0].action == "began to enroll"
         check_objects_of_version_2(catalog)
+        assert record_result(catalog, new_result(), image(1)) == 1
+
+
+def test_catalog_of_version_3_is_read_without_a_migration(tmp_path: Path) -> None:
+    old = catalog_of_version(3, tmp_path / "old")
+    before = (old / "catalog.sqlite").read_bytes()
+    with Catalog.open(old, clock=VirtualClock(), read_only=True) as catalog:
+        assert catalog.views("edges+colours").views.object_names == ("mug-white", "Tässe 2")
+        assert finished(verify(catalog, jobs=1)).findings == ()
+        assert (statistics(catalog).schema_version, statistics(catalog).results) == (3, 0)
+        with pytest.raises(CatalogOutdated, match="earlier program") as error:
+            find_results(catalog)
+    assert "rig catalog migrate" in error.value.next_step
+    assert (old / "catalog.sqlite").read_bytes() == before
 
 
 def test_bundle_of_version_1_is_imported(tmp_path: Path) -> None:
@@ -170,9 +188,9 @@ def test_second_migration_does_nothing(old: Path) -> None:
     assert migrate(old, clock=VirtualClock()).backup is None
 
 
-def test_failed_migration_changes_nothing(old: Path) -> None:
+def test_failed_migration_changes_nothing(old: Path, version: int) -> None:
     with closing(sqlite3.connect(old / "catalog.sqlite", isolation_level=None)) as connection:
-        connection.execute("UPDATE views SET sitting_id = 99 WHERE id = 1")
+        connection.execute(f"UPDATE views SET {'sitting' if version < 3 else 'session'}_id = 99 WHERE id = 1")
     before = tables(old)
     with pytest.raises(CatalogDamaged) as error:
         migrate(old, clock=VirtualClock())

@@ -56,8 +56,8 @@ def test_enroll_list_show_identify(rig):
     events = lines(found.stdout)
     assert found.exit_code == 0
     assert events[0]["event"] == "started"
-    assert events[-1]["event"] == "identified"
-    assert events[-1]["name"] == "lamp"
+    assert [event["event"] for event in events[-2:]] == ["identified", "recorded"]
+    assert events[-2]["name"] == "lamp"
     assert {e["event"] for e in events} >= {"moved", "accepted", "ranked", "decided"}
 
 

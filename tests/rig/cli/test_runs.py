@@ -3,8 +3,11 @@
 import json
 import os
 import re
+import shutil
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -81,6 +84,77 @@ def test_enrollment_ends_with_similar_objects_and_a_report(enrolled):
     assert not re.search(r'(src|href)="(?!data:|#)', page)  # the page is self-contained
 
 
+def in_json(done):
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_identification_is_recorded_corrected_and_exported(rig, tmp_path):
+    (first, *_) = in_json(rig("results", "list", "--json"))
+    assert (first["object"], first["outcome"], first["sample"], first["bench"]) == ("dice", "found", None, "sim")
+    with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
+        assert first["catalog_version"] == catalog.version()
+    assert Path("catalog", first["image"]).is_file()
+    shown = rig("results", "show", "1").stdout
+    assert "dice, rotated" in shown
+    wrong = rig("results", "correct", "1", "--object", "dise", "--reason", "label")
+    assert wrong.exit_code == 7
+    assert "did you mean 'dice'?" in wrong.stderr
+    assert rig("results", "correct", "1", "--sample", "S-1", "--reason", "label \x1b[2J read").exit_code == 2
+    corrected = rig("results", "correct", "1", "--sample", "S-1", "--reason", "label read")
+    assert corrected.stdout == "Result 1 is now dice, sample S-1.\n"
+    assert "label read" in rig("results", "show", "1").stdout
+    assert "dice *" in rig("results", "list", "--sample", "S-1").stdout
+    assert rig("results", "list", "--sample", "S-2").stdout == "No results match.\n"
+    log = rig("log", "--object", "dice").stdout
+    assert "identified" in log
+    assert "result corrected" in log
+    assert rig("results", "export", str(tmp_path / "a.csv"), "--object", "dice").exit_code == 0
+    assert rig("results", "export", str(tmp_path / "a.txt")).exit_code == 2
+
+
+def test_each_search_of_watch_asks_for_the_sample(enrolled, monkeypatch):
+    monkeypatch.chdir(enrolled[0])
+    command = ["identify", "--watch", "--scan", "--operator", "A. Silva", "--json", "--set", "bench.sim.object=dice"]
+    done = CliRunner().invoke(app, command, input="S-1\nS\x1d2\nS-2\n\n")
+    assert done.exit_code == 2  # the answers have ended
+    events = in_json(done)
+    assert [event["sample"] for event in events if event.get("event") == "recorded"] == ["S-1", "S-2", None]
+    kinds = [event["event"] for event in events[:-1]]
+    assert all(kinds[k + 1] == "recorded" for k, kind in enumerate(kinds) if kind == "identified")
+    assert "cannot be printed" in done.stderr
+    listed = in_json(CliRunner().invoke(app, ["results", "list", "--json", "--sample", "S-2"]))
+    assert [one["operator"] for one in listed] == ["A. Silva"]
+
+
+def test_sample_is_rejected_where_it_cannot_be_recorded(rig):
+    assert rig("identify", "--sample", "S-1", "--watch").exit_code == 2
+    assert rig("identify", "--sample", "S-1", "--set", "identify.record=none").exit_code == 2
+    assert rig("identify", "--sample", " ").exit_code == 2
+
+
+def earlier_version(root: Path) -> None:
+    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
+        connection.executescript("DROP TABLE results; DROP TABLE corrections; PRAGMA user_version = 3")
+
+
+def no_place_for_images(root: Path) -> None:
+    (root / "images" / "results").write_text("in the way")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "fix"), [(earlier_version, "rig catalog migrate"), (no_place_for_images, "check the folder")]
+)
+def test_answer_is_printed_even_if_it_cannot_be_recorded(rig, tmp_path, spoil, fix):
+    shutil.copytree("catalog", tmp_path / "catalog", ignore=shutil.ignore_patterns("results"))
+    spoil(tmp_path / "catalog")
+    settings = ["--set", f"catalog.path={tmp_path / 'catalog'}", "--set", "bench.sim.object=dice"]
+    done = rig("identify", "--sample", "S-1", *settings)
+    assert done.exit_code == 0
+    answer, warning = done.stdout.index("dice, rotated"), done.stdout.index("Warning: the answer is not recorded")
+    assert answer < warning < done.stdout.index(fix)
+    assert "Recorded" not in done.output
+
+
 def test_label_option_is_repeatable(rig):
     listed = json.loads(rig("catalog", "list", "--json").stdout)
     assert next(o["label"] for o in listed["objects"] if o["name"] == "lamp") == "kitchen, brass"
@@ -106,7 +180,6 @@ def test_saved_run_is_replayed_checked_and_reported(rig, enrolled):
 
 
 def test_replay_check_finds_a_changed_decision(rig, tmp_path):
-    import shutil
 
     shutil.copytree("runs/1", tmp_path / "run")
     lines = (tmp_path / "run" / "events.jsonl").read_text().splitlines()
@@ -146,7 +219,7 @@ def test_every_strategy_finds_the_object(rig, strategy):
     )
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert events[0]["strategy"] == strategy
-    assert (events[-1]["event"], events[-1]["name"]) == ("identified", "lamp")
+    assert (events[-2]["event"], events[-2]["name"]) == ("identified", "lamp")
     assert all(len(e["candidates"]) == 1 for e in events if e["event"] == "ranked")
     assert len([e for e in events if e["event"] == "accepted"]) == (3 if strategy == "hbr" else 2)
 
@@ -157,7 +230,7 @@ def test_dense_is_the_default_strategy(rig, enrolled):
         return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
 
     events, _ = searched("--top", "1", "--save-run", "runs/own")
-    started, *_, answer = (event for event in events if event["event"] != "empty_table_image")
+    started, *_, answer, _ = (event for event in events if event["event"] != "empty_table_image")
     assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
     assert 0.9 < answer["confidence"] <= 1
     assert answer["open_set_score"] >= answer["open_set_threshold"]
@@ -189,7 +262,6 @@ def test_stopping_rule_is_calibrated_stored_and_used(rig, enrolled):
 
 
 def test_catalog_without_dense_descriptors_is_searched_by_ahbr_with_a_note(enrolled, tmp_path, monkeypatch):
-    import shutil
 
     from rig.catalog import Catalog
     from rig.catalog.seal import seal_enrollments
@@ -376,7 +448,7 @@ def test_ambiguous_object_has_an_exit_code_of_its_own(rig):
         path.write_text(json.dumps(json.loads(before) | {"min_confidence": 1.5, "open_set_thresholds": [None] * 4}))
         words = ("identify", "--strategy", "dense", "--max-views", "2", "--set", "bench.sim.object=dice")
         done = rig(*words, "--json")
-        answer = json.loads(done.stdout.splitlines()[-1])
+        answer = json.loads(done.stdout.splitlines()[-2])
         assert done.exit_code == EXIT_AMBIGUOUS
         assert (answer["outcome"], answer["name"]) == ("ambiguous", "dice")
         assert answer["possible"] == [one["name"] for one in answer["candidates"]]

@@ -31,6 +31,7 @@ from rig.events.events import (
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
+from rig.plans.record import ResultRecorder
 from rig.plans.similar_objects import similar_objects
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.gyro_rotation import Stillness
@@ -120,7 +121,8 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
             seen.add(check_event(event))
         views = catalog.views().views
         seen |= {check_event(similar_objects(views, name)) for name in ("dice", "lamp")}
-        for event in identify(s.bench, hbr.ViewIndex(views), strategy="sweep"):
+        recorder = ResultRecorder(tmp_path, s.bench, clock=s.bench.clock, catalog_version=catalog.version)
+        for event in recorder.stream(identify(s.bench, hbr.ViewIndex(views), strategy="sweep")):
             seen.add(check_event(event))
         s.operator.next_object = "radio"  # not enrolled: the dense search weighs its rotations, and ends
         told = [event_dict(event) for event in identify(s.bench, load_model(catalog))]
