@@ -2,11 +2,10 @@
 
 from hbr.descriptors.base import Comparison, Descriptor
 from hbr.descriptors.embedding import MODEL_NAME, PREFIX
-from hbr.descriptors.registry import PAPERS, descriptor, load_descriptor, load_model, loaded_models, names
+from hbr.descriptors.registry import descriptor, load_descriptor, load_model, loaded_models, names, register
 
 __all__ = [
     "MODEL_NAME",
-    "PAPERS",
     "PREFIX",
     "Comparison",
     "Descriptor",
@@ -15,4 +14,5 @@ __all__ = [
     "load_model",
     "loaded_models",
     "names",
+    "register",
 ]

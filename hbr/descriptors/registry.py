@@ -1,5 +1,8 @@
 """The known descriptors and their names."""
 
+import warnings
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Final
 
@@ -9,6 +12,9 @@ from hbr.descriptors.edges import Edges
 from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
 from hbr.descriptors.joined import Joined
 from hbr.descriptors.plain_cedd import Cedd
+
+GROUP: Final = "hbr.descriptors"
+"""Entry-point group in which packages name their descriptors: instances, not classes."""
 
 _CEDD: Final = Cedd()
 _EDGES: Final = Edges()
@@ -25,10 +31,6 @@ _KNOWN: Final[dict[str, Descriptor]] = {
     )
 }
 
-#: Names of the descriptors of the whole image, which the paper's voting compares.
-PAPERS: Final = tuple(known.name for known in _KNOWN.values() if known.whole_image)
-
-
 _MODELS: Final[dict[str, Embedding]] = {}
 
 
@@ -40,12 +42,37 @@ def descriptor(name: str) -> Descriptor:
     ValueError
         The name is unknown (the message lists the known ones), or it names a model that is not loaded.
     """
-    known = _KNOWN.get(name) or _MODELS.get(name)
+    known = _KNOWN.get(name) or _MODELS.get(name) or _plugins().get(name)
     if known is None and name.startswith(PREFIX):
         raise ValueError(f"the model of descriptor {name!r} is not loaded; load its file first")
     if known is None:
         raise ValueError(f"descriptor {name!r} is unknown; use one of {', '.join(names())}, or {PREFIX}FILE")
     return known
+
+
+def register(added: Descriptor) -> None:
+    """Make a descriptor known by its name in this process; an entry point does so in every process.
+
+    Raises
+    ------
+    ValueError
+        The name belongs to another descriptor, or to networks.
+    """
+    if added.name.startswith(PREFIX) or _KNOWN.setdefault(added.name, added) != added:
+        raise ValueError(f"the name {added.name!r} is taken; choose another one")
+
+
+@cache
+def _plugins() -> dict[str, Descriptor]:
+    """Return the descriptors of other packages. One that cannot be loaded is left out, with a warning."""
+    found: dict[str, Descriptor] = {}
+    for point in entry_points(group=GROUP):
+        try:
+            plugged: Descriptor = point.load()
+            found[plugged.name] = plugged
+        except (ImportError, AttributeError) as error:
+            warnings.warn(f"the descriptor {point.name!r} of {point.value} cannot be loaded: {error}", stacklevel=2)
+    return found
 
 
 def load_descriptor(given: str) -> Descriptor:
@@ -79,5 +106,5 @@ def loaded_models() -> tuple[Embedding, ...]:
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all descriptors that come with the library, the paper's first."""
-    return tuple(_KNOWN)
+    """Return the names of all descriptors apart from networks, the paper's first."""
+    return tuple(_KNOWN | _plugins())

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.descriptors import PAPERS, Descriptor, descriptor, names
+from hbr.descriptors import Descriptor, descriptor, names
 from rig.catalog.columns import damaged
 from rig.catalog.places import image_file
 from rig.catalog.records import JsonObject, PackedDescriptor, Region, is_region
@@ -35,7 +35,8 @@ def stored_describer(
     CatalogError
         The empty-table image is missing or is not the stored one.
     """
-    if empty_table is None or all(name in PAPERS for name in names):  # the paper's descriptors need no segmentation
+    # Descriptors of the whole image, such as the paper's, need no segmentation.
+    if empty_table is None or all(descriptor(name).whole_image for name in names):
         return ViewDescriber(ViewConfig(roi=region), names)
     return ViewDescriber(ViewConfig(roi=region), names, images.read(image_file(root, empty_table[0]), empty_table[1]))
 
@@ -111,7 +112,7 @@ def matches(kind: Descriptor, packed: bytes, levels: NDArray[np.uint8]) -> bool:
     """
     if kind.pack(levels) == packed:
         return True
-    if kind.name in PAPERS or len(packed) != kind.size_bytes:
+    if kind.whole_image or len(packed) != kind.size_bytes:
         return False
     off = np.abs(kind.unpack(packed).astype(np.int16) - levels)
     return int(off.max()) <= 1 and float((off > 0).mean()) <= ROUNDED

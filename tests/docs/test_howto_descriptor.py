@@ -1,18 +1,22 @@
 """docs/how-to/add-a-descriptor.md"""
 
+import os
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
 
-from hbr.descriptors import registry
-from tests.docs.pages import blocks, run
+import hbr
+from hbr.descriptors import names, register, registry
+from tests.docs.pages import blocks, install, run
 
 
 @pytest.fixture
 def page(monkeypatch):
-    page = run("\n".join(blocks("add-a-descriptor")))
-    monkeypatch.setitem(registry._KNOWN, "grey", page["GreyHistogram"]())
-    return page
+    monkeypatch.setattr(registry, "_KNOWN", dict(registry._KNOWN))
+    return run("\n".join(blocks("add-a-descriptor")))
 
 
 def drawn(brightness: int, x: int = 64) -> np.ndarray:
@@ -36,3 +40,30 @@ def test_new_descriptor_keeps_the_protocol(page):
     prepared = grey.prepared(levels)
     assert prepared.only(np.array([1])).similarity(levels) == pytest.approx(grey.similarity(levels, levels)[:, 1:2])
     assert prepared.among(np.array([[0, 2]]))[0] == pytest.approx(grey.similarity(levels[[0, 2]], levels[[0, 2]]))
+
+
+def test_name_of_another_descriptor_is_not_replaced(page):
+    register(page["GREY"])
+    for name in ("cedd", "onnx:grey"):
+        with pytest.raises(ValueError, match="taken"):
+            register(page["GreyHistogram"](name=name))
+    assert names()[-1] == "grey"
+    assert hbr.descriptor("cedd").length == 144
+
+
+def test_descriptor_of_a_package_is_known_in_every_process(tmp_path):
+    definition, registration, _ = blocks("add-a-descriptor")
+    (toml,) = blocks("add-a-descriptor", "toml")
+    toml += 'broken = "no_such_module:GREY"\n'
+    package = install(
+        tmp_path / "package", {"my_package": definition + registration.replace("register(GREY)", "")}, toml
+    )
+    code = "import hbr; print(hbr.descriptor('grey').length, hbr.descriptors.names()[-1])"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(package), *sys.path])},
+    )
+    assert done.stdout.split() == ["16", "grey"]
+    assert "'broken' of no_such_module:GREY cannot be loaded" in done.stderr

@@ -1,8 +1,5 @@
 """docs/how-to/add-an-imu.md: the page's package is put on the path, and the rig uses its sensor."""
 
-import importlib
-import re
-import tomllib
 from pkgutil import resolve_name
 
 import pytest
@@ -21,34 +18,17 @@ from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.contract import test_imu as contract
-from tests.docs.pages import DOCS, blocks
+from tests.docs.pages import blocks, install
 from tests.rig.doctor.doctor_parts import unopened
 
 CHOSEN = "imu.model=lsm6dsox"
 
 
-def install(folder, monkeypatch, modules, toml):
-    """Put a package with the modules and the entry points of a page on the path."""
-    for name, code in modules.items():
-        (folder / f"{name}.py").write_text(code, encoding="utf-8")
-    points = tomllib.loads(toml)["project"]["entry-points"]
-    lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in rows.items()) for group, rows in points.items()]
-    info = folder / "example_plugin-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: example-plugin\nVersion: 1.0\n", encoding="utf-8")
-    (info / "entry_points.txt").write_text("".join(lines), encoding="utf-8")
-    monkeypatch.syspath_prepend(folder)
-    importlib.invalidate_caches()
-
-
 @pytest.fixture(autouse=True)
 def package(monkeypatch, tmp_path):
     driver, simulator = blocks("add-an-imu")
-    page = (DOCS / "how-to" / "add-an-imu.md").read_text(encoding="utf-8")
-    (toml,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
-    folder = tmp_path / "package"
-    folder.mkdir()
-    install(folder, monkeypatch, {"lsm6dsox": driver, "sim_lsm6dsox": simulator}, toml)
+    (toml,) = blocks("add-an-imu", "toml")
+    monkeypatch.syspath_prepend(install(tmp_path / "package", {"lsm6dsox": driver, "sim_lsm6dsox": simulator}, toml))
 
 
 def test_new_imu_measures_the_rotations_of_an_enrollment(tmp_path):
@@ -98,9 +78,8 @@ def test_other_sensor_at_the_address_is_rejected():
 
 
 def test_package_that_cannot_be_loaded_is_a_configuration_error(monkeypatch, tmp_path):
-    broken = tmp_path / "broken"
-    broken.mkdir()
-    install(broken, monkeypatch, {}, '[project.entry-points."rig.imus"]\nbroken = "no_such_module:KIND"\n')
+    toml = '[project.entry-points."rig.imus"]\nbroken = "no_such_module:KIND"\n'
+    monkeypatch.syspath_prepend(install(tmp_path / "broken", {}, toml))
     assert load_config(None, []).imu.model == "mpu6050"
     with pytest.raises(ConfigError, match="no_such_module"):
         load_config(None, ["imu.model=broken"])

@@ -11,7 +11,7 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.descriptors import PAPERS, descriptor
+from hbr.descriptors import descriptor
 from rig.catalog.describing import is_current, matches, pack, region_of
 from rig.catalog.exchange.batch import ImageSource, Session
 from rig.catalog.exchange.plan import Plan
@@ -129,7 +129,7 @@ def _is_wrong(
     """Return why a descriptor cannot be that of its image; empty if it is."""
     kind = descriptor(given.name)
     try:
-        table = None if empty_table is None or given.name in PAPERS else _table(*empty_table)
+        table = None if empty_table is None or kind.whole_image else _table(*empty_table)
         config = ViewConfig(roi=region_of(given.settings))
         levels = ViewDescriber(config, (given.name,), table)(image).levels[given.name]
     except (CatalogError, UsageError) as error:

@@ -126,7 +126,7 @@ def evaluate(
 
     Example: rig eval coil-100 --noise mb --methods all --trials 10
     """
-    from hbr.descriptors import PAPERS
+    import hbr
     from hbr.evaluation.condition import Condition
     from hbr.evaluation.methods import choose_methods
     from hbr.evaluation.noise import Noise
@@ -156,7 +156,7 @@ def evaluate(
                 reference,  # type: ignore[arg-type]
                 Noise.parse(enrolled_noise),
             ),
-            choose_methods((methods or ("all" if descriptor in PAPERS else "beyond")).split(",")),
+            choose_methods((methods or ("all" if hbr.descriptor(descriptor).whole_image else "beyond")).split(",")),
             Protocol(
                 trials,
                 views,
