@@ -229,7 +229,7 @@ class SimBenchKind:
         objects = photographs(options.objects) if options.objects else shelf()
         with ExitStack() as held:
             state = _state(config, held)
-            world = _world(options, seed, _stands_at_deg(config, state))
+            world = new_world(options, seed, rest_angle_deg(config, state))
             single = options.object if isinstance(options.object, str) else None
             operator = ShelfOperator(world, objects, next_object=single, yaw_deg=options.yaw_deg)
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
@@ -243,7 +243,7 @@ class SimBenchKind:
         """Yield the simulated computer with the faults that need no motion."""
         assert isinstance(options, SimOptions)
         with (
-            SimDevices.connected(config, _world(options, seed)) as devices,
+            SimDevices.connected(config, new_world(options, seed)) as devices,
             simulated_computer(config, devices) as computer,
         ):
             faults = Faults(devices)
@@ -254,7 +254,8 @@ class SimBenchKind:
                 faults.clear()
 
 
-def _world(options: SimOptions, seed: int | None, start_deg: float = 0.0) -> World:
+def new_world(options: SimOptions, seed: int | None, start_deg: float = 0.0) -> World:
+    """Return a world whose clock starts at the computer's time."""
     clock = VirtualClock(start_utc=SystemClock().utc())
     return World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock, start_deg=start_deg)
 
@@ -268,7 +269,7 @@ def _state(config: RigConfig, held: ExitStack) -> StateStore:
     return FileStore(path)
 
 
-def _stands_at_deg(config: RigConfig, state: StateStore) -> float:
+def rest_angle_deg(config: RigConfig, state: StateStore) -> float:
     """Return the angle at which the last simulated run left the table, as if only the supply had been off since."""
     table = state.load().table
     if table is None:

@@ -170,6 +170,15 @@ class SimCapture:
         self._grabbed = self._queue.popleft()
         return True
 
+    def wait_ns(self) -> int:
+        """Return how long `grab` would wait for a frame that is on its way."""
+        self._receive()
+        if not self._open or self._queue:
+            return 0
+        if self.hangs:
+            return round(SELECT_S * 1e9)
+        return max(self._arrival_ns(self._next) - self._clock.now_ns(), 0)
+
     def retrieve(self) -> tuple[bool, Image | None]:
         """Return the frame that was grabbed last, uint8 (480, 640, 3)."""
         if self._grabbed is None or not self._open:

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rig.bench.computer import SERIAL_NAMES, Computer, User
-from rig.config import RigConfig
+from rig.config import RigConfig, ServoConfig
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
@@ -118,7 +118,7 @@ class SimComputer(Computer):
         self._head_port = config.head.port
         self._bus = self.i2c_name(config.imu.bus)
 
-    def open_serial(self, path: str, baud: int) -> SerialConnection:
+    def open_serial(self, path: str, baud: int, device: str = "servo") -> SerialConnection:  # noqa: ARG002
         if self.devices.head is not None and self.same_file(path, self._head_port):
             return self.devices.head_port()
         if not self.same_file(path, self._port):
@@ -142,31 +142,37 @@ class SimComputer(Computer):
 def simulated_computer(config: RigConfig, devices: SimDevices) -> Iterator[SimComputer]:
     """Yield the computer of a simulated bench. The servo is configured as by opening the bench."""
     with TemporaryDirectory(prefix="sim-host-") as folder:
-        computer = ComputerFiles(Path(folder))
-        name = Path(config.servo.port).name
-        stable = config.servo.port.startswith("/dev/serial/by-id/")
-        if SERIAL_NAMES.fullmatch(name):
-            computer.serial_port(name)
-        else:
-            computer.serial_port(by_id=config.servo.port if stable else None)
-            if not stable:
-                computer.link(config.servo.port, Path(folder, "dev/ttyUSB0"))
-        if devices.head is None:
-            number = re.search(r"(\d+)$", str(config.imu.bus))
-            computer.i2c_bus(int(number[1]) if number else 1)
-        elif SERIAL_NAMES.fullmatch(Path(config.head.port).name):
-            computer.serial_port(Path(config.head.port).name, serial="SIM00002")
-        else:
-            computer.write(config.head.port)
-        number = re.search(r"(\d+)$", str(config.camera.source))
-        computer.camera(int(number[1]) if number else 0)
-        computer.keeps_time()
+        write_files(Path(folder), config)
         with suppress(RigError):  # no supply or a fault: the doctor reports it
-            _set_up(devices, config.servo.id, config.servo.model)
+            configure_servo(devices, config.servo)
         yield SimComputer(Path(folder), devices, config)
 
 
-def _set_up(devices: SimDevices, bus_id: int, model: str) -> None:
-    bus = DynamixelBus(ClockedPort(devices.adapter, devices.world.clock), protocol=protocol_of(model))
-    table = control_table(model)
-    settings.write(bus, bus_id, table, settings.compare(bus, bus_id, table))
+def write_files(folder: Path, config: RigConfig) -> None:
+    """Write the files of a computer to which the devices in ``config`` are connected."""
+    computer = ComputerFiles(folder)
+    name = Path(config.servo.port).name
+    stable = config.servo.port.startswith("/dev/serial/by-id/")
+    if SERIAL_NAMES.fullmatch(name):
+        computer.serial_port(name)
+    else:
+        computer.serial_port(by_id=config.servo.port if stable else None)
+        if not stable:
+            computer.link(config.servo.port, folder / "dev/ttyUSB0")
+    if config.imu.connection == "i2c":
+        number = re.search(r"(\d+)$", str(config.imu.bus))
+        computer.i2c_bus(int(number[1]) if number else 1)
+    elif SERIAL_NAMES.fullmatch(Path(config.head.port).name):
+        computer.serial_port(Path(config.head.port).name, serial="SIM00002")
+    else:
+        computer.write(config.head.port)
+    number = re.search(r"(\d+)$", str(config.camera.source))
+    computer.camera(int(number[1]) if number else 0)
+    computer.keeps_time()
+
+
+def configure_servo(devices: SimDevices, config: ServoConfig) -> None:
+    """Write the settings that the rig needs into the servo's EEPROM."""
+    bus = DynamixelBus(ClockedPort(devices.adapter, devices.world.clock), protocol=protocol_of(config.model))
+    table = control_table(config.model)
+    settings.write(bus, config.id, table, settings.compare(bus, config.id, table))

@@ -24,6 +24,14 @@ from sim.clock import VirtualClock
 BIT_NS = 2_500  # one bit at 400 kHz (fast mode); a byte takes nine, with its acknowledge
 TIMEOUT_S = 1.0  # how long the kernel waits for a bus that hangs (the default of ``i2c_adapter.timeout``)
 
+FUNCTIONS = (
+    smbus.I2cFunc.SMBUS_EMUL
+    | smbus.I2cFunc.SMBUS_READ_BLOCK_DATA
+    | smbus.I2cFunc.I2C
+    | smbus.I2cFunc.SMBUS_BLOCK_PROC_CALL
+) & ~smbus.I2cFunc.SMBUS_PEC
+"""What the adapter can do, for the ioctl I2C_FUNCS."""
+
 _MAX_MESSAGES = 42
 _MAX_MESSAGE_LENGTH = 8192
 
@@ -78,17 +86,14 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self.stuck = False
         self.nack_conditions: list[Callable[[int], bool]] = []
         self.wire: deque[Message] = deque(maxlen=1000)
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - without a name: a program that is killed leaves nothing
-        self.path = f"/dev/fd/{self._file.fileno()}"
-        self._key = _file_key(self._file.fileno())
-        _install(self._key, self)
+        self._file = RoutedFile(self)
+        self.path = self._file.path
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
         """Take the bus away; a second call does nothing."""
-        _remove(self._key)
         self._file.close()
 
     # -- world side -----------------------------------------------------------------------------------------------
@@ -118,9 +123,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         """Serve one ``ioctl`` of ``/dev/i2c-N``; raises OSError with the kernel's number."""
         match request:
             case smbus.I2C_FUNCS:
-                emulated = smbus.I2cFunc.SMBUS_EMUL | smbus.I2cFunc.SMBUS_READ_BLOCK_DATA
-                more = smbus.I2cFunc.I2C | smbus.I2cFunc.SMBUS_BLOCK_PROC_CALL
-                argument.value = (emulated | more) & ~smbus.I2cFunc.SMBUS_PEC
+                argument.value = FUNCTIONS
             case smbus.I2C_SLAVE | smbus.I2C_SLAVE_FORCE:
                 if not 0 <= argument <= 0x7F:
                     raise _os_error(EINVAL)
@@ -255,8 +258,34 @@ def _os_error(number: int) -> OSError:
 
 _FileKey = tuple[int, int]
 _seam: Any = smbus
-_open_buses: dict[_FileKey, SimI2cBus] = {}
+_routed: "dict[_FileKey, Adapter]" = {}
 _kernel_ioctl: Any = None
+
+
+class Adapter(Protocol):
+    """Answers the ``ioctl`` calls on the device file of an I2C bus."""
+
+    def ioctl(self, fd: int, request: int, argument: Any) -> int:
+        """Serve one call; raises OSError with the kernel's number."""
+
+
+class RoutedFile:
+    """A file at ``path`` whose ``ioctl`` calls go to an adapter when smbus2 opens it."""
+
+    def __init__(self, adapter: Adapter) -> None:
+        global _kernel_ioctl
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - without a name: a program that is killed leaves nothing
+        self.path = f"/dev/fd/{self._file.fileno()}"
+        self._key = _file_key(self._file.fileno())
+        if not _routed:
+            _kernel_ioctl, _seam.ioctl = _seam.ioctl, _routed_ioctl
+        _routed[self._key] = adapter
+
+    def close(self) -> None:
+        """Remove the file; a second call does nothing."""
+        if _routed.pop(self._key, None) and not _routed:
+            _seam.ioctl = _kernel_ioctl
+        self._file.close()
 
 
 def _file_key(fd: int) -> _FileKey:
@@ -265,17 +294,5 @@ def _file_key(fd: int) -> _FileKey:
 
 
 def _routed_ioctl(fd: int, request: int, argument: Any = 0, *rest: Any) -> Any:
-    bus = _open_buses.get(_file_key(fd))
-    return bus.ioctl(fd, request, argument) if bus else _kernel_ioctl(fd, request, argument, *rest)
-
-
-def _install(key: _FileKey, bus: SimI2cBus) -> None:
-    global _kernel_ioctl
-    if not _open_buses:
-        _kernel_ioctl, _seam.ioctl = _seam.ioctl, _routed_ioctl
-    _open_buses[key] = bus
-
-
-def _remove(key: _FileKey) -> None:
-    if _open_buses.pop(key, None) and not _open_buses:
-        _seam.ioctl = _kernel_ioctl
+    adapter = _routed.get(_file_key(fd))
+    return adapter.ioctl(fd, request, argument) if adapter else _kernel_ioctl(fd, request, argument, *rest)

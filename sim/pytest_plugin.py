@@ -59,3 +59,26 @@ def sim_catalog(sim_bench: "Bench", tmp_path: "Path") -> "Iterator[Catalog]":
 
     with Catalog.open(tmp_path / "catalog", clock=sim_bench.clock) as catalog:
         yield catalog
+
+
+@pytest.fixture
+def running_sim_bench(tmp_path: "Path") -> "Iterator[Path]":
+    """Return the folder of a simulated bench that another process runs in real time, as `rig sim-bench` does.
+
+    Programs under test use it with ``--config FOLDER/rig.toml``; `sim.realtime.wire.tell` changes its world.
+    """
+    import json
+    import subprocess
+    import sys
+
+    folder = tmp_path / "sim-bench"
+    start = "from rig.cli.main import main; main()"
+    arguments = [sys.executable, "-c", start, "sim-bench", "--json", "--folder", str(folder)]
+    process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["folder"] == str(folder)
+        yield folder
+    finally:
+        process.terminate()
+        process.communicate()

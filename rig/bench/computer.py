@@ -199,10 +199,11 @@ class Computer:
 
     # -- opening ----------------------------------------------------------------------------------------------------
 
-    def open_serial(self, path: str, baud: int) -> "SerialConnection":
+    def open_serial(self, path: str, baud: int, device: str = "servo") -> "SerialConnection":
+        """Open the serial port of ``device``, a section of the configuration."""
         from rig.devices.dynamixel.port import open_serial
 
-        return open_serial(path, baud)
+        return open_serial(path, baud, device)
 
     def i2c_name(self, bus: int | str) -> str:
         """Return the name of a bus: its device file."""

@@ -17,7 +17,7 @@ from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
-from rig.devices.dynamixel.port import SerialConnection, open_serial
+from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.head.head import RigHead
 from rig.devices.head.opening import open_head, powered, switch_on
@@ -25,7 +25,7 @@ from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu
 from rig.devices.open_imu import open_imu
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
-from rig.devices.opencv_capture import Capture, open_capture
+from rig.devices.opencv_capture import Capture
 from rig.devices.servo import Servo
 from rig.safety.saved_state import BenchLock, FileStore, StateStore
 
@@ -35,46 +35,62 @@ class NoOptions(Section):
 
 
 class HardwareBench:
-    """Opens the devices in the configuration."""
+    """Opens the devices in the configuration.
 
+    Attributes
+    ----------
+    name
+        The bench's name. Its state, calibrations and catalog belong to it.
+    """
+
+    name = "hardware"
     options: type[BaseModel] = NoOptions
 
-    def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:  # noqa: ARG002
-        """Open the real devices on the system's clock; there are no options, and ``seed`` is not used."""
-        clock, state_path = SystemClock(), config.state_path("hardware")
+    @contextmanager
+    def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:  # noqa: ARG002
+        """Yield the computer to which the devices are connected."""
+        yield Computer()
+
+    def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
+        """Open the devices on the system's clock; ``seed`` is not used."""
+        clock, state_path = SystemClock(), config.state_path(self.name)
         with ExitStack() as connections:
             connections.callback(BenchLock(state_path, clock).close)
-            connection = open_serial(config.servo.port, config.servo.baud)
+            computer = connections.enter_context(self.computer(config, options, seed))
+            connection = computer.open_serial(config.servo.port, config.servo.baud)
             connections.callback(connection.close)
-            capture = open_capture(config.camera.source)
+            capture = computer.open_capture(config.camera.source)
             connections.callback(capture.release)
-            camera_device = Computer().camera_device(config.camera.source)
+            camera_device = computer.camera_device(config.camera.source)
             bench = assemble(
-                "hardware",
+                self.name,
                 config,
                 clock,
                 connection=connection,
-                reopen_serial=lambda: open_serial(config.servo.port, config.servo.baud),
+                reopen_serial=lambda: computer.open_serial(config.servo.port, config.servo.baud),
                 guardian=Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id),
-                i2c_bus=config.imu.bus,
+                i2c_bus=computer.i2c_path(config.imu.bus),
                 capture=capture,
-                reopen_camera=lambda: _open_again(config.camera.source, camera_device),
+                reopen_camera=lambda: _open_again(computer, config.camera.source, camera_device),
                 camera_device=camera_device,
                 state=FileStore(state_path),
-                head_port=lambda: open_serial(config.head.port, BAUD, "head"),
+                head_port=lambda: computer.open_serial(config.head.port, BAUD, "head"),
             )
             bench.connections = connections.pop_all()
             return bench
 
     @contextmanager
-    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:  # noqa: ARG002
+    def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:
         """Open only the servo, also if the disk cannot be written: it must be possible to stop it."""
         clock = SystemClock()
         with ExitStack() as connections:
             with suppress(StateNotStored):
-                connections.callback(BenchLock(config.state_path("hardware"), clock).close)
-            connections.enter_context(powered(config, lambda: open_serial(config.head.port, BAUD, "head"), clock))
-            connection = open_serial(config.servo.port, config.servo.baud)
+                connections.callback(BenchLock(config.state_path(self.name), clock).close)
+            computer = connections.enter_context(self.computer(config, options, seed))
+            connections.enter_context(
+                powered(config, lambda: computer.open_serial(config.head.port, BAUD, "head"), clock)
+            )
+            connection = computer.open_serial(config.servo.port, config.servo.baud)
             connections.callback(connection.close)
             yield open_servo(connection, config.servo, clock, config.table.mode)
 
@@ -146,10 +162,10 @@ def assemble(
     return bench
 
 
-def _open_again(source: int | str, device: str | None) -> Capture:
+def _open_again(computer: Computer, source: int | str, device: str | None) -> Capture:
     """Open a camera that was unplugged. Raises `DeviceMismatch` if the source is another camera now."""
-    capture = open_capture(source)
-    now = Computer().camera_device(source)
+    capture = computer.open_capture(source)
+    now = computer.camera_device(source)
     if now != device:
         capture.release()
         raise DeviceMismatch(

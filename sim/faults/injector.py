@@ -65,6 +65,13 @@ class Faults:
         """The faults that have begun and not ended."""
         return tuple(fault for fault, _ in self._active.values())
 
+    def end(self, name: str) -> bool:
+        """End the active faults called ``name``; return whether there was one."""
+        numbers = [number for number, (fault, _) in self._active.items() if fault.kind.name == name]
+        for number in numbers:
+            self._end(number)
+        return bool(numbers)
+
     def clear(self) -> None:
         """End the active faults and cancel the scheduled ones, as if the bench had been repaired."""
         self._waiting.clear()

@@ -1,8 +1,12 @@
 """Rig heads for the contract of an IMU: the firmware in memory, its AVR binary, and a pseudo-terminal in real time."""
 
+import fcntl
+import sys
+import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 
 import pytest
 import serial
@@ -12,13 +16,14 @@ from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
 from rig.devices.head.sensors import HeadSensor, head_sensor
+from sim.clock import VirtualClock
 from sim.head.board import SimHead
 from sim.head.build import missing
-from sim.head.realtime import HeadPty, PacedClock
 from sim.head.serial_port import HeadSerial
 from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
+from sim.realtime.port import PtyPort
 from sim.world import World
 
 CLOCK_ERROR = 2e-3
@@ -93,6 +98,50 @@ def opened_head(
             imu.close()
 
 
+PUMP_S = 0.001
+LONGEST_STEP_NS = 20_000_000
+"""Longest time step: after a pause (a debugger, a busy computer) host and head must both catch up."""
+
+
+class PacedClock:
+    """A real-time clock: each time it is read, a virtual clock catches up with the computer's clock.
+
+    Simulated activity on ``virtual`` happens when a program reads this clock or sleeps.
+
+    Parameters
+    ----------
+    virtual
+        The simulated world's clock.
+    speed
+        Virtual seconds for each second of the computer.
+    """
+
+    def __init__(self, virtual: VirtualClock, speed: float = 1.0) -> None:
+        self._virtual = virtual
+        self._speed = speed
+        self._system = SystemClock()
+        self._real_ns = self._system.now_ns()
+
+    def now_ns(self) -> int:
+        real_ns = self._system.now_ns()
+        step_ns = min(round((real_ns - self._real_ns) * self._speed), LONGEST_STEP_NS)
+        self._real_ns = real_ns
+        self._virtual.advance_to(self._virtual.now_ns() + step_ns)
+        return self._virtual.now_ns()
+
+    def sleep(self, seconds: float) -> None:
+        until_ns = self.now_ns() + round(seconds * 1e9)
+        while (now_ns := self.now_ns()) < until_ns:
+            self._system.sleep(min(PUMP_S, (until_ns - now_ns) * 1e-9 / self._speed))
+
+    def utc(self) -> datetime:
+        return self._virtual.utc()
+
+    def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
+        """Call ``action`` every ``seconds`` while a program sleeps or reads the time; return what stops it."""
+        return self._virtual.every(seconds, action)
+
+
 @contextmanager
 def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterator[Head]:
     """Yield a driver with pyserial on a pseudo-terminal, ``speed`` times as fast as real time."""
@@ -102,17 +151,23 @@ def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterat
     head = SimHead(world, clock_error=CLOCK_ERROR)
     device = SimMpu6050(head.world_at_board_time)
     head.attach(device.address, device)
-    terminal = HeadPty(head)
+    terminal = PtyPort(lambda: HeadSerial(head))
+    stop = clock.every(PUMP_S, terminal.pump)
+
+    def unplug() -> None:
+        stop()
+        terminal.close()
+
     try:
-        port = serial.Serial(terminal.port, BAUD, timeout=0.002 / speed, exclusive=True)
+        port = serial.Serial(terminal.path, BAUD, timeout=0.002 / speed, exclusive=True)
         wire = _PacedWire(port, clock, terminal)
         imu = RigHead(wire, clock, mpu6050(), deadman_s=2.0)
         try:
-            yield Head(imu, clock, head, device, world, terminal.close)
+            yield Head(imu, clock, head, device, world, unplug)
         finally:
             imu.close()
     finally:
-        terminal.close()
+        unplug()
         head.close()
 
 
@@ -126,7 +181,7 @@ class _PacedWire:
     What one end has written is waited for at the other: how long a busy kernel takes to carry it is not under test.
     """
 
-    def __init__(self, port: serial.Serial, clock: Clock, terminal: HeadPty) -> None:
+    def __init__(self, port: serial.Serial, clock: Clock, terminal: PtyPort) -> None:
         self._port = port
         self._clock = clock
         self._terminal = terminal
@@ -148,8 +203,13 @@ class _PacedWire:
 
     def write(self, data: bytes, /) -> int | None:
         written = self._port.write(data)
-        self._until(lambda: self._terminal.waiting() >= len(data))
+        self._until(lambda: self._waiting() >= len(data))
         return written
+
+    def _waiting(self) -> int:
+        """Return the number of bytes of the host that the head has not received yet."""
+        count = fcntl.ioctl(self._terminal.fileno(), termios.FIONREAD, bytes(4))
+        return int.from_bytes(count, sys.byteorder)
 
     def reset_input_buffer(self) -> None:
         self._taken += len(self._port.read(self.in_waiting))

@@ -1,0 +1,207 @@
+"""What the trainee does to the simulated world: words such as ``put mug-white``, ``jam`` or ``turn 90``."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from rig.core.errors import RigError, UsageError
+from sim.bench import ShelfOperator
+from sim.calibration_board import calibration_targets
+from sim.devices import SimDevices
+from sim.faults import Fault, Faults, fault_kinds
+
+HELP: Final = """\
+put NAME [DEGREES]  Put an object on the table, rotated by so many degrees (default: at random). Clears the table first.
+clear               Clear the table.
+objects             List the objects.
+turn DEGREES        Rotate the table by hand, counter-clockwise. Works only while the torque is off.
+light FACTOR        Change the light: 1 is the normal light, 0.5 half of it.
+power-cycle         Switch the servo's supply off and on.
+estop press         Press the emergency stop of the rig head; estop release releases it.
+head unplug         Unplug the rig head's USB cable; head plug plugs it in again.
+FAULT               Start a simulated fault, for example jam, unplug, imu.off, camera.off or jam@move0+2s.
+end [FAULT]         End a simulated fault; without a name, all. For example: end unplug
+faults              List the simulated faults.
+status              Show the world as it really is.
+quit                End the simulated bench."""
+
+MAX_LIGHT: Final = 10.0
+MAX_DEG: Final = 3600.0
+_OF_ONE_PROGRAM: Final = ("disk_full", "clock_jump")
+
+
+class Commands:
+    """Changes a simulated world as the trainee says.
+
+    Parameters
+    ----------
+    operator
+        Puts objects on the table.
+    devices, faults
+        The devices and simulated faults of the bench.
+    quit
+        Called to end the bench.
+    """
+
+    def __init__(
+        self, operator: ShelfOperator, devices: SimDevices, faults: Faults, quit: Callable[[], None] = lambda: None
+    ) -> None:
+        self._operator = operator
+        self._devices = devices
+        self._world = devices.world
+        self._faults = faults
+        self._quit = quit
+
+    def do(self, words: Sequence[str]) -> str:
+        """Do what the words say, and return the result in words.
+
+        Raises
+        ------
+        UsageError, ObjectNotFound
+            There is no such command, object or fault, or it is not possible now.
+        """
+        command, *given = words or ["help"]
+        match command:
+            case "put":
+                return self._put(*_arguments(command, given, 1, 2))
+            case "clear":
+                _arguments(command, given)
+                self._world.put(None)
+                return "The table is empty."
+            case "objects":
+                return "\n".join([*self._operator.objects, *calibration_targets(self._operator.optics)])
+            case "turn":
+                return self._turn(_number(_arguments(command, given, 1, 1)[0], "degrees", MAX_DEG))
+            case "light":
+                factor = _number(_arguments(command, given, 1, 1)[0], "factor", MAX_LIGHT)
+                if factor < 0:
+                    raise UsageError("The light cannot be negative.", next_step="Give 0 (dark) or more.")
+                self._world.change(light=(factor,) * 3)
+                return f"The light is at {factor:.0%}."
+            case "power-cycle":
+                _arguments(command, given)
+                self._devices.servo.power_cycle()
+                return "The servo's supply was off for a moment."
+            case "estop" | "head":
+                return self._head(command, *_arguments(command, given, 1, 1))
+            case "end":
+                return self._end(*_arguments(command, given, 0, 1))
+            case "faults":
+                return "\n".join(f"{kind.name:18} {kind.what}" for kind in fault_kinds().values())
+            case "status":
+                _arguments(command, given)
+                return self._describe()
+            case "quit":
+                self._quit()
+                return "The simulated bench ends."
+            case "help":
+                return HELP
+        return self._begin(command, given)
+
+    def state(self) -> dict[str, Any]:
+        """Return the true state of the world as plain data."""
+        scene, servo = self._world.scene, self._devices.servo
+        return {
+            "object": scene.object.name if scene.object else None,
+            "object_deg": scene.yaw_deg % 360.0,
+            "table_deg": self._world.table_deg(),
+            "torque": bool(servo.memory["Torque Enable"]),
+            "light": list(scene.light),
+            "faults": [fault.kind.name for fault in self._faults.active],
+        }
+
+    def _put(self, name: str, angle: str | None = None) -> str:
+        operator = self._operator
+        operator.yaw_deg = None if angle is None else _number(angle, "degrees", MAX_DEG)
+        if name not in {*operator.objects, *calibration_targets(operator.optics)}:
+            raise UsageError(
+                f"There is no object {name!r}.",
+                next_step="Choose a listed object: objects",
+                evidence={"objects": list(operator.objects)},
+            )
+        operator.next_object = name
+        operator.place(None)
+        return f"{name} is on the table."
+
+    def _turn(self, angle_deg: float) -> str:
+        try:
+            seconds = self._devices.servo.turn_by_hand(angle_deg)
+        except ValueError as held:
+            raise UsageError("The servo holds the table.", next_step="Switch the torque off first: rig stop") from held
+        return f"The table is rotated by {angle_deg:g}° by hand, in {seconds:.1f} s."
+
+    def _head(self, part: str, action: str) -> str:
+        head = self._devices.head
+        if head is None:
+            step = "Start it with one: rig sim-bench --set imu.connection=head"
+            raise UsageError("This bench has no rig head.", next_step=step)
+        match part, action:
+            case "estop", "press" | "release":
+                head.estop_open = action == "press"
+                return f"The emergency stop is {'pressed' if head.estop_open else 'released'}."
+            case "head", "unplug" | "plug":
+                head.unplugged = action == "unplug"
+                return f"The rig head is {'unplugged' if head.unplugged else 'plugged in'}."
+        words = "estop press or estop release" if part == "estop" else "head unplug or head plug"
+        raise UsageError(f"{part!r} does not know {action!r}.", next_step=f"Write {words}.")
+
+    def _begin(self, command: str, given: list[str]) -> str:
+        try:
+            fault = Fault.parse(command)
+        except UsageError as error:
+            step = f"{error.next_step} For a list of all commands: rig sim-bench help"
+            raise UsageError(f"There is no command or fault {command!r}.", next_step=step) from error
+        _arguments(command, given)
+        name = fault.kind.name
+        if name in _OF_ONE_PROGRAM:
+            raise UsageError(
+                f"{name} happens to the computer of one program, not to this bench.",
+                next_step=f"Use it on the bench sim: rig demo --fault {name}",
+            )
+        if any(active.kind is fault.kind for active in self._faults.active):
+            raise UsageError(f"The fault {name} is already there.", next_step=f"End it: end {name}")
+        self._faults.schedule(fault)
+        return f"{fault.kind.what} To end it: end {name}"
+
+    def _end(self, name: str | None = None) -> str:
+        if name is None:
+            self._faults.clear()
+            return "No simulated fault is left."
+        if not self._faults.end(name):
+            active = ", ".join(fault.kind.name for fault in self._faults.active)
+            raise UsageError(
+                f"The fault {name} is not there.",
+                next_step=f"End one of: {active}" if active else "No simulated fault is there.",
+            )
+        return f"The fault {name} has ended."
+
+    def _describe(self) -> str:
+        now = self.state()
+        return (
+            f"On the table: {now['object'] or 'nothing'}. The table is at {now['table_deg']:.1f}°, its torque "
+            f"{'on' if now['torque'] else 'off'}. Faults: {', '.join(now['faults']) or 'none'}."
+        )
+
+
+def run(commands: Commands, words: Sequence[str]) -> dict[str, Any]:
+    """Do what the words say; return the result, or the error, as plain data with the state of the world."""
+    try:
+        return {"text": commands.do(words), "world": commands.state()}
+    except RigError as error:
+        return {"failed": error.as_dict(), "world": commands.state()}
+
+
+def _arguments(command: str, given: list[str], least: int = 0, most: int = 0) -> list[str]:
+    if least <= len(given) <= most:
+        return given
+    usage = next((line.split("  ")[0] for line in HELP.splitlines() if line.startswith(command)), command)
+    raise UsageError(f"{command!r} does not take {len(given)} words.", next_step=f"Write: {usage}")
+
+
+def _number(text: str, meaning: str, largest: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) <= largest:  # also true for nan
+        raise UsageError(f"{text!r} is not possible as {meaning}.", next_step=f"Give a number up to {largest:g}.")
+    return value

@@ -1,0 +1,177 @@
+"""Runs simulated devices in real time: a whole bench, servos alone, or a rig head alone."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from rig.cli.ui.settings import Settings
+from rig.config import ServoConfig
+from rig.core.errors import UsageError, os_errors_as
+from rig.devices.dynamixel.port import SerialConnection
+from rig.safety.saved_state import FileStore
+from sim.bench import ShelfOperator, new_world, rest_angle_deg
+from sim.computer import configure_servo, write_files
+from sim.devices import SimDevices
+from sim.faults import Faults
+from sim.faults.injector import Occurrence
+from sim.faults.schedule import read_faults
+from sim.motion import to_velocity
+from sim.objects.photographs import photographs
+from sim.objects.shelf import shelf
+from sim.realtime import folder as folders
+from sim.realtime.bench import RunningSimBench
+from sim.realtime.commands import Commands, run
+from sim.realtime.pace import RealTime
+from sim.realtime.port import PtyPort
+from sim.realtime.server import Server
+from sim.realtime.wire import COMPUTER, HEAD, SERVO
+from sim.servo import ServoBus, SimSerial
+from sim.servo.base import BOOT_S
+from sim.servo.configured import simulated_servo
+from sim.world import World
+
+
+def run_bench(settings: Settings, folder: Path | None, seconds: float | None) -> None:
+    """Run a bench in a folder until it is ended.
+
+    Raises
+    ------
+    BenchBusy, UsageError, ConfigError
+        See `sim.realtime.folder`.
+    """
+    with ExitStack() as ends:
+        # The world, as `rig.bench` finds it: the servo is configured, and the table is where it was left.
+        folder = folders.reserve(folder, ends)
+        config, options = folders.configure(folder, settings)
+        world = new_world(
+            options, settings.seed, rest_angle_deg(config, FileStore(config.state_path(RunningSimBench.name)))
+        )
+        devices = ends.enter_context(SimDevices.connected(config, world))
+        _set_up(devices, config.servo)
+        write_files(folder / COMPUTER, config)
+        faults = Faults(devices)
+        ends.callback(faults.clear)
+        faults.listeners.append(lambda occurrence: _print_fault(settings, occurrence))
+        faults.schedule(*read_faults(options.faults))
+
+        # What other programs and the trainee use.
+        ports = [_port(devices.reopen_adapter, folder / SERVO, ends)]
+        if devices.head is not None:
+            ports.append(_port(devices.head_port, folder / HEAD, ends))
+        time = RealTime(world.clock, ports)
+        operator = ShelfOperator(world, photographs(options.objects) if options.objects else shelf())
+        commands = Commands(operator, devices, faults, quit=lambda: setattr(time, "over", True))
+        server = ends.enter_context(Server(folder, devices, time, commands))
+        inputs: dict[int, Callable[[], bool]] = {server.fileno(): server.accept}
+        if (keyboard := _Keyboard(settings, time, commands)).usable():
+            inputs[sys.stdin.fileno()] = keyboard.read
+
+        text = (
+            f"The simulated bench is running in {folder}. Stop it with Ctrl+C.\n"
+            f"In a second terminal: cd {folder}; then for example: rig status\n"
+            "Type what happens at the bench, for example: put mug-white. For a list: help"
+        )
+        settings.say(text, {"folder": str(folder), "servo": ports[0].path, "head": config.imu.connection == "head"})
+        time.run(seconds, inputs)
+
+
+def run_servos(settings: Settings, ids: Sequence[int] | None, link: Path | None, seconds: float | None) -> None:
+    """Run servos on one bus, each in its own world."""
+    config = settings.load()
+    wanted = sorted(set(ids or [config.servo.id]))
+    bus: ServoBus | None = None
+    for bus_id in wanted:
+        world = World(seed=(settings.seed or 0) + bus_id, clock=bus.clock if bus else None)
+        bus = bus or ServoBus(world.clock)
+        bus.attach(simulated_servo(world, config.servo.model_copy(update={"id": bus_id})))
+    assert bus is not None
+    with ExitStack() as ends:
+        adapter = SimSerial(bus, config.servo.baud, 0.0)
+        port = _port(lambda: adapter, link, ends)
+        if settings.json:
+            settings.print_json({"port": port.path, "model": config.servo.model, "ids": wanted})
+        else:
+            print(port.path, flush=True)
+            what = f"{config.servo.model}, id {', '.join(map(str, wanted))}"
+            print(f"{what}. Use it with --set servo.port={port.path}. Stop with Ctrl+C.", file=sys.stderr)
+        RealTime(bus.clock, [port]).run(seconds)
+
+
+def run_head(settings: Settings, kind: str, spin_dps: float, link: Path | None, seconds: float | None) -> None:
+    """Run a rig head with its IMU on a platter that rotates at ``spin_dps``."""
+    config = settings.load()
+    imu = config.imu.model_copy(update={"connection": "head"})
+    config = config.model_copy(update={"imu": imu, "bench": {**config.bench, "sim": {"head": kind}}})
+    world = World(seed=settings.seed or 0)
+    with ExitStack() as ends:
+        devices = ends.enter_context(SimDevices.connected(config, world))
+        assert devices.head is not None
+        devices.head.listeners.append(
+            lambda change: print(f"{change.time_ns * 1e-9:.4f} s: {change.pin} {change.value:g}", file=sys.stderr)
+        )
+        if spin_dps:
+            world.drive(to_velocity(0.0, 0.0, spin_dps, abs(spin_dps), 100.0))
+        port = _port(devices.head_port, link, ends)
+        if settings.json:
+            settings.print_json({"port": port.path, "kind": kind, "imu": config.imu.model})
+        else:
+            print(port.path, flush=True)
+            where = f"--set imu.connection=head --set head.port={port.path}"
+            print(f"{config.imu.model} on a rig head. Use it with {where}. Stop with Ctrl+C.", file=sys.stderr)
+        RealTime(world.clock, [port]).run(seconds)
+
+
+class _Keyboard:
+    """The trainee's commands from standard input."""
+
+    def __init__(self, settings: Settings, time: RealTime, commands: Commands) -> None:
+        self._settings, self._time, self._commands = settings, time, commands
+        self._text = b""
+
+    def usable(self) -> bool:
+        """Return whether there is a standard input; a program in the background gets an error instead of a stop."""
+        signal.signal(signal.SIGTTIN, signal.SIG_IGN)
+        with suppress(OSError, ValueError, AttributeError):
+            os.fstat(sys.stdin.fileno())
+            return True
+        return False
+
+    def read(self) -> bool:
+        """Do what was typed; return False at the end of the input."""
+        try:
+            typed = os.read(sys.stdin.fileno(), 4096)
+        except OSError:  # in the background
+            return False
+        *lines, self._text = (self._text + typed).split(b"\n")
+        for line in lines:
+            if words := line.decode(errors="replace").split():
+                with self._time.present():
+                    answer = run(self._commands, words)
+                failed = answer.get("failed")
+                self._settings.say(f"{failed['what']} {failed['next_step']}" if failed else answer["text"], answer)
+        return bool(typed)
+
+
+def _port(open_connection: Callable[[], SerialConnection], link: Path | None, ends: ExitStack) -> PtyPort:
+    with os_errors_as(UsageError, f"Cannot create {link}.", next_step="Give a name that is not in use."):
+        port = PtyPort(open_connection, link)
+    ends.callback(port.close)
+    return port
+
+
+def _set_up(devices: SimDevices, config: ServoConfig) -> None:
+    """Write the servo's permanent settings, also if its supply is off."""
+    was_on = devices.servo.powered
+    devices.servo.power_on()
+    devices.world.clock.sleep(BOOT_S)
+    configure_servo(devices, config)
+    if not was_on:
+        devices.servo.power_off()
+
+
+def _print_fault(settings: Settings, occurrence: Occurrence) -> None:
+    name, word = occurrence.fault.kind.name, "begins" if occurrence.began else "ends"
+    settings.say(f"Fault {word}: {name}", {"fault": name, "began": occurrence.began})

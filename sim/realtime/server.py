@@ -1,0 +1,228 @@
+"""The end of the simulated bench that answers other programs: its camera, its I2C bus, and the trainee's commands.
+
+A request is one line of JSON. So is its answer, followed by as many raw bytes as its ``bytes`` says. A request that is
+none ends its connection, and nothing else.
+"""
+
+import ctypes
+import json
+import socketserver
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import smbus2.smbus2 as smbus
+
+from rig.core.clock import SystemClock
+from rig.core.files import json_values
+from sim.camera import SELECT_S
+from sim.devices import SimDevices
+from sim.i2c import SimI2cBus
+from sim.realtime.commands import Commands, run
+from sim.realtime.pace import RealTime
+from sim.realtime.wire import SOCKET, short_path
+
+MAX_LINE: Final = 100_000
+MAX_MESSAGES, MAX_MESSAGE_BYTES = 42, 8192
+MAX_CONNECTIONS: Final = 64
+_LOOK_S: Final = 0.05
+"""How often a program that waits for a frame looks whether the camera was unplugged."""
+
+Answer = tuple[dict[str, Any], bytes]
+
+
+class NotARequest(ValueError):
+    """The line is no request."""
+
+
+class Session:
+    """Answers the requests of one connection."""
+
+    def __init__(self, bench: "Server") -> None:
+        self._bench = bench
+        self._devices, self._time = bench.devices, bench.time
+
+    def answer(self, request: Any) -> Answer:
+        """Return the answer; raises `NotARequest`."""
+        match request:
+            case {"ask": "do", "words": [*words]} if all(isinstance(word, str) for word in words):
+                with self._time.present():
+                    return run(self._bench.commands, words), b""
+            case {"ask": "i2c", "address": int(address), **rest}:
+                return self._i2c(address, rest)
+            case {"ask": "camera", "call": "open"}:
+                return self._open_camera(), b""
+            case {"ask": "camera", "call": str(call), **rest}:
+                if self._bench.camera_user is not self:
+                    return {"ok": False}, b""
+                return self._camera(call, rest)
+        raise NotARequest
+
+    def close(self) -> None:
+        """End what the connection has open."""
+        with self._time.present():
+            if self._bench.camera_user is self:
+                self._bench.camera_user = None
+                self._devices.camera.release()
+
+    # -- camera -----------------------------------------------------------------------------------------------------
+
+    def _open_camera(self) -> dict[str, Any]:
+        with self._time.present():
+            if self._bench.camera_user not in (None, self):
+                return {"ok": False, "busy": True}
+            if not self._devices.camera.reopen():
+                return {"ok": False, "busy": False}
+            self._bench.camera_user = self
+            return {"ok": True}
+
+    def _camera(self, call: str, rest: Mapping[object, Any]) -> Answer:
+        camera = self._devices.camera
+        if call == "grab":
+            return {"ok": self._grab()}, b""
+        with self._time.present():
+            match call, rest:
+                case "isOpened", {}:
+                    return {"ok": camera.isOpened()}, b""
+                case "retrieve", {}:
+                    ok, image = camera.retrieve()
+                    if image is None:
+                        return {"ok": False}, b""
+                    return {"ok": ok, "shape": image.shape}, image.tobytes()
+                case "get", {"property": int(number)}:
+                    value = camera.get(number)
+                    if number == cv2.CAP_PROP_POS_MSEC and value > 0:
+                        value = self._time.system_ns(round(value * 1e6)) * 1e-6
+                    return {"value": value}, b""
+                case "set", {"property": int(number), "value": int() | float() as value}:
+                    return {"ok": camera.set(number, value)}, b""
+        raise NotARequest
+
+    def _grab(self) -> bool:
+        """Wait for the next frame, without holding the world meanwhile."""
+        camera, give_up_ns = self._devices.camera, self._time.now_ns() + round(SELECT_S * 1e9)
+        while True:
+            self._time.wait()
+            with self._time.present():
+                wait_ns = camera.wait_ns()
+                if not wait_ns:
+                    return camera.grab()
+            if self._time.now_ns() > give_up_ns:
+                return False
+            SystemClock().sleep(min(wait_ns * 1e-9, _LOOK_S))
+
+    # -- I2C --------------------------------------------------------------------------------------------------------
+
+    def _i2c(self, address: int, rest: Mapping[object, Any]) -> Answer:
+        bus = self._devices.i2c
+        if not isinstance(bus, SimI2cBus):
+            raise NotARequest
+        transfer, received = _transfer(rest)
+        with self._time.present():
+            try:
+                bus.ioctl(id(self), smbus.I2C_SLAVE, address)
+                bus.ioctl(id(self), *transfer)
+            except OSError as error:
+                answer: Answer = {"errno": error.errno}, b""
+            else:
+                answer = {"errno": 0}, received()
+        self._time.wait()  # a transfer takes time
+        return answer
+
+
+def _transfer(rest: Mapping[object, Any]) -> tuple[tuple[int, Any], Callable[[], bytes]]:
+    """Return the arguments of the ``ioctl``, and what returns the bytes that were read."""
+    match rest:
+        case {"smbus": [int(direction), int(command), int(size)], "data": str(text)}:
+            sent, data = bytes.fromhex(text), smbus.union_i2c_smbus_data()
+            if len(sent) != ctypes.sizeof(data) or not all(0 <= n < 256 for n in (direction, command, size)):
+                raise NotARequest
+            ctypes.memmove(ctypes.pointer(data), sent, len(sent))
+            argument = smbus.i2c_smbus_ioctl_data(
+                read_write=direction, command=command, size=size, data=ctypes.pointer(data)
+            )
+            return (smbus.I2C_SMBUS, argument), lambda: bytes(data)
+        case {"messages": [*given]} if 0 < len(given) <= MAX_MESSAGES:
+            messages = [_message(*each) for each in given if isinstance(each, list) and len(each) == 3]
+            if len(messages) < len(given):
+                raise NotARequest
+            combined = smbus.i2c_rdwr_ioctl_data.create(*messages)
+            return (smbus.I2C_RDWR, combined), lambda: b"".join(bytes(m) for m in messages if m.flags & smbus.I2C_M_RD)
+    raise NotARequest
+
+
+def _message(address: Any, count: Any, text: Any) -> Any:
+    """Return a message that writes the bytes in ``text``, or reads ``count`` bytes if there is no text."""
+    match address, count, text:
+        case int(), int(), None if 0 <= address < 128 and 0 <= count <= MAX_MESSAGE_BYTES:
+            return smbus.i2c_msg.read(address, count)
+        case int(), int(), str() if 0 <= address < 128 and len(text) <= 2 * MAX_MESSAGE_BYTES:
+            return smbus.i2c_msg.write(address, list(bytes.fromhex(text)))
+    raise NotARequest
+
+
+class _Handler(socketserver.StreamRequestHandler):
+    """Answers one connection in its own thread."""
+
+    def handle(self) -> None:
+        assert isinstance(self.server, Server)
+        session = Session(self.server)
+        try:
+            while line := self.rfile.readline(MAX_LINE):
+                answer, payload = session.answer(json_values(line))
+                self.wfile.write(json.dumps({**answer, "bytes": len(payload)}).encode() + b"\n" + payload)
+        except (ValueError, OverflowError, OSError):  # no request, or the program has ended
+            pass
+        finally:
+            session.close()
+
+    def finish(self) -> None:
+        with suppress(OSError):
+            super().finish()
+
+
+class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+    """Listens at a socket in ``folder``.
+
+    Parameters
+    ----------
+    folder
+        The bench's folder.
+    devices, time, commands
+        The world to serve.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = MAX_CONNECTIONS
+
+    def __init__(self, folder: Path, devices: SimDevices, time: RealTime, commands: Commands) -> None:
+        self.devices, self.time, self.commands = devices, time, commands
+        self.camera_user: Session | None = None
+        self._path = folder / SOCKET
+        self._connections = 0
+        self._path.unlink(missing_ok=True)
+        with short_path(folder) as path:
+            super().__init__(f"{path}/{SOCKET}", _Handler)
+
+    def verify_request(self, request: object, client_address: object) -> bool:  # noqa: ARG002
+        """Return whether there is room for one more connection."""
+        return self._connections < MAX_CONNECTIONS
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        self._connections += 1
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._connections -= 1
+
+    def accept(self) -> bool:
+        """Accept the connection that waits."""
+        self.handle_request()
+        return True
+
+    def server_close(self) -> None:
+        super().server_close()
+        self._path.unlink(missing_ok=True)

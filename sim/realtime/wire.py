@@ -1,0 +1,99 @@
+"""A connection to a running simulated bench.
+
+This module imports neither numpy nor OpenCV, so that the trainee's commands start at once.
+"""
+
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from errno import EIO
+from pathlib import Path
+from typing import Any, Final
+
+from rig.core.errors import DeviceNotFound, UsageError
+
+DEFAULT_FOLDER: Final = Path("sim-bench")
+SOCKET, SERVO, HEAD, COMPUTER, CONFIG = "socket", "servo", "head", "computer", "rig.toml"
+"""Names in the folder of a simulated bench: its socket, its ports, the files of its computer, its configuration."""
+PATIENCE_S: Final = 15.0
+"""How long an answer may take. A camera that hangs takes longest: OpenCV waits 10 s for a frame."""
+
+
+class Wire:
+    """A connection to the simulated bench in ``folder``.
+
+    Raises
+    ------
+    DeviceNotFound
+        The simulated bench is not running.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(PATIENCE_S)
+        try:
+            with short_path(folder) as path:
+                self._socket.connect(f"{path}/{SOCKET}")
+        except OSError as error:
+            self._socket.close()
+            raise not_running(folder) from error
+        self._file = self._socket.makefile("rb")
+
+    def ask(self, **request: Any) -> tuple[dict[str, Any], bytes]:
+        """Return the answer and its bytes; raises OSError if the simulated bench has ended."""
+        self._socket.sendall(json.dumps(request).encode() + b"\n")
+        line = self._file.readline()
+        if not line.endswith(b"\n"):
+            raise OSError(EIO, "the simulated bench has ended")
+        answer = json.loads(line)
+        payload = self._file.read(answer["bytes"])
+        if len(payload) < answer["bytes"]:
+            raise OSError(EIO, "the simulated bench has ended")
+        return answer, payload
+
+    def close(self) -> None:
+        """Close the connection; a second call does nothing."""
+        self._file.close()
+        self._socket.close()
+
+
+def tell(folder: Path, *words: str) -> dict[str, Any]:
+    """Have the running bench in ``folder`` do what the words say; return its answer and the state of its world.
+
+    Raises
+    ------
+    DeviceNotFound
+        No simulated bench is running in the folder.
+    UsageError
+        There is no such command, or it is not possible now.
+    """
+    wire = Wire(folder)
+    try:
+        answer, _ = wire.ask(ask="do", words=words)
+    except (OSError, ValueError) as error:
+        raise not_running(folder) from error
+    finally:
+        wire.close()
+    if failed := answer.get("failed"):
+        raise UsageError(failed["what"], next_step=failed["next_step"], evidence=failed["evidence"])
+    return answer
+
+
+def not_running(folder: Path) -> DeviceNotFound:
+    """Return the error that no simulated bench runs in ``folder``."""
+    return DeviceNotFound(
+        f"No simulated bench is running in {folder}.",
+        next_step=f"Start it in another terminal: rig sim-bench --folder {folder}",
+    )
+
+
+@contextmanager
+def short_path(folder: Path) -> Iterator[str]:
+    """Yield a short name of a folder: the path of a socket has at most 107 bytes."""
+    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{descriptor}"
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,113 @@
+"""docs/how-to/practise-on-a-simulated-bench.md: every command is typed, and answers as the page says."""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+from rig.core.clock import SystemClock, seconds_between
+from sim.realtime.wire import tell
+from tests.docs.pages import DOCS
+
+CLOCK = SystemClock()
+START = "from rig.cli.main import main; main()"
+PATIENCE_S = 60.0
+IN_DEPTH = ("A program is killed", "Enroll and identify")
+"""Sections that only the nightly test walks through."""
+
+
+@dataclass
+class Typed:
+    """A command of the page, with the answer that it promises."""
+
+    section: str
+    terminal: str
+    command: str
+    answer: str = ""
+
+    def check(self, found: str) -> None:
+        pattern = re.escape(self.answer.strip()).replace("…", ".*?")
+        assert re.search(rf"\A{pattern}\s*\Z", found.strip(), re.DOTALL), f"$ {self.command}\n{found}"
+
+
+def commands() -> Iterator[Typed]:
+    page = (DOCS / "how-to" / "practise-on-a-simulated-bench.md").read_text(encoding="utf-8")
+    for text in page.split("\n## ")[1:]:
+        section = text.partition("\n")[0]
+        for terminal, block in re.findall(r'```console title="(.*?)"\n(.*?)```', text, re.DOTALL):
+            typed: Typed | None = None
+            for line in block.splitlines():
+                if line.startswith("$ "):
+                    if typed:
+                        yield typed
+                    typed = Typed(section, terminal, line[2:])
+                elif typed:
+                    typed.answer += line + "\n"
+            if typed:
+                yield typed
+
+
+def until(reached: Callable[[], bool]) -> None:
+    """Wait for progress, however long a busy computer takes for it."""
+    start_ns = CLOCK.now_ns()
+    while not reached():
+        assert seconds_between(start_ns, CLOCK.now_ns()) < PATIENCE_S
+        CLOCK.sleep(0.02)
+
+
+def process(*words: str, cwd: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", START, *words],
+        cwd=cwd,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "500"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("in_depth", [False, pytest.param(True, marks=pytest.mark.nightly)])
+def test_trainee_sees_what_the_page_says(in_depth, tmp_path, monkeypatch):
+    first, *rest = commands()
+    assert {typed.section for typed in rest} > set(IN_DEPTH)
+    folder = tmp_path / "sim-bench"
+    bench = process(*shlex.split(first.command)[1:], cwd=tmp_path)
+    others: list[tuple[Typed, subprocess.Popen[str]]] = []
+    try:
+        assert bench.stdout is not None
+        first.check("".join(bench.stdout.readline() for _ in range(3)))
+        monkeypatch.chdir(folder)
+        monkeypatch.setenv("COLUMNS", "500")
+        walked = [typed for typed in rest if in_depth or typed.section not in IN_DEPTH]
+        for typed, following in zip(walked, [*walked[1:], None], strict=True):
+            program, *words = shlex.split(typed.command)
+            if program == "kill":
+                killed = others.pop()[1]
+                killed.kill()
+                killed.communicate()
+                until(lambda: not tell(folder, "status")["world"]["torque"])
+            elif following and (typed.terminal, following.terminal) == ("second terminal", "third terminal"):
+                start_deg = tell(folder, "status")["world"]["table_deg"]
+                others.append((typed, process(*words, cwd=folder)))
+                until(lambda start_deg=start_deg: abs(tell(folder, "status")["world"]["table_deg"] - start_deg) > 20.0)
+            else:
+                typed.check(CliRunner().invoke(app, words).output)
+        for typed, other in others:
+            typed.check(other.communicate(timeout=PATIENCE_S)[0])
+        bench.send_signal(signal.SIGINT)
+        assert "Traceback" not in bench.communicate(timeout=PATIENCE_S)[0]
+        assert {path.name for path in folder.iterdir()} <= {"lock", "rig.toml", "state", "catalog", "calibration"}
+    finally:
+        for other in (bench, *(other for _, other in others)):
+            other.kill()
+            other.communicate()
