@@ -15,7 +15,7 @@ from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.opencv_capture import Capture
 from rig.safety.saved_state import holder
-from sim.computer import CAMERA_DEVICE
+from sim.camera import CAMERA_DEVICE
 from sim.realtime.client import RemoteCapture, RemoteI2c
 from sim.realtime.wire import COMPUTER, DEFAULT_FOLDER, not_running
 

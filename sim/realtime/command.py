@@ -56,7 +56,7 @@ def sim_servo(
 ) -> None:
     """Simulate servos on a pseudo-terminal in real time, and print the port to connect to.
 
-    servo.model, servo.id and servo.gear_ratio of the configuration describe the servo. The port accepts any baud rate.
+    Model, id and gear ratio come from the section [servo]. The port accepts any baud rate.
 
     Example: rig sim-servo --set servo.model=xm430_w350 --id 1 --id 2
     """
@@ -82,7 +82,7 @@ def sim_head(
 ) -> None:
     """Simulate a rig head with its IMU on a pseudo-terminal in real time, and print the port to connect to.
 
-    Changes of its outputs are printed. imu.model and imu.address of the configuration describe the IMU.
+    Changes of its outputs are printed. Model and address of the IMU come from the section [imu].
 
     Example: rig sim-head --spin 30
     """

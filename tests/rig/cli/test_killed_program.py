@@ -5,12 +5,9 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -20,10 +17,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
-from sim.devices import SimDevices
-from sim.head.realtime import HeadPty
-from sim.servo.terminal import ServoTerminal
-from sim.world import World
+from sim.realtime.wire import tell
 
 CLOCK = SystemClock()
 
@@ -192,42 +186,6 @@ def test_guardian_switches_the_torque_off_of_a_killed_program(servo, number):
     assert torque_off_within(servo, 2.0)
 
 
-@pytest.fixture
-def hardware(tmp_path):
-    """Return the settings of a whole bench for the real program, and its servo: all simulated here in real time."""
-    film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
-    for grey in range(0, 250, 5):
-        film.write(np.full((48, 64, 3), grey, np.uint8))
-    film.release()
-    head = ["imu.connection='head'", "head.power=false"]
-    devices = SimDevices.connected(load_config(None, head), World())
-    terminal, done = HeadPty(devices.head), threading.Event()
-    devices.adapter.close()  # the host is the program, at the other end of the pseudo-terminal
-
-    def serve(servo):
-        while not done.is_set():
-            servo.serve(0.05)
-
-    with devices, ServoTerminal(devices.servo_bus, devices.servo.baudrate, CLOCK) as servo:
-        thread = threading.Thread(target=serve, args=(servo,))
-        thread.start()
-        yield (
-            [
-                *head,
-                f"head.port={terminal.port!r}",
-                f"servo.port={servo.port!r}",
-                "servo.write_settings=true",
-                f"camera.source={str(tmp_path / 'film.avi')!r}",
-                f"state_dir={str(tmp_path / 'state')!r}",
-                f"catalog.path={str(tmp_path / 'catalog')!r}",
-            ],
-            devices.servo,
-        )
-        done.set()
-        thread.join()
-        terminal.close()
-
-
 NIGHTLY = [
     *(["home", "--turns", "0"], ["enroll", "cup", "--yes"], ["empty-table"]),
     *(["calibrate", "servo"], ["calibrate", "imu"]),
@@ -237,26 +195,28 @@ NIGHTLY = [
 @pytest.mark.parametrize(
     "command", [["goto", "90"], *(pytest.param(words, marks=pytest.mark.nightly) for words in NIGHTLY)], ids=" ".join
 )
-def test_guardian_switches_the_torque_off_of_each_command_that_moves(hardware, tmp_path, command):
-    settings, servo = hardware
-    assert rig(settings, "home", "--here").exit_code == 0
+def test_guardian_switches_the_torque_off_of_each_command_that_moves(running_sim_bench, tmp_path, command):
+    config = ["--config", str(running_sim_bench / "rig.toml")]
+    assert CliRunner().invoke(app, ["home", "--here", *config]).exit_code == 0
     (tmp_path / "here").mkdir()
     for module in ("signal", "subprocess", "rig"):  # no process imports from the folder in which the program runs
         (tmp_path / "here" / f"{module}.py").write_text("open('imported', 'w')")
     process = subprocess.Popen(
-        [sys.executable, "-P", "-c", "from rig.cli.main import main; main()", *command, "--bench", "hardware"]
-        + [word for setting in settings for word in ("--set", setting)],
+        [sys.executable, "-P", "-c", "from rig.cli.main import main; main()", *command, *config],
         cwd=tmp_path / "here",
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    memory = servo.memory
-    until(lambda: memory["Torque Enable"] or process.poll() is not None, 30.0)
+
+    def torque() -> bool:
+        return tell(running_sim_bench, "status")["world"]["torque"]
+
+    until(lambda: torque() or process.poll() is not None, 30.0)
     assert process.poll() is None, process.stdout.read()
     process.kill()
     process.communicate()
-    until(lambda: not memory["Torque Enable"], 2.0)
+    until(lambda: not torque(), 2.0)
     assert not (tmp_path / "here" / "imported").exists()
 
 

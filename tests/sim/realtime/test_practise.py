@@ -35,8 +35,8 @@ class Typed:
     answer: str = ""
 
     def check(self, found: str) -> None:
-        pattern = re.escape(self.answer.strip()).replace("…", ".*?")
-        assert re.search(rf"\A{pattern}\s*\Z", found.strip(), re.DOTALL), f"$ {self.command}\n{found}"
+        pattern = re.escape(self.answer.strip("\n")).replace("…", ".*?")
+        assert re.search(rf"\A{pattern}\s*\Z", found.strip("\n"), re.DOTALL), f"$ {self.command}\n{found}"
 
 
 def commands() -> Iterator[Typed]:
