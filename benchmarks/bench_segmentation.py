@@ -17,7 +17,7 @@ import numpy as np
 
 from hbr import DenseIndex, Views
 from hbr.core.arrays import ImageArray
-from hbr.evaluation.condition import Condition, Shot
+from hbr.evaluation.condition import Condition, EvaluationImage
 from hbr.evaluation.datasets import load_coil, read_photograph
 from hbr.evaluation.matrix import enrolled_few, hits
 from hbr.evaluation.perturb import Perturbations
@@ -41,11 +41,11 @@ class TableCondition(Condition):
 
     shown: str = "own"
 
-    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> Shot:
+    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> EvaluationImage:
         image, own = super().query(image_bgr, rng)
         if self.shown == "none":
-            return Shot(image)
-        return Shot(image, own if self.shown == "own" else self.enrolled(image_bgr).empty)
+            return EvaluationImage(image)
+        return EvaluationImage(image, own if self.shown == "own" else self.enrolled(image_bgr).empty)
 
 
 def cases(descriptor: str) -> Iterator[tuple[str, TableCondition]]:

@@ -1,4 +1,4 @@
-"""How queries are photographed, compared with the enrolled views."""
+"""The condition of an evaluation: how the images of queries differ from those of enrolled views."""
 
 from dataclasses import dataclass, field
 from functools import cache
@@ -18,13 +18,13 @@ Background = Literal["same", "uniform", "textured", "bench", "other-bench"]
 Reference = Literal["own", "enrollment", "none"]
 _T = TypeVar("_T", np.uint8, np.float32)
 
-#: COIL's black background has sensor noise and the glow of its surroundings up to about here.
+#: Largest level of COIL's black background, with sensor noise and glow.
 _DARK: Final = 45
 _TEXTURE_OCTAVES: Final = (4, 8, 16, 32)
 
 
-class Shot(NamedTuple):
-    """An image, and the picture of an empty bench that is there to compare it with, if any."""
+class EvaluationImage(NamedTuple):
+    """An image and its empty-table image, if there is one."""
 
     image: ImageArray
     empty: ImageArray | None = None
@@ -37,26 +37,26 @@ class Condition:
     Attributes
     ----------
     size_px : int or None
-        The longer side of all images, enrolled ones too; None leaves them as they are.
+        Longer side of all images, also of enrolled views; None: the size of the file.
     noise : Noise
-        Of the queries, applied at that size.
+        Noise of the queries, applied at that size.
     rotation_deg : float
-        Queries are turned in the image plane by a random angle up to this much to either side.
+        Largest rotation of a query in the image plane, to either side; the angle is random.
     background : {"same", "uniform", "textured", "bench", "other-bench"}
-        What is behind a query's object instead of the dark surroundings. ``bench`` puts enrolled objects and queries on
-        one plain bench, ``other-bench`` the queries on one of several others with patterns and clutter; both come with
-        a picture of the empty bench.
+        Background of a query instead of the dark surroundings. ``bench`` puts enrolled objects and queries on the same
+        plain bench, ``other-bench`` the queries on one of several benches with patterns and clutter. Both provide an
+        empty-table image.
     prefilter_px : float
-        Standard deviation of a Gaussian blur of all images, enrolled ones too, before they are described; 0 for none.
+        Standard deviation of a Gaussian blur of all images, also of enrolled views; 0: no blur.
     perturbations : Perturbations
-        Of the queries.
+        Perturbations of the queries.
     descriptor : str
-        What enrolled views and queries are described by.
+        Descriptor of enrolled views and queries.
     reference : {"own", "enrollment", "none"}
-        The picture of the empty bench that queries on a bench have: of their own bench in their own light, or of the
-        enrollment's; or neither they nor the enrolled views have one.
+        Empty-table image of queries on a bench: of their own bench and illumination, of the enrollment's bench, or no
+        such image for queries and enrolled views.
     enrolled_noise : Noise
-        Of the enrolled views: what describing them under the bench's known noise is worth.
+        Noise of the enrolled views.
     """
 
     size_px: int | None = None
@@ -82,8 +82,8 @@ class Condition:
             raise ValueError(f"reference {self.reference!r} is unknown; use one of {', '.join(get_args(Reference))}")
         if (self.on_bench or self.perturbations) and (self.rotation_deg or self.background in ("uniform", "textured")):
             raise ValueError(
-                "neither a rotation in the plane nor a uniform or textured background goes with perturbations or a "
-                "bench; leave one of them away"
+                "a rotation in the plane, and a uniform or textured background, cannot be combined with perturbations "
+                "or a bench; leave out one of them"
             )
         descriptor(self.descriptor)
 
@@ -92,8 +92,8 @@ class Condition:
         """Whether objects stand on a drawn bench."""
         return self.background in ("bench", "other-bench")
 
-    def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> Shot:
-        """The image as it is enrolled, and the empty bench; `rng` draws the enrolled noise."""
+    def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> EvaluationImage:
+        """Return the image of an enrolled view; `rng` draws its noise."""
         image = self._sized(image_bgr)
         empty: ImageArray | None = None
         if self.on_bench:
@@ -101,10 +101,10 @@ class Condition:
                 image, object_mask(image), np.random.default_rng(0), _benches()[0]
             )
         noisy = self.enrolled_noise.apply(image, rng or np.random.default_rng(0))
-        return Shot(self._prefiltered(noisy), None if self.reference == "none" else empty)
+        return EvaluationImage(self._prefiltered(noisy), None if self.reference == "none" else empty)
 
-    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> Shot:
-        """The image as a query sees it, and the empty bench; the same draws for the same generator state."""
+    def query(self, image_bgr: ImageArray, rng: np.random.Generator) -> EvaluationImage:
+        """Return the image of a query; equal states of `rng` give equal images."""
         image = self._sized(image_bgr)
         if self.on_bench or self.perturbations:
             first, *others = _benches()
@@ -112,17 +112,17 @@ class Condition:
             image, empty = self.perturbations.photograph(image, object_mask(image), rng, bench)
             if self.reference != "own":
                 empty = _shown(first) if self.on_bench and self.reference == "enrollment" else None
-            return Shot(self._prefiltered(self.noise.apply(image, rng)), empty)
+            return EvaluationImage(self._prefiltered(self.noise.apply(image, rng)), empty)
         if self.rotation_deg or self.background != "same":
             mask = object_mask(image).astype(np.float32)
             if self.rotation_deg:
                 angle_deg = rng.uniform(-self.rotation_deg, self.rotation_deg)
-                image, mask = _turned(image, angle_deg), _turned(mask, angle_deg)
+                image, mask = _rotated(image, angle_deg), _rotated(mask, angle_deg)
             if self.background != "same":
                 behind = _uniform(image, rng) if self.background == "uniform" else _textured(image, rng)
                 share = mask[:, :, None]
                 image = np.rint(share * image + (1 - share) * behind).astype(np.uint8)
-        return Shot(self._prefiltered(self.noise.apply(image, rng)))
+        return EvaluationImage(self._prefiltered(self.noise.apply(image, rng)))
 
     def _sized(self, image_bgr: ImageArray) -> ImageArray:
         height, width = image_bgr.shape[:2]
@@ -130,7 +130,7 @@ class Condition:
             return image_bgr
         scale = self.size_px / max(height, width)
         size = max(1, round(width * scale)), max(1, round(height * scale))
-        # bicubic, as MATLAB's imresize
+        # bicubic like MATLAB's imresize
         method = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
         return cv2.resize(image_bgr, size, interpolation=method).astype(np.uint8, copy=False)
 
@@ -142,7 +142,7 @@ class Condition:
 
 
 def object_mask(image_bgr: ImageArray) -> NDArray[np.bool_]:
-    """Where the object is, (H, W): all but the dark region that is connected with the border of the image."""
+    """Return the pixels of the object, (H, W): all but the dark region that is connected with the image's border."""
     dark = (image_bgr.max(axis=2) <= _DARK).astype(np.uint8)
     # a frame of dark pixels joins all regions that touch the border
     labels = cv2.connectedComponents(cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1))[1]
@@ -152,7 +152,7 @@ def object_mask(image_bgr: ImageArray) -> NDArray[np.bool_]:
 
 @cache
 def _benches() -> tuple[Picture, ...]:
-    """The plain bench, and eight others."""
+    """Return the plain bench, and eight others."""
     rng = np.random.default_rng(801)
     return (plain_bench(rng), *(other_bench(rng) for _ in range(8)))
 
@@ -161,11 +161,11 @@ def _shown(bench: Picture) -> ImageArray:
     return np.clip(np.rint(bench), 0, 255).astype(np.uint8)
 
 
-def _turned(image: NDArray[_T], angle_deg: float) -> NDArray[_T]:
-    """Turned around its centre, counter-clockwise; what comes in from outside is black."""
+def _rotated(image: NDArray[_T], angle_deg: float) -> NDArray[_T]:
+    """Rotate an image counter-clockwise about its centre; pixels from outside are black."""
     height, width = image.shape[:2]
-    turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle_deg, 1.0)
-    return cv2.warpAffine(image, turn, (width, height), flags=cv2.INTER_LINEAR).astype(image.dtype, copy=False)
+    matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle_deg, 1.0)
+    return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR).astype(image.dtype, copy=False)
 
 
 def _uniform(image: ImageArray, rng: np.random.Generator) -> ImageArray:
@@ -173,7 +173,7 @@ def _uniform(image: ImageArray, rng: np.random.Generator) -> ImageArray:
 
 
 def _textured(image: ImageArray, rng: np.random.Generator) -> ImageArray:
-    """Coloured noise of several grain sizes, the coarse ones strongest, around a random colour."""
+    """Return coloured noise around a random colour, with several grain sizes; the coarse ones are the strongest."""
     height, width = image.shape[:2]
     texture = np.broadcast_to(rng.uniform(64, 192, 3), image.shape).astype(np.float32)
     for cells in _TEXTURE_OCTAVES:

@@ -1,4 +1,4 @@
-"""Photographs of objects from known angles, in files."""
+"""Data sets: files of photographs of objects from known angles."""
 
 import re
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from hbr.core.arrays import FloatArray, ImageArray
 
 _SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
 _COIL_NAME: Final = re.compile(r"obj(?P<number>\d+)__(?P<angle>\d+(?:\.\d+)?)")
-#: The last bytes of a whole file. OpenCV returns what it could decode of one that was cut off.
+#: The last bytes of a complete file. OpenCV does not reject a file that was cut off.
 _ENDS: Final = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 
@@ -23,7 +23,7 @@ class DatasetError(ValueError):
 
 @dataclass(frozen=True)
 class Photograph:
-    """A file, and the orientation that it was taken from."""
+    """A file, and the azimuth of the camera."""
 
     path: Path
     azimuth_deg: float
@@ -31,7 +31,7 @@ class Photograph:
 
 @dataclass(frozen=True)
 class PhotographedObject:
-    """An object and its photographs, ascending by azimuth in [0, 360)."""
+    """An object and its photographs, sorted by azimuth in [0, 360)."""
 
     name: str
     photographs: tuple[Photograph, ...]
@@ -43,18 +43,18 @@ class PhotographedObject:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Objects to enroll and to find again.
+    """Objects to enroll and to identify.
 
     Attributes
     ----------
     name : str
-        For people.
+        Name in reports.
     objects : tuple of PhotographedObject
-        At least two, of different names.
+        At least two objects with different names.
     ignored : int
-        Image files in the folder that are not named as views.
+        Number of image files in the folder whose names are not those of views.
     region : (int, int, int, int) or None
-        The part of every image to look at: x, y, width, height in pixels; None for all.
+        The part of every image that is described: x, y, width, height in pixels; None: the whole image.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Dataset:
 
     def __post_init__(self) -> None:
         if len(self.objects) < 2:
-            raise DatasetError(f"{self.name}: {len(self.objects)} object; at least two are needed to tell apart")
+            raise DatasetError(f"{self.name}: {len(self.objects)} object; at least two are needed")
         for item in self.objects:
             azimuth_deg = item.azimuth_deg
             for i in np.flatnonzero(np.diff(azimuth_deg) <= 0):
@@ -79,21 +79,21 @@ class Dataset:
 
     @property
     def spacing_deg(self) -> float:
-        """The usual step between neighbouring views: the median over all objects."""
+        """The median step between neighbouring views of all objects."""
         gaps = [np.diff(item.azimuth_deg, append=item.azimuth_deg[0] + 360) for item in self.objects]
         return float(np.median(np.concatenate(gaps)))
 
     @property
     def missing(self) -> int:
-        """How many views lack for every object to be seen all around at the usual step."""
+        """The number of views that are missing from complete revolutions at that step."""
         whole = round(360 / self.spacing_deg)
         return sum(max(0, whole - len(item.photographs)) for item in self.objects)
 
     def subset(self, first: int, last: int) -> "Dataset":
-        """The objects at positions `first` to `last`, counted from 1, both included."""
+        """Return the data set with the objects at positions `first` to `last`, counted from 1, both included."""
         if not 1 <= first <= last <= len(self.objects):
             raise DatasetError(
-                f"objects {first}-{last} were asked for but {self.name} has {len(self.objects)}; count from 1"
+                f"objects {first}-{last} were requested, but {self.name} has {len(self.objects)}; the first is 1"
             )
         return replace(self, objects=self.objects[first - 1 : last])
 
@@ -101,13 +101,13 @@ class Dataset:
 def load_coil(folder: Path) -> Dataset:
     """Find the views of a folder in the layout of COIL-100: ``obj{number}__{angle}.png`` or ``.jpg``.
 
-    Angles are degrees, fractions welcome. The angle in the name is taken as the azimuth; where it is the angle of the
-    table, left and right change their roles and nothing else. Objects are sorted by number.
+    Angles are degrees, with or without a fraction, and are taken for azimuths. If they are table angles, left and right
+    are exchanged. Objects are sorted by number.
 
     Raises
     ------
     DatasetError
-        The folder is missing or holds no such file, or a view is there twice.
+        The folder is missing or contains no such file, or two files show the same view.
     """
     if not folder.is_dir():
         raise DatasetError(
@@ -124,7 +124,7 @@ def load_coil(folder: Path) -> Dataset:
         found.setdefault(int(name["number"]), []).append(Photograph(path, wrap360(float(name["angle"]))))
     if not found:
         raise DatasetError(
-            f"{folder} holds no view; files are expected to be named obj1__0.png, obj1__5.png, obj2__0.jpg"
+            f"{folder} contains no view; name the files obj1__0.png, obj1__5.png, obj2__0.jpg, and so on"
         )
     objects = tuple(
         PhotographedObject(f"obj{number}", tuple(sorted(found[number], key=lambda view: view.azimuth_deg)))
@@ -141,7 +141,7 @@ def read_photograph(path: Path, size: tuple[int, int] | None = None) -> ImageArr
     path : Path
         PNG or JPEG.
     size : (int, int), optional
-        Width and height that it has to have.
+        Required width and height.
 
     Returns
     -------
@@ -151,18 +151,18 @@ def read_photograph(path: Path, size: tuple[int, int] | None = None) -> ImageArr
     Raises
     ------
     DatasetError
-        The file is missing or cut off, is no image, or has another size.
+        The file is missing, cut off, not an image, or of another size.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    # padding after the end is legal
+    # padding after the end is valid
     if _ENDS.get(path.suffix.lower(), b"") not in data[-4096:]:
-        raise DatasetError(f"{path} is cut off or no image; fetch it again")
+        raise DatasetError(f"{path} is cut off or not an image; copy it again")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        raise DatasetError(f"{path} is no image that OpenCV can read; fetch it again")
+        raise DatasetError(f"OpenCV cannot read the image {path}; copy it again")
     height, width = image.shape[:2]
     if size is not None and (width, height) != size:
         raise DatasetError(

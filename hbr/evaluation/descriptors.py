@@ -1,40 +1,38 @@
-"""Photographs to descriptors: as they are enrolled, and as queries see them."""
+"""Descriptors of photographs, as enrolled views and as queries."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors.describe import describe
-from hbr.evaluation.condition import Condition
+from hbr.evaluation.condition import Condition, EvaluationImage
 from hbr.evaluation.datasets import Dataset, read_photograph
 from hbr.evaluation.draws import generator
 
 
 def enrolled_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int]) -> LevelArray:
-    """Descriptors of all views of object `j` as they are enrolled, uint8 (n, length).
+    """Return the descriptors of all enrolled views of object `j`, uint8 (n, length).
 
     Raises
     ------
     DatasetError
-        A photograph cannot be used; `size` is the width and height that all must have.
+        A photograph cannot be used, or does not have the width and height `size`.
     """
     name = dataset.objects[j].name
-    shots = (
-        condition.enrolled(image, generator(0, name, "enrolled", i))
-        for i, image in enumerate(_images(dataset, j, size))
-    )
-    return np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in shots])
+    images = enumerate(_images(dataset, j, size))
+    return _levels((condition.enrolled(image, generator(0, name, "enrolled", i)) for i, image in images), condition)
 
 
 def query_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int) -> LevelArray:
-    """Descriptors of all views of object `j` as queries, uint8 (n, length); each photograph has noise of its own."""
+    """Return the descriptors of all views of object `j` as queries, uint8 (n, length). Each has its own noise."""
     name = dataset.objects[j].name
-    shots = (
-        condition.query(image, generator(seed, name, "photograph", i))
-        for i, image in enumerate(_images(dataset, j, size))
-    )
-    return np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in shots])
+    images = enumerate(_images(dataset, j, size))
+    return _levels((condition.query(image, generator(seed, name, "photograph", i)) for i, image in images), condition)
+
+
+def _levels(images: Iterable[EvaluationImage], condition: Condition) -> LevelArray:
+    return np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in images])
 
 
 def _images(dataset: Dataset, j: int, size: tuple[int, int]) -> Iterator[ImageArray]:

@@ -1,4 +1,4 @@
-"""Random numbers that depend on what they are for, and not on what else is drawn or in which order."""
+"""Random generators that depend on their purpose alone, not on other draws or their order."""
 
 import zlib
 from typing import Final, Literal
@@ -11,6 +11,6 @@ _PURPOSES: Final = {"trial": 0, "photograph": 1, "bootstrap": 2, "enrolled": 3}
 def generator(
     seed: int, name: str, purpose: Literal["trial", "photograph", "bootstrap", "enrolled"], number: int
 ) -> np.random.Generator:
-    """Return the generator of, say, the third trial of an object: the same whichever other objects are evaluated."""
+    """Return the generator for one purpose and number of an object; other objects do not change it."""
     key = (_PURPOSES[purpose], number)
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())], spawn_key=key))

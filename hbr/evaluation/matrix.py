@@ -1,4 +1,4 @@
-"""One thing at a time: hit-rates of the dense filter under every perturbation, at three strengths."""
+"""Hit-rates of the dense filter under each perturbation alone, at three strengths."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from hbr.evaluation.perturb import STRENGTHS, Perturbations
 from hbr.evaluation.protocol import Protocol, views_enrolled
 from hbr.model.views import Views
 
-#: Queries of a trial are taken at this step, as a search without any decision would.
+#: Step between the queries of a trial.
 _STEP_DEG: Final = 90.0
 _NOISES: Final[Mapping[str, tuple[str, str, str]]] = {
     "gn": ("gn:0.004", "gn:0.012", "gn:0.03"),
@@ -30,7 +30,7 @@ _BACKGROUNDS: Final = ("bench", "textured", "other-bench")
 
 @dataclass(frozen=True)
 class Cell:
-    """A perturbation at a strength, 0 for none, and the condition that it makes."""
+    """A perturbation, its strength (0: no perturbation), and the resulting condition."""
 
     kind: str
     strength: int
@@ -38,10 +38,10 @@ class Cell:
 
 
 def cells(base: Condition) -> tuple[Cell, ...]:
-    """Every perturbation at each strength, and none, of what is otherwise `base`.
+    """Return `base` without a perturbation, and with each perturbation at each strength.
 
-    A background is another thing with each strength: a bench that is known empty, a pattern that is not, and another
-    bench than at enrollment. Shadows fall on a bench alone.
+    The three strengths of the background are: a bench with an empty-table image, a pattern without one, and another
+    bench than at enrollment. A shadow needs a bench.
     """
     found = [Cell("none", 0, base)]
     for i in range(3):
@@ -56,41 +56,41 @@ def cells(base: Condition) -> tuple[Cell, ...]:
 
 
 def enrolled_few(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], count: int) -> Views:
-    """Views of object `j` as they are enrolled, so many at equal distances.
+    """Return `count` enrolled views of object `j` at equal distances.
 
     Raises
     ------
     DatasetError
-        A photograph cannot be used; `size` is the width and height that all must have.
+        A photograph cannot be used, or does not have the width and height `size`.
     """
     item = dataset.objects[j]
     kept = np.flatnonzero(views_enrolled(item.azimuth_deg, count))
-    shots = [
+    images = [
         condition.enrolled(read_photograph(item.photographs[i].path, size), generator(0, item.name, "enrolled", i))
         for i in kept.tolist()
     ]
-    levels = np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in shots])
+    levels = np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in images])
     return Views.of_object(item.name, levels, item.azimuth_deg[kept], condition.descriptor)
 
 
 def hits(
     dataset: Dataset, j: int, index: DenseIndex, condition: Condition, size: tuple[int, int], protocol: Protocol
 ) -> NDArray[np.bool_]:
-    """Whether object `j` was found, by trial and number of views, bool (trials, views).
+    """Return whether object `j` was found, by trial and number of views, bool (trials, views).
 
-    The trials of all conditions begin with the same views, and have the same errors of the orientation.
+    The first views and the orientation errors of a trial are the same under all conditions.
 
     Raises
     ------
     DatasetError, ValueError
-        A photograph cannot be used, or too few are left beside the enrolled ones.
+        A photograph cannot be used, or too few photographs are not enrolled.
     """
     item = dataset.objects[j]
     azimuth_deg = item.azimuth_deg
     free = np.flatnonzero(~views_enrolled(azimuth_deg, protocol.enrolled or len(azimuth_deg)))
     if len(free) < protocol.max_views:
         raise ValueError(
-            f"{item.name} has {len(free)} views beside those enrolled; for {protocol.max_views} queries enroll fewer"
+            f"{item.name} has {len(free)} views that are not enrolled; for {protocol.max_views} queries enroll fewer"
         )
     own = index.views.object_names.index(item.name)
     described: dict[int, LevelArray] = {}
@@ -103,11 +103,11 @@ def hits(
         for n in range(protocol.max_views):
             i = seen[-1]
             if i not in described:
-                shot = condition.query(
+                image, empty = condition.query(
                     read_photograph(item.photographs[i].path, size),
                     generator(protocol.seed, item.name, "photograph", i),
                 )
-                described[i] = describe(shot.image, descriptor=condition.descriptor, empty_table=shot.empty)
+                described[i] = describe(image, descriptor=condition.descriptor, empty_table=empty)
             so_far = belief = update_belief(described[i], float(azimuth_deg[i] + error_deg[n]), so_far)
             found[t, n] = belief.ranking().object_index[0] == own
             away_deg = np.abs(wrap180(azimuth_deg[free] - azimuth_deg[i] - _STEP_DEG))

@@ -27,21 +27,21 @@ class Method:
     Attributes
     ----------
     name : str
-        The name that selects it.
+        Name in ``--methods``.
     label : str
-        For tables and figures.
+        Name in tables and figures.
     strategy : str
-        How the next view is chosen. ``random``; ``sweep-45`` and ``sweep-90``: at fixed steps; ``ahbr``: by Eq. 5-7;
-        ``coin``: to a random side, with the step of Eq. 5-7. The last two need two views: the second is a random one,
-        or, with ``ahbr-90``, 90° to the left as on the rig. Only with the dense filter: ``next-best-view``, by
-        `hbr.next_best_view`; ``next-best-view-coin``, its rotation to a random side; ``mutual``, by mutual information;
-        ``oracle``, the photograph after which the true object, which it knows, leads most.
+        How the next view is chosen. ``random``; ``sweep-45``, ``sweep-90``: fixed steps; ``ahbr``: Eq. 5-7; ``coin``:
+        the step of Eq. 5-7 to a random side. ``ahbr`` and ``coin`` begin with two random views, ``ahbr-90`` with a
+        step of 90° to the left, like the rig. With the dense filter only: ``next-best-view``: `hbr.next_best_view`;
+        ``next-best-view-coin``: its rotation to a random side; ``mutual``: mutual information; ``oracle``: the
+        photograph with the largest lead of the true object.
     omega, list_length, extension
-        As for `hbr.retrieve`, or for `hbr.DenseIndex`.
+        Parameters of `hbr.retrieve` or `hbr.DenseIndex`.
     views : int or None
-        Largest number of views of this method; None for the protocol's.
+        Largest number of views of this method; None: that of the protocol.
     dense : bool
-        Ranked by the dense filter instead of the paper's voting.
+        Whether the dense filter ranks the objects, instead of the paper's voting.
     """
 
     name: str
@@ -67,7 +67,7 @@ _LISTED: Final = (
     Method("hbr-orient", "HBR ω = 0.5 (orient)", extension="orient"),
     Method("ahbr", "AHBR ω = 0.5", strategy="ahbr"),
     Method("ahbr-orient", "AHBR ω = 0.5 (orient)", strategy="ahbr", extension="orient"),
-    Method("ahbr-90", "AHBR, first turn 90°", strategy="ahbr-90"),
+    Method("ahbr-90", "AHBR, first rotation 90°", strategy="ahbr-90"),
     Method("coin", "coin flip", strategy="coin"),
     Method("sweep-45", "sweep 45°", strategy="sweep-45"),
     Method("sweep-90", "sweep 90°", strategy="sweep-90"),
@@ -102,7 +102,7 @@ def choose_methods(names: Iterable[str]) -> tuple[Method, ...]:
     Raises
     ------
     ValueError
-        No name, or one that is neither a method nor a group.
+        There is no name, or one is neither a method nor a group.
     """
     chosen: dict[str, Method] = {}
     for name in names:

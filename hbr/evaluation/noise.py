@@ -1,4 +1,4 @@
-"""What spoils a query's image: Gaussian noise and motion blur, with the meaning that MATLAB gives them."""
+"""Noise of a query's image: Gaussian noise and motion blur, as defined by MATLAB."""
 
 from dataclasses import dataclass
 from typing import Final, Self
@@ -15,16 +15,16 @@ MB_ANGLE_DEG: Final = 20.0
 
 @dataclass(frozen=True)
 class Noise:
-    """Motion blur, then Gaussian noise: the optics come before the sensor.
+    """Motion blur of the optics, then Gaussian noise of the sensor.
 
     Attributes
     ----------
     gaussian_variance : float
-        Of intensities in 0..1; 0 adds none.
+        Variance of intensities in 0..1; 0: no noise.
     motion_px : float
-        Length of the motion in pixels; 0 blurs nothing.
+        Length of the motion in pixels; 0: no blur.
     motion_deg : float
-        Its direction, counter-clockwise from the right.
+        Direction of the motion, counter-clockwise from the right.
     """
 
     gaussian_variance: float = 0.0
@@ -46,7 +46,7 @@ class Noise:
         Raises
         ------
         ValueError
-            It is none of these.
+            The text has another form.
         """
         settings: dict[str, float] = {}
         try:
@@ -80,7 +80,7 @@ class Noise:
         return "+".join(parts) or "none"
 
     def apply(self, image_bgr: ImageArray, rng: np.random.Generator) -> ImageArray:
-        """Return the image as this noise leaves it, uint8 (H, W, 3)."""
+        """Return the image with this noise, uint8 (H, W, 3)."""
         if self.motion_px:
             kernel = motion_kernel(self.motion_px, self.motion_deg)
             image_bgr = cv2.filter2D(image_bgr, -1, kernel, borderType=cv2.BORDER_REPLICATE).astype(
@@ -100,10 +100,10 @@ def gaussian(image_bgr: ImageArray, variance: float, rng: np.random.Generator) -
 
 
 def motion_kernel(length_px: float, angle_deg: float) -> FloatArray:
-    """Kernel of a straight motion, its weights falling linearly to 0 at one pixel from the line.
+    """Return the kernel of a straight motion: the weights fall linearly to 0 at one pixel from the line.
 
-    MATLAB's ``fspecial('motion', length, angle)``: a pixel whose centre is at least half a length away from the middle
-    is measured by its distance to the end of the line, any other by its distance to the line.
+    Like MATLAB's ``fspecial('motion', length, angle)``: the distance of a pixel is that to the end of the line if its
+    centre is at least half a length away from the middle, otherwise that to the line.
 
     Parameters
     ----------
@@ -115,14 +115,14 @@ def motion_kernel(length_px: float, angle_deg: float) -> FloatArray:
     Returns
     -------
     float64 array (odd, odd)
-        Sums to 1; equal to itself turned by 180 degrees.
+        The sum is 1. The kernel has a rotational symmetry of 180 degrees.
     """
     if not (np.isfinite(length_px) and length_px >= 1 and np.isfinite(angle_deg)):
         raise ValueError(f"a motion of {length_px} pixels to {angle_deg} degrees; at least 1 pixel is needed")
     half = (length_px - 1) / 2
     angle = np.radians(angle_deg % 180)
     cos, sin = np.cos(angle), np.sin(angle)
-    # a hair less than one pixel beyond the end, so that no border of zero weight is added
+    # slightly less than one pixel beyond the end, so that no border of zero weight is added
     reach_x, reach_y = (int(half * abs(part) + 1 - length_px * np.finfo(float).eps) for part in (cos, sin))
     right = np.arange(-reach_x, reach_x + 1)
     up = np.arange(reach_y, -reach_y - 1, -1)[:, None]

@@ -1,6 +1,6 @@
-"""What else may differ between an enrolled view and a query: place, light, what stands in front and behind.
+"""Perturbations of a query: placement, illumination, occlusion and background.
 
-Every perturbation has three strengths; the second is what a careful technician still lets happen.
+Every perturbation has three strengths. The second one can happen to a careful technician.
 """
 
 from collections.abc import Mapping
@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray
 from hbr.evaluation.scenes import FOOT_PX, HEIGHT, SIDE_PX, WIDTH, Picture
 
-#: What each strength means: 1, 2, 3.
+#: Magnitudes at the strengths 1, 2 and 3.
 STRENGTHS: Final[Mapping[str, tuple[float, float, float]]] = {
-    "shift": (0.03, 0.06, 0.09),  # to either side, of the photograph's side
-    "scale": (0.05, 0.10, 0.15),  # larger or smaller by up to so much
-    "elevation": (3.0, 6.0, 10.0),  # degrees of the camera, up or down
-    "occlusion": (0.05, 0.09, 0.15),  # width of a bar in front, of the photograph's side
-    "shadow": (0.3, 0.5, 0.7),  # share of the light that a cast shadow takes
+    "shift": (0.03, 0.06, 0.09),  # largest shift, relative to the photograph's side
+    "scale": (0.05, 0.10, 0.15),  # largest relative change of the size
+    "elevation": (3.0, 6.0, 10.0),  # largest change of the camera's elevation, degrees
+    "occlusion": (0.05, 0.09, 0.15),  # width of a bar in front, relative to the photograph's side
+    "shadow": (0.3, 0.5, 0.7),  # share of the light that is missing in a cast shadow
     "specular": (80.0, 140.0, 200.0),  # grey levels of highlights
-    "gain": (0.125, 0.25, 0.5),  # brighter or darker by up to so much
-    "white-balance": (0.035, 0.07, 0.25),  # each channel by up to so much
-    "gradient": (0.1, 0.2, 0.4),  # of the light from one side of the frame to the other
-    "gamma": (0.1, 0.2, 0.3),  # logarithm of the exponent
+    "gain": (0.125, 0.25, 0.5),  # largest relative change of the brightness
+    "white-balance": (0.035, 0.07, 0.25),  # largest relative change of each channel
+    "gradient": (0.1, 0.2, 0.4),  # relative change of the light across the frame
+    "gamma": (0.1, 0.2, 0.3),  # largest logarithm of the exponent
     "defocus": (1.0, 1.5, 2.0),  # standard deviation of the blur, pixels
 }
 
@@ -37,7 +37,7 @@ class Perturbations:
     Attributes
     ----------
     strengths : tuple of (str, int)
-        Kinds of `STRENGTHS`, each once, with 1, 2 or 3.
+        Names in `STRENGTHS`, each at most once, with a strength of 1, 2 or 3.
     """
 
     strengths: tuple[tuple[str, int], ...] = ()
@@ -59,7 +59,7 @@ class Perturbations:
         Raises
         ------
         ValueError
-            It is none of these.
+            The text has another form.
         """
         strengths: list[tuple[str, int]] = []
         for part in [] if text == "none" else text.split("+"):
@@ -76,31 +76,31 @@ class Perturbations:
         return bool(self.strengths)
 
     def of(self, kind: str) -> float:
-        """Return the magnitude of a kind, 0 where it is not asked for."""
+        """Return the magnitude of a perturbation; 0 if there is none."""
         return next((STRENGTHS[kind][strength - 1] for name, strength in self.strengths if name == kind), 0.0)
 
     def photograph(
         self, image_bgr: ImageArray, mask: NDArray[np.bool_], rng: np.random.Generator, bench: Picture | None = None
     ) -> tuple[ImageArray, ImageArray | None]:
-        """Photograph an object once more.
+        """Return the photograph of an object with these perturbations.
 
         Parameters
         ----------
         image_bgr : uint8 array (H, W, 3)
-            The photograph.
+            The photograph without perturbations.
         mask : bool array (H, W)
-            Where it shows the object.
+            The pixels of the object.
         rng : numpy Generator
-            Of this photograph: the same state gives the same picture.
+            Equal states give equal pictures.
         bench : float32 array (240, 320, 3), optional
-            What the object stands on; its own surroundings otherwise.
+            The new background; default: that of the photograph.
 
         Returns
         -------
         picture : uint8 array
-            As large as the bench, or as the photograph.
+            The size is that of the bench, or of the photograph.
         empty : uint8 array or None
-            The bench without the object in the same light; None without a bench.
+            The bench without the object in the same illumination; None without a bench.
         """
         seen, cover = self._placed(image_bgr, mask, rng, on_bench=bench is not None)
         ground = seen if bench is None else bench.copy()
@@ -110,17 +110,17 @@ class Perturbations:
         self._highlights(picture, cover, rng)
         pictures = [picture] if bench is None else [picture, bench.copy()]
         self._bar(pictures, cover, rng)
-        shots = self._lit(pictures, rng)
-        return shots[0], shots[1] if bench is not None else None
+        images = self._illuminated(pictures, rng)
+        return images[0], images[1] if bench is not None else None
 
     def _placed(
         self, image: ImageArray, mask: NDArray[np.bool_], rng: np.random.Generator, *, on_bench: bool
     ) -> tuple[Picture, Picture]:
-        """The photograph where it stands now, and how much of each pixel is object."""
+        """Return the photograph at its new place, and the share of the object in each pixel."""
         height, width = image.shape[:2]
         scale = 1 + rng.uniform(-1, 1) * self.of("scale")
         tilt_deg = rng.uniform(-1, 1) * self.of("elevation")
-        # seen from higher up, what stands upright is shorter
+        # from a higher camera, upright objects look shorter
         upright = scale * np.cos(np.radians(15 + tilt_deg)) / np.cos(np.radians(15))
         shift = rng.uniform(-1, 1, 2) * self.of("shift")
         if on_bench:
@@ -136,14 +136,14 @@ class Perturbations:
             size = width, height
         move = np.array([[scale, 0, to_x - scale * x], [0, upright, to_y - upright * y]])
         edge = mask.astype(np.float32)
-        if on_bench:  # half of a pixel at the edge shows the dark surroundings
+        if on_bench:  # a pixel at the edge shows the dark surroundings by half
             inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
             edge = np.minimum(cv2.GaussianBlur(edge, (0, 0), 0.7), 0.5 * (inner + edge)).astype(np.float32)
         seen = cv2.warpAffine(image, move, size, borderMode=cv2.BORDER_REPLICATE)
         return seen.astype(np.float32), np.asarray(cv2.warpAffine(edge, move, size), np.float32)
 
     def _shadows(self, cover: Picture, rng: np.random.Generator) -> Picture:
-        """Share of the light that is taken from the ground: at the foot always, and by a lamp from one side."""
+        """Return the share of the light that is missing on the ground: around the foot, and in a cast shadow."""
         left, top, width, height = cv2.boundingRect((cover > 0.5).astype(np.uint8))
         foot = np.zeros_like(cover)
         cv2.ellipse(foot, (left + width // 2, top + height - 3), (int(0.55 * width) + 3, 8), 0, 0, 360, 1, -1)
@@ -172,7 +172,7 @@ class Perturbations:
             picture += spot[:, :, None] * np.float32(rng.uniform(0.4, 1) * strength)
 
     def _bar(self, pictures: list[Picture], cover: Picture, rng: np.random.Generator) -> None:
-        """A holder from below in front of the object; every other one stands on the empty bench too."""
+        """Draw a bar in front of the object, from below; every second one is on the empty-table image, too."""
         size = SIDE_PX if len(pictures) > 1 else cover.shape[1]
         thick = int(rng.uniform(0.5, 1) * self.of("occlusion") * size)
         if not thick:
@@ -185,8 +185,8 @@ class Perturbations:
         for picture in pictures[: 2 if known else 1]:
             cv2.line(picture, (x, picture.shape[0]), tip, colour, thick)
 
-    def _lit(self, pictures: list[Picture], rng: np.random.Generator) -> list[ImageArray]:
-        """The same light, lens and sensor for all."""
+    def _illuminated(self, pictures: list[Picture], rng: np.random.Generator) -> list[ImageArray]:
+        """Return the pictures after the same change of illumination, lens and sensor."""
         height, width = pictures[0].shape[:2]
         gain = 1 + rng.uniform(-1, 1) * self.of("gain")
         channels = gain * (1 + rng.uniform(-1, 1, 3) * self.of("white-balance"))
@@ -195,19 +195,19 @@ class Perturbations:
         light = (1 + slope * (x * np.cos(direction) + y * np.sin(direction)))[:, :, None] * channels
         exponent = np.exp(rng.uniform(-1, 1) * self.of("gamma"))
         blur = rng.uniform(0.5, 1) * self.of("defocus")
-        shots = []
+        images = []
         for picture in pictures:
-            shot = np.clip(picture * light, 0, 255)
+            image = np.clip(picture * light, 0, 255)
             if exponent != 1:
-                shot = 255 * (shot / 255) ** exponent
+                image = 255 * (image / 255) ** exponent
             if blur:
-                shot = np.asarray(cv2.GaussianBlur(shot, (0, 0), blur))
-            shots.append(np.rint(shot).astype(np.uint8))
-        return shots
+                image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur))
+            images.append(np.rint(image).astype(np.uint8))
+        return images
 
 
 def _whole(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask without specks."""
+    """Return the mask without small regions."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     area = stats[1:, cv2.CC_STAT_AREA]
     whole: NDArray[np.bool_] = np.isin(labels, 1 + np.flatnonzero(area >= 0.05 * area.max(initial=0)))

@@ -1,7 +1,7 @@
-"""The trials: an object is looked at from several sides, its views near those are taken out, and it is searched for.
+"""The trials of an evaluation: searches for an object without the enrolled views near the queries.
 
-Everything that is drawn at random (first views, errors of the sensor, coins) is drawn once for each object and trial,
-so that all methods meet the same.
+All random values (first views, sensor errors, coins) are drawn once for each object and trial, so that they are equal
+for all methods.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,28 +34,28 @@ _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
 @dataclass(frozen=True)
 class Protocol:
-    """What a trial is.
+    """The settings of the trials.
 
     Attributes
     ----------
     trials : int
-        Of each object.
+        Number of trials for each object.
     max_views : int
-        Queries of a trial; results are kept after each.
+        Number of queries in a trial; there are results after each query.
     removal : {"near", "paper79", "queries"}
-        Which enrolled views of the object are taken out before it is searched for: those closer than `near_deg` to any
-        query so far; the queries and the next view of each (which leaves 79 % of 72 after 8 queries); the queries.
+        Enrolled views of the object that are removed before the search: those closer than `near_deg` to any query so
+        far; the queries and the next view of each (79 % of 72 views stay after 8 queries); the queries.
     near_deg : float
-        For ``near``.
+        The distance for ``near``.
     sigma_deg : float
         Standard deviation of the error of each measured orientation.
     drift_deg : float
-        What the measured orientation gains with each view.
+        Drift of the measured orientation with each view.
     seed : int
-        Of all that is random.
+        Seed of all random values.
     enrolled : int or None
-        Of each object so many views stay enrolled, at equal distances, and queries are taken from the others; None for
-        all views, queries among them.
+        Number of enrolled views of each object, at equal distances; queries are taken from the other views. None: all
+        views are enrolled, including the queries.
     absent : tuple of str
         Names of objects that are not enrolled, to measure unknown objects; only with the dense filter.
     """
@@ -77,8 +77,8 @@ class Protocol:
             raise ValueError(f"removal {self.removal!r} is unknown; use one of {', '.join(get_args(Removal))}")
         if not (0 < self.near_deg <= 180 and 0 <= self.sigma_deg < np.inf and np.isfinite(self.drift_deg)):
             raise ValueError(
-                f"removal nearer than {self.near_deg}, orientation errors of {self.sigma_deg} and a drift of "
-                f"{self.drift_deg} degrees; above 0, at least 0 and finite are needed"
+                f"near_deg is {self.near_deg}, sigma_deg {self.sigma_deg}, drift_deg {self.drift_deg}; needed are a "
+                "value above 0 and up to 180, one of at least 0, and a finite one"
             )
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; a whole number of at least 0 is needed")
@@ -88,32 +88,31 @@ class Protocol:
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """What came out, arrays of shape (methods, objects, trials, views).
+    """The results of the trials: arrays of shape (methods, objects, trials, views).
 
     Attributes
     ----------
     rank : int32
-        Place of the true object, 1 for found; 0 where it was no candidate, -1 where the method looks no more.
+        Rank of the true object, 1 if it leads; 0 if it is not a candidate, -1 after the last view of the method.
     pose_error_deg : float64
-        Distance of the estimated from the true orientation of the true object, 0..180; nan where it was no candidate.
+        Distance of the estimated from the true orientation of the true object, 0..180; nan if it is not a candidate.
     alike_error_deg : float64
-        The same to the nearest orientation from which the object looks as it does from the true one.
+        The same for the nearest orientation in which the object looks like in the true one.
     period_deg : float64
         Symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not symmetric;
         nan if it has too few views.
     margin : float64
-        `hbr.score_margin` of the best object, a view; by the dense filter, its score above the second's.
+        `hbr.score_margin` of the leading object per view; with the dense filter, its score minus the second score.
     best : int32
-        The best object, by its index in the views' names.
+        The leading object, as an index of the views' names.
     score : float64
-        Its score, a view.
+        Its score per view.
     outcome : int8
-        What the stopping rule decided after each view by the dense filter, as a place in `OUTCOMES`; -1 of the paper's
-        voting.
+        Decision of the stopping rule with the dense filter, as an index of `OUTCOMES`; -1 with the paper's voting.
     travelled_deg : float64
-        Degrees turned since the first view, to either side.
+        Sum of the rotations since the first view, without signs.
     step_ns : int64
-        Time of retrieval and decision, 0 where no timer was given.
+        Time of retrieval and decision; 0 without a timer.
     """
 
     rank: NDArray[np.int32]
@@ -129,24 +128,24 @@ class Runs:
 
     @classmethod
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
-        """Nothing looked at yet."""
+        """Return runs without any result."""
         filled = {"rank": (-1, np.int32), "best": (-1, np.int32), "outcome": (-1, np.int8), "step_ns": (0, np.int64)}
         shape = (methods, objects, trials, views)
         return cls(*(np.full(shape, *filled.get(item.name, (np.nan, np.float64))) for item in fields(cls)))
 
     def of(self, objects: slice) -> "Runs":
-        """The runs of some objects alone."""
+        """Return the runs of some objects."""
         return Runs(*(getattr(self, item.name)[:, objects] for item in fields(self)))
 
     @classmethod
     def concatenate(cls, parts: Sequence["Runs"]) -> "Runs":
-        """The objects of all parts, in their order."""
+        """Return the runs of the objects of all parts, in their order."""
         return cls(*(np.concatenate([getattr(part, item.name) for part in parts], axis=1) for item in fields(cls)))
 
 
 @dataclass(frozen=True)
 class _Draws:
-    """What chance decides in one trial."""
+    """The random values of one trial."""
 
     order: IndexArray
     error_deg: FloatArray
@@ -163,34 +162,29 @@ def run_object(
     rule: StoppingRule | None = None,
     now_ns: Callable[[], int] = lambda: 0,
 ) -> Runs:
-    """Search for one object by all methods, in all trials.
+    """Search for one object with all methods, in all trials, and return the runs of this object.
 
     Parameters
     ----------
     object_index : int
         The object.
     queries : uint8 array (n, 144)
-        Its photographs as queries see them, one for each of its views, in the order of `views.of`.
+        Descriptors of its photographs as queries, one for each of its views, in the order of `views.of`.
     views : Views
-        The whole model set, nothing taken out.
+        The complete model set.
     methods : sequence of Method
-        What to search by.
+        The methods of the search.
     protocol : Protocol
-        The trials.
+        The settings of the trials.
     rule : StoppingRule, optional
-        For methods of the dense filter; by default `rule_of_trial`.
+        The rule for methods of the dense filter; default: `rule_of_trial`.
     now_ns : callable
         Monotonic time, for `Runs.step_ns`.
-
-    Returns
-    -------
-    Runs
-        Of this object alone.
 
     Raises
     ------
     ValueError
-        The object has too few views, or other than there are queries.
+        The object has too few views, or the number of queries is another one.
     """
     if rule is None and any(method.dense for method in methods):
         rule = rule_of_trial(views, protocol)
@@ -232,7 +226,7 @@ class _Trials:
         self._ring = np.argsort(self._azimuth_deg, kind="stable")
         own = views.descriptors[self._rows]
         compared = descriptor(views.descriptor)
-        self._alike = _looks_alike(compared.similarity(own, own), self._ring)
+        self._alike = _same_looking(compared.similarity(own, own), self._ring)
         symmetric = symmetry(views, object_index, similarity=compared.similarity)
         self._period_deg = np.nan if symmetric is None else symmetric.period_deg
         similar = compared.similarity(queries, views.descriptors)
@@ -253,7 +247,7 @@ class _Trials:
     def run(
         self, method: Method, draws: _Draws, models: dict[bytes, Views], runs: Runs, at: tuple[int, int, int]
     ) -> None:
-        """Fill in the results of one trial by one method."""
+        """Store the results of one trial with one method in `runs`."""
         if method.dense:
             self._run_dense(method, draws, runs, at)
             return
@@ -267,7 +261,7 @@ class _Trials:
             key = keep.tobytes()
             if key not in models:
                 models[key] = self._without(keep)
-            # each method its own: an index that remembers another's searches would flatter the time
+            # a new index for each method: cached similarities of another method would shorten the measured time
             index = ViewIndex(models[key])
             measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
             start_ns = self._now_ns()
@@ -334,7 +328,7 @@ class _Trials:
                 return int(draws.order[len(seen)])
 
     def _oracle(self, seen: list[int], belief: Belief) -> int:
-        """Return the photograph after which the true object leads most, of every third."""
+        """Return the photograph with the largest lead of the true object, of every third photograph."""
         left = np.setdiff1d(self._free, seen)[::3]
         margins = []
         for i in left.tolist():
@@ -344,7 +338,7 @@ class _Trials:
         return int(left[int(np.argmax(margins))])
 
     def _keep(self, seen: IndexArray) -> NDArray[np.bool_]:
-        """Which of the object's views stay enrolled after these queries."""
+        """Return which of the object's views stay enrolled after these queries, bool (n,)."""
         keep = self._enrolled[self._rows].copy()
         keep[seen] = False
         match self._protocol.removal:
@@ -369,20 +363,21 @@ class _Trials:
         return self._views.select(mask)
 
     def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
-        """The photograph to look at next, of those not yet looked at."""
+        """Return the next query: a photograph that was not a query yet."""
         if method.active and len(seen) > 1:
             coin: Side = "left" if draws.coins[len(seen)] else "right"
-            turn_deg = next_view(ranking, side=coin if method.strategy == "coin" else None).rotation_deg
+            rotation_deg = next_view(ranking, side=coin if method.strategy == "coin" else None).rotation_deg
         elif method.strategy in _STEP_DEG:
-            turn_deg = _STEP_DEG[method.strategy]
+            rotation_deg = _STEP_DEG[method.strategy]
         else:
             return int(draws.order[len(seen)])
-        return self._nearest(seen, turn_deg)
+        return self._nearest(seen, rotation_deg)
 
-    def _nearest(self, seen: list[int], turn_deg: float) -> int:
-        """The photograph nearest to a turn from the last one, of those not yet looked at nor enrolled for good."""
+    def _nearest(self, seen: list[int], rotation_deg: float) -> int:
+        """Return the possible query that is nearest to a rotation from the last one."""
         away_deg = np.full(len(self._rows), np.inf)
-        away_deg[self._free] = np.abs(wrap180(self._azimuth_deg[self._free] - (self._azimuth_deg[seen[-1]] + turn_deg)))
+        wanted_deg = self._azimuth_deg[seen[-1]] + rotation_deg
+        away_deg[self._free] = np.abs(wrap180(self._azimuth_deg[self._free] - wanted_deg))
         away_deg[seen] = np.inf
         return int(away_deg.argmin())
 
@@ -407,7 +402,7 @@ class _Trials:
         at: tuple[int, int, int, int],
     ) -> None:
         runs.score[at] = ranking.scores[0] / len(seen)
-        # hbr.score_margin, of similarities computed once for all trials
+        # hbr.score_margin, from similarities that are computed once for all trials
         reach = self._reach[:, seen].sum(axis=1)
         reach[self._object] = self._own_similar[seen][:, keep].max(axis=1).sum()
         reach[ranking.object_index[0]] = -np.inf
@@ -415,12 +410,12 @@ class _Trials:
 
 
 def rule_of_trial(views: Views, protocol: Protocol) -> StoppingRule:
-    """Return the stopping rule that a bench would calibrate on the views that are enrolled in all trials."""
+    """Return the stopping rule, calibrated on the views that are enrolled in all trials, as on a bench."""
     return calibrate_stopping_rule(DenseIndex(views.select(views_of_trial(views, protocol)))).rule
 
 
 def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:
-    """Which views are the nearest to `count` equally spaced azimuths."""
+    """Return which views are the nearest to `count` equally spaced azimuths, bool (n,)."""
     mask = np.zeros(len(azimuth_deg), np.bool_)
     if len(azimuth_deg):
         away_deg = np.abs(wrap180(azimuth_deg[:, None] - np.arange(count) * 360 / count))
@@ -429,7 +424,7 @@ def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:
 
 
 def views_of_trial(views: Views, protocol: Protocol) -> NDArray[np.bool_]:
-    """Which views are enrolled at all: of every object that is not absent, all or so many as the protocol says."""
+    """Return which views are enrolled in all trials, bool (n,): those of absent objects are not."""
     mask = ~np.isin(views.object_index, [j for j, name in enumerate(views.object_names) if name in protocol.absent])
     if protocol.enrolled is not None:
         for j in range(len(views.object_names)):
@@ -438,11 +433,11 @@ def views_of_trial(views: Views, protocol: Protocol) -> NDArray[np.bool_]:
     return mask
 
 
-def _looks_alike(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
-    """Of each view, the views that are as similar to it as the less similar of its neighbours on the ring, (n, n)."""
+def _same_looking(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
+    """Return for each view which views are at least as similar to it as one of its two neighbours, bool (n, n)."""
     before, after = np.empty_like(ring), np.empty_like(ring)
     before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)
     rows = np.arange(len(ring))
     alike: NDArray[np.bool_] = similar >= np.minimum(similar[rows, before], similar[rows, after])[:, None]
-    alike[rows, rows] = True  # also of a view without any texture or colour
+    alike[rows, rows] = True  # also for a view without texture and colour
     return alike

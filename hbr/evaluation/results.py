@@ -1,4 +1,4 @@
-"""From runs to rates: hit-rate against the number of views, decisions, pose errors, and methods compared."""
+"""Results of runs: hit-rates by the number of views, decisions, pose errors, and comparisons of methods."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ _BEST: int = 10
 
 @dataclass(frozen=True)
 class Point:
-    """A method after `views` queries; pose errors are of the trials in which the object was found, None if in none.
+    """Results of a method after `views` queries.
 
-    The asymmetric ones are of objects that look the same after no turn. Intervals are Wilson's at 95 % and take trials
-    for independent.
+    Pose errors are those of the trials that found the object, None if there are none; the asymmetric ones are of
+    objects without a symmetry. Intervals are Wilson's at 95 %, for independent trials.
     """
 
     views: int
@@ -43,11 +43,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Stopping:
-    """Searches that end by themselves, or when all views are taken.
+    """Results of searches with an end: by a decision, or after all views.
 
     The paper's methods end when the margin per view reaches ``margin``; the dense filter ends by the stopping rule that
-    was calibrated on the enrolled views. A hit is a search that named the right object. ``unknown_rate`` is the share
-    of searches that called it unknown, ``ended_early`` of those that did not need all views.
+    was calibrated on the enrolled views. A hit is a search that identified the right object. ``unknown_rate`` is the
+    share of searches that called it unknown, ``ended_early`` the share that ended before the last view.
     """
 
     margin: float
@@ -63,7 +63,7 @@ class Stopping:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """All about one method."""
+    """The results of one method."""
 
     method: Method
     curve: tuple[Point, ...]
@@ -72,9 +72,9 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Contest:
-    """Two methods after some views each, on the same trials; the difference is the first's less the second's.
+    """A comparison of two methods on the same trials; the difference is the first hit-rate minus the second.
 
-    The interval resamples objects; McNemar's exact test takes trials for independent.
+    The interval comes from resampled objects; McNemar's exact test is for independent trials.
     """
 
     first: str
@@ -92,7 +92,7 @@ class Contest:
     p_value: float
 
 
-#: What is asked of the methods: first, its views, second, its views; None stands for all views.
+#: Comparisons: first method, its views, second method, its views; None: all views.
 QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
     ("ahbr", 4, "hbr", None),
     ("hbr", 4, "hbr", None),
@@ -118,31 +118,29 @@ QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
 def method_results(
     runs: Runs, methods: Sequence[Method], margin: float, min_views: int = 2
 ) -> tuple[MethodResult, ...]:
-    """Curve and stopping rule of every method.
+    """Return the results of every method.
 
     Parameters
     ----------
     runs : Runs
-        Of these methods, in their order.
-    methods : sequence of Method
-        As they were run.
+        The runs of `methods`, in their order.
     margin : float
-        Lead a view that ends a search.
+        Margin per view that ends a search of the paper.
     min_views : int
-        Views before which no search ends.
+        Smallest number of views of a search.
     """
     return tuple(
-        MethodResult(method, tuple(_point(runs, m, n) for n in _looked(runs, m)), _stopping(runs, m, margin, min_views))
+        MethodResult(method, tuple(_point(runs, m, n) for n in _steps(runs, m)), _stopping(runs, m, margin, min_views))
         for m, method in enumerate(methods)
     )
 
 
 def contests(runs: Runs, methods: Sequence[Method], rng: np.random.Generator) -> tuple[Contest, ...]:
-    """Answer those of `QUESTIONS` that the methods and views allow; `rng` resamples objects."""
+    """Return the comparisons of `QUESTIONS` for which there are methods and views; `rng` resamples objects."""
     place = {method.name: m for m, method in enumerate(methods)}
     all_views = runs.rank.shape[-1]
     answers = []
-    # a stream for each question: its interval does not depend on the others
+    # a stream for each question: its interval does not depend on the other questions
     for (first, first_views, second, second_views), own in zip(QUESTIONS, rng.spawn(len(QUESTIONS)), strict=True):
         a, b = first_views or all_views, second_views or all_views
         if first not in place or second not in place or max(a, b) > all_views:
@@ -172,8 +170,8 @@ def contests(runs: Runs, methods: Sequence[Method], rng: np.random.Generator) ->
 
 
 def pose_rmse_by_object(runs: Runs, method: int, *, alike: bool) -> FloatArray:
-    """Root mean square pose error of each object after all views, over the trials that found it; nan if none did."""
-    last = _looked(runs, method)[-1]
+    """Return each object's RMS pose error after all views, from the trials that found it; nan if there are none."""
+    last = _steps(runs, method)[-1]
     errors = (runs.alike_error_deg if alike else runs.pose_error_deg)[method, ..., last]
     hits = runs.rank[method, ..., last] == 1
     total = np.where(hits, errors, 0.0) ** 2
@@ -183,11 +181,12 @@ def pose_rmse_by_object(runs: Runs, method: int, *, alike: bool) -> FloatArray:
 
 
 def step_median_ms(runs: Runs, method: int) -> list[float]:
-    """Median time of a step after 1, 2, ... queries, in milliseconds."""
-    return [float(np.median(runs.step_ns[method, ..., n])) * 1e-6 for n in _looked(runs, method)]
+    """Return the median time of a step after 1, 2, ... queries, in milliseconds."""
+    return [float(np.median(runs.step_ns[method, ..., n])) * 1e-6 for n in _steps(runs, method)]
 
 
-def _looked(runs: Runs, method: int) -> NDArray[np.intp]:
+def _steps(runs: Runs, method: int) -> NDArray[np.intp]:
+    """Return the indices of the queries that a method takes."""
     return np.flatnonzero((runs.rank[method] >= 0).all(axis=(0, 1)))
 
 
@@ -216,7 +215,7 @@ def _point(runs: Runs, method: int, n: int) -> Point:
 
 
 def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> Stopping:
-    seen = _looked(runs, method)
+    seen = _steps(runs, method)
     margin, outcome, rank, travelled_deg = (
         part[method][..., seen].reshape(-1, len(seen))
         for part in (runs.margin, runs.outcome, runs.rank, runs.travelled_deg)

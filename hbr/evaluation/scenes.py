@@ -1,6 +1,6 @@
-"""Benches to put photographed objects on: a plain one, and others where everything is different.
+"""Drawn benches for photographed objects: a plain one, and others with patterns and clutter.
 
-Pictures are 320 x 240, BGR, float32 and not clipped, so that light can still be changed.
+Pictures are 320 x 240, BGR, float32 and not clipped, so that the illumination can be changed later.
 """
 
 from typing import Final
@@ -13,7 +13,7 @@ Picture = NDArray[np.float32]
 
 WIDTH: Final = 320
 HEIGHT: Final = 240
-#: Where the middle of an object's foot stands, and the side of an object's photograph, in pixels.
+#: Position of the middle of an object's foot, and side of an object's photograph, in pixels.
 FOOT_PX: Final = (160, 196)
 SIDE_PX: Final = 150
 _PLATTER_PX: Final = (105, 27)
@@ -21,7 +21,7 @@ _GRAINS: Final = (3, 6, 12, 24, 48)
 
 
 def plain_bench(rng: np.random.Generator) -> Picture:
-    """A wall and a table of nearly one grey, and a dark platter."""
+    """Return a wall and a table of similar greys, and a dark platter."""
     wall = rng.uniform(90, 170)
     picture = np.full((HEIGHT, WIDTH, 3), wall, np.float32) + rng.normal(0, 6, 3).astype(np.float32)
     picture *= np.linspace(1.04, 0.94, HEIGHT, dtype=np.float32)[:, None, None]
@@ -33,7 +33,7 @@ def plain_bench(rng: np.random.Generator) -> Picture:
 
 
 def other_bench(rng: np.random.Generator) -> Picture:
-    """Another wall and table, with a pattern, clutter around, and a platter of any brightness."""
+    """Return another wall and table, with a pattern and clutter, and a platter of any brightness."""
     horizon = int(rng.integers(120, 170))
     picture = _pattern(rng, rng.uniform(50, 200) + rng.normal(0, 25, 3))
     if rng.random() < 0.5:  # tiles
@@ -54,7 +54,7 @@ def other_bench(rng: np.random.Generator) -> Picture:
 
 
 def _pattern(rng: np.random.Generator, colour: NDArray[np.float64]) -> Picture:
-    """Noise of several grain sizes, the coarse ones strongest, mostly grey, around a colour."""
+    """Return mostly grey noise around a colour, with several grain sizes; the coarse ones are the strongest."""
     picture = np.broadcast_to(colour, (HEIGHT, WIDTH, 3)).astype(np.float32)
     for cells in _GRAINS:
         strength = 26 / np.sqrt(cells / _GRAINS[0])
@@ -65,7 +65,7 @@ def _pattern(rng: np.random.Generator, colour: NDArray[np.float64]) -> Picture:
 
 
 def _clutter(picture: Picture, rng: np.random.Generator) -> None:
-    """A thing beside or behind the platter."""
+    """Draw a thing next to or behind the platter."""
     colour = rng.uniform(20, 235, 3).tolist()
     half = int(rng.integers(10, 38)), int(rng.integers(10, 45))
     if rng.random() < 0.75:

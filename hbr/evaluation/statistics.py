@@ -1,4 +1,4 @@
-"""How sure a hit-rate is, and whether one method is better than another on the same trials."""
+"""Confidence intervals of hit-rates, and tests of two methods on the same trials."""
 
 from math import comb, isfinite, sqrt
 from statistics import NormalDist
@@ -12,7 +12,7 @@ Hits = NDArray[np.bool_]
 
 
 def wilson(hits: int, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a proportion.
+    """Return Wilson's score interval of a proportion.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def wilson(hits: int, trials: int, *, confidence: float = 0.95) -> tuple[float, 
     Returns
     -------
     low, high : float
-        Within 0..1, around ``hits / trials``.
+        The interval around ``hits / trials``, within 0..1.
 
     Source: E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22 (1927) 209.
     """
@@ -37,22 +37,17 @@ def wilson(hits: int, trials: int, *, confidence: float = 0.95) -> tuple[float, 
     shrink = 1 + z * z / trials
     centre = (rate + z * z / (2 * trials)) / shrink
     half = z / shrink * sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    # the limits at no hit and at all hits are exact; rounding must not leave them inside
+    # the limits 0 and 1 are exact if there is no hit or no miss; rounding must not change them
     return (0.0 if hits == 0 else centre - half), (1.0 if hits == trials else centre + half)
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
-    """Two-sided exact p-value of McNemar's test: hits of one method alone are as often the first's as the second's.
+    """Return the two-sided exact p-value of McNemar's test; 1 if the methods differ in no trial.
 
     Parameters
     ----------
     only_first, only_second : int
-        Trials that the one method hit and the other missed.
-
-    Returns
-    -------
-    float
-        1 where no trial tells the methods apart.
+        Trials that only the first or only the second method hit.
     """
     if only_first < 0 or only_second < 0:
         raise ValueError(f"{only_first} and {only_second} discordant trials; counts cannot be negative")
@@ -65,9 +60,9 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
 def bootstrap_difference(
     first: Hits, second: Hits, rng: np.random.Generator, *, confidence: float = 0.95, resamples: int = 2000
 ) -> tuple[float, float]:
-    """Percentile interval of the difference of two hit-rates, resampling whole objects.
+    """Return the percentile interval of the difference of two hit-rates, by resampling complete objects.
 
-    The trials of one object are alike: an interval that takes them for independent is too narrow.
+    The trials of one object are similar: an interval for independent trials would be too narrow.
 
     Parameters
     ----------
@@ -83,7 +78,7 @@ def bootstrap_difference(
     Returns
     -------
     low, high : float
-        Of ``first.mean() - second.mean()``.
+        The interval of ``first.mean() - second.mean()``.
     """
     if first.shape != second.shape or first.ndim != 2 or not first.size:
         raise ValueError(f"hits of shapes {first.shape} and {second.shape}; one (objects, trials) for both is needed")

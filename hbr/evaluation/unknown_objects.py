@@ -1,4 +1,4 @@
-"""Objects that were never enrolled: how often they are accepted, and how many enrolled objects are rejected."""
+"""Error rates for unknown objects: how many are accepted, and how many enrolled objects are rejected."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,11 +14,11 @@ from hbr.evaluation.protocol import Protocol, Runs
 
 @dataclass(frozen=True)
 class UnknownObjects:
-    """Results after so many views, over all draws of objects that were left out.
+    """Results after ``views`` views, over all draws of objects that were left out.
 
-    If ``calibrated``, all trials are compared with the thresholds of the stopping rule that a bench calibrates on the
-    enrolled views. Otherwise thresholds come from trials: the usual scores from the first third of the enrolled
-    objects' trials, thresholds from the second, false rejects from the last.
+    If ``calibrated``, the thresholds are those of the stopping rule that a bench calibrates on the enrolled views.
+    Otherwise the first third of the enrolled objects' trials gives the usual scores, the second third the thresholds,
+    and the last third the false rejects.
     """
 
     calibrated: bool
@@ -31,7 +31,7 @@ class UnknownObjects:
 
 
 def left_out(protocol: Protocol, names: tuple[str, ...], count: int, draws: int) -> tuple[Protocol, ...]:
-    """Return the protocol with so many objects absent, drawn at random, a few times; each draw has trials of its own.
+    """Return `draws` protocols with `count` absent objects, drawn at random; each draw has its own trials.
 
     Raises
     ------
@@ -57,11 +57,11 @@ def unknown_objects(
     Parameters
     ----------
     parts : sequence of (Runs, bool array (objects,))
-        For each draw, the runs of all objects by one method of the dense filter, and which objects were absent.
+        For each draw, the runs of all objects with one method of the dense filter, and which objects were absent.
     false_reject : float
         Share of enrolled objects that may be called unknown.
     rules : sequence of StoppingRule, optional
-        For each draw, the rule that was fitted for this rate; without rules, thresholds come from trials.
+        For each draw, the rule that was fitted for this rate; default: thresholds come from trials.
     """
     views = parts[0][0].score.shape[-1]
     counts = np.zeros((views, 4), int)

@@ -1,1 +1,1 @@
-"""Evaluations as people run them: over processes, resumable, with results to read, plot and process further."""
+"""The evaluations of `rig eval`: in several processes, resumable, with results as page, table, figures and JSON."""

@@ -1,4 +1,4 @@
-"""The matrix of perturbations: run over processes, and written for people and programs."""
+"""The matrix of perturbations: run in several processes; results as JSON and as a table."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,12 +22,12 @@ _Enrolled = dict[bool, Views]
 def run_matrix(plan: Plan, jobs: int, advance: Callable[[str], None]) -> dict[str, Any]:
     """Return the hit-rate of every cell after each number of views, as JSON values; equal plans give equal values.
 
-    `advance` is called with the name of each object, once when it is enrolled and once when it was searched for.
+    `advance` is called with the name of each object after its enrollment and after its searches.
 
     Raises
     ------
     DatasetError, ValueError
-        A photograph cannot be used, or there are too few.
+        A photograph cannot be used, or there are too few photographs.
     """
     matrix = cells(plan.condition)
     names = [item.name for item in plan.dataset.objects]
@@ -62,7 +62,7 @@ def run_matrix(plan: Plan, jobs: int, advance: Callable[[str], None]) -> dict[st
 
 
 def matrix_rows(results: dict[str, Any]) -> Rows:
-    """Return the table: a row a perturbation, a column a strength, hit-rates in percent with one view and with all."""
+    """Return a table: perturbations by strengths, with the hit-rates in percent after one view and after all."""
     by_kind: dict[str, dict[int, str]] = {}
     for row in results["matrix"]:
         one, last = (f"{100 * row['hit_rate'][n]:.1f}" for n in (0, -1))

@@ -1,4 +1,4 @@
-"""What is to be evaluated, in full: equal plans give equal results."""
+"""The complete plan of an evaluation: equal plans give equal results."""
 
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -11,13 +11,13 @@ from hbr.evaluation.methods import Method
 from hbr.evaluation.protocol import Protocol
 from rig.catalog import Catalog
 
-#: Changes when the same settings would give other numbers.
+#: Increased if the same settings give other numbers.
 FORMAT: Final = 4
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A data set, how it is photographed, the methods and the trials; `size` is that of the first photograph."""
+    """A data set, its condition, the methods and the trials; `size` is that of the first photograph."""
 
     dataset: Dataset
     size: tuple[int, int]
@@ -27,12 +27,12 @@ class Plan:
 
     @classmethod
     def of(cls, dataset: Dataset, condition: Condition, methods: tuple[Method, ...], protocol: Protocol) -> "Plan":
-        """Look at the first photograph for the size of all.
+        """Return the plan, with the size of the first photograph.
 
         Raises
         ------
         DatasetError
-            It cannot be read.
+            The photograph cannot be read.
         """
         height, width = read_photograph(dataset.objects[0].photographs[0].path).shape[:2]
         return cls(dataset, (width, height), condition, methods, protocol)
@@ -70,19 +70,17 @@ class Plan:
 
 
 def load_catalog(catalog: Catalog, region: tuple[int, int, int, int] | None) -> Dataset:
-    """The stored images of a catalog's objects.
+    """Return the stored images of a catalog as a data set.
 
     Parameters
     ----------
-    catalog
-        Open for reading.
     region
-        The part that is described: x, y, width, height in pixels; None for all.
+        The part that is described: x, y, width, height in pixels; None: the whole image.
 
     Raises
     ------
     DatasetError
-        Fewer than two objects, or two views of an object from the same angle.
+        There are fewer than two objects, or two views of an object from the same angle.
     """
     objects = []
     for summary in catalog.objects():

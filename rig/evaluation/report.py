@@ -1,4 +1,4 @@
-"""Results of an evaluation as JSON values, as CSV and as a table."""
+"""Results of an evaluation as JSON values, CSV and tables."""
 
 import csv
 import io
@@ -18,18 +18,16 @@ from rig.evaluation.plan import Plan
 def evaluate(
     plan: Plan, runs: Runs, margin: float, min_views: int, reported: tuple[int, int] | None = None
 ) -> dict[str, Any]:
-    """Return all results as JSON values, units in the keys; equal runs give equal values outside of ``wall_clock``.
+    """Return all results as JSON values, units in the keys; equal runs give equal values except ``wall_clock``.
 
     Parameters
     ----------
-    plan, runs
-        What was run, and what came of it.
     margin
-        Lead a view that ends a search.
+        Margin per view that ends a search of the paper.
     min_views
-        Views before which no search ends.
+        Smallest number of views of a search.
     reported
-        The first and the last object that count, from 1; all otherwise.
+        The first and the last reported object, counted from 1; None: all.
     """
     if reported is not None:
         runs = runs.of(slice(reported[0] - 1, reported[1]))
@@ -72,7 +70,7 @@ def csv_text(results: dict[str, Any]) -> str:
 
 
 class Rows(NamedTuple):
-    """A table as text: its headings and its rows, the first column being names."""
+    """A table of texts: headings and rows; the first column contains names."""
 
     columns: list[str]
     rows: list[list[str]]
@@ -87,7 +85,7 @@ class Rows(NamedTuple):
 
 
 def curve_rows(results: dict[str, Any], *, interval: bool = False) -> Rows:
-    """Return hit-rates in percent by method and number of views, with or without their intervals, and Best 10."""
+    """Return hit-rates in percent by method and number of views, optionally with intervals, and Best 10."""
     count = max(len(method["curve"]) for method in results["methods"])
     rows = []
     for method in results["methods"]:
@@ -103,7 +101,7 @@ def curve_rows(results: dict[str, Any], *, interval: bool = False) -> Rows:
 
 
 def decision_rows(results: dict[str, Any]) -> Rows:
-    """Return what a decision costs, and how well the pose is known after all views."""
+    """Return the cost of a decision, and the error of the pose after all views, by method."""
     rows = []
     for method in results["methods"]:
         last, stopping = method["curve"][-1], method["stopping"]
@@ -139,7 +137,7 @@ def decision_rows(results: dict[str, Any]) -> Rows:
 
 
 def contest_sentences(results: dict[str, Any]) -> list[str]:
-    """Return who is better, each with its interval and p-value, in words."""
+    """Return each comparison in words, with its interval and p-value."""
     labels = {method["name"]: method["label"] for method in results["methods"]}
     return [_sentence(Contest(**contest), labels) for contest in results["contests"]]
 

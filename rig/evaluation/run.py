@@ -1,4 +1,4 @@
-"""Carries a plan out, one object after the other or several at once in processes."""
+"""Run a plan, with several objects in parallel processes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +15,7 @@ from rig.evaluation.store import Store
 
 
 def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Views:
-    """Describe every photograph as it is enrolled; `advance` is called with the name of each object.
+    """Return the descriptors of all photographs as enrolled views; `advance` is called with each object's name.
 
     Raises
     ------
@@ -36,10 +36,10 @@ def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Vie
 
 
 def run_plan(plan: Plan, views: Views, store: Store, jobs: int, advance: Callable[[str], None]) -> Runs:
-    """Search for every object that the store has no runs of, and return the runs of all.
+    """Search for every object that has no stored runs, and return the runs of all objects.
 
-    The results do not depend on `jobs`; `advance` is called with the name of each object. Whatever ends the call, the
-    store keeps the objects that were done.
+    The results do not depend on `jobs`. `advance` is called with the name of each object. If the call is interrupted,
+    the runs of the completed objects are in the store.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Runs on disk, a file an object, so that an interrupted evaluation goes on where it was."""
+"""Runs on disk, one file for each object, so that an interrupted evaluation can continue."""
 
 import io
 import json
@@ -18,21 +18,21 @@ _MAX_SETTINGS = 10_000_000
 
 
 class Store:
-    """The folder ``runs`` of an evaluation: its settings, and the runs of each object that is done.
+    """The folder ``runs`` of an evaluation: its settings, and the runs of each completed object.
 
     Parameters
     ----------
     folder
-        Made where it is missing.
+        Created if it is missing.
     settings
-        What determines the results.
+        The values that determine the results.
     resume
-        Keep what is there; otherwise it must be empty.
+        Whether the folder may contain runs with these settings.
 
     Raises
     ------
     UsageError
-        There are runs and they were not to be resumed, or they are of other settings, or the folder cannot be written.
+        The folder contains runs with other settings, or any runs without `resume`; or it cannot be written.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
@@ -47,7 +47,7 @@ class Store:
                 files.write(recorded, json.dumps(wanted, indent=1).encode())
         except (OSError, json.JSONDecodeError) as error:
             raise UsageError(
-                f"The runs cannot be kept in {folder}.",
+                f"The runs cannot be stored in {folder}.",
                 next_step="Name another folder with --out.",
                 evidence={"reason": str(error)},
             ) from error
@@ -56,19 +56,19 @@ class Store:
         different = sorted(key for key in found.keys() | wanted.keys() if found.get(key) != wanted.get(key))
         if different:
             raise UsageError(
-                f"{self._folder} holds runs with other settings.",
+                f"{self._folder} contains runs with other settings.",
                 next_step="Name another folder with --out, or give the same options again.",
                 evidence={f"{key} there": found.get(key) for key in different if key not in ("dataset", "methods")}
                 | {"different": different},
             )
         if not resume:
             raise UsageError(
-                f"{self._folder} holds runs already.",
-                next_step="Go on with them by --resume, or name another folder with --out.",
+                f"{self._folder} already contains runs.",
+                next_step="Continue with --resume, or name another folder with --out.",
             )
 
     def load(self, name: str) -> Runs | None:
-        """Return the runs of an object; None where there are none, or the file was damaged."""
+        """Return the runs of an object; None if there are none, or if the file is damaged."""
         try:
             with self._path(name).open("rb") as file, np.load(file) as arrays:
                 return Runs(**arrays)
@@ -76,11 +76,11 @@ class Store:
             return None
 
     def save(self, name: str, runs: Runs) -> None:
-        """Keep the runs of an object, whole or not at all."""
+        """Store the runs of an object, completely or not at all."""
         content = io.BytesIO()
         np.savez_compressed(content, **asdict(runs))
         files.write(self._path(name), content.getvalue())
 
     def _path(self, name: str) -> Path:
-        # names of a catalog may hold what a file's name may not
+        # a name in a catalog may contain characters that a file name must not contain
         return self._folder / f"{name.encode().hex() if not name.isalnum() else name}.npz"

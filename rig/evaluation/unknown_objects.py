@@ -1,4 +1,4 @@
-"""Objects left out of the catalog and searched for, over processes."""
+"""Searches for objects that are not enrolled, in several processes."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -60,7 +60,7 @@ def run_unknown_objects(
 
 
 def unknown_object_rows(results: dict[str, Any]) -> Rows:
-    """Return the table: a row for each nominal rate, realized false rejects and false accepts in percent by views."""
+    """Return a table: nominal rates by views, with the measured false rejects and false accepts in percent."""
     by_nominal: dict[tuple[bool, float], list[str]] = {}
     for row in results["unknown_objects"]:
         rejected = 100 * row["false_rejects"] / row["known_trials"]

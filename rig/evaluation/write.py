@@ -1,4 +1,4 @@
-"""The files that an evaluation leaves."""
+"""The files that an evaluation writes."""
 
 import json
 from collections.abc import Mapping
@@ -19,26 +19,26 @@ from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decis
 _HEADINGS = {
     "hit-rate": (
         "Hit-rate",
-        "Shaded: Wilson's 95 % intervals of HBR, AHBR and Best 10, which take trials for independent.",
+        "Shaded: Wilson's 95 % intervals of HBR, AHBR and Best 10, for independent trials.",
     ),
-    "travel": ("Hit-rate by degrees turned", "The same points over the way to them."),
+    "travel": ("Hit-rate by degrees of rotation", "The same points by the sum of the rotations before them."),
     "pose": (
         "Pose",
-        "Of the trials that found the object. Symmetry-aware: to the nearest orientation from which the object looks "
-        "as much like the true view as the views beside it do.",
+        "Trials that found the object. Symmetry-aware: error to the nearest orientation in which the object is as "
+        "similar to the true view as its neighbouring views are.",
     ),
-    "omega-sweep": ("Weight of the orientation", "Common trials."),
-    "list-sweep": ("Length of the retrieval lists", "Common trials."),
+    "omega-sweep": ("Weight of the orientation", "The same trials for all weights."),
+    "list-sweep": ("Length of the retrieval lists", "The same trials for all lengths."),
 }
 
 
 def write_json(results: Mapping[str, Any], path: Path) -> None:
-    """Write results as a JSON file, in a folder that is made where it is missing.
+    """Write results as a JSON file; a missing folder is created.
 
     Raises
     ------
     UsageError
-        It cannot be written.
+        The file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ def write_results(
     except OSError as error:
         raise UsageError(
             f"The results cannot be written to {folder}.",
-            next_step="Free space there, then give the same command with --resume: the runs are kept.",
+            next_step="Free some disk space, then give the same command with --resume: the runs are stored.",
             evidence={"reason": error.strerror or str(error)},
         ) from error
     return results
@@ -110,11 +110,11 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Chart]) -> str:
             ("Hit-rates", "Percent, with Wilson's 95 % interval; best 10 after all views.", *curves),
             (
                 "Decisions and poses",
-                f"A search of the paper ends when the best object leads by {stopping['margin']:g} per view, one of the "
-                "dense filter by the stopping rule calibrated on the enrolled views, or after all views: views "
-                "taken (mean, 95th percentile), hit-rate and share of unknown then, mean of the degrees rotated. Pose "
-                "error after all views, of the trials that found the object: median and RMSE, plain, then "
-                "symmetry-aware, and the median of objects without symmetry. Median time of the last step.",
+                f"A search of the paper ends when the best object leads by {stopping['margin']:g} per view, one "
+                "with the dense filter by the stopping rule calibrated on the enrolled views; both end after the last view. "
+                "Columns: number of views (mean, 95th percentile), hit-rate, share of unknown, mean sum of rotations; "
+                "pose error after all views in the trials that found the object (median and RMSE, then symmetry-aware, "
+                "then the median of objects without symmetry); median time of the last step.",
                 *decisions,
             ),
         ],

@@ -39,7 +39,7 @@ def test_duplicate_view_is_named(tmp_path: Path) -> None:
 def test_missing_or_empty_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="nowhere"):
         load_coil(tmp_path / "nowhere")
-    with pytest.raises(DatasetError, match=f"{tmp_path.name} holds no view"):
+    with pytest.raises(DatasetError, match=f"{tmp_path.name} contains no view"):
         load_coil(tmp_path)
     picture(tmp_path / "obj1__0.png")
     with pytest.raises(DatasetError, match="at least two"):

@@ -110,11 +110,11 @@ def test_bench_descriptor_is_robust_to_another_bench_and_cedd_is_not() -> None:
 
 @pytest.mark.parametrize("setting", [{"rotation_deg": 10}, {"background": "uniform"}])
 def test_conflicting_conditions_are_rejected(setting: dict) -> None:
-    with pytest.raises(ValueError, match="leave one of them away"):
+    with pytest.raises(ValueError, match="leave out one of them"):
         Condition(perturbations=Perturbations.parse("gain"), **setting)
 
 
-def test_queries_on_another_bench_have_its_picture_or_the_enrollment_s_or_none() -> None:
+def test_queries_on_another_bench_have_the_requested_empty_table_image() -> None:
     shots = {}
     for reference in ("own", "enrollment", "none"):
         condition = Condition(background="other-bench", reference=reference)  # type: ignore[arg-type]

@@ -182,7 +182,7 @@ def test_impossible_runs_are_rejected() -> None:
     [{"trials": 0}, {"max_views": 0}, {"removal": "all"}, {"near_deg": 0}, {"sigma_deg": -1}, {"seed": -1}],
 )
 def test_invalid_protocol_is_rejected(setting: dict) -> None:
-    with pytest.raises(ValueError, match=r"trials|removal|seed"):
+    with pytest.raises(ValueError, match=r"trials|removal|near_deg|seed"):
         Protocol(**setting)
 
 

@@ -252,9 +252,9 @@ def test_other_descriptors_are_evaluated_with_the_dense_filter(photographs: Path
         (("--descriptor", "sift"), "'sift' is unknown"),
         (("--perturb", "fog"), "'fog' is unknown"),
         (("--report", "3"), "'3' is not a range"),
-        (("--report", "3-5"), "has 4; count from 1"),
+        (("--report", "3-5"), "has 4; the first is 1"),
         (("--descriptor", "edges", "--methods", "hbr"), "compares CEDD alone"),
-        (("--background", "bench", "--rotate", "10"), "leave one of them"),
+        (("--background", "bench", "--rotate", "10"), "leave out one of them"),
         (("--enrolled", "12", "--methods", "dense"), "queries it needs more"),
     ],
 )
