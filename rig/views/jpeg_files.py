@@ -81,8 +81,9 @@ def _has_all_scans(segments: list[_Segment]) -> bool:
                 begin, end, precision = 0, 63, 0
             if precision & 0x0F == 0:  # the last bit of these coefficients
                 done |= {(one, k) for one in data[1 : 1 + 2 * data[0] : 2] for k in range(begin, min(end, 63) + 1)}
-    # An encoder may leave out coefficients that are all zero, but not the first one.
-    return bool(components) and all((one, 0) in done for one in components)
+    # The standard lets an encoder leave out coefficients that are all zero. No common one does, and a file that was cut
+    # between two scans looks the same.
+    return bool(components) and all((one, k) in done for one in components for k in range(64))
 
 
 @contextmanager

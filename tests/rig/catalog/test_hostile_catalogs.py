@@ -357,6 +357,13 @@ def test_half_a_jpeg_is_rejected() -> None:
         for share in (0.5, 0.7, 0.9, 0.99):
             with pytest.raises(images.BadImage, match="truncated"):
                 images.decode(whole[: int(share * len(whole))] + b"\xff\xd9")
+    for image in (pixels, pixels[..., 0]):
+        whole = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+        scans = whole.split(b"\xff\xda")  # tables for the next scan may follow the data of one
+        assert len(scans) > 6
+        for count in range(2, len(scans)):
+            with pytest.raises(images.BadImage, match="truncated"):
+                images.decode(b"\xff\xda".join(scans[:count]) + b"\xff\xd9")
 
 
 def test_wrong_descriptors_of_another_catalog_are_rejected(root: Path, tmp_path: Path) -> None:
