@@ -20,6 +20,12 @@ from rig.devices.dynamixel.registers import Register
 OWED_S = 2.0
 """How long a missing reply may still arrive: longer than any buffer can delay it."""
 
+DOUBT_S = 60.0
+"""How long a bus counts as one that repeats replies, after one arrived that belongs to no request."""
+
+CONFIRM_ATTEMPTS = 16
+"""How often a reading is repeated until nothing else arrives beside its reply."""
+
 _ECHO_SIZE = 2  # in Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself
 
 READ_LENGTHS = {1: 16, 2: 4}
@@ -51,8 +57,9 @@ class DynamixelBus:
 
     The protocols have no sequence numbers, so a reply after its time-out would be taken for the next one. Here replies
     are distinguished by their length: reads in a row ask for different numbers of bytes (some more, below the address),
-    and while a reply is still owed, no other read asks for its number. A write is then read back, because the replies
-    to all writes are equal.
+    and while a reply is still owed, no other read asks for its number. The replies to all writes are equal. So while a
+    reply is owed, and for `DOUBT_S` after a reply that belongs to no request, each write is read back, and each reading
+    is confirmed. In Protocol 1.0, where no reading shows its age, all readings are.
 
     Parameters
     ----------
@@ -78,6 +85,7 @@ class DynamixelBus:
         self._owed: list[
             tuple[int, int]
         ] = []  # replies that may still arrive: number of parameters, time of the request
+        self._foreign_ns: int | None = None  # when the last reply arrived that belongs to no request
 
     def alert(self, device_id: int) -> int:
         """Return the alert of the device's last status packet; 0 if its hardware has no fault, see `Reply`."""
@@ -93,8 +101,39 @@ class DynamixelBus:
     def read(self, device_id: int, register: Register) -> int:
         return register.decode(self.read_block(device_id, register.address, register.size))
 
-    def read_block(self, device_id: int, address: int, size: int) -> bytes:
-        """Return ``size`` bytes from ``address``, read in one transaction."""
+    def read_block(self, device_id: int, address: int, size: int, *, dated: bool = False) -> bytes:
+        """Return ``size`` bytes from ``address``, read in one transaction; ``dated`` if they show their own age.
+
+        In doubt, a reading is confirmed by a second one. If the reply to the first was an old one, its own reply is
+        there already or arrives before that to the second; then both are discarded.
+        """
+        data = self._read_once(device_id, address, size)
+        if dated or not (self.protocol == 1 or self._repeats_replies()):
+            return data
+        counts = self.statistics
+        for _ in range(CONFIRM_ATTEMPTS):
+            alone, before = not self._drop_foreign(), (counts.late, counts.retries)
+            again = self._read_once(device_id, address, size)
+            if alone and (counts.late, counts.retries) == before:
+                return data
+            data = again
+        what = f"read of {size} bytes at {address}"
+        raise self._silent(what, (device_id,), "replies arrive twice", "Check the adapter and its driver.")
+
+    def _drop_foreign(self) -> bool:
+        """Drop what arrived after the last reply; return whether a reply or the beginning of one is among it."""
+        waiting = self.port.getBytesAvailable()
+        data, start = self.port.ser.read(waiting) if waiting else b"", self._packets.start
+        found = any(data[i:].startswith(start) or start.startswith(data[i:]) for i in range(len(data)))
+        if found:
+            self._foreign_ns = self.port.clock.now_ns()
+        return found
+
+    def _repeats_replies(self) -> bool:
+        """Return whether a reply that belongs to no request arrived recently."""
+        return self._foreign_ns is not None and seconds_between(self._foreign_ns, self.port.clock.now_ns()) <= DOUBT_S
+
+    def _read_once(self, device_id: int, address: int, size: int) -> bytes:
         skipped = 0
 
         def attempt() -> Answers:
@@ -111,7 +150,7 @@ class DynamixelBus:
         data = register.encode(value)
 
         def attempt() -> Answers:
-            doubtful = self._owes(0)  # an earlier reply may be taken for this one
+            doubtful = self._owes(0) or self._repeats_replies()  # an earlier reply may be taken for this one
             parameters = self._packets.write_parameters(register.address, data)
             answers = self._ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
             reply = answers[0].get(device_id)
@@ -194,6 +233,7 @@ class DynamixelBus:
         parameters is owed, it is accepted only if no better one arrives.
         """
         answering = (target,) if answering is None else answering
+        self._drop_foreign()
         ambiguous = size > 0 and self._owes(0)
         self._owed += [(size, self.port.clock.now_ns())] * max(len(answering), 1)
         result = self._packets.send(self.port, target, instruction, parameters)
@@ -211,8 +251,11 @@ class DynamixelBus:
                 self.statistics.foreign += 1
             elif reply.error and not reply.data and ambiguous:
                 doubtful[reply.bus_id] = reply
+            elif self.protocol == 1 and reply.data == parameters and len(parameters) not in (0, size):
+                pass  # the adapter's echo of the instruction
             elif len(reply.data) != size and not (reply.error and not reply.data):
                 self.statistics.late += 1
+                self._foreign_ns = self.port.clock.now_ns()
             else:
                 replies[reply.bus_id] = reply
                 del self._owed[[owed for owed, _ in self._owed].index(size)]

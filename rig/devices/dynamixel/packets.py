@@ -41,6 +41,9 @@ class Packets(Protocol):
     corrupted: ClassVar[int]
     """The error of a `Reply` by which the device reports that the instruction arrived damaged."""
 
+    start: ClassVar[bytes]
+    """The first bytes of a packet."""
+
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
         """Drop unread bytes and send an instruction; return the SDK's result."""
 
@@ -67,6 +70,7 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
         7: "access error",
     }
     corrupted: ClassVar[int] = 3
+    start: ClassVar[bytes] = _HEADER
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
         length = len(parameters) + 3
@@ -119,6 +123,7 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
         0x40: "instruction error",
     }
     corrupted: ClassVar[int] = 0x10
+    start: ClassVar[bytes] = b"\xff\xff"
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
         return int(self.txPacket(port, [0, 0, bus_id, len(parameters) + 2, instruction, *parameters, 0]))

@@ -212,13 +212,16 @@ class RegisterServo(ABC):
                 evidence={"hardware_errors": list(errors), **evidence},
             )
 
-    def _read_registers(self, first: str, last: str) -> tuple[int, dict[str, int]]:
-        """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name."""
+    def _read_registers(self, first: str, last: str, *, dated: bool = False) -> tuple[int, dict[str, int]]:
+        """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name.
+
+        ``dated`` if the registers contain the servo's clock, which the caller checks.
+        """
         block = self._blocks.get((first, last))
         if block is None:
             block = self._blocks[first, last] = Block.of(self._table, first, last)
         begun_ns = self._clock.now_ns()
-        image = self.bus.read_block(self._id, block.address, block.layout.size)
+        image = self.bus.read_block(self._id, block.address, block.layout.size, dated=dated)
         time_ns = (begun_ns + self._clock.now_ns()) // 2
         return time_ns, block.values(image)
 

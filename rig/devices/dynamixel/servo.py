@@ -142,7 +142,7 @@ class DynamixelServo(RegisterServo):
     def _read_fresh(self) -> tuple[int, dict[str, int]]:
         """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""
         for _ in range(_FRESH_ATTEMPTS):
-            time_ns, values = self._read_registers("Realtime Tick", "Present Temperature")
+            time_ns, values = self._read_registers("Realtime Tick", "Present Temperature", dated=True)
             if self._is_fresh((time_ns, values["Realtime Tick"])):
                 return time_ns, values
         raise DeviceFault(

@@ -357,8 +357,8 @@ def test_half_a_jpeg_is_rejected() -> None:
         for share in (0.5, 0.7, 0.9, 0.99):
             with pytest.raises(images.BadImage, match="truncated"):
                 images.decode(whole[: int(share * len(whole))] + b"\xff\xd9")
-    for image in (pixels, pixels[..., 0]):
-        whole = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    for picture in (pixels, pixels[..., 0]):
+        whole = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
         scans = whole.split(b"\xff\xda")  # tables for the next scan may follow the data of one
         assert len(scans) > 6
         for count in range(2, len(scans)):

@@ -4,9 +4,22 @@ import random
 
 import pytest
 
+from rig.config import load_config
 from rig.core.errors import RigError
+from rig.devices.dynamixel.opening import open_servo as open_configured
+from rig.devices.servo import MotionProfile
+from sim.devices import SimDevices
+from sim.noise import NoiseModel
+from sim.world import World
 from tests.rig.bench_parts import open_servo, servo_wires
 
+AX12 = [
+    'servo.model="ax_12a"',
+    "servo.baud=57600",
+    'table.mode="pan"',
+    "table.zero_deg=150",
+    "table.limits_deg=[-150,150]",
+]
 NIGHTLY = [0.008, 0.011, 0.015, 0.022, 0.08, 0.12, 0.16, 0.2, 0.3, 0.32, 0.64, 1.0, 2.1, 5.0]
 
 
@@ -42,6 +55,74 @@ def test_no_old_answer_is_taken_for_a_reading(delay_s, spread, poll_s):
         assert begun_deg - 0.6 <= state.position_deg - 180.0 <= wires.world.shaft()[0] + 0.6
     assert readings > 140
     assert rejected < 10
+
+
+@pytest.mark.parametrize("poll_s", [0.02, pytest.param(0.04, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_ax12_reads_no_old_answer_although_it_has_no_clock(share, poll_s):
+    config = load_config(None, AX12)
+    with SimDevices.connected(config, World(noise=NoiseModel.none())) as devices:
+        clock, world, bus, rng = devices.world.clock, devices.world, devices.servo_bus, random.Random(1)
+        servo = open_configured(devices.adapter, config.servo, clock, "pan")
+        servo.torque_on()
+        servo.set_profile(MotionProfile(20.0, 1000.0))
+        answers: dict[int, bytes] = {}
+
+        def repeat(frame):
+            """Let the last answer of the same length arrive once more, just before this one."""
+            old = answers.get(len(frame.data))
+            if old and rng.random() < share:
+                bus.disturb(old, frame.baudrate)
+            answers[len(frame.data)] = frame.data
+            return frame
+
+        bus.filters.append(repeat)
+        readings = refused = 0
+        for goal_deg in (300.0, 0.0):
+            servo.move_to(goal_deg)
+            for _ in range(150):
+                clock.sleep(poll_s)
+                begun_deg = world.shaft()[0]
+                try:
+                    position_deg = servo.read_state().position_deg - 150.0
+                except RigError:
+                    refused += 1
+                    continue
+                readings += 1
+                low_deg, high_deg = sorted((begun_deg, world.shaft()[0]))
+                assert low_deg - 0.6 <= position_deg <= high_deg + 0.6
+    assert readings > 280
+    assert refused < 20
+
+
+@pytest.mark.parametrize("model", [[], AX12], ids=["xl430", "ax12"])
+def test_repeated_answer_to_a_write_does_not_hide_that_the_next_one_was_lost(model):
+    config = load_config(None, model)
+    with SimDevices.connected(config, World(noise=NoiseModel.none())) as devices:
+        clock, bus = devices.world.clock, devices.servo_bus
+        servo = open_configured(devices.adapter, config.servo, clock, config.table.mode)
+        hear = bus.send
+
+        def repeat(frame):
+            if len(frame.data) <= 11:  # the answer to a write
+                clock.call_at(frame.start_ns + 4_500_000, lambda: bus.disturb(frame.data, frame.baudrate))
+            return frame
+
+        bus.filters.append(repeat)
+        servo.move_to(10.0)
+        clock.sleep(0.1)
+        servo.read_state()  # the repeated answer is found: from now on the bus is in doubt
+        for goal in range(300, 360, 2):
+            clock.sleep(3.0)  # no answer is owed any more
+            servo.move_to(goal * servo.resolution_deg)
+
+            def lose_first(data, baudrate):
+                bus.send = hear
+                return hear(b"", baudrate)
+
+            bus.send = lose_first
+            servo.move_to((goal + 1) * servo.resolution_deg)
+            assert devices.servo.memory["Goal Position"] == goal + 1
 
 
 def test_restarted_servo_is_read_again_although_its_clock_starts_at_zero():
