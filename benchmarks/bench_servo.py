@@ -12,7 +12,7 @@ from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
 from rig.config import ServoConfig
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
-from rig.devices.dynamixel.register_servo import RegisterServo, prepare_servo
+from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import control_table
 from sim.noise import NoiseModel
 from sim.servo import Frame, ServoBus, SimSerial, Source, XSeriesServo
@@ -62,7 +62,7 @@ def opened() -> tuple[RegisterServo, RepeatingSerial, list[Frame]]:
     bus.attach(XSeriesServo(world, baudrate=BAUD))
     wire = RepeatingSerial(bus, BAUD, READ_SLICE_S)
     servo = open_servo(wire, ServoConfig(baud=BAUD), world.clock)
-    prepare_servo(servo, write=True)
+    servo.prepare(write=True)
     frames: list[Frame] = []
     bus.taps.append(frames.append)
     servo.read_state()

@@ -18,7 +18,6 @@ from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStore
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.head.head import RigHead
 from rig.devices.head.opening import open_head, powered, switch_on
 from rig.devices.head.protocol import BAUD
@@ -129,7 +128,7 @@ def assemble(
             opened.callback(head.close)
             fault = switch_on(head, config.head, clock)  # first, because the servo's supply may go through it
         servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial, guardian)
-        findings = prepare_servo(servo, write=config.servo.write_settings)
+        findings = servo.prepare(write=config.servo.write_settings)
         findings += tuple(f"servo: {one}" for one in servo.remarks)
         _check_reach(config, servo)
         imu: Imu = head or open_imu(config.imu, i2c_bus, clock)

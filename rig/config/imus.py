@@ -5,10 +5,9 @@ identities, and the simulator the simulated sensor. A package adds rows by entry
 """
 
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Final
 
-from rig.core.errors import ConfigError
+from rig.core.plugins import plugins
 
 GROUP = "rig.imus"
 
@@ -107,18 +106,7 @@ def imu_kinds() -> dict[str, ImuKind]:
     ConfigError
         A package's row cannot be loaded.
     """
-    rows = dict(_BUILT_IN)
-    for point in entry_points(group=GROUP):
-        try:
-            row: ImuKind = point.load()
-        except (ImportError, AttributeError) as error:
-            raise ConfigError(
-                f"The IMU {point.name!r} of {point.value} cannot be loaded.",
-                next_step="Fix or uninstall the package that provides it.",
-                evidence={"reason": str(error)},
-            ) from error
-        rows[row.key] = row
-    return rows
+    return _BUILT_IN | {row.key: row for _, row in plugins(GROUP)}
 
 
 def imu_kind(key: str) -> ImuKind:

@@ -44,7 +44,7 @@ class ServoConfig(Section):
     port: str = Field("/dev/ttyUSB0", description="serial port of the U2D2 or another adapter")
     baud: int = Field(57600, ge=9600, le=4_500_000, description="baud rate; the servo's factory setting is 57600")
     id: int = Field(1, ge=0, le=252, description="id on the bus")
-    model: str = Field("xl430_w250", description="model as in the SDK's control tables, or ax_12a")
+    model: str = Field("xl430_w250", description="model as in the SDK's control tables, ax_12a, or one of a plug-in")
     gear_ratio: float = Field(
         1.0,
         ge=0.001,

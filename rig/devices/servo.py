@@ -3,9 +3,12 @@
 Angles are the encoder's, unwrapped, on the table's side of a gear, without the table's zero and direction.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
+
+from rig.config import ServoConfig
+from rig.core.clock import Clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,19 @@ class Servo(Protocol):
     """A position servo that rotates the table."""
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """Notes for the operator about this model."""
+
+    def prepare(self, *, write: bool) -> tuple[str, ...]:
+        """Compare the servo's permanent settings with what the rig needs; return what was changed.
+
+        Raises
+        ------
+        DeviceMismatch
+            Settings differ, and ``write`` is False.
+        """
+
+    @property
     def identity(self) -> ServoIdentity: ...
 
     @property
@@ -125,3 +141,21 @@ class Servo(Protocol):
 
     def disarm_watchdog(self) -> None: ...
     def close(self) -> None: ...
+
+
+class ServoDriver(Protocol):
+    """Opens a servo of another make. A package names it in the entry-point group ``rig.servos``.
+
+    ``connection`` is the open port ``servo.port`` with pyserial's interface, ``mode`` is `table.mode`, and ``reopen``
+    opens the port again after its adapter was unplugged. Opening moves nothing and leaves the torque as it is.
+    """
+
+    def __call__(
+        self,
+        connection: Any,
+        config: ServoConfig,
+        clock: Clock,
+        *,
+        mode: str,
+        reopen: Callable[[], Any] | None,
+    ) -> Servo: ...

@@ -15,7 +15,7 @@ from rig.core.clock import Clock
 from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
-from rig.devices.dynamixel.registers import model_numbers
+from rig.devices.dynamixel.registers import model_of
 
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
 """Baud rates of Protocol 2.0: the factory setting first, then in order of frequency."""
@@ -202,7 +202,7 @@ class _ShortTimeout(ClockedPort):
 
 
 def _servo(bus_id: int, baud: int, protocol: int, number: int, firmware: int) -> FoundServo:
-    return FoundServo(bus_id, baud, protocol, model_numbers().get(number), number, firmware)
+    return FoundServo(bus_id, baud, protocol, model_of(number), number, firmware)
 
 
 def _answers_corrupt(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:

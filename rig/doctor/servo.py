@@ -10,7 +10,8 @@ from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.register_servo import RegisterServo
-from rig.devices.dynamixel.registers import control_table, protocol_of
+from rig.devices.dynamixel.registers import DynamixelModel, control_table, protocol_of, servo_plugin
+from rig.devices.servo import Servo
 from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
@@ -38,16 +39,18 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
             yield of_error("servo", error)
             return
         opened.callback(wire.close)
+        plugged = servo_plugin(config.model)
+        foreign = plugged is not None and not isinstance(plugged, DynamixelModel)  # it must hear no Dynamixel packets
         try:
             found = open_servo(wire, config, context.computer.clock, context.config.table.mode)
-        except DeviceNotFound:
-            yield from _scan_rates(context, wire)
+        except DeviceNotFound as error:
+            yield from [of_error("servo", error)] if foreign else _scan_rates(context, wire)
             return
         except DeviceMismatch as error:
             yield of_error("servo", error, context.set("servo.model", error.evidence["got"]))
             return
         except DeviceSilent as error:
-            yield from _others_on_bus(context, wire)
+            yield from () if foreign else _others_on_bus(context, wire)
             yield of_error("servo", error)
             return
         identity = found.identity
@@ -57,10 +60,12 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
         for remark in found.remarks:
             fix = "Stay at the bench, or use a servo of the X series"
             yield warning("servo", FindingCode.SERVO_LIMITATION, fix, remark=remark)
-        yield from _others_on_bus(context, wire)
-        yield from _settings(context, found)
+        if isinstance(found, RegisterServo):
+            yield from _others_on_bus(context, wire)
+            yield from _settings(context, found)
         yield from _condition(context, found)
-        yield from _bus_quality(context, found)
+        if isinstance(found, RegisterServo):
+            yield from _bus_quality(context, found)
 
 
 def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding | str]:
@@ -140,7 +145,7 @@ def _settings(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]
         yield bad("servo", FindingCode.SETTING_DIFFERS, fix, difference=difference, **values)
 
 
-def _condition(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
+def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
     state, limits, safety = found.read_state(), found.limits, context.config.safety
     condition = found.read_condition()
     if condition.hardware_errors:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from rig.devices.dynamixel.registers import number_of
 from sim.servo.base import SimulatedServoBase
 from sim.servo.models import ServoModel
 from sim.servo.protocol1 import Error
@@ -98,9 +99,10 @@ _LIVE = slice(36, 47)
 class Image:
     """The control table's bytes, by register name."""
 
-    def __init__(self) -> None:
+    def __init__(self, model_number: int) -> None:
         self._bytes = bytearray(SIZE)
         self.restore(0)
+        self["Model Number"] = model_number
 
     def __getitem__(self, name: str) -> int:
         entry = ENTRIES[name]
@@ -154,6 +156,8 @@ class Ax12Servo(SimulatedServoBase):
     ----------
     shaft
         What it turns.
+    model
+        Its name and its speed; the registers are those of an AX-12A.
     bus_id, baudrate
         Its settings before the test.
     center_counts
@@ -169,15 +173,21 @@ class Ax12Servo(SimulatedServoBase):
     memory: Image
 
     def __init__(
-        self, shaft: Shaft, *, bus_id: int = 1, baudrate: int = 1_000_000, center_counts: int = CENTER_COUNTS
+        self,
+        shaft: Shaft,
+        model: ServoModel = AX_12A,
+        *,
+        bus_id: int = 1,
+        baudrate: int = 1_000_000,
+        center_counts: int = CENTER_COUNTS,
     ) -> None:
         if bus_id not in range(254):
             raise ValueError(f"no servo has the id {bus_id}: choose one of 0 to 253")
         if baudrate not in BAUD_RATES.values():
             known = ", ".join(map(str, sorted(BAUD_RATES.values())))
             raise ValueError(f"no AX-12A speaks at {baudrate} baud: choose one of {known}")
-        super().__init__(shaft, AX_12A)
-        self.memory = Image()
+        super().__init__(shaft, model)
+        self.memory = Image(number_of(model.name))
         self.memory["ID"] = bus_id
         self.memory["Baud Rate"] = next(n for n, rate in BAUD_RATES.items() if rate == baudrate)
         self._shaft = shaft

@@ -3,8 +3,9 @@
 from rig.config import ServoConfig
 from rig.core.errors import ConfigError
 from rig.devices.dynamixel.registers import protocol_of
-from sim.servo.ax12 import Ax12Servo
+from sim.servo.ax12 import AX_12A, Ax12Servo
 from sim.servo.device import XSeriesServo
+from sim.servo.models import servo_model
 from sim.servo.shaft import Geared, Shaft
 from sim.world import World
 
@@ -19,7 +20,8 @@ def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
     shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
     try:
         if protocol_of(config.model) == 1:
-            return Ax12Servo(shaft, bus_id=config.id, baudrate=config.baud)
+            model = AX_12A if config.model == AX_12A.name else servo_model(config.model)
+            return Ax12Servo(shaft, model, bus_id=config.id, baudrate=config.baud)
         return XSeriesServo(shaft, config.model, bus_id=config.id, baudrate=config.baud)
     except ValueError as error:
         raise ConfigError(

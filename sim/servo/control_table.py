@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from rig.devices.dynamixel.registers import ControlTable, Register, control_table, model_numbers
+from rig.devices.dynamixel.registers import ControlTable, Register, control_table, number_of
 from sim.servo.models import ServoModel
 from sim.servo.protocol2 import StatusError
 
@@ -50,8 +50,7 @@ class Memory:
         self._image = bytearray(self._size)
         last = self._registers["Present Temperature"]
         self._live_end = last.address + last.size
-        number = next(number for number, name in model_numbers().items() if name == model.name)
-        identity = {"Firmware Version": firmware, "Model Number": number}
+        identity = {"Firmware Version": firmware, "Model Number": number_of(model.name)}
         self._defaults = {**model.initial, **identity}
         for address, pointer in self._indirect.items():
             self._defaults[pointer.name] = address

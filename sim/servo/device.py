@@ -6,7 +6,7 @@ from rig.devices.dynamixel.registers import Register
 from sim.servo.base import OVERLOAD_ERROR, SimulatedServoBase
 from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, Memory, Rejection
 from sim.servo.controller import Controller
-from sim.servo.models import BAUD_RATES, COUNTS_PER_TURN, MODELS, POSITION_MODE
+from sim.servo.models import BAUD_RATES, COUNTS_PER_TURN, POSITION_MODE, servo_model
 from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, Status, StatusError
 from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
 from sim.servo.shaft import Shaft
@@ -31,7 +31,7 @@ class XSeriesServo(SimulatedServoBase):
     world
         The world it turns, or a gear on it. A second servo on the same bus has a world of its own on the same clock.
     model
-        A name of `sim.servo.models.MODELS`.
+        A name that `sim.servo.models.servo_model` knows.
     bus_id, baudrate
         Its settings before the test; Factory Reset restores 1 and 57,600.
     firmware
@@ -58,11 +58,10 @@ class XSeriesServo(SimulatedServoBase):
         firmware: int | None = None,
         center_counts: int = COUNTS_PER_TURN // 2,
     ) -> None:
-        if model not in MODELS:
-            raise ValueError(f"no simulated servo {model!r}: choose one of {', '.join(MODELS)}")
+        row = servo_model(model)
         if baudrate not in BAUD_RATES:
             raise ValueError(f"no servo speaks at {baudrate} baud: choose one of {', '.join(map(str, BAUD_RATES))}")
-        super().__init__(world, MODELS[model])
+        super().__init__(world, row)
         if bus_id not in self.model.ranges["ID"]:
             raise ValueError(f"no servo has the id {bus_id}: choose one of 0 to 252")
         self.memory = Memory(self.model, self.model.firmware if firmware is None else firmware)

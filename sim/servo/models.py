@@ -8,6 +8,10 @@ from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+from rig.core.plugins import plugins
+
+GROUP = "rig.simulated_servos"
+
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate."""
 
@@ -194,3 +198,17 @@ _MODELS = (
     ),
 )
 MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})
+
+
+def servo_model(name: str) -> ServoModel:
+    """Return the simulated model of that name, which a package may add by an entry point of the group `GROUP`.
+
+    Raises
+    ------
+    ValueError
+        There is none.
+    """
+    model = MODELS.get(name) or dict(plugins(GROUP)).get(name)
+    if model is None:
+        raise ValueError(f"no simulated servo {name!r}: choose one of {', '.join(MODELS)}")
+    return model

@@ -1,39 +1,70 @@
-"""docs/how-to/add-a-servo.md"""
+"""docs/how-to/add-a-servo.md: packages of the page are put on the path, and the rig uses their servos."""
 
-from types import MappingProxyType
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pytest
 
 from rig import Catalog, enroll
+from rig.bench.hardware import assemble
 from rig.config import load_config
-from rig.devices.mpu6050 import Mpu6050
-from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+from rig.core.errors import ConfigError
+from rig.devices.dynamixel.opening import open_servo
 from rig.events.events import Enrolled, Moved
+from rig.safety.saved_state import MemoryStore
 from rig.safety.state_machine import TableState
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.devices import SimDevices
 from sim.motion import to_position, to_velocity
 from sim.objects.shelf import shelf
-from sim.servo import models
 from sim.world import World
-from tests.docs.pages import blocks, run
+from tests.docs.pages import blocks, install
+from tests.rig.doctor.doctor_parts import unopened
 
-MODEL, DRIVER, BENCH = blocks("add-a-servo")
+ROW, SIMULATED, DRIVER, OPEN = blocks("add-a-servo")
+ROWS_TOML, DRIVER_TOML = blocks("add-a-servo", "toml")
+PAN = [
+    "servo.model=ax_18a",
+    "servo.baud=1000000",
+    "table.mode=pan",
+    "table.zero_deg=150",
+    "table.limits_deg=[-150,150]",
+]
 
 
-def test_new_dynamixel_model_moves_the_simulated_table(monkeypatch):
-    model = run(MODEL)["xm430_w210"]
-    monkeypatch.setattr(models, "MODELS", MappingProxyType({**models.MODELS, model.name: model}))
-    monkeypatch.setattr("sim.servo.configured.MODELS", models.MODELS, raising=False)
-    monkeypatch.setattr("sim.servo.device.MODELS", models.MODELS, raising=False)
+@pytest.fixture
+def rows(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(install(tmp_path / "rows", {"my_servos": ROW + SIMULATED}, ROWS_TOML))
+
+
+def test_simulated_model_of_a_package_moves_the_simulated_table(rows):
     config = load_config(None, ["servo.model=xm430_w210"])
     with open_sim_bench(config, ShelfOperator(World(seed=1), shelf())) as bench:
         assert bench.servo.identity.model == "xm430_w210"
 
 
+def test_row_of_a_package_opens_and_finds_a_dynamixel(rows):
+    config = load_config(None, PAN)
+    with SimDevices.connected(config, World(seed=1)) as devices:
+        servo = open_servo(devices.adapter, config.servo, devices.world.clock, config.table.mode)
+        assert (servo.identity.model, servo.identity.model_number) == ("ax_18a", 18)
+        assert servo.read_state().position_deg == pytest.approx(150.0, abs=2.0)
+    with unopened(*PAN) as bench:
+        bench.findings("servo")
+        assert bench.context.identities["servo"]["model"] == "ax_18a"
+
+
+def test_models_of_no_package_are_a_configuration_error():
+    config = load_config(None, ["servo.model=ax_18a"])
+    with pytest.raises(ConfigError):
+        SimDevices.connected(config, World(seed=1))
+
+
 class Controller:
     """The vendor's controller: it drives the shaft of the simulated world."""
 
-    def __init__(self, world):
-        self.world = world
+    def __init__(self, connection):
+        self.world = connection.world
         self.profile = 90.0, 240.0
         self.watchdog_s = None
 
@@ -58,23 +89,28 @@ class Controller:
         pass
 
 
-def test_new_servo_turns_the_table_for_an_enrollment(tmp_path):
+@pytest.fixture
+def stepper(monkeypatch, tmp_path):
+    vendor = ModuleType("vendor")
+    vendor.Controller = Controller
+    monkeypatch.setitem(sys.modules, "vendor", vendor)
+    monkeypatch.syspath_prepend(install(tmp_path / "stepper", {"my_stepper": DRIVER + OPEN}, DRIVER_TOML))
+    return load_config(None, ["servo.model=stepper", "table.zero_deg=0"])
+
+
+def test_servo_of_another_make_turns_the_table_for_an_enrollment(stepper, tmp_path):
     world = World(seed=1)
-    config = load_config(None, ["table.zero_deg=0"])
-    with SimDevices.connected(config, world) as devices:
-
-        def open_my_devices(config):
-            imu = Mpu6050(devices.i2c.path, clock=world.clock)
-            settings = CameraSettings(**config.camera.model_dump(exclude={"source"}))
-            camera = OpenCvCamera(devices.camera, clock=world.clock, settings=settings, name="camera")
-            return world.clock, imu, camera, Controller(world)
-
-        page = run(DRIVER + BENCH)
-        page["open_my_devices"] = open_my_devices
-        with (
-            page["STEPPER"].open(config, None, None) as bench,
-            Catalog.open(tmp_path, clock=bench.clock) as catalog,
-        ):
+    with SimDevices.connected(load_config(None, []), world) as devices:
+        bench = assemble(
+            "stepper",
+            stepper,
+            world.clock,
+            connection=SimpleNamespace(world=world),
+            i2c_bus=devices.i2c.path,
+            capture=devices.camera,
+            state=MemoryStore(),
+        )
+        with bench, Catalog.open(tmp_path / "catalog", clock=bench.clock) as catalog:
             bench.operator = ShelfOperator(world, shelf())
             assert bench.safety.state is TableState.UNREFERENCED  # as the page says
             bench.safety.set_revolutions(0)
@@ -83,3 +119,13 @@ def test_new_servo_turns_the_table_for_an_enrollment(tmp_path):
     moves = [event for event in events if isinstance(event, Moved)]
     assert len(moves) >= 8
     assert all(move.agrees for move in moves)  # the gyro on the platter confirms the new servo
+
+
+def test_doctor_sends_no_dynamixel_packets_to_a_servo_of_another_make(stepper):
+    with unopened() as bench:
+        wire = SimpleNamespace(world=bench.devices.world, close=lambda: None)
+        bench.context.computer.open_serial = lambda *_: wire
+        bench.context.config = stepper
+        assert bench.context.identities.get("servo") is None
+        bench.findings("servo")
+        assert bench.context.identities["servo"]["model"] == "stepper"

@@ -9,7 +9,6 @@ from rig.bench import Bench
 from rig.config import load_config
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
-from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
 from rig.safety.saved_state import MemoryStore, StateStore
@@ -53,7 +52,7 @@ def open_bus(wires: Wires, retries: int = 3) -> DynamixelBus:
 
 def open_servo(wires: Wires, **options: Any) -> DynamixelServo:
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock, **options)
-    prepare_servo(servo, write=True)
+    servo.prepare(write=True)
     return servo
 
 

@@ -8,10 +8,10 @@ from rig.devices.dynamixel.ax12 import Ax12Servo
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
-from rig.devices.dynamixel.register_servo import RegisterServo
-from rig.devices.dynamixel.registers import protocol_of
+from rig.devices.dynamixel.registers import DynamixelModel, protocol_of, servo_plugin
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.dynamixel.settings import ServoMode
+from rig.devices.servo import Servo
 
 
 def open_servo(
@@ -21,7 +21,7 @@ def open_servo(
     mode: str = "turntable",
     reopen: Callable[[], SerialConnection] | None = None,
     guardian: Guardian | None = None,
-) -> RegisterServo:
+) -> Servo:
     """Return the configured servo on ``connection``, for ``mode`` (`table.mode`); write nothing.
 
     ``reopen`` opens the connection again after its adapter was unplugged. ``guardian`` switches the torque off if this
@@ -34,6 +34,10 @@ def open_servo(
     DeviceNotFound, DeviceMismatch, DeviceSilent
         No servo answers, another model answers, or the servo stops answering.
     """
+    driver = servo_plugin(config.model)
+    if driver is not None and not isinstance(driver, DynamixelModel):
+        opened: Servo = driver(connection, config, clock, mode=mode, reopen=reopen)
+        return opened
     protocol = protocol_of(config.model)
     kind = Ax12Servo if protocol == 1 else DynamixelServo
     return kind(

@@ -8,7 +8,7 @@ from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceS
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.guardian import Guardian
-from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_numbers
+from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_of
 from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
 
@@ -31,7 +31,7 @@ class RegisterServo(ABC):
     bus
         The servo's bus.
     bus_id, model
-        The servo's id, and its model as in `model_numbers`.
+        The servo's id, and its model as in `model_of`.
     mode
         How the servo is used.
     gear_ratio
@@ -79,7 +79,7 @@ class RegisterServo(ABC):
                 "configuration. An AX-12A uses another protocol than the other models.",
                 evidence=silent.evidence,
             ) from silent
-        found = model_numbers().get(number, f"unknown model {number}")
+        found = model_of(number) or f"unknown model {number}"
         if found != model:
             raise DeviceMismatch(
                 f"The servo at id {bus_id} is not the configured model.",
@@ -108,8 +108,21 @@ class RegisterServo(ABC):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Notes for the operator about this model."""
         return ()
+
+    def prepare(self, *, write: bool) -> tuple[str, ...]:
+        differences = self.setting_differences()
+        if not differences:
+            return ()
+        if not write:
+            raise DeviceMismatch(
+                f"{len(differences)} EEPROM settings of the servo differ from what the rig needs.",
+                next_step="Run `rig servo settings --write` to write these values with the torque off, or open the "
+                "bench once with --set servo.write_settings=true.",
+                evidence={d.register: _found_wanted(d) for d in differences},
+            )
+        self.write_settings(differences)
+        return tuple(f"servo: {d.register} was {d.found}, is now {d.wanted}" for d in differences)
 
     def close(self) -> None:
         self.bus.close()
@@ -173,10 +186,10 @@ class RegisterServo(ABC):
                 next_step="Connect the bench's servo again, or start again with the new one.",
                 evidence={
                     "expected": f"{self.identity.model}, firmware {self.identity.firmware}",
-                    "got": f"{model_numbers().get(number, f'unknown model {number}')}, firmware {firmware}",
+                    "got": f"{model_of(number) or f'unknown model {number}'}, firmware {firmware}",
                 },
             )
-        prepare_servo(self, write=False)
+        self.prepare(write=False)
 
     def reboot(self) -> None:
         self.bus.reboot(self._id)
@@ -229,28 +242,6 @@ class RegisterServo(ABC):
 def hardware_errors(bits: int) -> tuple[str, ...]:
     """Return the names of the bits of Hardware Error Status."""
     return tuple(name for bit, name in _HARDWARE_ERRORS.items() if bits >> bit & 1)
-
-
-def prepare_servo(servo: RegisterServo, *, write: bool) -> tuple[str, ...]:
-    """Compare the servo's EEPROM with what the rig needs; write the differences if ``write``.
-
-    Raises
-    ------
-    DeviceMismatch
-        Settings differ and writing is not allowed.
-    """
-    differences = servo.setting_differences()
-    if not differences:
-        return ()
-    if not write:
-        raise DeviceMismatch(
-            f"{len(differences)} EEPROM settings of the servo differ from what the rig needs.",
-            next_step="Run `rig servo settings --write` to write these values with the torque off, or open the bench "
-            "once with --set servo.write_settings=true.",
-            evidence={d.register: _found_wanted(d) for d in differences},
-        )
-    servo.write_settings(differences)
-    return tuple(f"servo: {d.register} was {d.found}, is now {d.wanted}" for d in differences)
 
 
 def _found_wanted(difference: SettingDifference) -> str:

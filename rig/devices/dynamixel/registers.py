@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from struct import Struct
-from typing import Self
+from typing import Any, Self
 
 from rig.core.errors import ConfigError
+from rig.core.plugins import plugins
 
 _FOLDER = "control_table"
 _PACKAGE = "dynamixel_easy_sdk"
@@ -38,7 +39,33 @@ _RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdo
 _STARTUP = (60, 1, "Startup Configuration")
 _STARTUP_FIRMWARE = {"xl330": 46, "xc330": 46, "x": 45}
 
-_AX_12A_NUMBER, _AX_12A = 12, "ax_12a"
+GROUP = "rig.servos"
+"""Entry-point group in which packages name a `DynamixelModel`, or a `rig.devices.servo.ServoDriver`."""
+
+
+@dataclass(frozen=True, slots=True)
+class DynamixelModel:
+    """A model that has no `.model` file in the SDK.
+
+    Attributes
+    ----------
+    name, number : str, int
+        Value of ``servo.model``, and Model Number.
+    protocol : int
+        1 or 2.
+    registers : tuple of (int, int, str)
+        Address, size and e-manual name of each register.
+    ram_start : int
+        First address of the RAM area.
+    """
+
+    name: str
+    number: int
+    protocol: int
+    registers: tuple[tuple[int, int, str], ...]
+    ram_start: int = 64
+
+
 _AX_12A_TABLE = (
     (0, 2, "Model Number"),
     (2, 1, "Firmware Version"),
@@ -74,7 +101,7 @@ _AX_12A_TABLE = (
     (48, 2, "Punch"),
 )
 """No value is signed: speed and load have their direction in bit 10."""
-
+AX_12A = DynamixelModel("ax_12a", 12, 1, _AX_12A_TABLE, ram_start=24)
 
 _LETTERS = {1: "b", 2: "h", 4: "i"}  # formats of the module struct, signed
 
@@ -153,14 +180,47 @@ def _rows(file_name: str, section: str) -> list[list[str]]:
 
 @cache
 def model_numbers() -> Mapping[int, str]:
-    """Return the supported models by their Model Number."""
+    """Return the models of the SDK and the AX-12A by their Model Number."""
     known = {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel.model", "")}
-    return {**known, _AX_12A_NUMBER: _AX_12A}
+    return {**known, AX_12A.number: AX_12A.name}
+
+
+def servo_plugin(model: str) -> Any:
+    """Return what a package names ``model`` in the group `GROUP`; None for other models.
+
+    Raises
+    ------
+    ConfigError
+        A package cannot be loaded.
+    """
+    if model in model_numbers().values():
+        return None
+    return next((plugged for name, plugged in plugins(GROUP) if name == model), None)
+
+
+def model_of(number: int) -> str | None:
+    """Return the model with this Model Number; None if it is unknown."""
+    if (known := model_numbers().get(number)) is not None:
+        return known
+    rows = (row for _, row in plugins(GROUP) if isinstance(row, DynamixelModel))
+    return next((row.name for row in rows if row.number == number), None)
+
+
+def number_of(model: str) -> int:
+    """Return the Model Number of a model."""
+    row = _row(model)
+    return row.number if row else next(number for number, name in model_numbers().items() if name == model)
 
 
 def protocol_of(model: str) -> int:
     """Return the protocol version of ``model``: 1 or 2."""
-    return 1 if model == _AX_12A else 2
+    row = _row(model)
+    return row.protocol if row else 2
+
+
+def _row(model: str) -> DynamixelModel | None:
+    row = AX_12A if model == AX_12A.name else servo_plugin(model)
+    return row if isinstance(row, DynamixelModel) else None
 
 
 @cache
@@ -172,9 +232,10 @@ def control_table(model: str, firmware: int | None = None) -> ControlTable:
     ConfigError
         The model does not exist.
     """
-    if model == _AX_12A:
-        rows = (Register(name, address, size, signed=False) for address, size, name in _AX_12A_TABLE)
-        return ControlTable(model, {register.name: register for register in rows}, ram_start=24)
+    if (row := _row(model)) is not None:
+        signed = _SIGNED if row.protocol == 2 else frozenset()
+        listed = (Register(name, address, size, name in signed) for address, size, name in row.registers)
+        return ControlTable(model, {register.name: register for register in listed}, row.ram_start)
     known = sorted(model_numbers().values())
     if model not in known:
         raise ConfigError(

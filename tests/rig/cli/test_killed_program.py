@@ -32,7 +32,6 @@ from rig.core.clock import SystemClock
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
-from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.imu import ImuIdentity, ImuSamples
 from rig.safety.saved_state import BenchLock, FileStore
 from rig.motion.turntable import Turntable
@@ -60,7 +59,7 @@ def go(settings: Settings) -> None:
     if "GUARD" in os.environ:
         guardian = Guardian(port.port, port.baud, port.model, port.id)
     servo = open_servo(bus, port, CLOCK, guardian=guardian)
-    prepare_servo(servo, write=True)
+    servo.prepare(write=True)
     bench = Bench("hardware", config, CLOCK, servo, StillImu(), None, state=FileStore(config.state_path("hardware")))
     bench.safety.connect()
     if bench.safety.doubt:

@@ -5,7 +5,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
-from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.dynamixel.registers import control_table, model_numbers
 from rig.devices.dynamixel.servo import DEG_PER_COUNT, DynamixelServo
 from rig.devices.servo import MotionProfile
@@ -26,7 +25,7 @@ def servo(wires):
 def test_factory_settings_are_rejected_with_a_list_of_differences_and_not_changed(wires):
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
     with pytest.raises(DeviceMismatch) as caught:
-        prepare_servo(servo, write=False)
+        servo.prepare(write=False)
     assert {frame[7] for frame in wires.instructions} <= {1, 2}  # Ping and Read
     told = {register: text.partition(":")[0] for register, text in caught.value.evidence.items()}
     assert told == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
@@ -36,11 +35,11 @@ def test_factory_settings_are_rejected_with_a_list_of_differences_and_not_change
 
 def test_settings_are_written_once_and_reported(wires):
     servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
-    assert prepare_servo(servo, write=True) == (
+    assert servo.prepare(write=True) == (
         "servo: Operating Mode was 3, is now 4",
         "servo: Return Delay Time was 250, is now 0",
     )
-    assert prepare_servo(servo, write=False) == ()
+    assert servo.prepare(write=False) == ()
 
 
 def test_wrong_model_is_named():

@@ -10,7 +10,7 @@ from rig.config import load_config
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent, RequestRejected, UsageError
 from rig.devices.dynamixel import settings as permanent
 from rig.devices.dynamixel.opening import open_servo
-from rig.devices.dynamixel.register_servo import RegisterServo, prepare_servo
+from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile
@@ -31,7 +31,7 @@ def servo_of(devices: SimDevices, *overrides: str, write: bool = True) -> Regist
     config = load_config(None, overrides)
     servo = open_servo(devices.adapter, config.servo, devices.world.clock, config.table.mode)
     if write:
-        prepare_servo(servo, write=True)
+        servo.prepare(write=True)
     return servo
 
 
@@ -283,7 +283,7 @@ def test_wrong_settings_are_found_explained_written_and_verified(devices: SimDev
     assert all(d.reason and str(d).startswith(f"{d.register}: {d.found} → {d.wanted} (") for d in differences)
     before = {name: devices.servo.memory[name] for name in WRONG}
     with pytest.raises(DeviceMismatch, match="7 EEPROM settings"):
-        prepare_servo(servo, write=False)
+        servo.prepare(write=False)
     assert {name: devices.servo.memory[name] for name in WRONG} == before  # nothing without a confirmation
     servo.write_settings(differences)
     assert servo.setting_differences() == []
@@ -294,7 +294,7 @@ def test_settings_are_written_with_torque_off_and_without_write_replies(devices:
     servo = servo_of(devices, write=False)
     servo.torque_on()
     devices.servo.memory["Status Return Level"] = 1
-    prepare_servo(servo, write=True)
+    servo.prepare(write=True)
     assert (devices.servo.memory["Torque Enable"], devices.servo.memory["Status Return Level"]) == (0, 2)
     assert servo.setting_differences() == []
 

@@ -16,7 +16,6 @@ from rig.config import ServoConfig
 from rig.core.clock import SystemClock
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
-from rig.devices.dynamixel.register_servo import prepare_servo
 from rig.devices.servo import MotionProfile
 
 START = "from rig.cli.main import main; main()"
@@ -82,7 +81,7 @@ def test_sdk_and_rig_driver_find_the_servo(sim_servo: Callable[..., dict[str, An
     clock = SystemClock()
     wire = open_serial(str(tmp_path / "servo"), 57_600)
     servo = open_servo(wire, ServoConfig(), clock)
-    prepare_servo(servo, write=True)
+    servo.prepare(write=True)
     servo.set_profile(MotionProfile(180.0, 2000.0))
     servo.torque_on()
     start_deg = servo.read_state().position_deg
