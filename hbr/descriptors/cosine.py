@@ -58,10 +58,11 @@ class Cosine:
         return Cosine(self._to_unit, np.take(self._blocks, rows, axis=1))
 
     def among(self, rows: IndexArray, /) -> FloatArray:
-        total = np.zeros((*rows.shape, rows.shape[-1]), np.float32)
-        for block in self._blocks:
-            part = block[rows]
-            total += part @ part.transpose(0, 2, 1)
+        part = np.take(self._blocks, rows, axis=1)
+        products = part @ part.transpose(0, 1, 3, 2)
+        total = products[0]
+        for product in products[1:]:  # in this order: a sum over an axis may add up in another one
+            total += product
         similar: FloatArray = np.clip(total, 0, 1, dtype=np.float64)
         return similar
 
