@@ -69,6 +69,19 @@ class Segmentation:
             "issues": [issue.as_json() for issue in self.issues],
         }
 
+    def frame_mask(self, width: int, height: int) -> NDArray[np.bool_]:
+        """Return the object's pixels in its frame of this size, bool (height, width); none if no object was found."""
+        whole = np.zeros((height, width), np.bool_)
+        if self.box is None:
+            return whole
+        left, top, side = _square_around(self.box)
+        scale = CROP_PX / side
+        move = np.array([[scale, 0, scale * (0.5 - left) - 0.5], [0, scale, scale * (0.5 - top) - 0.5]])
+        share = cv2.warpAffine(self.mask, move, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        x, y, w, h = self.box
+        whole[y : y + h, x : x + w] = share[y : y + h, x : x + w] > 127
+        return whole
+
     @cached_property
     def alone(self) -> ImageArray:
         """The crop with an even grey instead of the background, half as bright as the object, uint8 (160, 160, 3)."""
@@ -192,8 +205,7 @@ def _cut_out(
         side = float(min(height, width))
         left, top = (width - side) / 2, (height - side) / 2
     else:
-        side = max(box[2], box[3]) * _MARGIN
-        left, top = box[0] + (box[2] - side) / 2, box[1] + (box[3] - side) / 2
+        left, top, side = _square_around(box)
     crop = _square(image, left, top, side)
     if correction is not None:
         crop = _corrected(crop, correction, left, top, side, width, height)
@@ -206,6 +218,12 @@ def _cut_out(
         mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
     gains = None if correction is None else correction.gains
     return Segmentation(crop, mask, box, gains, agreement, method, issues)
+
+
+def _square_around(box: Box) -> tuple[float, float, float]:
+    """Return left, top and side of the square that is cropped."""
+    side = max(box[2], box[3]) * _MARGIN
+    return box[0] + (box[2] - side) / 2, box[1] + (box[3] - side) / 2, side
 
 
 def _box_of(found: NDArray[np.bool_], width: int, height: int) -> Box:

@@ -106,7 +106,7 @@ class ViewDescriber:
             The region is too small for a segmentation.
         """
         part = within(image_bgr, self.region)
-        found = self._segment(image_bgr, part) if self._segments else None
+        found = self.segment(image_bgr) if self._segments else None
         levels = {
             one.name: one.describe(part if found is None or one.whole_image else found) for one in self._descriptors
         }
@@ -125,7 +125,9 @@ class ViewDescriber:
         parameters = {"frames": IN_A_ROW, "agreement": round(max(self._low), 3)}
         return TableProblem(TableProblemCode.SURROUNDINGS, parameters)
 
-    def _segment(self, image_bgr: NDArray[np.uint8], part: NDArray[np.uint8]) -> hbr.Segmentation:
+    def segment(self, image_bgr: NDArray[np.uint8]) -> hbr.Segmentation:
+        """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3); errors as for a call."""
+        part = within(image_bgr, self.region)
         if self._table is None:
             return hbr.segment(part)
         if self._table.shape != image_bgr.shape:

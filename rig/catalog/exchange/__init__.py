@@ -1,7 +1,7 @@
 """Export a catalog to open formats, and import objects from them."""
 
 from rig.catalog.exchange.batch import Gap, ImportBatch, RejectedFile
-from rig.catalog.exchange.bundle import read_bundle, write_bundle
+from rig.catalog.exchange.bundle import read_bundle, read_unpacked, write_bundle
 from rig.catalog.exchange.catalog_reader import read_catalog, read_objects
 from rig.catalog.exchange.folder import DEFAULT_PATTERN, read_folder, write_folder
 from rig.catalog.exchange.importing import Imported, import_objects, preview_import
@@ -24,6 +24,7 @@ __all__ = [
     "read_folder",
     "read_objects",
     "read_table",
+    "read_unpacked",
     "write_bundle",
     "write_folder",
     "write_parquet",

@@ -12,7 +12,7 @@ import hashlib
 import json
 import stat
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import IO, Final
@@ -21,8 +21,9 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 from pydantic import ValidationError
 
 from rig.catalog.exchange.batch import ExportedObject, ImageSource, ImportBatch, Object
-from rig.core.errors import ExportFailed, ImportRejected, RigError
-from rig.core.files import open_new, sync_file, sync_folder
+from rig.catalog.places import files_within
+from rig.core.errors import CatalogDamaged, ExportFailed, ImportRejected, RigError
+from rig.core.files import no_follow, open_new, sync_file, sync_folder
 from rig.views import image_files as images
 
 SUFFIX: Final = ".rigcat.zip"
@@ -48,38 +49,45 @@ def write_bundle(path: Path, objects: Iterable[ExportedObject]) -> int:
     ExportFailed
         The file exists already or cannot be written, or an image is not the stored one.
     """
-    count = views = 0
-    lines = []
+    items = []
     with new_file(path) as file, ZipFile(file, "w") as archive:
         for item, files in objects:
-            wanted = {
-                name: sha256
-                for enrollment in item.enrollments
-                for name, sha256 in (
-                    *((view.image, view.image_sha256) for view in enrollment.views),
-                    *((session.empty_table_image, session.empty_table_image_sha256) for session in enrollment.sessions),
-                )
-                if name is not None
-            }
-            for name, sha256 in wanted.items():
+            for name, sha256 in images_of(item).items():
                 archive.writestr(_member(name), read_stored(files[name], sha256), ZIP_STORED)
-            lines.append(item.model_dump_json() + "\n")
-            count += 1
-            views += sum(len(enrollment.views) for enrollment in item.enrollments)
-        text = "".join(lines).encode()
-        manifest = {
-            "format": FORMAT,
-            "version": VERSION,
-            "objects": count,
-            "views": views,
-            "objects_sha256": hashlib.sha256(text).hexdigest(),
-        }
+            items.append(item)
+        text, manifest = index_of(items)
         compressible = len(text) > MAX_RATIO // 2 * len(zlib.compress(text))  # as a reader would not believe it
         archive.writestr(_member(OBJECTS), text, ZIP_STORED if compressible else ZIP_DEFLATED)
-        archive.writestr(_member(MANIFEST), json.dumps(manifest, indent=1) + "\n", ZIP_STORED)
+        archive.writestr(_member(MANIFEST), manifest, ZIP_STORED)
         archive.close()
         _check_readable(path, Path(file.name))
-    return count
+    return len(items)
+
+
+def images_of(item: Object) -> dict[str, str | None]:
+    """Return the paths of all images of an object, with their SHA-256."""
+    return {
+        name: sha256
+        for enrollment in item.enrollments
+        for name, sha256 in (
+            *((view.image, view.image_sha256) for view in enrollment.views),
+            *((session.empty_table_image, session.empty_table_image_sha256) for session in enrollment.sessions),
+        )
+        if name is not None
+    }
+
+
+def index_of(items: Sequence[Object]) -> tuple[bytes, bytes]:
+    """Return the content of `OBJECTS` and of `MANIFEST`."""
+    text = "".join(item.model_dump_json() + "\n" for item in items).encode()
+    manifest = {
+        "format": FORMAT,
+        "version": VERSION,
+        "objects": len(items),
+        "views": sum(len(enrollment.views) for item in items for enrollment in item.enrollments),
+        "objects_sha256": hashlib.sha256(text).hexdigest(),
+    }
+    return text, (json.dumps(manifest, indent=1) + "\n").encode()
 
 
 def _check_readable(path: Path, part: Path) -> None:
@@ -144,7 +152,11 @@ def read_bundle(path: Path) -> ImportBatch:
     try:
         with ZipFile(path) as archive:
             members = _members(path, archive)
-            objects = _objects(path, archive, members)
+            with archive.open(MANIFEST) as manifest, archive.open(OBJECTS) as lines:
+                sizes = {name: info.file_size for name, info in members.items()}
+                objects, names = _objects(path, manifest, lines, sizes)
+        if unused := sorted(members.keys() - names - {MANIFEST, OBJECTS}):
+            raise rejected(path, f"its file {unused[0]!r} belongs to no view")
     except (BadZipFile, OSError, EOFError, NotImplementedError, ValueError, RuntimeError, zlib.error) as error:
         raise rejected(path, f"it cannot be read: {error}") from error
     return ImportBatch(
@@ -153,6 +165,31 @@ def read_bundle(path: Path) -> ImportBatch:
         {name: ImageSource(str(path), name) for name in members if name not in (MANIFEST, OBJECTS)},
         strict=True,
     )
+
+
+def read_unpacked(folder: Path) -> ImportBatch:
+    """Read the objects of a folder with the files of a bundle, such as an export for training; errors as `read_bundle`.
+
+    Other files in the folder are ignored. No link is followed.
+    """
+    try:
+        files = [*files_within(folder / images.IMAGE_FOLDER), folder / MANIFEST, folder / OBJECTS]
+        sizes = {
+            file.relative_to(folder).as_posix(): found.st_size
+            for file in files
+            if stat.S_ISREG((found := file.lstat()).st_mode) and found.st_size <= MAX_OBJECTS_BYTES
+        }
+        if missing := {MANIFEST, OBJECTS} - sizes.keys():
+            raise rejected(folder, f"its file {min(missing)} is missing or cannot be read")
+        with _open(folder / MANIFEST) as manifest, _open(folder / OBJECTS) as lines:
+            objects, names = _objects(folder, manifest, lines, sizes)
+    except (OSError, ValueError, RecursionError, CatalogDamaged) as error:
+        raise rejected(folder, f"it cannot be read: {error}") from error
+    return ImportBatch(str(folder), objects, {name: ImageSource(str(folder / name)) for name in names}, strict=True)
+
+
+def _open(path: Path) -> IO[bytes]:
+    return open(path, "rb", opener=no_follow)
 
 
 def rejected(path: Path, why: str) -> ImportRejected:
@@ -221,9 +258,11 @@ def _suspicious(info: ZipInfo) -> str:
     return ""
 
 
-def _objects(path: Path, archive: ZipFile, members: dict[str, ZipInfo]) -> tuple[Object, ...]:
-    with archive.open(MANIFEST) as file:
-        manifest = json.loads(file.read(100_000))
+def _objects(
+    path: Path, manifest_file: IO[bytes], lines: IO[bytes], sizes: Mapping[str, int]
+) -> tuple[tuple[Object, ...], set[str]]:
+    """Return the objects and the names of their images, which have these sizes."""
+    manifest = json.loads(manifest_file.read(100_000))
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise rejected(path, f"its {MANIFEST} is not the manifest of a bundle")
     version = manifest.get("version")
@@ -235,24 +274,21 @@ def _objects(path: Path, archive: ZipFile, members: dict[str, ZipInfo]) -> tuple
             next_step="update hbr-rig on this computer",
         )
     found: list[Object] = []
-    images_of: set[str] = set()
+    names: set[str] = set()
     digest = hashlib.sha256()
-    with archive.open(OBJECTS) as file:
-        number = 0
-        while line := file.readline(MAX_LINE_BYTES + 1):
-            number += 1
-            digest.update(line)
-            if len(line) > MAX_LINE_BYTES:
-                raise rejected(path, f"line {number} of {OBJECTS} is longer than {MAX_LINE_BYTES} bytes")
-            found.append(_object(path, number, line))
-            images_of |= _images_of(path, number, found[-1], members)
+    number = 0
+    while line := lines.readline(MAX_LINE_BYTES + 1):
+        number += 1
+        digest.update(line)
+        if len(line) > MAX_LINE_BYTES:
+            raise rejected(path, f"line {number} of {OBJECTS} is longer than {MAX_LINE_BYTES} bytes")
+        found.append(_object(path, number, line))
+        names |= _images_of(path, number, found[-1], sizes)
     if digest.hexdigest() != manifest.get("objects_sha256"):
         raise rejected(path, f"its {OBJECTS} was changed after it was written")
     if len({item.name for item in found}) < len(found):
         raise rejected(path, "two objects have the same name")
-    if unused := sorted(members.keys() - images_of - {MANIFEST, OBJECTS}):
-        raise rejected(path, f"its file {unused[0]!r} belongs to no view")
-    return tuple(found)
+    return tuple(found), names
 
 
 def _object(path: Path, number: int, line: bytes) -> Object:
@@ -266,7 +302,7 @@ def _object(path: Path, number: int, line: bytes) -> Object:
         raise rejected(path, f"line {number} of {OBJECTS}: {error.what}") from error
 
 
-def _images_of(path: Path, number: int, item: Object, members: dict[str, ZipInfo]) -> set[str]:
+def _images_of(path: Path, number: int, item: Object, sizes: Mapping[str, int]) -> set[str]:
     names: set[str] = set()
     for enrollment in item.enrollments:
         for name, size, sha256 in (
@@ -279,9 +315,9 @@ def _images_of(path: Path, number: int, item: Object, members: dict[str, ZipInfo
         ):
             if name in names:
                 raise rejected(path, f"line {number} of {OBJECTS}: {name!r} is the image of two views")
-            if name not in members or name in (MANIFEST, OBJECTS):
+            if name not in sizes or name in (MANIFEST, OBJECTS):
                 raise rejected(path, f"line {number} of {OBJECTS}: the image {name!r} is missing")
-            if sha256 is None or size != members[name].file_size:
+            if sha256 is None or size != sizes[name]:
                 raise rejected(path, f"line {number} of {OBJECTS}: {name!r} has another size than when it was stored")
             names.add(name)
     return names

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rig.catalog.exchange import ImportBatch, Imported
+    from rig.catalog.exchange.batch import ExportedObject, Session
+    from rig.catalog.exchange.training import Intrinsics
 
 SHOWN = 20
 """Number of rejected files and of gaps that are listed. With --json all of them are."""
@@ -31,6 +33,8 @@ class Format(StrEnum):
     PARQUET = "parquet"
     SHEETS = "sheets"
     HTML = "html"
+    COCO = "coco"
+    YOLO = "yolo"
 
 
 @command
@@ -38,7 +42,9 @@ def import_(
     settings: Settings,
     source: Annotated[
         Path,
-        typer.Argument(metavar="SOURCE", help="Folder of photographs, bundle (.rigcat.zip), or table (.csv)."),
+        typer.Argument(
+            metavar="SOURCE", help="Folder of photographs or of a training set, bundle (.rigcat.zip), or table (.csv)."
+        ),
     ],
     pattern: Annotated[
         str | None,
@@ -122,7 +128,8 @@ def run_import(
 
 
 def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "ImportBatch":
-    from rig.catalog.exchange import DEFAULT_PATTERN, read_bundle, read_folder, read_table
+    from rig.catalog.exchange import DEFAULT_PATTERN, read_bundle, read_folder, read_table, read_unpacked
+    from rig.catalog.exchange.bundle import MANIFEST
     from rig.core.clock import SystemClock
     from rig.core.errors import ImportRejected, UsageError
 
@@ -130,6 +137,8 @@ def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "Impor
     if source.is_dir():
         if (source / "catalog.sqlite").exists():
             raise UsageError(f"{source} is a catalog", next_step=f"import it with rig catalog merge {source}")
+        if (source / MANIFEST).exists():
+            return read_unpacked(source)
         return read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=now)
     if pattern is not None or table_angles:
         raise UsageError(f"{source} is not a folder", next_step="use --pattern and --table-angles only with a folder")
@@ -190,13 +199,26 @@ def export(
         Format | None, typer.Option("--format", help="Format. Default: by the suffix of the target, coil for a folder.")
     ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(metavar="object|view", help="Of a training set: divide the objects, or the views of each object."),
+    ] = None,
+    fractions: Annotated[
+        str, typer.Option(metavar="TRAIN,VAL,TEST", help="Of a training set: shares of its parts.")
+    ] = "0.8,0.1,0.1",
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Of a training set: number of processes. Default: one per core.")
+    ] = None,
 ) -> None:
     """Export objects in an open format.
 
     Formats: bundle (everything, for rig import), coil (folder of images), csv (table and images), parquet (table
-    without images), sheets (contact sheets), html (page with contact sheets).
+    without images), sheets (contact sheets), html (page with contact sheets), coco and yolo (training sets with boxes
+    and masks; --seed chooses the parts).
 
     Example: rig export tray.rigcat.zip --label kitchen --bench sim
+
+    Example: rig export training --format coco --split view --bench sim
     """
     from rig.catalog.exchange import read_objects, write_bundle, write_folder, write_parquet, write_table
     from rig.core.errors import ExportFailed
@@ -225,10 +247,72 @@ def export(
                 count = write_sheets(target, objects)
             case Format.HTML:
                 count = write_catalog_page(target, objects)
+            case Format.COCO | Format.YOLO:
+                _export_training(settings, target, list(objects), form, split, fractions, jobs)
+                return
     settings.say(
         f"Exported {counted(count, 'object')} to {target} ({form}).",
         {"target": str(target), "format": form, "objects": count},
     )
+
+
+def _export_training(
+    settings: Settings,
+    target: Path,
+    objects: "list[ExportedObject]",
+    form: Format,
+    split: str | None,
+    fractions: str,
+    jobs: int | None,
+) -> None:
+    from rig.catalog.exchange.training import Annotations, Split, write_training
+    from rig.core.errors import UsageError
+    from rig.events.events import plain
+    from rig.events.wording import counted
+
+    try:
+        shares = [float(part) for part in fractions.split(",")]
+        divided = None if split is None else Split(split)
+    except ValueError as error:
+        raise UsageError(
+            f"--split {split} or --fractions {fractions} is not possible",
+            next_step="give object or view, and shares such as 0.8,0.1,0.1",
+        ) from error
+    job = write_training(
+        *(target, objects, Annotations(form.value)),
+        split=divided,
+        fractions=shares,
+        seed=settings.seed or 0,
+        intrinsics=_intrinsics(settings),
+        jobs=jobs,
+    )
+    done = run_job("exporting", job, interrupted="Interrupted; nothing was exported.")
+    parts = ", ".join(f"{name} {views}" for name, views in done.views.items())
+    text = f"Exported {counted(done.objects, 'object')} to {target} ({form}). Views: {parts}."
+    if done.without_mask:
+        what = "marked as a region to ignore" if form is Format.COCO else "left out"
+        text += f" No object was found in {counted(done.without_mask, 'view')}, {what}."
+    settings.say(text, {"target": str(target), "format": form, **plain(done)})
+
+
+def _intrinsics(settings: Settings) -> "Intrinsics":
+    """Return a function that finds the calibrated camera of a session among the calibration results of its bench."""
+    from functools import cache
+
+    from rig.calibrations import CalibrationStore
+    from rig.calibrations.store import CALIBRATIONS
+
+    @cache
+    def of_bench(bench: str) -> dict[str, dict[str, float]]:
+        results = CalibrationStore(settings.load().calibration_path(bench)).history("camera.intrinsics")
+        return {one.id: {name: estimate.value for name, estimate in one.estimates.items()} for one in results}
+
+    def of_session(session: "Session") -> dict[str, float] | None:
+        known = of_bench(session.bench) if session.bench == settings.bench_name else {}
+        used = session.conditions.get(CALIBRATIONS)
+        return next((known[str(one)] for one in used if str(one) in known), None) if isinstance(used, list) else None
+
+    return of_session
 
 
 def _format(target: Path) -> Format:

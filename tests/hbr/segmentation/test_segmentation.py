@@ -268,3 +268,17 @@ def test_code_of_the_descriptors_page_runs(monkeypatch: pytest.MonkeyPatch) -> N
     assert known["best"].rotation_deg in known["rotations_deg"]
     named = set(re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE))
     assert named == {*hbr.descriptors.names(), "onnx:FILE"}
+
+
+@pytest.mark.parametrize("box", [BOX, (30, 20, 20, 30)], ids=["larger-than-the-crop", "smaller-than-the-crop"])
+def test_mask_of_the_frame_covers_the_object(box: tuple[int, int, int, int]) -> None:
+    empty = table()
+    frame = with_object(empty, box)
+    height, width = frame.shape[:2]
+    found = segment(frame, empty_table=empty)
+    mask = found.frame_mask(width, height)
+    really = np.abs(frame.astype(int) - empty).max(axis=2) > 20
+    assert cv2.boundingRect(mask.astype(np.uint8)) == pytest.approx(found.box, abs=2)
+    assert np.argwhere(mask).mean(axis=0) == pytest.approx(np.argwhere(really).mean(axis=0), abs=1)
+    assert (mask & really).sum() > 0.97 * really.sum()
+    assert not segment(np.full_like(frame, 128)).frame_mask(width, height).any()

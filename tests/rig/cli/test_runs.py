@@ -155,6 +155,24 @@ def test_answer_is_printed_even_if_it_cannot_be_recorded(rig, tmp_path, spoil, f
     assert "Recorded" not in done.output
 
 
+def test_training_set_is_exported_and_imported(rig, tmp_path):
+    target = str(tmp_path / "set")
+    words = ["export", target, "dice", "--format", "coco", "--split", "view", "--fractions", "0.5,0.5", "--json"]
+    done = rig(*words)
+    assert json.loads(done.stdout) == {
+        "target": target,
+        "format": "coco",
+        "objects": 1,
+        "views": {"train": 4, "val": 4},
+        "without_mask": 0,
+    }
+    assert rig(*words).exit_code == 7
+    imported = json.loads(rig("import", target, "--json", "--set", f"catalog.path={tmp_path / 'new'}").stdout)
+    assert (imported["objects"], imported["views"], imported["rejected"]) == (1, 8, [])
+    for wrong in (["--split", "colour"], ["--fractions", "a,b"], ["--fractions", "0.1,0.1"]):
+        assert rig("export", f"{target}-2", "--format", "yolo", *wrong).exit_code == 2
+
+
 def test_label_option_is_repeatable(rig):
     listed = json.loads(rig("catalog", "list", "--json").stdout)
     assert next(o["label"] for o in listed["objects"] if o["name"] == "lamp") == "kitchen, brass"

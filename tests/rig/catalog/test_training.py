@@ -1,0 +1,231 @@
+"""Training sets: COCO and YOLO with masks of the objects, divided into parts, and imported without loss."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from rig.catalog import Catalog
+from rig.catalog.exchange import import_objects, plan_import, read_objects, read_unpacked, write_bundle
+from rig.catalog.exchange.training import Annotations, Split, write_training
+from rig.config import ViewConfig
+from rig.core.errors import ExportFailed, ImportRejected, UsageError
+from rig.views.description import ViewDescriber
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record, without_waiting
+
+REGION = (16, 0, 160, 144)
+VIEWS = 8
+AREA = np.pi * 28 * 44
+
+
+@pytest.fixture(autouse=True)
+def _without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_waiting(monkeypatch)
+
+
+def scene(index: int | None, colour: tuple[int, int, int] = (40, 60, 200)) -> NDArray[np.uint8]:
+    """A plain frame with an ellipse; without it for None."""
+    frame = np.random.default_rng(index or 0).normal(128, 1.5, (144, 192, 3)).clip(0, 255).astype(np.uint8)
+    if index is not None:
+        cv2.ellipse(frame, (80 + 2 * index, 72), (28, 44), 0, 0, 360, colour, -1)
+    return frame
+
+
+def enroll(catalog: Catalog, name: str, frames: list[NDArray[np.uint8]], region: Any, table: Any) -> None:
+    enrollment = catalog.begin(name, planned_azimuth_deg=plan(len(frames)), provenance=PROVENANCE, label="toys")
+    if table is not None:
+        enrollment.store_empty_table(table)
+    describe = ViewDescriber(ViewConfig(roi=region), empty_table=table)
+    for index, frame in enumerate(frames):
+        found = describe(frame)
+        enrollment.add(
+            record(
+                index,
+                azimuth_deg=plan(len(frames))[index],
+                descriptors=found.levels,
+                region=region,
+                segmentation=found.segmentation,
+            ),
+            frame,
+        )
+    enrollment.finish()
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two objects with 8 views each: one with an empty-table image and a region, one with neither."""
+    path = tmp_path_factory.mktemp("training") / "catalog"
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(path, clock=VirtualClock()) as catalog:
+        without_waiting(patch)
+        enroll(catalog, "mug", [scene(i) for i in range(VIEWS)], REGION, scene(None))
+        enroll(catalog, 'tin: "7"', [*(scene(i, (200, 90, 30)) for i in range(VIEWS - 1)), scene(None)], None, None)
+    return path
+
+
+@pytest.fixture
+def catalog(sample: Path) -> Iterator[Catalog]:
+    with Catalog.open(sample, clock=VirtualClock(), read_only=True) as opened:
+        yield opened
+
+
+def export(catalog: Catalog, folder: Path, form: Annotations = Annotations.COCO, **options: Any) -> Any:
+    return finished(write_training(folder, list(read_objects(catalog)), form, jobs=1, **options))
+
+
+def parts_of(folder: Path) -> dict[str, Any]:
+    return {path.stem.partition("_")[2]: json.loads(path.read_text()) for path in (folder / "annotations").iterdir()}
+
+
+def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path) -> None:
+    done = export(catalog, tmp_path / "out", intrinsics=lambda _: {"fx": 700.0})
+    assert (done.objects, done.views, done.without_mask) == (2, {"train": 2 * VIEWS}, 1)
+    (content,) = parts_of(tmp_path / "out").values()
+    assert [(one["name"], one["supercategory"]) for one in content["categories"]] == [
+        ("mug", "toys"),
+        ('tin: "7"', "toys"),
+    ]
+    views = [view for name in ("mug", 'tin: "7"') for view in catalog.object(name).views]
+    for view, picture, annotation in zip(views, content["images"], content["annotations"], strict=True):
+        assert (tmp_path / "out" / picture["file_name"]).read_bytes() == catalog.image_path(view).read_bytes()
+        assert picture["azimuth_deg"] == annotation["azimuth_deg"] == view.record.azimuth_deg
+        assert (picture["width"], picture["height"], picture["intrinsics"]) == (192, 144, {"fx": 700.0})
+        assert view.record.segmentation is not None
+        stored = view.record.segmentation["box_px"]
+        x0, y0, *_ = view.record.region or (0, 0)
+        expected = [0, 0, 192, 144] if stored is None else [stored[0] + x0, stored[1] + y0, *stored[2:]]
+        assert annotation["bbox"] == expected
+        assert annotation["iscrowd"] == (stored is None)
+        assert annotation["area"] == sum(annotation["segmentation"]["counts"][1::2])
+        assert stored is None or annotation["area"] == pytest.approx(AREA, rel=0.15)
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
+def test_pycocotools_reads_the_masks(catalog: Catalog, tmp_path: Path) -> None:
+    coco = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
+    export(catalog, tmp_path / "out")
+    read = coco.COCO(tmp_path / "out" / "annotations" / "instances_train.json")
+    for annotation in read.loadAnns(read.getAnnIds(iscrowd=False)):
+        mask = read.annToMask(annotation)
+        (picture,) = read.loadImgs(annotation["image_id"])
+        frame = cv2.imread(str(tmp_path / "out" / picture["file_name"]))
+        really = np.abs(frame.astype(int) - 128).max(axis=2) > 30
+        assert (mask & really).sum() / (mask | really).sum() > 0.9
+        x, y, width, height = annotation["bbox"]
+        assert not mask[:y, :].any()
+        assert mask[y : y + height, x : x + width].sum() == mask.sum() == annotation["area"]
+    assert len(read.getAnnIds(iscrowd=True)) == 1
+
+
+@pytest.mark.parametrize("form", Annotations)
+def test_import_restores_everything(catalog: Catalog, tmp_path: Path, form: Annotations) -> None:
+    export(catalog, tmp_path / "out", form, split=Split.VIEW)
+    with Catalog.open(tmp_path / "new", clock=VirtualClock()) as new:
+        finished(import_objects(new, plan_import(new, read_unpacked(tmp_path / "out")), jobs=1))
+        for which, opened in (("old", catalog), ("new", new)):
+            write_bundle(tmp_path / f"{which}.zip", read_objects(opened))
+    assert (tmp_path / "old.zip").read_bytes() == (tmp_path / "new.zip").read_bytes()
+
+
+def test_split_by_view_divides_the_views_of_each_object(catalog: Catalog, tmp_path: Path) -> None:
+    def split(name: str, seed: int) -> dict[str, list[str]]:
+        export(catalog, tmp_path / name, split=Split.VIEW, fractions=(0.5, 0.25, 0.25), seed=seed)
+        return {
+            part: [one["file_name"] for one in content["images"]] for part, content in parts_of(tmp_path / name).items()
+        }
+
+    first = split("a", 1)
+    for part, count in (("train", 4), ("val", 2), ("test", 2)):
+        assert [sum(key in name for name in first[part]) for key in ("-mug", "-tin")] == [count, count]
+    assert split("b", 1) == first
+    assert split("c", 2) != first
+
+
+def test_split_by_object_keeps_the_views_of_an_object_together(catalog: Catalog, tmp_path: Path) -> None:
+    done = export(catalog, tmp_path / "out", split=Split.OBJECT, fractions=(0.5, 0.5))
+    assert done.views == {"train": VIEWS, "val": VIEWS}
+    for content in parts_of(tmp_path / "out").values():
+        assert len({one["category_id"] for one in content["annotations"]}) == 1
+        assert len(content["categories"]) == 2
+
+
+def test_yolo_has_outlines_and_leaves_out_views_without_an_object(catalog: Catalog, tmp_path: Path) -> None:
+    done = export(catalog, tmp_path / "out", Annotations.YOLO)
+    assert done.without_mask == 1
+    about = yaml.safe_load((tmp_path / "out" / "data.yaml").read_text())
+    assert about == {"train": "train.txt", "val": "train.txt", "names": {0: "mug", 1: 'tin: "7"'}}
+    names = (tmp_path / "out" / "train.txt").read_text().split()
+    assert len(names) == 2 * VIEWS - 1
+    for name in names:
+        assert (tmp_path / "out" / name).is_file()
+        label = (tmp_path / "out" / name.replace("/images/", "/labels/")).with_suffix(".txt").read_text().split()
+        corners = np.array(label[1:], float).reshape(-1, 2) * (192, 144)
+        assert label[0] == ("0" if "-mug" in name else "1")
+        assert cv2.contourArea(corners.astype(np.float32)) == pytest.approx(AREA, rel=0.15)
+
+
+@pytest.mark.parametrize("fractions", [(0.5, 0.6), (1.2, -0.2), (0.25,) * 4, (float("nan"), 1.0), ()])
+def test_impossible_fractions_are_rejected(catalog: Catalog, tmp_path: Path, fractions: tuple[float, ...]) -> None:
+    with pytest.raises(UsageError):
+        export(catalog, tmp_path / "out", split=Split.VIEW, fractions=fractions)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupted_or_failed_export_leaves_nothing(catalog: Catalog, tmp_path: Path) -> None:
+    job = write_training(tmp_path / "out", list(read_objects(catalog)), Annotations.COCO, jobs=1)
+    next(job)
+    job.close()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ExportFailed, match="no complete enrollments"):
+        finished(write_training(tmp_path / "out", [], Annotations.COCO))
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "diary.txt").touch()
+    with pytest.raises(ExportFailed, match="exists already"):
+        export(catalog, tmp_path / "full")
+    assert [path.name for path in tmp_path.rglob("*")] == ["full", "diary.txt"]
+
+
+def remove_index(folder: Path) -> None:
+    (folder / "objects.jsonl").unlink()
+
+
+def change_index(folder: Path) -> None:
+    text = (folder / "objects.jsonl").read_text()
+    (folder / "objects.jsonl").write_text(text.replace('"mug"', '"jug"'))
+
+
+def link_image(folder: Path) -> None:
+    image = next((folder / "images").rglob("*.png"))
+    image.rename(folder.parent / "elsewhere.png")
+    image.symlink_to(folder.parent / "elsewhere.png")
+
+
+def link_images(folder: Path) -> None:
+    (folder / "images").rename(folder.parent / "elsewhere")
+    (folder / "images").symlink_to(folder.parent / "elsewhere")
+
+
+@pytest.mark.parametrize("spoil", [remove_index, change_index, link_image, link_images])
+def test_spoiled_training_set_is_not_imported(catalog: Catalog, tmp_path: Path, spoil: Callable[[Path], None]) -> None:
+    export(catalog, tmp_path / "out")
+    spoil(tmp_path / "out")
+    with pytest.raises(ImportRejected):
+        read_unpacked(tmp_path / "out")
+
+
+def test_image_that_was_changed_is_not_imported(catalog: Catalog, tmp_path: Path) -> None:
+    export(catalog, tmp_path / "out")
+    one, other = sorted((tmp_path / "out" / "images").rglob("00[01].png"))[:2]
+    size = one.stat().st_size
+    shutil.copy(other, one)
+    with one.open("r+b") as file:
+        file.truncate(size)
+    with Catalog.open(tmp_path / "new", clock=VirtualClock()) as new, pytest.raises(ImportRejected):
+        finished(import_objects(new, plan_import(new, read_unpacked(tmp_path / "out")), jobs=1))
