@@ -1,8 +1,8 @@
-"""A retrieval kept in a folder of open formats: what is needed to look at it again, and to compute it again.
+"""A saved run: the folder of one search, with all data to show it and to compute it again.
 
-``run.json`` has the conditions and settings, ``model.jsonl`` the enrolled views, an object a line, ``events.jsonl``
-what happened, an event a line, and ``frames/000.png``, ... the accepted frames, lossless. Of a dense search
-``search_rules.json`` has the rules that it went by, ``empty_table.png`` the picture that the object was found with.
+``run.json`` contains the conditions and settings, ``model.jsonl`` the enrolled views (one object in each line),
+``events.jsonl`` the events (one in each line), ``frames/000.png``, ... the accepted frames without loss. The folder of
+a dense search also contains the stopping rule (``search_rules.json``) and the empty-table image (``empty_table.png``).
 
 Decision: docs/decisions/0018.
 """
@@ -39,38 +39,38 @@ from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
 VERSION: Final = 3
-"""Version 2 brought the dense search; version 3 stores codes instead of sentences, and terms of the glossary."""
+"""Version 2 added the dense search; version 3 stores codes instead of sentences, and the terms of the glossary."""
 EMPTY_TABLE: Final = "empty_table.png"
 
 MAX_FRAME_PIXELS: Final = 64_000_000
-"""Of 8000 x 8000, the largest frame of the configuration."""
+"""8000 x 8000, the largest frame of the configuration."""
 MAX_REASON: Final = 300
 _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.jsonl": 10_000_000}
-"""Far above those of real runs. Values of JSON can need twenty times as much memory as their text."""
+"""Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
 _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
-"""What values of the wrong kind raise."""
+"""Exceptions because of values of a wrong type."""
 
 _KINDS: Final[dict[str, type]] = {event_kind(kind): kind for kind in get_args(Event)}
 
 
 class RunWriter:
-    """Keeps one retrieval while it runs: what has been seen of it is in the folder, wherever it ends.
+    """Stores one search while it runs: after an interruption the folder contains all events so far.
 
     Parameters
     ----------
     folder
-        New or empty; missing folders above it are made.
+        A new or empty folder; missing folders above it are created.
     bench
-        The bench that the retrieval runs on.
+        The bench of the search.
     model : Model or hbr.ViewIndex
-        What is enrolled.
+        The enrolled views.
     empty_table : uint8 array (H, W, 3), optional
-        As `rig.plans.identify.identify` is given it.
+        See `rig.plans.identify.identify`.
 
     Raises
     ------
     UsageError
-        The folder holds something already, or cannot be written to.
+        The folder is not empty, or cannot be written to.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class RunWriter:
         self._events.close()
 
     def add(self, event: Event) -> None:
-        """Take the next event of the stream; a frame is in the folder before its event.
+        """Store the next event; a frame is in the folder before its event.
 
         Raises
         ------
@@ -151,22 +151,20 @@ class RunWriter:
 
 @dataclass(frozen=True, slots=True)
 class SavedRun:
-    """A run as its folder has it.
+    """The content of a saved run.
 
     Attributes
     ----------
-    folder
-        Where it is.
     about
         Bench, devices, conditions and software, as JSON values.
     config
-        The settings it ran under.
+        The settings of the search.
     model : Model
-        The enrolled views, and the rules, that it was decided by.
+        The enrolled views and the stopping rule of the search.
     empty_table : uint8 array (H, W, 3), or None
-        The bench without an object.
+        The empty-table image.
     error
-        What ended it, where that was an error, as `RigError.as_dict` tells it.
+        The error that ended the search, as in `RigError.as_dict`.
     is_cut
         Whether the last line of the events was cut off while it was written.
     """
@@ -182,7 +180,7 @@ class SavedRun:
 
     @property
     def views(self) -> hbr.Views:
-        """The enrolled views it was decided by."""
+        """The enrolled views of the search."""
         return self.model.views
 
     def events(self) -> Iterator[Event]:
@@ -191,7 +189,7 @@ class SavedRun:
         Raises
         ------
         UsageError
-            An event is none that this program knows, or a frame is missing.
+            An event is not known to this program, or a frame is missing.
         """
         for number, line in enumerate(self._lines, 1):
             try:
@@ -205,7 +203,7 @@ class SavedRun:
     def damage(self) -> Iterator[None]:
         """Report errors of a computation with the run's values as damage of the run, in a ``with`` block.
 
-        Values can have the right types and still not fit together, such as a list of candidates that is empty.
+        Values with the right types may still not fit together, for example an empty list of candidates.
 
         Raises
         ------
@@ -219,12 +217,12 @@ class SavedRun:
 
     @property
     def started(self) -> Started:
-        """How the run began.
+        """The first event.
 
         Raises
         ------
         UsageError
-            It does not say.
+            The first event has another kind.
         """
         first = next(self.events(), None)
         if not isinstance(first, Started):
@@ -237,7 +235,7 @@ class SavedRun:
 
     @property
     def is_current(self) -> bool:
-        """Whether the run has the format of this version."""
+        """Whether the run has the format of this program version."""
         return bool(self.about["version"] == VERSION)
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
@@ -254,13 +252,13 @@ def load_run(folder: Path) -> SavedRun:
     Raises
     ------
     UsageError
-        The folder holds no run, a damaged one, or one of a newer version; or the run needs a model that is not loaded
-        (`hbr.descriptors.load_model`).
+        The folder contains no run, a damaged run, or one of a newer version; or the run needs a model that is not
+        loaded (`hbr.descriptors.load_model`).
     """
     try:
         about = json_values(_bytes(folder, "run.json"))
         if about.get("format") != FORMAT:
-            raise ValueError("run.json is not that of a saved run")
+            raise ValueError("run.json does not belong to a saved run")
         if about["version"] not in range(1, VERSION + 1):
             raise UsageError(
                 f"The run {folder} has the format version {about['version']}; this program reads 1 to {VERSION}.",
@@ -290,19 +288,19 @@ def load_run(folder: Path) -> SavedRun:
 
 
 def frame_path(folder: Path, index: int) -> Path:
-    """Return where the frame of an accepted view is kept."""
+    """Return the file of the frame of an accepted view."""
     return folder / "frames" / f"{index:03d}.png"
 
 
 def event_of(values: dict[str, Any], frame: Any) -> Event:
-    """Return the event that `event_dict` made ``values`` of; ``frame`` gives the picture of an accepted view.
+    """Return the event of JSON ``values`` from `event_dict`; ``frame`` returns the image of an accepted view.
 
-    Numbers that were not finite come back as nan: what they were is not known.
+    Numbers that were not finite become nan.
 
     Raises
     ------
     LookupError, TypeError, ValueError, ArithmeticError
-        It is no event, or its fields are not those of its kind.
+        The values are not an event, or a field has a wrong type.
     """
     values = dict(values)
     name = values.pop("event")
@@ -315,7 +313,7 @@ def event_of(values: dict[str, Any], frame: Any) -> Event:
 
 
 def built(kind: Any, value: Any) -> Any:
-    """Return JSON values as the type that is meant; fields that a newer program added are left out."""
+    """Return JSON values as an object of type ``kind``; fields that a newer program added are left out."""
     origin = get_origin(kind)
     if is_dataclass(kind):
         hints = get_type_hints(kind)
@@ -334,10 +332,10 @@ def built(kind: Any, value: Any) -> Any:
         if value is None:
             return nan
         if type(value) not in (int, float) or not isfinite(value):
-            raise TypeError(f"{value!r} is no finite number")
+            raise TypeError(f"{value!r} is not a finite number")
         return float(value)
     if kind in (str, bool, int) and type(value) is not kind:
-        raise TypeError(f"{value!r} is no {kind.__name__}")
+        raise TypeError(f"{value!r} is not of type {kind.__name__}")
     return value
 
 
@@ -367,7 +365,7 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
 
 
 def _descriptor(folder: Path, used: dict[str, Any]) -> Descriptor:
-    """Return the descriptor of a run. A network is known by its digest: the path of its file is the user's to give."""
+    """Return the descriptor of a run. A network is identified by its digest; the user gives the path of its file."""
     name, number = used["name"], used["version"]
     if name.startswith(PREFIX):
         for model in loaded_models():
@@ -404,14 +402,14 @@ def _image(folder: Path, path: Path) -> NDArray[np.uint8]:
 
 
 def _lines(content: bytes) -> list[str]:
-    """Return the lines of JSON Lines; only a line feed ends a line, and the last line may lack it."""
+    """Return the lines of JSON Lines; only a line feed ends a line; it may be missing in the last line."""
     return content.decode().removesuffix("\n").split("\n") if content else []
 
 
 def _object(line: str) -> dict[str, Any]:
     values = json_values(line)
     if not isinstance(values, dict):
-        raise TypeError("a line is no JSON object")
+        raise TypeError("a line is not a JSON object")
     return values
 
 
@@ -431,7 +429,7 @@ def _bytes(folder: Path, name: str) -> bytes:
 
 
 def _reason(error: Exception) -> str:
-    """Return what an error says about a value; that of a KeyError is only the key."""
+    """Return the text of an error; with its type if the text alone is not clear, such as the key of a KeyError."""
     text = str(error) if type(error) in (ValueError, TypeError) else f"{type(error).__name__}: {error}"
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}…"
 
@@ -439,7 +437,7 @@ def _reason(error: Exception) -> str:
 def _damaged(folder: Path, reason: str) -> UsageError:
     return UsageError(
         f"The run in {folder} cannot be read.",
-        next_step="Take it from a backup, or look at its files: they are PNG and JSON Lines.",
+        next_step="Use a backup, or open its files in other programs: they are PNG and JSON Lines.",
         evidence={"reason": reason},
     )
 

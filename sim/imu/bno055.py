@@ -1,11 +1,11 @@
 """A register-true BNO055 for the simulated I2C bus: fusion, calibration status, start-up and mode switch times.
 
-Behaviour follows the data sheet BST-BNO055-DS000. Register names and numbers are written down here once more, not
-shared with the driver, so that an error in one does not hide in the other.
+The behaviour follows the data sheet BST-BNO055-DS000. The driver has its own copy of the register numbers, so that
+tests find an error in one of them.
 
-Not simulated: the magnetometer (its modes run as the IMU mode does, without north), page 1, interrupts, axis
-remapping, self test, low-power modes, UART, and stretching of the clock. The fusion is the integral of the gyro about
-the vertical, the tilt kept; its bias is learned at rest, as the device does.
+Not simulated: the magnetometer (its modes run like the IMU mode, without north), page 1, interrupts, axis remapping,
+self test, low-power modes, UART, and stretching of the clock. The fusion is the integral of the gyro about the
+vertical, with a constant tilt. It measures its bias at rest, like the device.
 """
 
 from collections.abc import Callable
@@ -41,8 +41,8 @@ TO_CONFIG_S, FROM_CONFIG_S = 0.019, 0.007
 TICK_NS = 10_000_000  # period of the fusion
 GYRO_BANDWIDTH_HZ = 32.0
 GYRO_NOISIER, GYRO_TRUER = 2.8, 0.2
-"""Its gyro's noise, 0.014 °/s/√Hz, and zero rate, ±1 °/s, over those of the bench's noise model."""
-REST_TICKS, JUDGE_TICKS = 100, 20  # how long the sensor must be still to measure its bias, and how often it checks that
+"""Ratio of its gyro's noise (0.014 °/s/√Hz) and zero rate (±1 °/s) to those of the bench's noise model."""
+REST_TICKS, JUDGE_TICKS = 100, 20  # time at rest before the sensor measures its bias, and period of the check
 REST_DPS, REST_SPREAD_DPS = 3.0, 0.5
 
 _IDENTITY = {CHIP_ID: 0xA0, 0x01: 0xFB, 0x02: 0x32, 0x03: 0x0F, 0x04: 0x11, 0x05: 0x03, 0x06: 0x15}
@@ -54,9 +54,9 @@ _G = 9.80665
 class SimBno055:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
-    World side: `inertial` (bias, gain and vertical of this part), `temperature_c`, `chip_id`, `power_cycle`,
-    `run_clock`, `fail` (the fusion stops with an error), and `distortions`, each of which is given words as those of
-    the MPU-6050, int16 (n, 7), and returns those that the fusion works with.
+    Interface to the world: `inertial` (bias, gain and vertical of this part), `temperature_c`, `chip_id`,
+    `power_cycle`, `run_clock`, `fail` (the fusion stops with an error), and `distortions`: each receives words like
+    those of the MPU-6050, int16 (n, 7), and returns those that the fusion uses.
     """
 
     def __init__(self, world: World, *, address: int = 0x28, chip_id: int = 0xA0) -> None:
@@ -72,11 +72,11 @@ class SimBno055:
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of a true clock."""
+        """Samples per second of the world's clock."""
         return 1e9 / self._tick_ns
 
     def run_clock(self, error: float) -> None:
-        """Set the relative error of its clock from now on."""
+        """Set the relative error of its clock."""
         self._catch_up()
         self.clock_error = error
         self._epoch_ns, self._ticks = self._clock.now_ns(), 0
@@ -103,7 +103,7 @@ class SimBno055:
 
     @property
     def answers(self) -> bool:
-        """Whether it acknowledges its address: not during start-up."""
+        """Whether it acknowledges its address; it does not during start-up."""
         return self._clock.now_ns() >= self._silent_until_ns
 
     def start(self, reading: bool) -> None:

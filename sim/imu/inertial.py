@@ -21,28 +21,28 @@ _NOTHING = 1e-12  # share of an input that a 16-bit register cannot show
 class InertialModel:
     """Rate and specific force at the sensor of one part, drawn from the world's noise model.
 
-    The rate is the table's, about the vertical as the mounting tilt shows it to the sensor, averaged over each internal
-    sample, so that a knock is felt however short it is; with a scale error for each axis, a bias that walks and follows
-    the sensor's own warming up, and white noise of the given one-sided density. The force is gravity with a bias and
-    white noise. Both pass a second-order Butterworth low-pass. Left out: the centripetal and tangential acceleration of
-    a sensor off the axis (1 cm at 90 °/s: 2.5 mg).
+    The rate is that of the table about the vertical, which is tilted in the sensor's axes by the mounting. It is
+    averaged over each internal sample, so that even a short knock is measured. It has a scale error for each axis, a
+    bias with a random walk and a dependence on the sensor's temperature, and white noise of the given one-sided
+    density. The force is gravity with a bias and white noise. Both pass a second-order Butterworth low-pass. The
+    centripetal and tangential acceleration of a sensor off the axis is left out (1 cm at 90 °/s: 2.5 mg).
 
     Parameters
     ----------
     world
-        Gives the motion, the noise model, and the streams ``name-part`` (drawn once) and ``name-noise``.
+        Provides the motion, the noise model, and the streams ``name-part`` (drawn once) and ``name-noise``.
     name
-        Of the sensor.
+        Name of the sensor.
     gyro_noisier
-        Its gyro's noise density over that of the noise model.
+        Ratio of its gyro's noise density to that of the noise model.
 
     Attributes
     ----------
     up : float64 (3,)
         The vertical in the sensor's axes.
     gyro_gain, gyro_bias_dps, gyro_slope_dps_c, accel_bias_g : float64 (3,)
-        Truth that tests compare with and may set; the gyro's bias walks on from it, and grows by the slope with every
-        degree of warmth.
+        The true values, for tests. The random walk of the gyro's bias continues from its value; the bias also grows by
+        the slope for each degree of warming.
     """
 
     def __init__(self, world: World, name: str, gyro_noisier: float = 1.0) -> None:
@@ -73,8 +73,8 @@ class InertialModel:
     def sample(self, times_ns: NDArray[np.int64], rate_hz: float, bandwidth_hz: float) -> tuple[Floats, Floats]:
         """Return rate (°/s) and specific force (g), each (n, 3), at consecutive internal sample times.
 
-        The result does not depend on how a row of samples is cut into calls. Before the first of ``times_ns`` a stretch
-        may be left out: then its mean rate stands in the first sample.
+        The result does not depend on how the samples are divided among calls. If samples before the first of
+        ``times_ns`` are left out, the first sample has the mean rate of that time.
         """
         n = len(times_ns)
         draws = self._rng.standard_normal((n, 9))
@@ -106,9 +106,9 @@ class InertialModel:
 
 @cache
 def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[float, float, float, Floats]:
-    """Return b₀, a₁ and a₂ of a Butterworth low-pass of second order (bilinear transform), and its recursion's echo.
+    """Return b₀, a₁ and a₂ of a Butterworth low-pass of second order (bilinear transform), and its impulse response.
 
-    b₁ = 2b₀, b₂ = b₀. The echo is what one input leaves behind in the outputs, until nothing of it is left.
+    b₁ = 2b₀, b₂ = b₀. The response of the recursion ends where it is negligible.
     """
     k = tan(pi * bandwidth_hz / rate_hz)
     norm = 1 / (1 + sqrt(2) * k + k * k)
@@ -120,10 +120,10 @@ def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[float, float, float,
 
 
 def _filtered(felt: Floats, filtered_before: Floats, rate_hz: float, bandwidth_hz: float) -> Floats:
-    """Return the low-pass of ``felt`` (n + 2, 6) from its third row on, (n, 6); two rows came out before.
+    """Return the low-pass of ``felt`` (n + 2, 6) from its third row, (n, 6); the first two rows belong to earlier ones.
 
-    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]), solved by its echo: the import of scipy's filters would
-    take longer than all else of the simulator together.
+    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]), solved by the impulse response: importing scipy's
+    filters would take longer than all other imports of the simulator.
     """
     b0, a1, a2, echo = _low_pass(rate_hz, bandwidth_hz)
     right = b0 * (felt[2:] + 2 * felt[1:-1] + felt[:-2])
@@ -142,7 +142,7 @@ def _steps(before: float, values: NDArray[np.int64] | Floats) -> Floats:
 
 
 class SimulatedImu(I2cDevice, Protocol):
-    """What the simulated bench and its faults need of a sensor, apart from its side on the bus.
+    """The interface of a sensor to the simulated bench and its faults, besides its interface to the bus.
 
     Each of ``distortions`` receives the words of samples, int16 (n, 7): accelerometer x, y, z, temperature, gyro x, y,
     z. It returns the words that the sensor delivers.
@@ -154,10 +154,10 @@ class SimulatedImu(I2cDevice, Protocol):
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of a true clock."""
+        """Samples per second of the world's clock."""
 
     def run_clock(self, error: float) -> None:
-        """Set the relative error of its clock from now on."""
+        """Set the relative error of its clock."""
 
     def power_cycle(self) -> None:
         """Lose all registers, as after a brown-out."""

@@ -1,13 +1,13 @@
 """A register-true MPU-6050 for the simulated I2C bus, and the sensors with its registers.
 
-Behaviour follows the register map RM-MPU-6000A rev 4.2 and the product specification PS-MPU-6000A rev 3.4; for the
-MPU-6500 and the MPU-9250, RM-MPU-6500A, PS-MPU-6500A, RM-MPU-9250A and PS-MPU-9250A. Register names and numbers are
-written down here once more, not shared with the driver, so that an error in one does not hide in the other.
+The behaviour follows the register map RM-MPU-6000A rev 4.2 and the product specification PS-MPU-6000A rev 3.4; for the
+MPU-6500 and the MPU-9250, RM-MPU-6500A, PS-MPU-6500A, RM-MPU-9250A and PS-MPU-9250A. The driver has its own copy of the
+register numbers, so that tests find an error in one of them.
 
-Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, interrupts other
-than a new sample's, the signal paths' reset, the motion processor, and start-up times. The low-pass is of second order,
-and the accelerometer follows the gyro's rate and bandwidth. Of the MPU-6500 also the bypass of its low-pass and its
-accelerometer's own low-pass, of the MPU-9250 its magnetometer.
+Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, interrupts
+except that of a new sample, the signal paths' reset, the motion processor, and start-up times; the bypass of the
+low-pass and the separate low-pass of the accelerometer (MPU-6500); the magnetometer (MPU-9250). The low-pass is of
+second order, and the accelerometer has the gyro's rate and bandwidth.
 """
 
 from collections.abc import Callable
@@ -53,10 +53,10 @@ _FIFO_BITS = (0x08, 0x08, 0x08, 0x80, 0x40, 0x20, 0x10)
 class SimMpu6050:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
-    World side: `inertial` (bias, gain and vertical of this part, and its warmth), `temperature_c` (of its
-    surroundings), `clock_error` (how much too fast its clock runs, relatively; set before it wakes, or by `run_clock`),
-    `who_am_i` (a clone answers otherwise), `power_cycle`, and `distortions`, each of which is given the samples' words,
-    int16 (n, 7), and returns those that are kept.
+    Interface to the world: `inertial` (bias, gain, vertical and warming of this part), `temperature_c` (of its
+    surroundings), `clock_error` (relative error of its clock, positive if it is fast; set it before the sensor wakes,
+    or by `run_clock`), `who_am_i` (other for a clone), `power_cycle`, and `distortions`: each receives the samples'
+    words, int16 (n, 7), and returns those that are stored.
     """
 
     IDENTITY: ClassVar[int] = 0x68
@@ -67,7 +67,7 @@ class SimMpu6050:
     LSB_PER_C: ClassVar[float] = 340.0
     ZERO_C: ClassVar[float] = 36.53
     GYRO_NOISIER: ClassVar[float] = 1.0
-    """Its gyro's noise over that of the bench's noise model."""
+    """Ratio of its gyro's noise to that of the bench's noise model."""
 
     def __init__(self, world: World, *, address: int = 0x68, who_am_i: int | None = None) -> None:
         self.address = address
@@ -81,13 +81,13 @@ class SimMpu6050:
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of a true clock."""
+        """Samples per second of the world's clock."""
         registers = self._registers
         internal_hz = 8000 if registers[CONFIG] & 0x07 in (0, 7) else 1000
         return internal_hz / (1 + registers[SMPLRT_DIV]) * (1 + self.clock_error)
 
     def run_clock(self, error: float) -> None:
-        """Set the relative error of its clock from now on."""
+        """Set the relative error of its clock."""
         self._take_samples()
         self.clock_error = error
         self._begin_sampling()
@@ -103,7 +103,7 @@ class SimMpu6050:
         self._begin_sampling()
 
     def next_edge_ns(self, after_ns: int) -> int | None:
-        """Return when the interrupt pin next rises after ``after_ns``: at each sample, if enabled."""
+        """Return the time of the interrupt pin's next edge after ``after_ns``: at each sample, if enabled."""
         if self._registers[PWR_MGMT_1] & SLEEP or not self._registers[INT_ENABLE] & DATA_RDY:
             return None
         period_ns = self._internal_clock()[1] * (1 + self._registers[SMPLRT_DIV])

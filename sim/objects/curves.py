@@ -17,7 +17,7 @@ def smooth(*corners: tuple[float, ...]) -> Curve:
 
 
 def evenly(curve: Curve, step: float, *, dimensions: int) -> NDArray[np.float64]:
-    """Return ``curve`` resampled about ``step`` apart, (n, d); a point's first ``dimensions`` numbers are its place."""
+    """Return ``curve`` resampled at steps of about ``step``, (n, d); the first ``dimensions`` numbers are positions."""
     points = np.array(curve, dtype=np.float64)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :dimensions], axis=0), axis=1))])
     even = np.linspace(0.0, s[-1], max(int(np.ceil(s[-1] / step)), 1) + 1)

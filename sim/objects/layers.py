@@ -16,12 +16,12 @@ def blend(below: Image, above: Image, cover: Image) -> None:
 
 
 def place(image: Image, seen: Image, clear: Image, corner_px: Floats) -> None:
-    """Lay ``seen``, already weighted by its cover, on ``image`` at a corner between pixels.
+    """Draw ``seen``, already weighted by its cover, on ``image``, at a position that may be between pixels.
 
     Parameters
     ----------
     image, seen, clear
-        uint8 (H, W, 3), (h, w, 3), (h, w, 3); ``clear`` is what is left of the image below, 255 where nothing is laid.
+        uint8 (H, W, 3), (h, w, 3), (h, w, 3); ``clear`` is the weight of the image below, 255 outside ``seen``.
     corner_px
         Position (x, y) of the upper left pixel's centre in the image.
     """
@@ -40,7 +40,7 @@ def place(image: Image, seen: Image, clear: Image, corner_px: Floats) -> None:
 
 
 def _shifted(plane: Image, right: float, down: float, beyond: int) -> Image:
-    """Return ``plane`` moved by less than a pixel, bilinear, a pixel larger; what comes in is ``beyond``."""
+    """Return ``plane`` moved by less than a pixel, bilinear, one pixel larger; new pixels are ``beyond``."""
     wide = cv2.copyMakeBorder(plane, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(beyond, beyond, beyond))
     across = cv2.addWeighted(wide[:, 1:], 1 - right, wide[:, :-1], right, 0)
     return np.asarray(cv2.addWeighted(across[1:], 1 - down, across[:-1], down, 0), dtype=np.uint8)

@@ -44,8 +44,8 @@ def _can(name: str, colour: Colour, word: str, fruit: Colour, *extra: Brush) -> 
         s.band(0.13, 0.16, (110, 110, 108))
         s.band(0.95, 1.0, p.GREY)
         s.band(0.3, 0.34, p.CREAM)
-        for turn in (0, 180):
-            s.around(turn, face)
+        for rotation_deg in (0, 180):
+            s.around(rotation_deg, face)
 
     def face(s: Sheet) -> None:
         s.text(word, 0.5, 0.46, 0.1, p.WHITE, width=0.34)

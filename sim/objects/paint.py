@@ -1,8 +1,7 @@
 """Brushes for the textures of the built-in objects.
 
-A texture is painted in units of its own size: u runs across from 0 (left) to 1 (right), v down from 0 (top) to 1
-(bottom). On a body of revolution u = 0.5 is the front, and the sheet closes to a ring: shapes that run over one edge
-come in at the other.
+The coordinates of a texture are relative to its size: u from 0 (left) to 1 (right), v from 0 (top) to 1 (bottom). On a
+body of revolution u = 0.5 is the front, and the sheet is a ring: a shape that exceeds one edge continues at the other.
 """
 
 from collections.abc import Callable, Sequence
@@ -52,7 +51,7 @@ class Sheet:
         return self.pixels.shape[1]
 
     def band(self, top: float, bottom: float, colour: Colour) -> None:
-        """Fill all the way across between two heights."""
+        """Fill the whole width between two heights."""
         self.panel(0.0, top, 1.0, bottom, colour)
 
     def panel(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
@@ -60,8 +59,8 @@ class Sheet:
 
     def polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
         scale = np.array([self.columns, self.rows], dtype=np.float64)
-        for turn in _turns(min(u for u, _ in points), max(u for u, _ in points)):
-            corners = (np.array(points) + np.array([turn, 0.0])) * scale - 0.5
+        for ring in _rings(min(u for u, _ in points), max(u for u, _ in points)):
+            corners = (np.array(points) + np.array([ring, 0.0])) * scale - 0.5
             fixed = np.round(corners * (1 << _SHIFT)).astype(np.int32)
             cv2.fillPoly(self.pixels, [fixed], colour, cv2.LINE_AA, _SHIFT)
 
@@ -75,8 +74,8 @@ class Sheet:
         """Paint a round spot; ``radius`` as a share of the sheet's height."""
         reach = radius * self.rows / self.columns
         size, y = round(radius * self.rows * (1 << _SHIFT)), round((v * self.rows - 0.5) * (1 << _SHIFT))
-        for turn in _turns(u - reach, u + reach):
-            x = round(((u + turn) * self.columns - 0.5) * (1 << _SHIFT))
+        for ring in _rings(u - reach, u + reach):
+            x = round(((u + ring) * self.columns - 0.5) * (1 << _SHIFT))
             cv2.circle(self.pixels, (x, y), size, colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
 
     def star(self, u: float, v: float, radius: float, colour: Colour, *, points: int = 5, waist: float = 0.42) -> None:
@@ -108,14 +107,14 @@ class Sheet:
         cv2.putText(self.pixels, words, origin, font, scale, colour, thickness, cv2.LINE_AA)
 
     def lines(self, left: float, top: float, right: float, bottom: float, n: int, colour: Colour, seed: int) -> None:
-        """Suggest ``n`` lines of small print."""
+        """Draw ``n`` lines that look like small print."""
         lengths = np.random.default_rng(seed).uniform(0.55, 1.0, n)
         for i, length in enumerate(lengths):
             v = top + (i + 0.2) * (bottom - top) / n
             self.panel(left, v, left + (right - left) * float(length), v + 0.5 * (bottom - top) / n, colour)
 
     def mottle(self, strength: float, size: tuple[float, float], seed: int) -> None:
-        """Cloud the sheet with smooth noise of ``strength`` grey levels, its grains ``size`` (u, v) of the sheet."""
+        """Add smooth noise of ``strength`` grey levels, with grains of ``size`` (u, v)."""
         rng = np.random.default_rng(seed)
         cells = (max(round(1 / size[1]), 1), max(round(1 / size[0]), 1))
         coarse = rng.standard_normal(cells, dtype=np.float32)
@@ -130,34 +129,34 @@ class Sheet:
         cloud = fine[top : top + self.rows, left : left + self.columns, None] * strength
         self.pixels[:] = np.clip(self.pixels + cloud, 0, 255).astype(np.uint8)
 
-    def around(self, turn_deg: float, brush: Brush) -> None:
-        """Let ``brush`` paint with its front turned counter-clockwise by ``turn_deg`` on a ring."""
-        by = round(turn_deg / 360 * self.columns)
+    def around(self, rotation_deg: float, brush: Brush) -> None:
+        """Paint with ``brush`` on the ring, rotated counter-clockwise by ``rotation_deg``."""
+        by = round(rotation_deg / 360 * self.columns)
         self.pixels = np.roll(self.pixels, -by, axis=1)
         brush(self)
         self.pixels = np.roll(self.pixels, by, axis=1)
 
 
-def _turns(left: float, right: float) -> range:
-    """Return by how many rings a shape is repeated so that what runs over one edge comes in at the other."""
+def _rings(left: float, right: float) -> range:
+    """Return the offsets, in rings, at which a shape is repeated so that it continues over an edge."""
     return range(-1 if right > 1 else 0, 2 if left < 0 else 1)
 
 
 def painted(ground: Colour, *brushes: Brush) -> Paint:
-    """Return a texture that is ``ground`` with ``brushes`` applied in turn."""
+    """Return a texture: ``ground`` with ``brushes`` applied in their order."""
 
     def paint(shape: tuple[int, int]) -> Image:
         sheet = Sheet(shape, ground)
         for brush in brushes:
             brush(sheet)
-        # Printing is no sharper than the lens: edges of a texel alias when the surface is seen at a slant.
+        # Without this blur, sharp edges alias on surfaces at a slant.
         return np.asarray(cv2.GaussianBlur(sheet.pixels, (0, 0), 0.7), dtype=np.uint8)
 
     return paint
 
 
 def wood(seed: int) -> Brush:
-    """Return a grain that runs across the sheet."""
+    """Return the grain of wood, across the sheet."""
 
     def brush(sheet: Sheet) -> None:
         sheet.mottle(9.0, (0.5, 0.03), seed)

@@ -29,7 +29,7 @@ class PhotographedObject:
     Attributes
     ----------
     azimuth_deg : float64 (n,)
-        Angles of its photographs, rising, in [0, 360).
+        Angles of its photographs, ascending, in [0, 360).
     files
         The photographs, in that order.
     """
@@ -53,8 +53,8 @@ class PhotographedObject:
 def photographs(folder: str | Path) -> Mapping[str, PhotographedObject]:
     """Return the objects of a folder by name, ``obj2`` before ``obj10``; photographs are read when they are drawn.
 
-    Raises `UsageError` if the folder does not exist, or holds no photograph in this layout, or shows an object twice at
-    one angle.
+    Raises `UsageError` if the folder does not exist, contains no photograph in this layout, or contains two photographs
+    of an object at one angle.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -19,7 +19,7 @@ _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 @dataclass(frozen=True)
 class Face:
-    """One face: its corners (k, 3) in millimetres, counter-clockwise seen from outside, and what is printed on it.
+    """A face: its corners (k, 3) in millimetres, counter-clockwise seen from outside, and its texture or colour.
 
     A painted face's texture spans the parallelogram of the upper left, upper right and lower left corner in ``frame``.
     """
@@ -88,7 +88,7 @@ class Polyhedron:
 
     @cached_property
     def _geometry(self) -> tuple[Floats, list[slice], Floats, Floats]:
-        """All corners (n, 3), which of them are each face's, the frames' points (3 m, 3), the normals (m, 3)."""
+        """All corners (n, 3), the slice of each face, the frames' points (3 m, 3), the normals (m, 3)."""
         corners = np.concatenate([face.corners for face in self.faces])
         ends = np.cumsum([len(face.corners) for face in self.faces])
         frames = np.concatenate([np.stack(face.frame) for face in self.faces])
@@ -97,7 +97,7 @@ class Polyhedron:
 
     def _draw(self, pose: Pose, image: Image) -> None:
         corners_mm, slices, frames_mm, normals = self._geometry
-        corners, normals = pose.to_image(corners_mm), pose.turn(normals)
+        corners, normals = pose.to_image(corners_mm), pose.rotate(normals)
         left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2, 0).tolist()
         size = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, image.shape[1::-1]) - (left, top)
         if (size <= 0).any():
@@ -159,7 +159,7 @@ def box(
     *,
     top: Paint | Colour,
     at: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    turned_deg: float = 0.0,
+    rotation_deg: float = 0.0,
     layer: int = 0,
 ) -> Polyhedron:
     """Return a box (width, depth, height) at ``at``, rotated about its own axis, without a bottom.
@@ -173,7 +173,7 @@ def box(
         for i, paint in enumerate(walls)
     ]
     lid = quad([(-w, d, h), (-w, -d, h), (w, -d, h), (w, d, h)], top)
-    return moved(Polyhedron((*sides, lid), layer), at, turned_deg)
+    return moved(Polyhedron((*sides, lid), layer), at, rotation_deg)
 
 
 def prism(sides: int, radius_mm: float, height_mm: float, *, wall: Paint | Colour, top: Paint | Colour) -> Polyhedron:
@@ -195,7 +195,7 @@ def lying_cylinder(
     wall: Colour,
     end: Paint | Colour,
     at: tuple[float, float, float],
-    turned_deg: float = 0.0,
+    rotation_deg: float = 0.0,
     layer: int = 0,
     depth_at: tuple[float, float] | None = None,
     sides: int = 36,
@@ -211,7 +211,7 @@ def lying_cylinder(
     far = np.array([(x, 0.0, z) for x, z in ring[:-1]])[::-1].copy()
     lid = Face(near, end, (np.array([-r, y, r]), np.array([r, y, r]), np.array([-r, y, -r])))
     cap = Face(far, wall, (far[0], far[1], far[2]))
-    return moved(Polyhedron((*walls, lid, cap), layer, depth_at), at, turned_deg)
+    return moved(Polyhedron((*walls, lid, cap), layer, depth_at), at, rotation_deg)
 
 
 def roof(
@@ -230,12 +230,12 @@ def roof(
     return moved(Polyhedron(faces, layer), at, 0.0)
 
 
-def moved(solid: Polyhedron, at: tuple[float, float, float], turned_deg: float) -> Polyhedron:
+def moved(solid: Polyhedron, at: tuple[float, float, float], rotation_deg: float) -> Polyhedron:
     """Return ``solid`` rotated about its own axis and moved to ``at`` in the object's frame."""
-    turn = Pose(turned_deg)
+    pose = Pose(rotation_deg)
 
     def there(points: Floats) -> Floats:
-        return np.asarray(turn.turn(points) + np.array(at))
+        return np.asarray(pose.rotate(points) + np.array(at))
 
     faces = tuple(Face(there(f.corners), f.paint, _three(there(np.array(f.frame)))) for f in solid.faces)
     return Polyhedron(faces, solid.layer, solid.depth_at)

@@ -106,8 +106,8 @@ def _amphora() -> Solid:
             sheet.band(top + 0.075, top + 0.09, p.BLACK)
             for i in range(24):
                 sheet.panel((i + 0.2) / 24, top + 0.03, (i + 0.8) / 24, top + 0.06, p.BLACK)
-        for turn in (0, 180):
-            sheet.around(turn, lambda s: s.star(0.5, 0.57, 0.09, p.BLACK, points=8, waist=0.55))
+        for rotation_deg in (0, 180):
+            sheet.around(rotation_deg, lambda s: s.star(0.5, 0.57, 0.09, p.BLACK, points=8, waist=0.55))
         sheet.mottle(6.0, (1.0, 0.02), 11)
 
     body = (

@@ -29,7 +29,7 @@ CENTRE_PX = (320, 398)  # where the image shows the centre of the platter's top
 SIN, COS = sin(radians(ELEVATION_DEG)), cos(radians(ELEVATION_DEG))
 TO_CAMERA: Floats = np.array([0.0, -COS, SIN])
 TO_LIGHT: Floats = np.array([-0.50, -0.62, 0.605]) / np.linalg.norm([-0.50, -0.62, 0.605])
-AMBIENT = 0.42  # part of the light that comes from everywhere; the rest comes from the lamp at the front left
+AMBIENT = 0.42  # ambient part of the light; the rest comes from the lamp at the front left
 
 
 @runtime_checkable
@@ -48,7 +48,7 @@ class Visible(Protocol):
 
 
 class Drawing(NamedTuple):
-    """One step of the painter; what has the lower ``order`` (layer, then nearness to the camera) is drawn first."""
+    """One step of drawing; the lowest ``order`` (layer, then nearness to the camera) is drawn first."""
 
     order: tuple[int, float]
     onto: Callable[[Image], None]
@@ -64,22 +64,22 @@ class Pose:
 
     def to_room(self, points_mm: Floats) -> Floats:
         """Return points (n, 3) of the object in the room's frame."""
-        turned = self.turn(points_mm)
-        turned[:, :2] += self.x_mm, self.y_mm
-        return turned
+        rotated = self.rotate(points_mm)
+        rotated[:, :2] += self.x_mm, self.y_mm
+        return rotated
 
-    def turn(self, vectors: Floats) -> Floats:
+    def rotate(self, vectors: Floats) -> Floats:
         """Return vectors (n, 3) rotated by the azimuth."""
         c, s = cos(radians(self.azimuth_deg)), sin(radians(self.azimuth_deg))
         return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
     def depth(self, x_mm: float, y_mm: float) -> float:
-        """Return how far a point of the object stands to the front of the room, whatever its height."""
+        """Return the distance of a point of the object to the front of the room; its height does not matter."""
         a = radians(self.azimuth_deg)
         return -(self.y_mm + x_mm * sin(a) + y_mm * cos(a))
 
     def facing(self, x_mm: float, y_mm: float) -> float:
-        """Return how much the side of the object at (x, y) of its frame looks towards the camera: 0 (not) to 1."""
+        """Return how much the side of the object at (x, y) of its frame faces the camera, 0..1."""
         return max((self.depth(x_mm, y_mm) + self.y_mm) / max(hypot(x_mm, y_mm), 1e-9), 0.0)
 
     def to_image(self, points_mm: Floats) -> Floats:
@@ -89,7 +89,7 @@ class Pose:
 
 
 def nearness(room_mm: Floats) -> Floats:
-    """Return how far points (..., 3) lie towards the camera, in millimetres."""
+    """Return the positions of points (..., 3) along the direction to the camera, in millimetres."""
     return np.asarray(room_mm @ TO_CAMERA)
 
 

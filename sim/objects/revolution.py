@@ -1,11 +1,10 @@
 """Bodies of revolution about a vertical axis, drawn with one remap of their texture.
 
-A body that turns about its own axis keeps its silhouette and its shading; only the texture moves. So what each pixel
-sees is worked out once: with the profile sampled from its top to its bottom as (r, h), a pixel at x right of the axis
-and v above its foot looks along v = y sin e + h cos e; sample k is the circle of radius r_k, which the pixel's column
-meets where x² = r_k² - y_k² =: g_k. Coming from the camera, the ray meets high samples first: it hits the first k with
-g_k >= x². If that is k = 0 it has gone through the mouth of a vessel and goes on to the first inner sample with g_k <=
-x².
+When a body rotates about its axis, its silhouette and its shading stay; only the texture moves. So the point that each
+pixel shows is computed once. The profile is sampled from top to bottom as (r, h). The ray of a pixel at x to the right
+of the axis and v above the foot is v = y sin e + h cos e. Sample k is the circle of radius r_k; the pixel's column
+meets it where x² = r_k² - y_k² =: g_k. From the camera the ray meets high samples first: it hits the first k with
+g_k >= x². If that is k = 0, the ray enters a vessel through its mouth and hits the first inner sample with g_k <= x².
 """
 
 from dataclasses import dataclass
@@ -32,8 +31,8 @@ class Revolution:
     Parameters
     ----------
     profile
-        (radius, height) in millimetres from the top down to the foot, heights not rising. A vessel's begins at the
-        inner edge of its rim.
+        (radius, height) in millimetres from the top to the foot; heights do not increase. A vessel's profile begins
+        at the inner edge of its rim.
     paint
         Returns the texture of the outside for its (rows, columns): uint8 (rows, columns, 3). Rows run along the
         profile, columns once around, counter-clockwise, the front (azimuth 0) in the middle.
@@ -42,11 +41,11 @@ class Revolution:
     lining
         Colour of the inside, B, G, R.
     at
-        Where the axis stands in the object's frame, in millimetres.
+        Position of the axis in the object's frame, in millimetres.
     shine
         Strength of the highlight, 0..1.
     layer
-        Parts of higher layers lie on those of lower ones.
+        Parts of higher layers cover those of lower ones.
     """
 
     profile: Curve
@@ -67,16 +66,15 @@ class Revolution:
         return self.profile[-1][0]
 
     def _draw(self, azimuth_deg: float, foot_px: Floats, image: Image) -> None:
-        look = self._look
-        texture = self._texture
-        columns = look.columns
+        base = self._at_azimuth_0
+        columns = base.columns
         shift = -azimuth_deg / 360 * columns
         whole = int(np.floor(shift))
-        turned = texture[:, whole % columns :]
-        seen = cv2.remap(turned, look.column + np.float32(shift - whole), look.row, cv2.INTER_LINEAR)
-        lit = np.asarray(cv2.multiply(seen, look.light, scale=1 / 255), dtype=np.uint8)
-        cv2.add(lit, look.highlight, dst=lit)
-        place(image, lit, look.clear, foot_px - look.foot_px)
+        texture = self._texture[:, whole % columns :]
+        seen = cv2.remap(texture, base.column + np.float32(shift - whole), base.row, cv2.INTER_LINEAR)
+        lit = np.asarray(cv2.multiply(seen, base.light, scale=1 / 255), dtype=np.uint8)
+        cv2.add(lit, base.highlight, dst=lit)
+        place(image, lit, base.clear, foot_px - base.foot_px)
 
     @cached_property
     def _outside(self) -> Floats:
@@ -84,7 +82,7 @@ class Revolution:
 
     @cached_property
     def _texture(self) -> Image:
-        """The texture twice side by side, so that every turn of it is one slice, and the two columns beyond."""
+        """The texture twice side by side, so that every rotation is one slice, and two more columns."""
         radius = max(r for r, _ in self.profile)
         rows = round(len(self._outside) * _STEP_MM * TEXELS_PER_MM)
         texture = self.paint((rows, round(2 * np.pi * radius * TEXELS_PER_MM)))
@@ -92,15 +90,15 @@ class Revolution:
         return np.ascontiguousarray(np.hstack([texture, texture, texture[:, :2]]))
 
     @cached_property
-    def _look(self) -> "_Look":
+    def _at_azimuth_0(self) -> "_Seen":
         inside = evenly(self.inside, _STEP_MM, dimensions=2) if self.inside else None
         rows, width, _ = self._texture.shape
         return _trace(self._outside, inside, rows - _LINING_ROWS, (width - 2) // 2, self.shine)
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
-    """What each pixel of a body sees at azimuth 0, (h, w); `foot_px` is where its axis meets z = 0."""
+class _Seen:
+    """The points that the pixels of a body show at azimuth 0, (h, w); `foot_px` is where its axis meets z = 0."""
 
     column: NDArray[np.float32]
     row: NDArray[np.float32]
@@ -111,7 +109,7 @@ class _Look:
     columns: int  # once around the texture
 
 
-def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shine: float) -> _Look:
+def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shine: float) -> _Seen:
     half = int(np.ceil(outside[:, 0].max() * PX_PER_MM)) + 2
     top = int(np.ceil(outside[:, 1].max() * PX_PER_MM * COS + half * SIN)) + 2
     up = np.arange(top, -int(np.ceil(half * SIN)) - 3, -1, dtype=np.float64)
@@ -132,8 +130,8 @@ def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shin
     azimuth = np.arctan2(y, x)  # in the room, 0 to the right; the front is at -90°
     column = ((azimuth / (2 * np.pi) + 0.75) * columns - 0.5) % columns
     normals = np.stack([radial * np.cos(azimuth), radial * np.sin(azimuth), rising], axis=-1)
-    light = shade(normals) * np.where(hollow, 0.85, 1.0)  # less of the room is seen from within
-    return _Look(
+    light = shade(normals) * np.where(hollow, 0.85, 1.0)  # the inside gets less ambient light
+    return _Seen(
         column=column.astype(np.float32),
         row=row.astype(np.float32),
         light=_three(light * cover * 255),
@@ -145,7 +143,7 @@ def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shin
 
 
 def _hits(profile: Floats, up_mm: Floats, x_mm: Floats, *, entering: bool) -> tuple[Floats, Floats]:
-    """Return where each pixel's ray first comes into a profile's body, or out of it: the fractional sample, and y."""
+    """Return where each pixel's ray first enters or leaves a profile's body: the fractional sample, and y."""
     g, y = _sections(profile, up_mm)
     sign = 1.0 if entering else -1.0
     g *= sign
@@ -154,7 +152,7 @@ def _hits(profile: Floats, up_mm: Floats, x_mm: Floats, *, entering: bool) -> tu
     sample = np.empty((len(up_mm), len(x_mm)))
     depth = np.empty_like(sample)
     for i in range(len(up_mm)):
-        square = np.minimum(sign * x_mm**2, reach[i, -1])  # a pixel that is covered in part may have its centre outside
+        square = np.minimum(sign * x_mm**2, reach[i, -1])  # the centre of a partly covered pixel may be outside
         after = np.searchsorted(reach[i], square)
         before = np.maximum(after - 1, 0)
         step = np.where(after > before, g[i, after] - g[i, before], 1.0)

@@ -69,7 +69,7 @@ def _blocks() -> Solid:
         size: float, letters: str, ink: Colour, at: tuple[float, float, float], turned: float, layer: int
     ) -> Polyhedron:
         front, right, back, left, top = (face(letter, ink) for letter in letters)
-        return box((size, size, size), (front, right, back, left), top=top, at=at, turned_deg=turned, layer=layer)
+        return box((size, size, size), (front, right, back, left), top=top, at=at, rotation_deg=turned, layer=layer)
 
     return Solid(
         "toy-blocks",
@@ -109,7 +109,7 @@ def _car() -> Solid:
     body = box((150, 62, 30), (side, painted(p.BLUE, nose), side, painted(p.BLUE, tail)), top=p.BLUE, at=(0, 0, 14))
     top = box((78, 54, 28), (cabin, shield, cabin, shield), top=p.WHITE, at=(-8, 0, 44), layer=2)
     wheels = [
-        lying_cylinder(18, 10, wall=p.BLACK, end=hub, at=(x, y, 18), turned_deg=turned, depth_at=(0.1 * x, y))
+        lying_cylinder(18, 10, wall=p.BLACK, end=hub, at=(x, y, 18), rotation_deg=turned, depth_at=(0.1 * x, y))
         for x in (-46, 46)
         for y, turned in ((-29, 0.0), (29, 180.0))
     ]
@@ -201,9 +201,9 @@ def _clock() -> Solid:
     return Solid("clock", (*feet, drum, *bells, grip))
 
 
-def _mark(turn: float, near: float, far: float, half: float) -> list[tuple[float, float]]:
-    """Return a hand of a dial as a rectangle at ``turn`` of a circle, clockwise from twelve."""
-    c, s = cos(2 * pi * turn), sin(2 * pi * turn)
+def _mark(share: float, near: float, far: float, half: float) -> list[tuple[float, float]]:
+    """Return a hand of a dial as a rectangle at ``share`` of a circle, clockwise from twelve."""
+    c, s = cos(2 * pi * share), sin(2 * pi * share)
     corners = ((-half, near), (half, near), (half, far), (-half, far))
     return [(0.5 + x * c + y * s, 0.5 + x * s - y * c) for x, y in corners]
 

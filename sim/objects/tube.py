@@ -16,17 +16,17 @@ _STEP_MM = 4.0
 _FAR_MM, _EDGE_ON_MM = 1e6, 1e-6
 _RINGS = ((1.0, 0.60), (0.84, 0.76), (0.66, 0.88), (0.46, 0.97), (0.24, 1.05))
 """(radius, brightness) of the discs that shade a sphere, from its edge to the side of the light."""
-_LEAN = np.array([TO_LIGHT[0], -(TO_LIGHT[1] * SIN + TO_LIGHT[2] * COS)])  # where the image shows the light to be
+_LEAN = np.array([TO_LIGHT[0], -(TO_LIGHT[1] * SIN + TO_LIGHT[2] * COS)])  # direction of the light in the image
 
 
 @dataclass(frozen=True)
 class Tube:
     """A tube along a curve.
 
-    Where its ends are joined to the side of a body, what the body hides depends on the side it is seen from. So it is
-    drawn twice: behind the body, which then covers what is inside or behind it, and, as far as it stands on the
-    camera's side of the axis, before the body. There each round end lacks what would lie inside the body: nothing where
-    the joint faces the camera, all where it is seen from the side.
+    If its ends are joined to the side of a body, the visible part depends on the azimuth. So the tube is drawn twice:
+    first behind the body, which then covers the parts that are inside or behind it; then the part on the camera's side
+    of the axis, in front of the body. There each round end is cut by the part that would be inside the body: nothing if
+    the joint faces the camera, all of it if the joint is at the side.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Tube:
     colour
         B, G, R.
     joints
-        How many ends are joined to the side of a body in the same layer: 2 (a handle), 1 (the first: a spout), or 0.
+        Number of ends that are joined to the side of a body in the same layer: 2 (handle), 1 (spout: the first), or 0.
     layer
         As in `sim.objects.revolution.Revolution`.
     """
@@ -56,7 +56,7 @@ class Tube:
         cuts = [radius * (1 - pose.facing(x, y)) for x, y, _, radius in points[[0, -1]].tolist()]
         even = np.linspace(cuts[0], length[-1] - (cuts[1] if self.joints == 2 else 0.0), len(points))
         trimmed = np.column_stack([np.interp(even, length, column) for column in points.T])
-        depth = -pose.turn(trimmed[:, :3])[:, 1]
+        depth = -pose.rotate(trimmed[:, :3])[:, 1]
         depth = (depth[1:] + depth[:-1]) / 2
         before = depth > _EDGE_ON_MM
         joint = (length[:-1] < 2 * points[0, 3]) | (length[1:] > length[-1] - 2 * points[-1, 3])
@@ -89,13 +89,13 @@ class Tube:
 
 
 def handle(radius: float, top: float, bottom: float, reach: float, thickness: float, azimuth_deg: float) -> Curve:
-    """Return the D of a mug's handle: from its body's ``radius``, ``reach`` further out, between two heights, in mm.
+    """Return the D of a mug's handle, in mm: from the body's ``radius`` outwards by ``reach``, between two heights.
 
-    It stands at ``azimuth_deg``, counter-clockwise from the front.
+    ``azimuth_deg`` is its position, counter-clockwise from the front.
     """
     middle, half = (top + bottom) / 2, (top - bottom) / 2
-    turns = [pi * (i / 14 - 0.5) for i in range(15)]
-    arc = [(radius + reach * max(cos(t), 0.0) ** 0.6, middle + half * sin(t), thickness) for t in turns]
+    angles = [pi * (i / 14 - 0.5) for i in range(15)]
+    arc = [(radius + reach * max(cos(a), 0.0) ** 0.6, middle + half * sin(a), thickness) for a in angles]
     return ray(azimuth_deg, *arc)
 
 

@@ -124,7 +124,7 @@ class Commands:
 
     def _turn(self, angle_deg: float) -> str:
         try:
-            seconds = self._devices.servo.turn_by_hand(angle_deg)
+            seconds = self._devices.servo.rotate_by_hand(angle_deg)
         except ValueError as held:
             raise UsageError("The servo holds the table.", next_step="Switch the torque off first: rig stop") from held
         return f"The table is rotated by {angle_deg:g}° by hand, in {seconds:.1f} s."

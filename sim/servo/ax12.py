@@ -1,7 +1,7 @@
-"""One simulated AX-12A: its control table, its answers in Protocol 1.0, and methods for tests.
+"""A simulated AX-12A: its control table, its answers in Protocol 1.0, and methods for tests.
 
-Source: e-manual page "AX-12+, AX-12A". Addresses are written down here once more, not shared with the driver, so that
-an error in one does not hide in the other. Kept but without effect: LEDs, compliance, punch, Max Torque.
+Source: e-manual page "AX-12+, AX-12A". The driver has its own copy of the addresses, so that tests find an error in one
+of them. LEDs, compliance, punch and Max Torque are stored but have no effect.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ BAUD_RATES = {
     103: 19_200,
     207: 9_600,
 }
-"""Baud rates by the register's value n: the nearest to 2,000,000 / (n + 1)."""
+"""Baud rates by the register's value n: the standard rate next to 2,000,000 / (n + 1)."""
 
 _COUNTS = range(1024)
 _BYTE = range(256)
@@ -117,7 +117,7 @@ class Image:
         return bytes(self._bytes[_LIVE])
 
     def set_live(self, data: bytes) -> None:
-        """Set them to other values."""
+        """Set the registers that follow the world."""
         self._bytes[_LIVE] = data
 
     def restore(self, start: int) -> None:
@@ -149,24 +149,24 @@ class Image:
 class Ax12Servo(SimulatedServoBase):
     """A servo of Protocol 1.0 on the table's shaft: 0..300° in joint mode, endless rotation in wheel mode.
 
-    Both angle limits 0 make a wheel. As on the device, a goal written while torque is off switches it on. After a
-    shutdown (overload, heat) Torque Limit is 0, and holds nothing until it is written again.
+    The servo is in wheel mode if both angle limits are 0. Like on the device, writing a goal switches the torque on.
+    After a shutdown (overload, heat) Torque Limit is 0, and the servo does not hold until it is written again.
 
     Parameters
     ----------
     shaft
-        What it turns.
+        The shaft that it rotates.
     model
-        Its name and its speed; the registers are those of an AX-12A.
+        Its name and speed; the registers are those of an AX-12A.
     bus_id, baudrate
-        Its settings before the test.
+        Initial settings.
     center_counts
-        What the position reads at the shaft's angle 0.
+        The position reading at the shaft's angle 0.
 
     Raises
     ------
     ValueError
-        No such id or baud rate.
+        There is no such id or baud rate.
     """
 
     protocol = 1
@@ -185,7 +185,7 @@ class Ax12Servo(SimulatedServoBase):
             raise ValueError(f"no servo has the id {bus_id}: choose one of 0 to 253")
         if baudrate not in BAUD_RATES.values():
             known = ", ".join(map(str, sorted(BAUD_RATES.values())))
-            raise ValueError(f"no AX-12A speaks at {baudrate} baud: choose one of {known}")
+            raise ValueError(f"an AX-12A has no baud rate {baudrate}: choose one of {known}")
         super().__init__(shaft, model)
         self.memory = Image(number_of(model.name))
         self.memory["ID"] = bus_id
@@ -216,11 +216,11 @@ class Ax12Servo(SimulatedServoBase):
             return None
         level = self.memory["Status Return Level"]
         if not packet.intact:
-            return None if everyones else Status(self._trouble() | Error.CHECKSUM)
+            return None if everyones else Status(self._hardware_errors() | Error.CHECKSUM)
         error, data = self._perform(packet)
         ping = packet.instruction == Instruction.PING
         answers = ping or (not everyones and level >= 2 - (packet.instruction == Instruction.READ))
-        return Status(self._trouble() | error, data) if answers else None
+        return Status(self._hardware_errors() | error, data) if answers else None
 
     def _perform(self, packet: InstructionPacket) -> tuple[int, bytes]:
         parameters = packet.parameters
@@ -303,7 +303,7 @@ class Ax12Servo(SimulatedServoBase):
         self.memory.restore(RAM_START)
         self.memory["Torque Limit"] = self.memory["Max Torque"]
 
-    def _trouble(self) -> int:
+    def _hardware_errors(self) -> int:
         """Return the error bits of the hardware's state."""
         return self._supply_and_heat() | self._failed | (Error.OVERLOAD if self._overload else 0)
 
@@ -311,7 +311,7 @@ class Ax12Servo(SimulatedServoBase):
         if not self._powered:
             return
         self._overload |= self.motor.overloaded
-        if self._trouble() & self.memory["Shutdown"] and self.memory["Torque Enable"]:
+        if self._hardware_errors() & self.memory["Shutdown"] and self.memory["Torque Enable"]:
             self.memory["Torque Enable"] = self.memory["Torque Limit"] = 0
             self.motor.release()
 
@@ -347,11 +347,11 @@ class Ax12Servo(SimulatedServoBase):
         if self._wheel and self.memory["Torque Enable"]:
             speed = self.memory["Moving Speed"]
             dps = (speed & 0x3FF) / 1023 * self.motor.fastest_dps
-            self.motor.turn_at(-dps if speed & _DIRECTION else dps, self.motor.steepest_dps2)
+            self.motor.rotate_at(-dps if speed & _DIRECTION else dps, self.motor.steepest_dps2)
             self._supervise()
 
     def _position(self) -> int:
-        """Return the position reading; outside the 300° of the potentiometer it is the nearest end."""
+        """Return the position reading; outside the 300° of the potentiometer it is the next end."""
         noise_deg = self._shaft.noise.encoder_noise_deg
         error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
         counts = round((self._shaft.shaft()[0] + error_deg) / DEG_PER_COUNT + self._center)

@@ -9,8 +9,8 @@ from sim.servo.models import ServoModel
 from sim.servo.motor import Motor
 from sim.servo.shaft import Shaft
 
-BOOT_S = 0.2  # how long a servo is silent after power-up or Reboot; the e-manual states no value
-SUPERVISION_S = 0.1  # how often the servo checks load and temperature while it works
+BOOT_S = 0.2  # silence after power-up or Reboot; the e-manual states no value
+SUPERVISION_S = 0.1  # period of the checks of load and temperature while the servo works
 RETURN_DELAY_UNIT_NS = 2_000
 
 VOLTAGE_ERROR, OVERHEATING_ERROR, ENCODER_ERROR, ELECTRICAL_ERROR, OVERLOAD_ERROR = 0x01, 0x04, 0x08, 0x10, 0x20
@@ -30,8 +30,7 @@ class SimulatedServoBase(ABC):
     Attributes
     ----------
     distortions
-        Called with the memory each time its live registers have been filled in, before they are read: a tired servo
-        reports something else.
+        Called with the memory after its live registers are updated and before they are read, to falsify the readings.
     """
 
     memory: Registers
@@ -60,12 +59,9 @@ class SimulatedServoBase(ABC):
 
     # -- for tests and faults -------------------------------------------------------------------------------------
 
-    def turn_by_hand(self, angle_deg: float, speed_dps: float = 90.0) -> float:
-        """Rotate the shaft by hand by ``angle_deg``, with torque off; return how many seconds that takes.
-
-        Raises `ValueError` if the servo holds the shaft.
-        """
-        return self.motor.push(angle_deg, speed_dps, 4 * speed_dps)
+    def rotate_by_hand(self, angle_deg: float) -> float:
+        """Rotate the shaft by hand by ``angle_deg``; see `Motor.push`."""
+        return self.motor.push(angle_deg)
 
     def jam(self) -> None:
         """Block the shaft."""

@@ -15,9 +15,9 @@ BITS_PER_BYTE = 10  # a start bit, 8 data bits, a stop bit
 ABANDON_S = 0.05  # silence after which a device drops an incomplete packet; the e-manual states no value
 PING_SLOT_S = 0.003
 PING_STATUS_BYTES = 14
-"""Broadcast Ping: each id has a slot of one status packet and 3 ms, which is what the SDK's timeout reckons with."""
+"""Broadcast Ping: each id has a slot of one status packet and 3 ms, as in the SDK's timeout."""
 COLLISION_SHIFT_BITS = 3
-"""How much later the second of two devices with one id starts: no two of them answer at the same instant."""
+"""Delay of the second of two devices with one id: they never answer at exactly the same time."""
 
 
 class Source(Enum):
@@ -76,24 +76,24 @@ class Device(Protocol):
 
 
 class ServoBus:
-    """Servos on one line, and the host's adapter.
+    """Servos on one bus, and the host's adapter.
 
-    An instruction reaches the devices when its last byte has arrived; an answer begins after the device's Return Delay
-    Time, in a chained read after the answer before it (behind a silent device the rest of the chain is silent too). A
-    device set to another baud rate than the host's understands nothing. Two devices with one id spoil each other's
-    answers. What the host sends while a device answers does no harm here.
+    An instruction reaches the devices when its last byte has arrived. An answer begins after the device's Return Delay
+    Time, in a chained read after the previous answer (all devices after a silent one are silent, too). A device with
+    another baud rate than the host receives nothing. The answers of two devices with one id collide. Bytes of the host
+    do not collide with the answer of a device here.
 
     Attributes
     ----------
     taps
-        Called with each frame that is sent, both ways, as the host sees it.
+        Called with each frame in both directions, as the host sees it.
     filters
-        Called with each frame of a device on its way to the host, one after the other; a tamper returns the frame that
-        goes on in its place (other bytes, another time), or None to lose it.
+        Called in their order with each frame from a device to the host. A filter returns the frame that the host
+        receives instead (other bytes, another time), or None if the frame is lost.
     echo
-        Whether the adapter hears itself, as a half-duplex one without a switched receiver does.
+        Whether the adapter receives its own bytes, like a half-duplex one without a switched receiver.
     deaf
-        Whether what the host sends gets lost on its way.
+        Whether all bytes of the host are lost.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
@@ -127,7 +127,7 @@ class ServoBus:
         self._deliver = None
 
     def send(self, data: bytes, baudrate: int) -> int:
-        """Send the host's bytes after those still being sent; return when the last one arrives."""
+        """Send the host's bytes after those still being sent; return the time at which the last one arrives."""
         frame = Frame(Source.HOST, max(self.clock.now_ns(), self._sent_until_ns), baudrate, data)
         self._sent_until_ns = frame.end_ns
         for tap in self.taps:
@@ -198,8 +198,8 @@ class ServoBus:
         return frames
 
     def _reply(self, frame: Frame) -> None:
-        for tamper in self.filters:
-            changed = tamper(frame)
+        for change in self.filters:
+            changed = change(frame)
             if changed is None:
                 return
             frame = changed

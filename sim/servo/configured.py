@@ -15,7 +15,7 @@ SimulatedServo = XSeriesServo | Ax12Servo
 def simulated_servo(world: World, config: ServoConfig) -> SimulatedServo:
     """Return the servo that ``config`` describes, with factory settings, on the table's shaft or behind its gear.
 
-    Raises `ConfigError` if there is no simulated servo of that model, or it does not know the baud rate.
+    Raises `ConfigError` if there is no simulated servo of that model, or the model does not have the baud rate.
     """
     shaft: Shaft = world if config.gear_ratio == 1 else Geared(world, config.gear_ratio)
     try:

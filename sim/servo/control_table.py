@@ -1,4 +1,4 @@
-"""The memory of one servo: its bytes, its registers, its EEPROM and its access rules."""
+"""The memory of a servo: its bytes, its registers, its EEPROM and its access rules."""
 
 from collections.abc import Iterator
 
@@ -28,9 +28,9 @@ class Rejection(Exception):
 
 
 class Memory:
-    """Control table of one servo; values by register name, signed if the register is.
+    """Control table of a servo; values by register name, signed if the register is.
 
-    Indirect Data is resolved through its Indirect Address, to the byte that it stands for.
+    A byte of Indirect Data is the byte at its Indirect Address.
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
@@ -73,7 +73,7 @@ class Memory:
         return bytes(self._image[FIRST_LIVE_REGISTER : self._live_end])
 
     def set_live(self, block: bytes) -> None:
-        """Set them, in the order of `live`."""
+        """Set the registers that follow the world, in the order of `live`."""
         self._image[FIRST_LIVE_REGISTER : self._live_end] = block
 
     @property
@@ -86,7 +86,7 @@ class Memory:
         self._restore(RAM_START, self._size)
 
     def forget_all(self, keep: tuple[str, ...] = ()) -> None:
-        """Set all registers but those named in ``keep`` to their initial values."""
+        """Set all registers except those named in ``keep`` to their initial values."""
         kept = {name: self[name] for name in keep}
         self._restore(0, self._size)
         for name, value in kept.items():
@@ -98,7 +98,7 @@ class Memory:
         Raises
         ------
         Rejection
-            DATA_LENGTH for no bytes at all, ACCESS where the range leaves the table.
+            DATA_LENGTH for no bytes, ACCESS if the range exceeds the table.
         """
         if size == 0:
             raise Rejection(StatusError.DATA_LENGTH)
@@ -115,7 +115,7 @@ class Memory:
         Raises
         ------
         Rejection
-            ACCESS for a register that is read only or no register at all, DATA_LENGTH for a part of a register,
+            ACCESS for a read-only register or an address without a register, DATA_LENGTH for a part of a register,
             DATA_RANGE for a value outside its range.
         """
         if not data:
@@ -163,10 +163,10 @@ def _plain(table: ControlTable) -> Iterator[Register]:
 
 
 def _indirect_blocks(table: ControlTable) -> Iterator[tuple[int, int, int]]:
-    """Yield (first Indirect Address, first Indirect Data, how many) of each block.
+    """Yield (first Indirect Address, first Indirect Data, count) of each block.
 
-    The addresses of a block end where its data begins. The table's entries "Write" and "Read" are parts of blocks that
-    the SDK's users have agreed on; only a "Read" beyond the first block's data is a block of its own.
+    The addresses of a block end where its data begins. The table's entries "Write" and "Read" are a convention of the
+    SDK's users for parts of blocks; only a "Read" beyond the first block's data is another block.
     """
     if "Indirect Address 1" not in table:
         return

@@ -21,7 +21,7 @@ from sim.servo.shaft import Shaft
 
 IN_POSITION_COUNTS = 4
 FOLLOWING_ERROR_COUNTS = 100  # the e-manual calls these two thresholds of Moving Status predefined and states no values
-SINGLE_TURN_HOMING_COUNTS = 1024  # a Homing Offset beyond it is ignored in position mode
+SINGLE_TURN_HOMING_COUNTS = 1024  # a larger Homing Offset is ignored in position mode
 TICK_MODULUS_MS = 32_768
 
 _REVERSE, _TIME_BASED = 0x01, 0x04  # bits of Drive Mode
@@ -37,12 +37,12 @@ class Profile(IntEnum):
 
 
 class Controller:
-    """Turns the goal registers into the motor's trajectories.
+    """Converts the goal registers to trajectories of the motor.
 
-    Position registers count steps of `DEG_PER_COUNT` from the encoder's zero, in the direction of Drive Mode; the turns
-    count until they are forgotten where the e-manual says so (`wrap_position`). Gains, PWM and current limits are kept
-    but do not act. What the encoder reads too much over a turn are the `harmonics_deg`: cosine and sine of the first,
-    and of the second.
+    Position registers count steps of `DEG_PER_COUNT` from the encoder's zero, in the direction of Drive Mode. Whole
+    revolutions are counted until `wrap_position`, as in the e-manual. Gains, PWM and current limits are stored but have
+    no effect. `harmonics_deg` is the encoder's error over a revolution: cosine and sine of the first and the second
+    harmonic.
     """
 
     def __init__(self, world: Shaft, memory: Memory, motor: Motor, model: ServoModel, center_counts: int) -> None:
@@ -55,7 +55,7 @@ class Controller:
         part = world.rng(f"servo-{memory['ID']}-part")
         drawn = world.noise.encoder_harmonic_deg * part.standard_normal((2, 2))
         self.harmonics_deg = [(float(a), float(b)) for a, b in drawn]
-        self._turns_counts = 0
+        self._revolution_counts = 0
         self._profile = Profile.STEP
         self._started_ns = 0
 
@@ -71,7 +71,7 @@ class Controller:
         self.wrap_position()
 
     def change_mode(self) -> None:
-        """Reset what a change of the Operating Mode resets (e-manual, Operating Mode and Present Position)."""
+        """Reset the registers after a change of the Operating Mode (e-manual, Operating Mode and Present Position)."""
         for name in ("Profile Velocity", "Profile Acceleration", "Goal Velocity"):
             self._memory[name] = 0
         for name in GAINS:
@@ -81,7 +81,7 @@ class Controller:
             self.wrap_position()
 
     def torque_on(self) -> None:
-        """Hold the shaft where it is: a goal written while torque was off is ignored."""
+        """Hold the shaft at its angle: a goal written while torque was off is ignored."""
         if self._memory["Operating Mode"] == POSITION_MODE:
             self.wrap_position()
         self._motor.hold()
@@ -90,7 +90,7 @@ class Controller:
         self._profile = Profile.STEP
 
     def stop(self) -> None:
-        """Stop and hold, as a tripped Bus Watchdog does; the goal register does not change."""
+        """Stop and hold, like a tripped Bus Watchdog; the goal register does not change."""
         self._memory["Profile Velocity"] = self._memory["Profile Acceleration"] = 0
         self._profile = Profile.STEP
         self._motor.brake()
@@ -131,14 +131,14 @@ class Controller:
             a_max = min(a_max, abs(goal_dps - self._motor.state().target_dps) / (acceleration * 1e-3))
         elif acceleration:
             a_max = min(a_max, acceleration * DPS2_PER_UNIT)
-        self._motor.turn_at(goal_dps, max(a_max, _STANDSTILL))
+        self._motor.rotate_at(goal_dps, max(a_max, _STANDSTILL))
         self._profile = Profile.TRAPEZOIDAL if acceleration else Profile.STEP
 
     def wrap_position(self) -> None:
         """Reset the count of revolutions: the position continues from within one revolution."""
-        self._turns_counts = 0
+        self._revolution_counts = 0
         present = self._present_position() - self._homing
-        self._turns_counts = present - present % COUNTS_PER_TURN
+        self._revolution_counts = present - present % COUNTS_PER_TURN
         self._memory["Goal Position"] = self._present_position()
 
     def slip_encoder(self, angle_deg: float) -> None:
@@ -203,11 +203,11 @@ class Controller:
     def _counts(self, angle_deg: float) -> int:
         """Return the value of a position register at a shaft angle."""
         read_deg = angle_deg + self._encoder_error_deg(angle_deg)
-        return self._sign * round(read_deg / DEG_PER_COUNT + self._center) - self._turns_counts + self._homing
+        return self._sign * round(read_deg / DEG_PER_COUNT + self._center) - self._revolution_counts + self._homing
 
     def _degrees(self, counts: int) -> float:
         """Return the shaft angle at which a position register reads ``counts``."""
-        read_deg = (self._sign * (counts - self._homing + self._turns_counts) - self._center) * DEG_PER_COUNT
+        read_deg = (self._sign * (counts - self._homing + self._revolution_counts) - self._center) * DEG_PER_COUNT
         angle_deg = read_deg
         for _ in range(3):  # the error changes by a hundredth of the angle at most
             angle_deg = read_deg - self._encoder_error_deg(angle_deg)
@@ -217,10 +217,8 @@ class Controller:
         """Return the encoder's error at a shaft angle: its magnet is a little off the axis."""
         if not self._world.noise.encoder_harmonic_deg:
             return 0.0
-        turn = radians(angle_deg)
-        return sum(
-            a * cos(order * turn) + b * sin(order * turn) for order, (a, b) in enumerate(self.harmonics_deg, start=1)
-        )
+        angle = radians(angle_deg)
+        return sum(a * cos(n * angle) + b * sin(n * angle) for n, (a, b) in enumerate(self.harmonics_deg, start=1))
 
     def _present_position(self) -> int:
         noise_deg = self._world.noise.encoder_noise_deg
@@ -228,4 +226,4 @@ class Controller:
         return self._counts(self._world.shaft()[0] + error_deg)
 
 
-_STANDSTILL = 1e-9  # smallest limit of a profile: a profile of length 0 has no speed
+_STANDSTILL = 1e-9  # smallest speed and acceleration of a profile: a profile of length 0 would have none

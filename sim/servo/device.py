@@ -1,4 +1,4 @@
-"""One simulated X-series (or MX 2.0) servo: its answers on the bus, and methods for tests."""
+"""A simulated X-series (or MX 2.0) servo: its answers on the bus, and methods for tests."""
 
 from collections.abc import Callable
 
@@ -23,26 +23,26 @@ _CLEAR_MULTI_TURN = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 class XSeriesServo(SimulatedServoBase):
     """A servo whose horn is the table's shaft.
 
-    A block is written as a whole or, where one of its registers rejects, not at all. Writing an id, a baud rate or a
-    delay is answered with the old one.
+    If one register of a block rejects its value, nothing of the block is written. The answer to a new id, baud rate or
+    delay still uses the old one.
 
     Parameters
     ----------
     world
-        The world it turns, or a gear on it. A second servo on the same bus has a world of its own on the same clock.
+        The world that it rotates, or a gear. A second servo on the same bus has another world on the same clock.
     model
-        A name that `sim.servo.models.servo_model` knows.
+        A name for `sim.servo.models.servo_model`.
     bus_id, baudrate
-        Its settings before the test; Factory Reset restores 1 and 57,600.
+        Initial settings; Factory Reset restores 1 and 57,600.
     firmware
-        Firmware Version; the model's usual one where not given.
+        Firmware Version; default: that of the model.
     center_counts
-        What the encoder reads at the shaft's angle 0.
+        The encoder's reading at the shaft's angle 0.
 
     Raises
     ------
     ValueError
-        No such model, id or baud rate.
+        There is no such model, id or baud rate.
     """
 
     protocol = 2
@@ -60,7 +60,7 @@ class XSeriesServo(SimulatedServoBase):
     ) -> None:
         row = servo_model(model)
         if baudrate not in BAUD_RATES:
-            raise ValueError(f"no servo speaks at {baudrate} baud: choose one of {', '.join(map(str, BAUD_RATES))}")
+            raise ValueError(f"no servo has the baud rate {baudrate}: choose one of {', '.join(map(str, BAUD_RATES))}")
         super().__init__(world, row)
         if bus_id not in self.model.ranges["ID"]:
             raise ValueError(f"no servo has the id {bus_id}: choose one of 0 to 252")
@@ -220,7 +220,7 @@ class XSeriesServo(SimulatedServoBase):
 
     def _factory_reset(self, option: int, everyones: bool) -> None:
         if everyones and option == 0xFF:
-            return  # from firmware 42 on: else all servos of the bus would get the same id
+            return  # since firmware 42: otherwise all servos on the bus would get the same id
         self.memory.forget_all(keep={0xFF: (), 0x01: ("ID",), 0x02: ("ID", "Baud Rate")}[option])
         self.power_cycle()
 
@@ -233,7 +233,7 @@ class XSeriesServo(SimulatedServoBase):
             self.motor.release()
         elif self._shut_down():
             self.memory["Torque Enable"] = 0
-        elif not self.motor.driven:  # written again, it disturbs no motion
+        elif not self.motor.driven:  # if it is written again, a motion continues
             self._torque_on()
 
     def _torque_on(self) -> None:

@@ -1,6 +1,6 @@
 """The differences between servo models as data: initial values, ranges, speed, current.
 
-Source: the e-manual's control tables and specifications of each model. A further X-series or MX (2.0) model is one more
+Source: the e-manual's control tables and specifications of each model. For another X-series or MX (2.0) model, add a
 `ServoModel`; its register addresses come from the SDK's `.model` file.
 """
 
@@ -73,25 +73,25 @@ _RANGES: dict[str, Container[int]] = {
 
 @dataclass(frozen=True)
 class ServoModel:
-    """One model.
+    """A servo model.
 
     Attributes
     ----------
     name
-        Name of its `.model` file, which gives the registers.
+        Name of its `.model` file, which contains the registers.
     firmware
-        Firmware of a new one.
+        Firmware of a new servo.
     initial
-        Initial values of registers by name; those not named start at 0.
+        Initial values of registers by name; default: 0.
     ranges
-        Values that a register takes; a register not named takes all that fit.
+        Valid values of registers by name; default: all that fit.
     supply_v
-        Supply that it runs from, one for which the specifications give a speed.
+        Supply voltage, for which the specifications give a speed.
     no_load_dps
-        Speed without load at that supply, in °/s: the fastest that the shaft turns.
+        Speed without load at that supply, in °/s: the maximum.
     acceleration_dps2
-        Acceleration at stall torque, in °/s², with a light platter: the steepest ramp. An estimate (no-load speed
-        within about 0.1 s): the e-manual gives the torque, but the inertia is the user's.
+        Acceleration at stall torque with a light platter, in °/s²: the maximum. It is an estimate (no-load speed within
+        about 0.1 s): the e-manual gives the torque, but the inertia depends on the platter.
     stall_current
         Present Current at stall, in the register's unit; None for models that report Present Load instead.
     """

@@ -9,17 +9,19 @@ from sim.servo.shaft import Shaft
 
 FRICTION_LOAD = 0.04  # friction of the gears while the shaft rotates, as a part of the stall torque
 PWM_PER_COUNT = 5.0
-"""PWM that the position controller adds for each count of error: Position P Gain 640 / 128 (e-manual, XL430-W250)."""
+"""PWM of the position controller for each count of error: Position P Gain 640 / 128 (e-manual, XL430-W250)."""
 SUPPLY_DROP_V = 0.4  # voltage lost in the supply's cable at stall
 
 AMBIENT_C = 25.0
-STANDBY_RISE_C = 8.0  # warming by the electronics alone
-STALL_RISE_C = 90.0  # final warming at stall torque; it is proportional to the square of the load
+STANDBY_RISE_C = 8.0  # rise of the temperature by the electronics alone
+STALL_RISE_C = 90.0  # final rise at stall torque; proportional to the square of the load
 THERMAL_TIME_S = 400.0  # time constant of the case
+
+HAND_DPS = 90.0  # speed of a rotation by hand
 
 OVERLOAD = 0.99
 OVERLOAD_S = 2.0
-"""How long the motor may push with full torque before the servo reports an overload; the e-manual states no value."""
+"""Time at full torque after which the servo reports an overload; the e-manual states no value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +42,9 @@ class MotorState:
 class Motor:
     """A position- or speed-controlled shaft in the world's degrees.
 
-    The shaft follows what is commanded exactly, unless it is jammed: then it stands, the controller's error grows, and
-    the load with it. `settle` takes heat and overload forward, with the load of that moment; whoever owns the motor
-    calls it now and then while the motor is `busy`.
+    The shaft follows the commanded trajectory exactly, unless it is jammed: then it does not move, and the controller's
+    error and the load grow. `settle` updates heat and overload with the present load; the owner of the motor calls it
+    repeatedly while the motor is `busy`.
     """
 
     def __init__(self, world: Shaft, model: ServoModel) -> None:
@@ -101,7 +103,7 @@ class Motor:
         return self.supply_v - SUPPLY_DROP_V * abs(load)
 
     def temperature_c(self, load: float) -> float:
-        """Return the temperature of the case, taking ``load`` for the time since `settle`."""
+        """Return the temperature of the case, with ``load`` since the last `settle`."""
         target = AMBIENT_C + STANDBY_RISE_C + STALL_RISE_C * load**2
         return target + (self._temperature_c - target) * exp((self._settled_s - self._now_s()) / THERMAL_TIME_S)
 
@@ -119,7 +121,7 @@ class Motor:
     # -- commands of the controller -------------------------------------------------------------------------------
 
     def hold(self) -> None:
-        """Hold the shaft where it is."""
+        """Hold the shaft at its angle."""
         self._follow(rest(self._now_s(), self._world.shaft()[0]), driven=True)
 
     def release(self) -> None:
@@ -134,14 +136,14 @@ class Motor:
         state = self.state()
         self._follow(to_position(self._now_s(), state.target_deg, state.target_dps, angle_deg, v_max, a_max))
 
-    def turn_at(self, speed_dps: float, a_max: float) -> None:
+    def rotate_at(self, speed_dps: float, a_max: float) -> None:
         state = self.state()
         self._follow(to_velocity(self._now_s(), state.target_deg, state.target_dps, speed_dps, a_max))
 
     # -- for tests and faults -------------------------------------------------------------------------------------
 
     def jam(self) -> None:
-        """Block the shaft where it is, against whatever drives it."""
+        """Block the shaft at its angle."""
         self.settle()
         self._jammed = True
         self._world.drive(rest(self._now_s(), self._world.shaft()[0]))
@@ -159,15 +161,15 @@ class Motor:
             goal = float(self.commanded.position_deg[-1])
             self._follow(to_position(self._now_s(), angle, 0.0, goal, self.fastest_dps, self.steepest_dps2))
 
-    def push(self, angle_deg: float, v_max: float, a_max: float) -> float:
-        """Rotate the released shaft by hand by ``angle_deg``; return how many seconds that takes.
+    def push(self, angle_deg: float) -> float:
+        """Rotate the released shaft by hand by ``angle_deg``; return the time of the motion in seconds.
 
         Raises `ValueError` if the shaft is driven or jammed.
         """
         if self.driven or self._jammed:
             raise ValueError("A held shaft cannot be rotated: switch the servo's torque off and free it first.")
         angle, speed = self._world.shaft()
-        self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, v_max, a_max))
+        self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, HAND_DPS, 4 * HAND_DPS))
         return self.commanded.end_s - self._now_s()
 
     def _stop(self) -> Trajectory:

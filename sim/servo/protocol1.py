@@ -1,7 +1,7 @@
-"""Dynamixel Protocol 1.0 as a slave speaks it: instruction packets in, status packets out.
+"""The device's side of Dynamixel Protocol 1.0: it receives instruction packets and sends status packets.
 
 Source: e-manual "DYNAMIXEL Protocol 1.0". Packets are FF FF, id, length, instruction or error, parameters, and the
-inverted sum of all but the header; nothing is stuffed, and the sum has 8 bits.
+inverted sum of all bytes except the header; nothing is stuffed, and the sum has 8 bits.
 """
 
 from enum import IntFlag
@@ -32,7 +32,7 @@ def checksum(body: bytes) -> int:
 
 
 class PacketParser1:
-    """Finds instruction packets in a stream of bytes, in pieces of any size and in noise."""
+    """Finds instruction packets in a stream of bytes that arrives in pieces of any size, with noise."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()

@@ -1,4 +1,4 @@
-"""Dynamixel Protocol 2.0 as a slave speaks it: instruction packets in, status packets out.
+"""The device's side of Dynamixel Protocol 2.0: it receives instruction packets and sends status packets.
 
 Source: e-manual "DYNAMIXEL Protocol 2.0" (packet format, byte stuffing) and "CRC Calculation" (CRC-16 of 0x8005).
 """
@@ -76,7 +76,7 @@ _CRC_TABLE = tuple(_crc_of_byte(byte) for byte in range(256))
 
 
 def crc16(data: bytes, crc: int = 0) -> int:
-    """Return the CRC-16 of ``data`` (polynomial 0x8005, initial value 0, not reflected), going on from ``crc``."""
+    """Return the CRC-16 of ``data`` (polynomial 0x8005, not reflected), continued from ``crc``."""
     for byte in data:
         crc = (crc << 8) & 0xFFFF ^ _CRC_TABLE[crc >> 8 ^ byte]
     return crc
@@ -87,7 +87,7 @@ def with_crc(frame: bytes) -> bytes:
 
 
 class PacketParser:
-    """Finds instruction packets in a stream of bytes, in pieces of any size and in noise."""
+    """Finds instruction packets in a stream of bytes that arrives in pieces of any size, with noise."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -137,8 +137,8 @@ def status_packet(bus_id: int, status: Status) -> bytes:
 def fast_status_parts(sizes: list[int], answers: list[tuple[int, Status]]) -> list[bytes]:
     """Return the part of each device in the status packet of a Fast Sync Read or Fast Bulk Read.
 
-    The packet's length counts all devices asked (``sizes``: bytes asked of each), also those that stay silent; the CRC
-    of each part covers everything before it, so the last one is the packet's own. Nothing is byte-stuffed (e-manual,
+    The packet's length includes all requested devices (``sizes``: requested bytes of each), also silent ones. The CRC
+    of each part covers everything before it, so the last one is that of the packet. Nothing is byte-stuffed (e-manual,
     Fast Sync Read). There are no parts if the length does not fit into its two bytes.
     """
     length = 1 + sum(size + 4 for size in sizes)

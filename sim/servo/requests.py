@@ -1,4 +1,4 @@
-"""The parameters of the instructions that concern several devices at once, by device id in the order of the packet.
+"""The parameters of instructions to several devices, by device id in the order of the packet.
 
 Source: e-manual "DYNAMIXEL Protocol 2.0", Sync Read, Sync Write, Bulk Read, Bulk Write and the fast variants.
 """
@@ -10,7 +10,7 @@ CHAINED_READS = frozenset(
 )
 """Instructions that devices answer one after the other."""
 FAST_READS = frozenset({Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ})
-"""Those of them whose answers make up one status packet."""
+"""Chained reads whose answers form one status packet."""
 
 
 def word(data: bytes, start: int = 0) -> int:

@@ -9,21 +9,21 @@ from sim.servo.bus import Frame, ServoBus
 
 
 class SimSerial:
-    """Looks like an open `serial.Serial`; who reads waits on the bus's clock.
+    """An open port with the interface of `serial.Serial`; reads wait on the bus's clock.
 
     Parameters
     ----------
     bus
-        The line behind the adapter.
+        The bus at the adapter.
     baudrate, timeout
-        As of `serial.Serial`: ``timeout`` in seconds, 0 to return what is there, None to wait for ever.
+        As in `serial.Serial`: ``timeout`` in seconds, 0: return the available bytes, None: wait without a limit.
     port
-        What the port calls itself in messages.
+        The port's name in messages.
 
     Raises
     ------
     serial.SerialException
-        The bus has a host already.
+        The bus already has a host.
     """
 
     def __init__(self, bus: ServoBus, baudrate: int = 57_600, timeout: float | None = None, port: str = "sim") -> None:
@@ -76,14 +76,14 @@ class SimSerial:
         return len(self._received)
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to ``size`` bytes: all of them as soon as they are there, fewer at the timeout.
+        """Return up to ``size`` bytes: all as soon as they have arrived, fewer at the timeout.
 
         Raises
         ------
         serial.SerialException
             The port is closed or unplugged.
         RuntimeError
-            Without a timeout, nothing that is scheduled can bring the missing bytes.
+            There is no timeout, and no scheduled event can deliver the missing bytes.
         """
         self._require_open()
         clock = self._bus.clock
@@ -92,7 +92,7 @@ class SimSerial:
         while len(self._received) < size and (deadline_ns is None or clock.now_ns() < deadline_ns):
             wake_ns = [t for t in (deadline_ns, clock.next_event_ns(), self._arrival_ns(size)) if t is not None]
             if not wake_ns:
-                raise RuntimeError("this read would never return: no byte is on its way, give the port a timeout")
+                raise RuntimeError("this read would never return, because no byte arrives: give the port a timeout")
             clock.advance_to(min(wake_ns))
             self._require_open()
             self._collect()
@@ -141,7 +141,7 @@ class SimSerial:
             self._taken = 0
 
     def _arrival_ns(self, size: int) -> int | None:
-        """Return when ``size`` bytes will be there, or the last one that is on its way."""
+        """Return the time at which ``size`` bytes, or all bytes on their way, will have arrived."""
         missing = size - len(self._received)
         taken = self._taken
         arrival_ns = None

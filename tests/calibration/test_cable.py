@@ -9,7 +9,7 @@ from tests.calibration.rejected import codes
 
 
 def hand(s, angle_deg: float) -> None:
-    s.bench.clock.sleep(s.operator.devices.servo.turn_by_hand(angle_deg))
+    s.bench.clock.sleep(s.operator.devices.servo.rotate_by_hand(angle_deg))
     s.bench.clock.sleep(abs(angle_deg) / 60)
 
 

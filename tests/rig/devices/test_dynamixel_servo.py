@@ -56,7 +56,7 @@ def test_missing_servo_raises_device_not_found(wires):
 
 
 def test_torque_on_sets_the_goal_to_the_present_position_first(wires, servo):
-    wires.device.turn_by_hand(123.0)
+    wires.device.rotate_by_hand(123.0)
     wires.world.clock.sleep(3.0)
     before = wires.world.shaft()[0]
     servo.torque_on()

@@ -122,7 +122,7 @@ def test_missing_features_of_the_ax12_are_reported() -> None:
 def test_ax12_holds_its_position_when_torque_goes_on() -> None:
     devices = parts_of(*AX)
     servo = servo_of(devices, *AX)
-    devices.servo.turn_by_hand(40.0)
+    devices.servo.rotate_by_hand(40.0)
     devices.world.clock.sleep(2.0)
     servo.torque_on()
     devices.world.clock.sleep(1.0)

@@ -176,12 +176,12 @@ def test_restored_revolutions_survive_a_kill_at_rest(start, wires):
 def test_rotation_by_hand_is_counted_with_supply_and_needs_a_new_reference_without(start, wires):
     with start() as bench, Turntable(bench) as table:
         table.goto(90.0)
-    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
+    wires.world.clock.sleep(wires.device.rotate_by_hand(-30.0))
     with start() as bench:
         assert "by hand" in bench.findings[0]
         with Turntable(bench) as table:
             assert table.rest_deg == pytest.approx(60.0, abs=0.3)
-    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0))
+    wires.world.clock.sleep(wires.device.rotate_by_hand(-30.0))
     wires.device.power_cycle()
     wires.world.clock.sleep(1.0)
     with start() as bench, pytest.raises(Unreferenced, match="rotated while the servo had no supply"), Turntable(bench):
@@ -341,14 +341,14 @@ def test_changed_settings_of_the_table_need_home_here(change, tmp_path, start, w
 def test_position_beyond_the_limits_is_never_ready(start, wires):
     with start() as bench, Turntable(bench) as table:
         table.goto(390.0)
-    wires.world.clock.sleep(wires.device.turn_by_hand(30.0) + 0.1)
+    wires.world.clock.sleep(wires.device.rotate_by_hand(30.0) + 0.1)
     with start() as bench:
         assert bench.safety.state is TableState.UNREFERENCED
         assert bench.safety.doubt.finding is AngleFinding.BEYOND_LIMITS
         with pytest.raises(Unreferenced, match=r"4[12]\d\.\d°, beyond its cable budget") as rejected, Turntable(bench):
             pass
         assert "by hand back into its limits" in rejected.value.next_step
-    wires.world.clock.sleep(wires.device.turn_by_hand(-30.0) + 0.1)
+    wires.world.clock.sleep(wires.device.rotate_by_hand(-30.0) + 0.1)
     with start() as bench, Turntable(bench) as table:
         table.goto(300.0)
 

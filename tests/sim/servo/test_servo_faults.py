@@ -214,7 +214,7 @@ def test_jam_without_torque_causes_no_overload(line: Line) -> None:
     line.sleep(10.0)
     assert line.read("Hardware Error Status") == 0
     with pytest.raises(ValueError, match="held"):
-        line.servos[1].turn_by_hand(10.0)
+        line.servos[1].rotate_by_hand(10.0)
 
 
 def test_stalling_heats_the_case(line: Line) -> None:
@@ -240,7 +240,7 @@ def test_servo_without_power_is_silent_and_has_no_torque(line: Line) -> None:
     line.sleep(1.0)
     stopped = line.shaft()
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
-    line.servos[1].turn_by_hand(30.0)
+    line.servos[1].rotate_by_hand(30.0)
     line.sleep(5.0)
     assert line.shaft() == pytest.approx(stopped + 30)
     line.servos[1].power_on()

@@ -155,7 +155,7 @@ def test_reg_write_is_checked_and_waits_for_action(line: Line) -> None:
 @pytest.mark.parametrize("fast", [False, True])
 def test_sync_read_answers_in_the_requested_order(three: Line, fast: bool) -> None:
     for bus_id, position in ((1, 10.0), (7, 20.0), (4, 30.0)):
-        three.servos[bus_id].turn_by_hand(position)
+        three.servos[bus_id].rotate_by_hand(position)
     three.sleep(2.0)
     group = GroupSyncRead(three.port, three.sdk, 132, 4)
     for bus_id in (4, 7, 1):
@@ -254,7 +254,7 @@ def test_indirect_data_reads_and_writes_the_bytes_it_points_to(line: Line) -> No
     assert line.sdk.read1ByteTxRx(line.port, 1, 224) == (42, COMM_SUCCESS, 0)
     for i, target in enumerate((132, 133, 134, 135, 65)):
         assert line.sdk.write2ByteTxRx(line.port, 1, 168 + 2 * i, target) == (COMM_SUCCESS, 0)
-    line.servos[1].turn_by_hand(90.0)
+    line.servos[1].rotate_by_hand(90.0)
     line.sleep(3.0)
     data, _, error = line.sdk.readTxRx(line.port, 1, 224, 5)
     assert (int.from_bytes(bytes(data[:4]), "little"), data[4], error) == (2048 + 1024, 0, 0)

@@ -162,7 +162,7 @@ def test_current_models_report_current() -> None:
 
 def test_extended_position_counts_revolutions_also_with_torque_off(line: Line) -> None:
     line.put(Operating_Mode=4)
-    seconds = line.servos[1].turn_by_hand(-800.0)
+    seconds = line.servos[1].rotate_by_hand(-800.0)
     line.sleep(seconds)
     assert line.read("Present Position") == round(2048 - 800 / DEG_PER_COUNT)
     line.put(Torque_Enable=1)
@@ -170,7 +170,7 @@ def test_extended_position_counts_revolutions_also_with_torque_off(line: Line) -
 
 
 def test_position_mode_loses_the_revolutions_when_torque_comes_on(line: Line) -> None:
-    seconds = line.servos[1].turn_by_hand(720.0 + 90.0)
+    seconds = line.servos[1].rotate_by_hand(720.0 + 90.0)
     line.sleep(seconds)
     assert line.read("Present Position") == 2048 + 2 * 4096 + 1024
     line.put(Torque_Enable=1)
@@ -183,7 +183,7 @@ def test_power_up_reads_within_one_revolution(turns_deg: float, center: int) -> 
     line = Line()
     line.add(1, center_counts=center)
     line.put(Operating_Mode=4)
-    line.sleep(line.servos[1].turn_by_hand(turns_deg))
+    line.sleep(line.servos[1].rotate_by_hand(turns_deg))
     assert line.read("Present Position") == round(center + turns_deg / DEG_PER_COUNT)
     line.servos[1].power_cycle()
     line.sleep(0.5)
@@ -251,7 +251,7 @@ def test_goal_enables_torque_if_the_drive_mode_says_so(line: Line) -> None:
 def test_torque_holds_the_shaft_and_torque_off_releases_it(line: Line) -> None:
     extended(line, velocity=100)
     with pytest.raises(ValueError, match="torque"):
-        line.servos[1].turn_by_hand(10.0)
+        line.servos[1].rotate_by_hand(10.0)
     line.put(Goal_Position=20_000)
     line.sleep(1.0)
     line.put(Torque_Enable=0)
