@@ -234,7 +234,7 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
         return hbr.Views.empty(kind.name), np.empty(0, np.int64)
     object_ids, names, view_ids, azimuths_deg, packed, enrollment_ids = zip(*rows, strict=True)
     if None in packed:
-        raise _outdated(connection, kind, {name for name, levels in zip(names, packed, strict=True) if levels is None})
+        raise _outdated(connection, kind, names, [levels is None for levels in packed])
     check_loaded(connection, set(object_ids), set(enrollment_ids))
     if set(map(len, packed)) != {kind.size_bytes}:
         raise damaged("the length of a descriptor", sorted(set(map(len, packed))))
@@ -255,18 +255,30 @@ def searched_version(connection: Connection) -> str:
     return sha256(ascii([tuple(row) for row in connection.execute(used)]).encode()).hexdigest()
 
 
-def _outdated(connection: Connection, kind: Descriptor, names: set[str]) -> DescriptorOutdated:
+def _outdated(
+    connection: Connection, kind: Descriptor, names: Sequence[str], is_missing: Sequence[bool]
+) -> DescriptorOutdated:
+    """Return the error that some views, given by their objects, are not described by this version."""
     versions = connection.scalars(
         select(descriptors.c.version).where(descriptors.c.name == kind.name).distinct().order_by(descriptors.c.version)
     ).all()
-    found = f"is described by {kind.name} {', '.join(map(str, versions))}" if versions else f"has no {kind.name}"
-    shown = ", ".join(map(repr, sorted(names)[:3]))
+    lacking = sorted({name for name, missing in zip(names, is_missing, strict=True) if missing})
+    shown = ", ".join(map(repr, lacking[:3])) + (f" and {len(lacking) - 3} more" if len(lacking) > 3 else "")
+    others = [str(version) for version in versions if version != kind.version]
+    also = f" Other views have version {' or '.join(others)}." if others else ""
     option = "" if kind.name == PAPER_DESCRIPTOR else f" --descriptor {kind.name}"
+    views, described = len(names), len(names) - sum(is_missing)
     return DescriptorOutdated(
-        f"{shown}{' and others' if len(names) > 3 else ''} cannot be compared: this program compares {kind.name} "
-        f"{kind.version}, the catalog {found}",
-        next_step=f"describe the stored images again: rig catalog redescribe{option}",
-        evidence={"objects": len(names), "versions": list(versions), "version": kind.version},
+        f"{described} of {views} views have the descriptor {kind.name} {kind.version}; it is missing for {shown}."
+        f"{also}",
+        next_step=f"Describe the stored images: rig catalog redescribe{option}",
+        evidence={
+            "views": views,
+            "described": described,
+            "objects": len(lacking),
+            "versions": list(versions),
+            "version": kind.version,
+        },
     )
 
 

@@ -346,9 +346,10 @@ class TestRedescribe:
         true_fill(catalog, "mug", 3, 0)
         true_fill(catalog, "tin", 2, 10)
         monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
-        with pytest.raises(DescriptorOutdated, match=r"compares cedd 2, the catalog is described by cedd 1") as error:
+        with pytest.raises(DescriptorOutdated, match=r"0 of 5 views have the descriptor cedd 2") as error:
             catalog.views()
         assert "rig catalog redescribe" in error.value.next_step
+        assert "it is missing for 'mug', 'tin'. Other views have version 1." in error.value.what
         assert error.value.evidence["objects"] == 2
         assert catalog.object("mug").views[0].record.descriptors == {}
         done = finished(redescribe(catalog))
@@ -362,13 +363,17 @@ class TestRedescribe:
 
     def test_redescribe_adds_another_descriptor(self, catalog: Catalog) -> None:
         true_fill(catalog, "mug", 3, 0, (2, 0, 12, 12))
-        with pytest.raises(DescriptorOutdated, match="has no cedd-blurred") as error:
+        with pytest.raises(DescriptorOutdated, match="0 of 3 views have the descriptor cedd-blurred") as error:
             catalog.views("cedd-blurred")
         assert "--descriptor cedd-blurred" in error.value.next_step
         finished(redescribe(catalog, "cedd-blurred"))
         wanted = descriptor("cedd-blurred").describe(image(1)[:, 2:14])
         assert np.array_equal(catalog.views("cedd-blurred").views.descriptors[1], wanted)
         assert np.array_equal(catalog.views().views.descriptors[1], hbr.describe(image(1)[:, 2:14]))
+        true_fill(catalog, "tin", 2, 10)
+        with pytest.raises(DescriptorOutdated) as error:
+            catalog.views("cedd-blurred")
+        assert error.value.what == "3 of 5 views have the descriptor cedd-blurred 1; it is missing for 'tin'."
         with pytest.raises(UsageError, match="sift"):
             catalog.views("sift")
 
