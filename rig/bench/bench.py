@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol, runtime_checkable
 
@@ -24,7 +24,7 @@ from rig.devices.camera import Camera
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
 from rig.devices.servo import Servo
-from rig.safety.saved_state import MemoryStore, StateStore
+from rig.safety.saved_state import MemoryStore, SessionEnd, StateStore
 from rig.safety.supervisor import Safety
 
 GROUP = "rig.benches"
@@ -86,6 +86,7 @@ class Bench(AbstractContextManager["Bench"]):
     head: RigHead | None = None
     connections: ExitStack = field(default_factory=ExitStack, repr=False)
     safety: Safety = field(init=False, repr=False)
+    _end: SessionEnd = field(default=SessionEnd.FINISHED, init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)
     _as_opened: tuple[RigConfig, tuple[str, ...]] | None = field(default=None, init=False, repr=False)
 
@@ -93,6 +94,7 @@ class Bench(AbstractContextManager["Bench"]):
         self.safety = Safety(self.servo, self.config, self.clock, self.state)
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        self._end = SessionEnd.of(error)
         try:
             self.close()
         except (RigError, OSError) as failure:
@@ -113,6 +115,7 @@ class Bench(AbstractContextManager["Bench"]):
         failures: list[Exception] = []
         for step in (
             self.servo.torque_off,
+            partial(self.safety.end_session, self._end),
             self.servo.close,
             self.imu.close,
             self.camera.close,

@@ -57,7 +57,8 @@ def halt(
         state = _agreed_reading(servo, clock, path)
         if state is None:
             servo.torque_off()
-            servo.disarm_watchdog()
+            if servo.read_condition().watchdog_armed:  # or the next program would find it armed
+                servo.disarm_watchdog()
             return True
         ramp_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
         bus_s = 2 * min(seconds_between(state.time_ns, clock.now_ns()), STALE_S)  # for the answer and for the goal

@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 from contextlib import AbstractContextManager, suppress
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
@@ -17,13 +18,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.core import files
 from rig.core.clock import Clock
-from rig.core.errors import BenchBusy, RigError, StateNotStored, os_errors_as
+from rig.core.errors import BenchBusy, MotionStopped, RigError, StateNotStored, os_errors_as
 from rig.core.files import no_follow
 
 VERSION = 2
 """Version 1 has neither the settings of the table nor the file of the latched fault."""
 LATCH_BYTES = 8192
 """Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
+SESSION = "session.json"
 LOCK_ATTEMPTS = 3
 _MAKE_ROOM = "Make room on the disk, or set state_dir to a folder that you may write to."
 
@@ -86,6 +88,38 @@ class Holder(_Saved):
     command: str
     since_utc: str
     terminates: bool = False
+
+
+class SessionEnd(StrEnum):
+    """How a program ended its session with the bench."""
+
+    FINISHED = "finished"
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+    """By Ctrl+C or another signal."""
+    STOPPED = "stopped"
+    """By ``rig stop``."""
+
+    @classmethod
+    def of(cls, error: BaseException | None) -> "SessionEnd":
+        """Return the end of a session that ended with this exception, or without one."""
+        match error:
+            case None:
+                return cls.FINISHED
+            case MotionStopped():
+                return cls.STOPPED
+            case Exception():
+                return cls.FAILED
+            case _:
+                return cls.INTERRUPTED
+
+
+class SavedSession(_Saved):
+    """A session of a program with the bench; ``ended`` is None until it ends, and stays so if the program dies."""
+
+    command: str
+    since_utc: str
+    ended: SessionEnd | None = None
 
 
 class StateStore(Protocol):
@@ -287,6 +321,35 @@ class FileStore:
             (self.path / name).unlink()
 
 
+def begin_session(store: StateStore, clock: Clock) -> SavedSession | None:
+    """Store that this program uses the bench, and return the session before; None if it is not known."""
+    before = _session(store)
+    _store_session(store, SavedSession(command=_this_command(), since_utc=clock.utc().isoformat(timespec="seconds")))
+    return before
+
+
+def end_session(store: StateStore, ended: SessionEnd) -> None:
+    """Store how the present session ends."""
+    if (session := _session(store)) is not None:
+        _store_session(store, session.model_copy(update={"ended": ended}))
+
+
+def _session(store: StateStore) -> SavedSession | None:
+    try:
+        return SavedSession.model_validate_json(store.read_file(SESSION) or b"")
+    except (StateNotStored, ValidationError):
+        return None
+
+
+def _store_session(store: StateStore, session: SavedSession) -> None:
+    with suppress(StateNotStored):  # full disk: only the words about the session are missing
+        store.store_file(SESSION, session.model_dump_json().encode())
+
+
+def _this_command() -> str:
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
 class BenchLock:
     """Reserves a bench for this process until it is closed; the kernel releases it when the process dies.
 
@@ -312,7 +375,7 @@ class BenchLock:
         FileStore(path).clear_stop()  # an old request, meant for an earlier program
         mine = Holder(
             pid=os.getpid(),
-            command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            command=_this_command(),
             since_utc=clock.utc().isoformat(timespec="seconds"),
             terminates=callable(signal.getsignal(signal.SIGTERM)),
         )

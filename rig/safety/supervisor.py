@@ -24,10 +24,18 @@ from rig.core.errors import (
     UsageError,
 )
 from rig.core.signals import uninterrupted
-from rig.devices.servo import Servo, ServoState
+from rig.devices.servo import Servo, ServoCondition, ServoState
 from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck
 from rig.safety.motion_checks import find_servo_fault
-from rig.safety.saved_state import LatchedFault, MemoryStore, StateStore
+from rig.safety.saved_state import (
+    LatchedFault,
+    MemoryStore,
+    SavedSession,
+    SessionEnd,
+    StateStore,
+    begin_session,
+    end_session,
+)
 from rig.safety.state_machine import StateEvent, StateMachine
 from rig.safety.state_machine import TableState as TableState
 from rig.safety.table_record import TableRecord
@@ -123,10 +131,8 @@ class Safety:
         findings = [f"the bench's stored state is lost: {self._record.damage}"] if self._record.damage else []
         if condition.torque:
             findings.append("the servo's torque was on: the last program could not switch it off")
-        if condition.watchdog_tripped:
-            findings.append("the servo's watchdog stopped it: the last program was killed, or the cable was unplugged")
-        elif condition.watchdog_armed:
-            findings.append("the servo's watchdog was still armed: the last program was killed during a motion")
+        if watchdog := _watchdog_finding(condition, begin_session(self._store, self._clock)):
+            findings.append(watchdog)
         if condition.hardware_errors:
             findings.append(f"the servo reports: {', '.join(condition.hardware_errors)}")
         self._record.findings = findings
@@ -244,6 +250,10 @@ class Safety:
         if self._store.stop_requested():
             raise _stopped()
         self._run_monitors()
+
+    def end_session(self, ended: SessionEnd) -> None:
+        """Store how this program ends its session, so that the next one does not take its end for a crash."""
+        end_session(self._store, ended)
 
     def released(self) -> None:
         """Store where the table rests now that the torque is off, and clear a request to stop."""
@@ -400,6 +410,19 @@ class Safety:
                 return NotReady(
                     f"The table is {self.state}.", next_step="Open the bench, and move it in `with Turntable(bench):`."
                 )
+
+
+def _watchdog_finding(condition: ServoCondition, last: SavedSession | None) -> str:
+    """Return what the servo's watchdog shows about the last session; empty if that ended in an orderly way."""
+    if not (condition.watchdog_tripped or condition.watchdog_armed):
+        return ""
+    if last is not None and last.ended is not None:
+        was_pulled = condition.watchdog_tripped and last.ended in (SessionEnd.FINISHED, SessionEnd.FAILED)
+        return "the servo's watchdog stopped it: the cable was unplugged, or the computer paused" * was_pulled
+    program = f"the last program (`{last.command}`, since {last.since_utc})" if last else "the last program"
+    if condition.watchdog_tripped:
+        return f"the servo's watchdog stopped it: {program} was killed{'' if last else ', or the cable was unplugged'}"
+    return f"the servo's watchdog was still armed: {program} was killed during a motion"
 
 
 def _stopped() -> MotionStopped:

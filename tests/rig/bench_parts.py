@@ -7,11 +7,12 @@ from typing import Any
 
 from rig.bench import Bench
 from rig.config import load_config
+from rig.core.errors import RigError
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
 from rig.devices.dynamixel.servo import DynamixelServo
 from rig.devices.mpu6050 import Mpu6050
-from rig.safety.saved_state import MemoryStore, StateStore
+from rig.safety.saved_state import MemoryStore, SessionEnd, StateStore
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
@@ -83,8 +84,16 @@ def program(wires: Wires, i2c: SimI2cBus, state: StateStore, *settings: str, **s
     bench = Bench("test", config, wires.world.clock, servo, imu, camera=None, state=state)  # type: ignore[arg-type]
     bench.safety.connect()
     bench.findings = bench.safety.findings
-    yield bench
-    imu.close()
+    end = SessionEnd.FINISHED
+    try:
+        yield bench
+    except RigError as error:
+        end = SessionEnd.of(error)
+        raise
+    finally:
+        if wires.serial.is_open:  # else it was killed
+            bench.safety.end_session(end)
+        imu.close()
 
 
 def kill(wires: Wires, motion: Generator[Any, None, None] | None = None) -> None:

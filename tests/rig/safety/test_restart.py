@@ -1,5 +1,6 @@
 """What one program leaves, the next one finds: killed, without supply, without its cable, with another servo."""
 
+import json
 from collections.abc import Generator
 from contextlib import suppress
 
@@ -12,6 +13,7 @@ from rig.core.errors import (
     DeviceNotFound,
     DeviceSilent,
     FaultLatched,
+    MotionStopped,
     NoProgress,
     RigError,
     Stalled,
@@ -395,6 +397,37 @@ def test_stop_request_ends_the_motion_with_torque_off(tmp_path, start, wires):
         assert not FileStore(tmp_path / "state").stop_requested()
         with Turntable(bench) as table:  # stopped, not broken
             assert table.goto(0.0).agrees
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.3, 0.5, 0.6, 0.7, 0.8])
+def test_stop_is_not_reported_as_the_death_of_a_program(tmp_path, start, wires, after_s):
+    """Also while the table comes to rest or stands, with its watchdog armed."""
+    with pytest.raises(MotionStopped), start() as bench, Turntable(bench) as table:
+        after(wires, after_s, FileStore(tmp_path / "state").request_stop)
+        table.goto(20.0)
+    assert json.loads((tmp_path / "state/session.json").read_bytes())["ended"] == "stopped"
+    wires.world.clock.sleep(1.0)  # a watchdog that is still armed would trip
+    with start() as bench:
+        assert bench.findings == ()
+
+
+@pytest.mark.parametrize("last", ["", '{"command": "rig home", "since_utc": "2026-01-02"}', "{"])
+def test_watchdog_is_explained_by_the_end_of_the_last_session(tmp_path, start, wires, last):
+    with start():
+        pass
+    session = tmp_path / "state/session.json"
+    ended = session.read_text()
+    for register, words in ((0xFF, "the servo's watchdog stopped it"), (10, "the servo's watchdog was still armed")):
+        session.write_text(last)
+        wires.device.memory["Bus Watchdog"] = register
+        with start() as bench:
+            (told,) = bench.findings
+        assert told.startswith(words)
+        assert "the last program" in told
+        assert ("`rig home`, since 2026-01-02" in told) == ("home" in last)
+        session.write_text(ended)
+        with start() as bench:  # it ended in an orderly way
+            assert not any("the last program" in told for told in bench.findings)
 
 
 @pytest.mark.parametrize("when", ["in a motion", "between two"])
