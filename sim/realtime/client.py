@@ -111,7 +111,7 @@ class RemoteI2c:
         try:
             self._wire = self._wire or Wire(self._folder)
             answer, received = self._wire.ask(ask="i2c", address=address, **transfer)
-        except (DeviceNotFound, ValueError) as error:
+        except (DeviceNotFound, OSError, ValueError) as error:
             raise OSError(EIO, os.strerror(EIO)) from error
         if answer["errno"]:
             raise OSError(answer["errno"], os.strerror(answer["errno"]))

@@ -30,6 +30,11 @@ class RealTime:
         The world's clock.
     ports
         Ports through which other programs use the world.
+
+    Attributes
+    ----------
+    over
+        Whether the world has ended: its time stands still.
     """
 
     def __init__(self, clock: VirtualClock, ports: Sequence[PtyPort] = ()) -> None:
@@ -65,7 +70,13 @@ class RealTime:
 
         ``inputs`` are further file descriptors and what to do when they are readable; False: do not ask again.
         """
-        inputs = inputs if inputs is not None else {}
+        try:
+            self._run(seconds, {} if inputs is None else inputs)
+        finally:
+            with self._lock:  # other threads leave the world alone from now on
+                self.over = True
+
+    def _run(self, seconds: float | None, inputs: dict[int, Callable[[], bool]]) -> None:
         end_ns = None if seconds is None else self.now_ns() + round(seconds * 1e9)
         while not self.over and (end_ns is None or self.now_ns() < end_ns):
             with uninterrupted(), self.present():
@@ -81,7 +92,7 @@ class RealTime:
 
     def _catch_up(self) -> None:
         now_ns = self.now_ns()
-        while True:
+        while not self.over:
             for port in self._ports:
                 if port.pump():
                     self._active_until_ns = now_ns + ACTIVE_NS

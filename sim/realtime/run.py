@@ -75,7 +75,9 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
             "Type what happens at the bench, for example: put mug-white. For a list: help"
         )
         settings.say(text, {"folder": str(folder), "servo": ports[0].path, "head": config.imu.connection == "head"})
-        time.run(seconds, inputs)
+        with suppress(KeyboardInterrupt):  # Ctrl+C is how it is meant to end
+            time.run(seconds, inputs)
+    settings.say("The simulated bench has ended.", {"ended": True})
 
 
 def run_servos(settings: Settings, ids: Sequence[int] | None, link: Path | None, seconds: float | None) -> None:
@@ -133,8 +135,8 @@ class _Keyboard:
 
     def usable(self) -> bool:
         """Return whether there is a standard input; a program in the background gets an error instead of a stop."""
-        signal.signal(signal.SIGTTIN, signal.SIG_IGN)
-        with suppress(OSError, ValueError, AttributeError):
+        with suppress(OSError, ValueError, AttributeError):  # closed, or this is not the main thread
+            signal.signal(signal.SIGTTIN, signal.SIG_IGN)
             os.fstat(sys.stdin.fileno())
             return True
         return False

@@ -6,6 +6,7 @@ none ends its connection, and nothing else.
 
 import ctypes
 import json
+import socket
 import socketserver
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -202,21 +203,21 @@ class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
         self.devices, self.time, self.commands = devices, time, commands
         self.camera_user: Session | None = None
         self._path = folder / SOCKET
-        self._connections = 0
+        self._connections: set[socket.socket] = set()
         self._path.unlink(missing_ok=True)
         with short_path(folder) as path:
             super().__init__(f"{path}/{SOCKET}", _Handler)
 
     def verify_request(self, request: object, client_address: object) -> bool:  # noqa: ARG002
         """Return whether there is room for one more connection."""
-        return self._connections < MAX_CONNECTIONS
+        return len(self._connections) < MAX_CONNECTIONS
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        self._connections += 1
+        self._connections.add(request)
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._connections -= 1
+            self._connections.discard(request)
 
     def accept(self) -> bool:
         """Accept the connection that waits."""
@@ -225,4 +226,7 @@ class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
 
     def server_close(self) -> None:
         super().server_close()
+        for connection in tuple(self._connections):
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
         self._path.unlink(missing_ok=True)

@@ -32,10 +32,10 @@ class Wire:
 
     def __init__(self, folder: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.settimeout(PATIENCE_S)
         try:
             with short_path(folder) as path:
                 self._socket.connect(f"{path}/{SOCKET}")
+            self._socket.settimeout(PATIENCE_S)
         except OSError as error:
             self._socket.close()
             raise not_running(folder) from error

@@ -30,7 +30,7 @@ BenchOption = Annotated[
     typer.Option(
         "--bench",
         metavar="NAME",
-        help="Bench to use: hardware, sim or the bench of a plug-in (default: default_bench).",
+        help="Bench to use: hardware, sim, sim-bench or the bench of a plug-in (default: default_bench).",
         autocompletion=bench_names,
         rich_help_panel=COMMON,
     ),

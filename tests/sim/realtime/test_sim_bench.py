@@ -1,0 +1,374 @@
+"""A simulated bench in real time as other programs use it: through its folder, its ports and its socket."""
+
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import serial
+from hypothesis import example, given
+from hypothesis import strategies as st
+from smbus2 import SMBus, i2c_msg
+
+from rig.cli.ui.settings import Settings
+from rig.config import load_config
+from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import BenchBusy, DeviceNotFound, UsageError
+from rig.core.files import json_values
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import open_serial
+from sim.bench import ShelfOperator
+from sim.devices import SimDevices
+from sim.faults import Faults
+from sim.objects.shelf import shelf
+from sim.realtime.client import RemoteCapture, RemoteI2c
+from sim.realtime.commands import HELP, Commands
+from sim.realtime.pace import RealTime
+from sim.realtime.run import run_bench
+from sim.realtime.server import MAX_CONNECTIONS, MAX_LINE, Server, Session
+from sim.realtime.wire import SOCKET, Wire, short_path, tell
+from sim.world import World
+from tests.fuzzing import fuzz_settings
+
+CLOCK = SystemClock()
+LEFT = {"lock", "rig.toml"}
+"""What an ended bench leaves that no program has moved."""
+
+
+@pytest.fixture
+def start(tmp_path) -> Iterator[Callable[..., Path]]:
+    """Return a function that runs a bench in a thread of this process, and returns its folder."""
+    running: list[tuple[Path, threading.Thread]] = []
+
+    def begin(name: str = "bench", *overrides: str) -> Path:
+        folder = tmp_path / name
+        thread = threading.Thread(target=run_bench, args=(Settings(overrides=overrides, json=True), folder, None))
+        thread.start()
+        until(lambda: answers(folder) or not thread.is_alive())
+        running.append((folder, thread))
+        return folder
+
+    yield begin
+    for folder, thread in running:
+        with suppress(DeviceNotFound):  # it has ended
+            tell(folder, "quit")
+        thread.join()
+
+
+def answers(folder: Path) -> bool:
+    try:
+        return "world" in tell(folder, "status")
+    except (DeviceNotFound, FileNotFoundError):
+        return False
+
+
+def until(reached: Callable[[], bool], patience_s: float = 30.0) -> None:
+    begun_ns = CLOCK.now_ns()
+    while not reached():
+        assert seconds_between(begun_ns, CLOCK.now_ns()) < patience_s
+        CLOCK.sleep(0.01)
+
+
+def ping(folder: Path) -> int:
+    """Return the servo's id, asked through its port."""
+    config = load_config(folder / "rig.toml")
+    connection = open_serial(config.servo.port, config.servo.baud)
+    try:
+        return open_servo(connection, config.servo, CLOCK).identity.bus_id
+    finally:
+        connection.close()
+
+
+def connected(folder: Path) -> socket.socket:
+    client = socket.socket(socket.AF_UNIX)
+    with short_path(folder) as path:
+        client.connect(f"{path}/{SOCKET}")
+    client.settimeout(10.0)
+    return client
+
+
+# -- the folder -------------------------------------------------------------------------------------------------------
+
+
+def test_benches_have_their_own_folders_and_clean_them(start, tmp_path, capsys):
+    one, other = start("one"), start("a-folder-whose-name-is-longer-than-the-path-of-a-socket-may-be-" * 3)
+    tell(one, "put", "lamp")
+    assert [tell(folder, "status")["world"]["object"] for folder in (one, other)] == ["lamp", None]
+    assert (one / "servo").readlink() != (other / "servo").readlink()
+    with pytest.raises(BenchBusy, match="running already"):
+        run_bench(Settings(), one, None)
+    tell(one, "quit")
+    until(lambda: not answers(one))
+    until(lambda: {path.name for path in one.iterdir()} == LEFT)
+    assert ping(other) == 1
+    with pytest.raises(DeviceNotFound, match="No simulated bench is running"):
+        tell(one, "status")
+
+
+def test_bench_recognizes_what_a_killed_one_left(start, tmp_path):
+    folder = start("bench", "servo.id=7", "table.limits_deg=[-500, 500]")
+    tell(folder, "quit")
+    until(lambda: {path.name for path in folder.iterdir()} == LEFT)
+    (folder / "servo").symlink_to("/dev/pts/no-such-terminal")
+    left = socket.socket(socket.AF_UNIX)
+    with short_path(folder) as path:
+        left.bind(f"{path}/{SOCKET}")
+    left.close()
+    (folder / "computer" / "dev").mkdir(parents=True)
+    (folder / "rig.toml").write_text("# mine\n" + (folder / "rig.toml").read_text())
+    with pytest.raises(DeviceNotFound, match="No simulated bench is running"):
+        tell(folder, "status")
+    assert ping(start("bench")) == 7  # the settings of the first start
+    text = (folder / "rig.toml").read_text()
+    assert text.startswith("# mine\n")
+    assert load_config(folder / "rig.toml").table.limits_deg == (-500, 500)
+
+
+@pytest.mark.parametrize("content", ["thesis.txt", "rig.toml"])
+def test_folder_of_something_else_is_left_alone(tmp_path, content):
+    (tmp_path / content).write_text("default_bench = 'hardware'")
+    with pytest.raises(UsageError, match="other files"):
+        run_bench(Settings(), tmp_path, None)
+    assert [path.name for path in tmp_path.iterdir()] == [content]
+
+
+def test_default_folder_is_the_first_that_is_not_in_use(start, tmp_path, monkeypatch, capsys):
+    start("sim-bench")
+    monkeypatch.chdir(tmp_path)
+    run_bench(Settings(), None, 0.0)
+    assert str(tmp_path / "sim-bench-2") in capsys.readouterr().out
+
+
+# -- its ports --------------------------------------------------------------------------------------------------------
+
+
+def test_unplugged_port_disappears_and_returns_under_its_name(start):
+    folder = start()
+    before = serial.Serial(str(folder / "servo"), timeout=0.01, exclusive=True)
+    with pytest.raises(DeviceNotFound, match="Cannot open"):
+        ping(folder)  # another program uses it
+    tell(folder, "unplug")
+    with pytest.raises(serial.SerialException):
+        until(lambda: bool(before.write(b"1") and before.read()))
+    before.close()
+    assert not os.path.lexists(folder / "servo")
+    tell(folder, "end", "unplug")
+    until((folder / "servo").exists)
+    assert ping(folder) == 1
+
+
+def test_garbage_does_not_end_the_bench(start):
+    folder = start()
+    rng = np.random.default_rng(1)
+    port = open_serial(str(folder / "servo"), 57_600)
+    port.write(rng.bytes(300) + b"\xff\xff\xfd\0")
+    port.close()
+    CLOCK.sleep(0.1)  # the bytes take 53 ms on the bus
+    for garbage in (b"\n", b"{}\n", b"[" * 5000 + b"\n", rng.bytes(3000), b"x" * (MAX_LINE + 1), b'{"ask": "camera"'):
+        with connected(folder) as client:
+            client.sendall(garbage + b"\n")
+            client.shutdown(socket.SHUT_WR)
+            assert client.recv(1) == b""
+    crowd = [connected(folder) for _ in range(MAX_CONNECTIONS + 5)]  # and none of them asks for anything
+    for client in crowd:
+        client.close()
+    until(lambda: answers(folder))
+    assert ping(folder) == 1
+
+
+# -- its camera and its I2C bus ---------------------------------------------------------------------------------------
+
+
+def test_camera_shows_the_world_on_the_clock_of_all_programs(start):
+    folder = start()
+    camera = RemoteCapture(folder)
+    assert camera.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1)
+    assert not camera.set(cv2.CAP_PROP_FRAME_WIDTH, 123)
+    asked_ns, frames = CLOCK.now_ns(), []
+    for command in (["status"], ["put", "lamp", "0"]):
+        tell(folder, *command)
+        changed_ns = CLOCK.now_ns()
+        while camera.grab() and camera.get(cv2.CAP_PROP_POS_MSEC) * 1e6 < changed_ns:
+            pass
+        ok, image = camera.retrieve()
+        assert (ok, image.shape) == (True, (480, 640, 3))
+        assert asked_ns < camera.get(cv2.CAP_PROP_POS_MSEC) * 1e6 < CLOCK.now_ns()
+        frames.append(image.astype(float))
+    assert np.abs(frames[1] - frames[0])[100:400, 250:390].mean() > 10.0
+
+    with pytest.raises(DeviceNotFound, match="camera") as busy:
+        RemoteCapture(folder)
+    assert busy.value.next_step == "Close the program that uses it."
+    tell(folder, "camera.off")
+    assert (camera.isOpened(), camera.grab()) == (False, False)
+    camera.release()
+    with pytest.raises(DeviceNotFound):
+        until(lambda: RemoteCapture(folder).isOpened())
+    tell(folder, "end")
+    again = RemoteCapture(folder)
+    assert again.grab()
+    tell(folder, "quit")
+    until(lambda: not again.grab())
+    again.release()
+
+
+def test_i2c_transfers_arrive_as_on_a_bus_of_the_computer(start):
+    folder = start()
+    remote = RemoteI2c(folder)
+    with SMBus(remote.path) as bus:
+        assert bus.read_byte_data(0x68, 0x75) == 0x68  # WHO_AM_I
+        bus.write_byte_data(0x68, 0x19, 7)
+        bus.write_i2c_block_data(0x68, 0x1A, [3, 0x18])
+        assert bus.read_i2c_block_data(0x68, 0x19, 3) == [7, 3, 0x18]
+        assert bus.read_word_data(0x68, 0x1A) == 0x1803
+        answer = i2c_msg.read(0x68, 2)
+        bus.i2c_rdwr(i2c_msg.write(0x68, [0x19]), answer)
+        assert list(answer) == [7, 3]
+        with pytest.raises(OSError, match="No such device or address"):
+            bus.read_byte(0x50)
+        tell(folder, "imu.off")
+        with pytest.raises(OSError, match="No such device or address"):
+            bus.read_byte_data(0x68, 0x75)
+        tell(folder, "quit")
+        until(lambda: not answers(folder))
+        with pytest.raises(OSError, match="Input/output error"):
+            bus.read_byte_data(0x68, 0x75)
+    remote.close()
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
+    max_leaves=8,
+)
+REQUESTS = st.one_of(
+    ANYTHING,
+    st.fixed_dictionaries({"ask": st.just("do"), "words": st.lists(st.sampled_from(HELP.split()), max_size=4)}),
+    st.fixed_dictionaries(
+        {"ask": st.just("camera"), "call": st.sampled_from(["open", "isOpened", "get", "set", "retrieve"])},
+        optional={"property": st.integers() | ANYTHING, "value": st.floats() | ANYTHING},
+    ),
+    st.fixed_dictionaries(
+        {"ask": st.just("i2c"), "address": st.integers(-1, 200) | ANYTHING},
+        optional={
+            "smbus": st.lists(st.integers(-1, 300), min_size=3, max_size=3) | ANYTHING,
+            "data": st.binary(min_size=34, max_size=34).map(bytes.hex) | ANYTHING,
+            "messages": st.lists(st.lists(st.integers(0, 300) | st.just("00ff") | st.none(), max_size=3)) | ANYTHING,
+        },
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory) -> Iterator[Session]:
+    world = World()
+    with SimDevices.connected(load_config(None, ()), world) as devices:
+        commands = Commands(ShelfOperator(world, shelf()), devices, Faults(devices))
+        with Server(tmp_path_factory.mktemp("fuzz"), devices, RealTime(world.clock), commands) as server:
+            yield Session(server)
+
+
+@fuzz_settings(0.3)
+@given(request_=REQUESTS)
+@example(request_={"ask": "i2c", "address": 0x68, "messages": [[0x68, 10**12, None]]})
+@example(request_={"ask": "i2c", "address": 0x68, "smbus": [1, 0, 8], "data": "00" * 34})
+@example(request_={"ask": "camera", "call": "set", "property": 10**30, "value": 1e999})
+@example(request_={"ask": "do", "words": []})
+def test_any_request_is_answered_or_rejected(session, request_):
+    try:
+        answer, payload = session.answer(request_)
+    except (ValueError, OverflowError):
+        return
+    assert isinstance(payload, bytes)
+    assert isinstance(answer, dict)
+
+
+# -- the trainee's commands -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def commands() -> Iterator[Commands]:
+    world = World()
+    with SimDevices.connected(load_config(None, ()), world) as devices:
+        yield Commands(ShelfOperator(world, shelf()), devices, Faults(devices))
+
+
+def test_each_command_changes_the_world(commands):
+    commands.do(["put", "lamp", "30"])
+    commands.do(["light", "0.5"])
+    commands.do(["turn", "-30"])
+    commands._world.clock.sleep(2.0)
+    commands.do(["jam"])
+    commands.do(["camera.off@0s"])
+    assert commands.state() == {
+        "object": "lamp",
+        "object_deg": 30.0,
+        "table_deg": pytest.approx(-30.0, abs=1.0),
+        "torque": False,
+        "light": [0.5, 0.5, 0.5],
+        "faults": ["jam", "camera.off"],
+    }
+    assert "jam, camera.off" in commands.do(["status"])
+    commands.do(["end", "jam"])
+    commands.do(["end"])
+    commands.do(["clear"])
+    assert (commands.state()["faults"], commands.state()["object"]) == ([], None)
+    assert "lamp" in commands.do(["objects"]).splitlines()
+    assert commands.do(["help"]) == commands.do([]) == HELP
+
+
+@pytest.mark.parametrize(
+    ("words", "step"),
+    [
+        (["put"], "Write: put NAME [DEGREES]"),
+        (["put", "nothing"], "objects"),
+        (["put", "lamp", "nan"], "number"),
+        (["turn", "fast"], "number"),
+        (["light", "-1"], "0 (dark) or more"),
+        (["jamm"], "Did you mean jam? For a list of all commands: rig sim-bench help"),
+        (["jam:x=1"], "Remove the parameter"),
+        (["disk_full"], "rig demo --fault disk_full"),
+        (["end", "jam"], "No simulated fault is there"),
+        (["estop", "press"], "imu.connection=head"),
+    ],
+)
+def test_impossible_command_names_the_next_step(commands, words, step):
+    with pytest.raises(UsageError) as error:
+        commands.do(words)
+    assert step in error.value.next_step
+
+
+def test_fault_cannot_begin_twice(commands):
+    commands.do(["jam"])
+    with pytest.raises(UsageError, match="already there"):
+        commands.do(["jam"])
+
+
+def test_held_table_cannot_be_rotated_by_hand(commands):
+    commands._devices.servo.memory["Torque Enable"] = 1
+    commands._devices.servo._on_torque_enable()
+    with pytest.raises(UsageError, match="holds the table"):
+        commands.do(["turn", "90"])
+
+
+def test_lost_connection_is_an_error_of_the_device(tmp_path):
+    listener = socket.socket(socket.AF_UNIX)
+    with short_path(tmp_path) as path:
+        listener.bind(f"{path}/{SOCKET}")
+    listener.listen()
+    wire = Wire(tmp_path)
+    listener.accept()[0].close()
+    with pytest.raises(OSError, match=r"ended|Broken pipe|reset"):
+        wire.ask(ask="do", words=[])
+    wire.close()
+    listener.close()
+
+
+def test_request_must_be_plain_json():
+    with pytest.raises(ValueError, match="NaN"):
+        json_values('{"ask": NaN}')
