@@ -46,8 +46,9 @@ class Stopping:
     """Results of searches with an end: by a decision, or after all views.
 
     The paper's methods end when the margin per view reaches ``margin``; the dense filter ends by the stopping rule that
-    was calibrated on the enrolled views. A hit is a search that identified the right object. ``unknown_rate`` is the
-    share of searches that called it unknown, ``ended_early`` the share that ended before the last view.
+    was calibrated on the enrolled views. A hit is a search that found the right object. ``unknown_rate`` and
+    ``ambiguous_rate`` are the shares of searches with these outcomes, ``ended_early`` the share that ended before the
+    last view.
     """
 
     margin: float
@@ -57,6 +58,7 @@ class Stopping:
     hit_rate_low: float
     hit_rate_high: float
     unknown_rate: float
+    ambiguous_rate: float
     travelled_mean_deg: float
     ended_early: float
 
@@ -110,8 +112,7 @@ QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
     ("ahbr-90", 4, "sweep-90", 4),
     ("ahbr-90", 4, "sweep-45", 4),
     *(("dense", n, other, n) for n in (2, 3) for other in ("dense-90", "dense-45", "dense-coin", "dense-random")),
-    ("dense", 2, "dense-mutual", 2),
-    ("dense", 2, "dense-oracle", 2),
+    *(("dense", n, other, n) for n in (2, 3) for other in ("dense-mutual", "dense-oracle")),
 )
 
 
@@ -224,8 +225,8 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
     ends = outcome != OUTCOMES.index(Outcome.CONTINUE) if dense else (margin >= least_margin) & (seen + 1 >= min_views)
     end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(seen) - 1)
     trial = np.arange(len(end))
-    unknown = outcome[trial, end] == OUTCOMES.index(Outcome.UNKNOWN)
-    hits = int(((rank[trial, end] == 1) & ~unknown).sum())
+    unknown, ambiguous = (outcome[trial, end] == OUTCOMES.index(one) for one in (Outcome.UNKNOWN, Outcome.AMBIGUOUS))
+    hits = int(((rank[trial, end] == 1) & ~unknown & ~ambiguous).sum())
     return Stopping(
         least_margin,
         float(end.mean()) + 1,
@@ -233,6 +234,7 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
         hits / len(trial),
         *wilson(hits, len(trial)),
         float(unknown.mean()),
+        float(ambiguous.mean()),
         float(travelled_deg[trial, end].mean()),
         float(ends[:, :-1].any(axis=1).mean()),
     )

@@ -100,9 +100,11 @@ def test_dense_searches_end_by_the_stopping_rule_and_methods_are_compared() -> N
     runs.rank[0] = 1
     runs.outcome[0] = [OUTCOMES.index(Outcome.CONTINUE)] * 2 + [OUTCOMES.index(Outcome.FOUND)] * 2
     runs.outcome[0, 0, :, 2:] = OUTCOMES.index(Outcome.UNKNOWN)
+    runs.outcome[0, 1, :, 2:] = OUTCOMES.index(Outcome.AMBIGUOUS)  # the right object leads, but was not found
     stopping = method_results(runs, methods, margin=10.0)[0].stopping
     assert (stopping.views_mean, stopping.ended_early) == (3, 1.0)
-    assert (stopping.hit_rate, stopping.unknown_rate) == (pytest.approx(5 / 6), pytest.approx(1 / 6))
+    assert (stopping.hit_rate, stopping.unknown_rate) == (pytest.approx(4 / 6), pytest.approx(1 / 6))
+    assert stopping.ambiguous_rate == pytest.approx(1 / 6)
     assert method_results(runs, methods, margin=10.0)[3].stopping.views_mean == 4
     asked = {(c.first, c.first_views, c.second) for c in contests(runs, methods, np.random.default_rng(0))}
     assert {("dense", 3, "dense-90"), ("dense", 2, "dense-mutual")} <= asked
