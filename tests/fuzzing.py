@@ -1,4 +1,4 @@
-"""How hard inputs are fuzzed: hundreds of cases in CI, thousands in the nightly profile, each with limits."""
+"""How many cases a property is tested with: tens by default, thousands in the nightly profile, each with limits."""
 
 import resource
 import signal
@@ -9,16 +9,26 @@ from typing import NoReturn
 
 from hypothesis import HealthCheck, settings
 
-CASES, NIGHTLY_CASES = 500, 20_000
+CASES, NIGHTLY_CASES = 120, 20_000
 
 
 def fuzz_settings(share: float = 1.0) -> settings:
     """Return settings for ``share`` of the cases of the profile in force (`--hypothesis-profile=nightly`: 20,000)."""
-    nightly = settings.get_current_profile_name() == "nightly"
-    cases = round(share * (NIGHTLY_CASES if nightly else CASES))
+    cases = round(share * (NIGHTLY_CASES if _is_nightly() else CASES))
     return settings(
-        max_examples=cases, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+        max_examples=max(cases, 5),
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
     )
+
+
+def examples(count: int) -> settings:
+    """Return settings for ``count`` cases, and 20 times as many in the nightly profile."""
+    return settings(max_examples=count * (20 if _is_nightly() else 1), deadline=None)
+
+
+def _is_nightly() -> bool:
+    return settings.get_current_profile_name() == "nightly"
 
 
 MAX_MEMORY = 1 << 30

@@ -34,7 +34,8 @@ def seen(
         for angle_deg in angles_deg:
             picture = empty_platter()
             thing.draw(picture, angle_deg)
-            noisy = np.clip(spoil(picture) + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+            noise = 2 * rng.standard_normal(picture.shape, dtype=np.float32)
+            noisy = np.clip(spoil(picture) + noise, 0, 255).astype(np.uint8)
             found = detect_board(board or thing.board, noisy)
             if found.ids.size >= MIN_CORNERS:
                 encoder_deg = ratio * angle_deg + float(rng.normal(0, 0.03))

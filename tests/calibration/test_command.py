@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from calibration import camera_light, camera_model, encoder, table_axis
-from calibration.procedures import Encoder, GyroRotation, ImuMounting, MotionModel
+from calibration.procedures import Backlash, Encoder, GyroNoise, GyroRotation, GyroScale, ImuMounting, MotionModel
 from calibration.report import plots
 from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.cli.main import app
@@ -20,17 +20,32 @@ from rig.views.charuco_board import Board
 CONFIG = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
 
 
-@pytest.fixture(scope="module")
-def imu_calibration(tmp_path_factory):
-    """Calibrate the IMU once; return the folder of the results, and the output."""
-    folder = tmp_path_factory.mktemp("imu")
+SERVO = ("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
+
+
+def calibrated(folder, *arguments: str):
+    """Calibrate devices; return the folder of the results, and the output."""
     (folder / "rig.toml").write_text(CONFIG, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        arguments = ["calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4"]
         done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     return folder / "calibrations", done.stdout
+
+
+@pytest.fixture(scope="module")
+def imu_calibration(tmp_path_factory):
+    words = ("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4")
+    return calibrated(tmp_path_factory.mktemp("imu"), *words)
+
+
+@pytest.fixture(scope="module")
+def servo_calibration(tmp_path_factory):
+    return calibrated(tmp_path_factory.mktemp("servo"), *SERVO)
+
+
+def results_in(folder) -> list[CalibrationResult]:
+    return [CalibrationResult.from_file(path) for path in sorted((folder / "sim").iterdir())]
 
 
 @pytest.fixture
@@ -84,9 +99,7 @@ def test_rejected_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, im
     assert done.exit_code == 6
     assert "FAIL imu.scale" in done.stdout
     assert "imu.axis" in done.stdout
-    passed = [
-        CalibrationResult.from_file(path).passed for path in sorted((tmp_path / "calibrations" / "sim").iterdir())
-    ]
+    passed = [result.passed for result in results_in(tmp_path / "calibrations")]
     assert passed == [True, True, True, True, False]
     assert json.loads(rig("goto", "90", "--json").stdout)["bound_deg"] < 1.5
 
@@ -95,14 +108,13 @@ def test_too_few_revolutions_are_a_usage_error(rig):
     assert rig("calibrate", "imu", "--turns", "3").exit_code == 2
 
 
-def test_servo_results_replace_earlier_ones(rig, tmp_path, monkeypatch):
-    done = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
-    assert done.exit_code == 0, done.output
-    results = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "calibrations" / "sim").iterdir())]
-    assert [result.name for result in results] == ["servo.backlash", "servo.encoder", "servo.motion"]
+def test_servo_results_replace_earlier_ones(rig, tmp_path, monkeypatch, servo_calibration):
+    copytree(servo_calibration[0], tmp_path / "calibrations")
+    names = [result.name for result in results_in(tmp_path / "calibrations")]
+    assert names == ["servo.backlash", "servo.encoder", "servo.motion"]
     for slow in (Encoder, MotionModel):
         monkeypatch.setattr(slow, "measure", lambda *_: (event for event in ()))
-    again = rig("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
+    again = rig(*SERVO)
     assert again.exit_code == 0, "a newer result takes the place of an older one"
     assert "of the configuration takes precedence" not in again.output
 
@@ -130,8 +142,11 @@ def test_show_and_history_list_results(rig, tmp_path, imu_calibration):
     ]
 
 
-def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch):
-    # Fewer frames and sides: other tests show what the procedures find.
+def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch, imu_calibration, servo_calibration):
+    # Results of other tests, fewer frames and sides: other tests show what the procedures find.
+    known = {result.name: result for folder, _ in (imu_calibration, servo_calibration) for result in results_in(folder)}
+    for procedure in (Backlash, Encoder, MotionModel, GyroScale, ImuMounting, GyroNoise, GyroRotation):
+        monkeypatch.setattr(procedure, "live", lambda self, *_: (known[name] for name in self.names))
     monkeypatch.setattr(camera_light, "CARD_FRAMES", 12)
     monkeypatch.setattr(camera_light, "PAIRS", 12)
     monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::2])
@@ -144,7 +159,7 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
     assert done.exit_code == 0, done.output
     assert "[O] camera" in done.stderr, "a picture of the request"
     assert "rig calibrate noise NAME" in done.stderr
-    results = [CalibrationResult.from_file(path) for path in sorted((tmp_path / "calibrations" / "sim").iterdir())]
+    results = results_in(tmp_path / "calibrations")
     assert [result.name for result in results] == [
         "servo.backlash",
         "servo.encoder",

@@ -109,7 +109,7 @@ def test_wrong_board_size_is_found_by_the_measured_distance():
     assert not larger.settings
 
 
-ANGLES = camera_model.ANGLES_DEG[::2]
+ANGLES = camera_model.ANGLES_DEG[::4]
 
 
 def test_too_few_views_are_rejected():

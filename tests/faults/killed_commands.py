@@ -1,7 +1,6 @@
 """A program that runs commands again and again and kills each run at another point of its progress.
 
-    python killed_commands.py FOLDER KILLS SEED [NAME ...]
-
+Arguments: FOLDER KILLS SEED [NAME ...].
 FOLDER/home is the state before a command. Every run works on a copy of it, FOLDER/<command>/<number>, in a child
 process (`tests.faults.kills`). FOLDER/<command>/complete is the copy on which the command ran to its end.
 """
@@ -58,7 +57,3 @@ def _enter(folder: Path, command: str, number: str) -> None:
 def _run(command: str) -> None:
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):  # noqa: PTH123
         app(COMMANDS[command], standalone_mode=False)
-
-
-if __name__ == "__main__":
-    main()

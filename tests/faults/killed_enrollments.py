@@ -1,9 +1,7 @@
 """A program that runs enrollments and kills each at another point of its progress (`tests.faults.kills`).
 
-    python killed_enrollments.py FOLDER KILLS SEED
-
-Each enrollment runs in a child process, writes to FOLDER/<number> and reports every view when the plan says that it is
-stored. The program prints one line of JSON for each child: its number and the views that it reported.
+Arguments: FOLDER KILLS SEED. Each enrollment runs in a child process, writes to FOLDER/<number> and reports every view
+when the plan says that it is stored. The program prints one line of JSON for each child: its number and its views.
 """
 
 import json
@@ -18,7 +16,7 @@ from rig.plans.enroll import enroll
 from tests.faults.fault_runs import NAME, Rig, new_rig
 from tests.faults.kills import killed_child, points
 
-VIEWS = 8
+VIEWS = 6
 
 
 def main() -> None:
@@ -36,7 +34,3 @@ def _enroll(rig: Rig, folder: Path, report: Callable[[int], object]) -> None:
         for event in enroll(bench, catalog, NAME, views=VIEWS):
             if isinstance(event, Accepted):
                 report(event.index)
-
-
-if __name__ == "__main__":
-    main()

@@ -36,7 +36,7 @@ from tests.faults.scenarios import BOOT_S, FOUND, SCENARIOS, After, Scenario, St
 TOLERANCE_DEG = 0.5
 """Half the backlash, the encoder's noise, and a slip smaller than the gyro's error over 5°."""
 UPDATE = "docs/faults.md is out of date: check the difference, then run python tests/faults/document.py"
-RESUMED_VIEWS = 8
+RESUMED_VIEWS = 3
 LATE_MOVE = 20
 
 

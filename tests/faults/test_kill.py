@@ -1,30 +1,23 @@
 """A process that is killed at any point of an enrollment loses no view that it has reported, and can go on."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from rig.catalog import Catalog
-from tests.faults import killed_enrollments
 from tests.faults.fault_runs import NAME, check_stored, enrolled, enrollment, new_rig
 from tests.faults.killed_enrollments import VIEWS
+from tests.programs import Program
 
 
-@pytest.mark.parametrize("kills", [10, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
+@pytest.mark.parametrize("kills", [6, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
 def test_killed_enrollment_keeps_reported_views_and_resumes(tmp_path: Path, kills: int) -> None:
-    done = subprocess.run(
-        [sys.executable, killed_enrollments.__file__, str(tmp_path), str(kills), "1"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-    assert done.returncode == 0, done.stderr
-    runs = [json.loads(line) for line in done.stdout.splitlines()]
+    code = "from tests.faults.killed_enrollments import main; main()"
+    process = Program(str(tmp_path), str(kills), "1", code=code)
+    output, errors = process.communicate()
+    assert process.returncode == 0, errors
+    runs = [json.loads(line) for line in output.splitlines()]
     assert len(runs) == kills
     assert len({len(run["reported"]) for run in runs}) > VIEWS / 2  # they died at different points
     for run in runs:

@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,8 +12,8 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from rig.cli.main import app
-from tests.faults import killed_commands
 from tests.faults.killed_commands import COMMANDS, environment
+from tests.programs import Program
 
 CONFIG = """default_bench = "sim"
 [camera]
@@ -75,14 +73,11 @@ def state(rig: Rig, home: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_killed_command_loses_nothing_and_completes(folder: Path, rig: Rig, command: str) -> None:
-    done = subprocess.run(
-        [sys.executable, killed_commands.__file__, str(folder), str(KILLS), "1", command],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    process = Program(
+        str(folder), str(KILLS), "1", command, code="from tests.faults.killed_commands import main; main()"
     )
-    assert done.returncode == 0, done.stderr
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
     before, complete = (state(rig, home) for home in (folder / "home", folder / command / "complete"))
     for number in range(KILLS):
         home = folder / command / str(number)

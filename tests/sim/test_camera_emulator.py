@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -16,6 +16,7 @@ from sim.objects.projection import CENTRE_PX, PX_PER_MM, Image
 from sim.objects.shelf import shelf
 from sim.sensor import white_balance
 from sim.world import World
+from tests.fuzzing import examples
 
 QUIET = NoiseModel.none()
 
@@ -113,7 +114,7 @@ def test_number_of_buffers_can_be_chosen(buffers: int) -> None:
     assert at_once == buffers
 
 
-@settings(max_examples=30, deadline=None)
+@examples(12)
 @given(st.lists(st.integers(0, 400_000_000), min_size=1, max_size=12))
 def test_stamps_rise_and_no_frame_comes_before_it_is_exposed(waits_ns: list[int]) -> None:
     world = World(noise=QUIET)

@@ -3,12 +3,13 @@
 from datetime import UTC, datetime, timedelta
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.clock import EPOCH, VirtualClock
+from tests.fuzzing import examples
 
-quick = settings(max_examples=60, deadline=None)
+quick = examples(21)
 times = st.lists(st.integers(0, 1_000), max_size=30)
 
 

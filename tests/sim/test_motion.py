@@ -4,12 +4,13 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sim.motion import Platter, Trajectory, rest, to_position, to_velocity
+from tests.fuzzing import examples
 
-quick = settings(max_examples=60, deadline=None)
+quick = examples(21)
 angles = st.floats(-2_000, 2_000)
 speeds = st.floats(-300, 300)
 limits = st.floats(1, 400)

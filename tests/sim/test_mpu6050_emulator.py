@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
@@ -13,6 +13,7 @@ from sim.imu.mpu6050 import BANDWIDTH_HZ, SimMpu6050
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.world import World
+from tests.fuzzing import examples
 
 AT = 0x68
 DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, FIFO_EN, INT_STATUS = 0x19, 0x1A, 0x1B, 0x1C, 0x23, 0x3A
@@ -109,7 +110,7 @@ def test_ad0_changes_the_address_not_the_identity() -> None:
 
 
 @given(register=st.integers(0, 0x7F), value=st.integers(0, 255))
-@settings(max_examples=200)
+@examples(70)
 def test_only_the_writable_bits_of_writable_registers_change(register: int, value: int) -> None:
     kept = {DIV: 0xFF, CONFIG: 0x3F, GYRO_CONFIG: 0xF8, ACCEL_CONFIG: 0xF8, FIFO_EN: 0xFF, USER_CTRL: 0x70, PWR: 0x6F}
     sensor = SimMpu6050(World(noise=NoiseModel.none()))
@@ -165,7 +166,7 @@ def test_temperature_follows_the_datasheets_formula(chip: Chip) -> None:
     fifo=st.integers(0, 31).map(lambda bits: bits << 3),
     wait_ms=st.integers(1, 80),
 )
-@settings(max_examples=60)
+@examples(21)
 def test_fifo_fills_at_the_sample_rate_with_what_was_chosen(divider: int, dlpf: int, fifo: int, wait_ms: int) -> None:
     words = 3 * bool(fifo & 0x08) + sum(bool(fifo & bit) for bit in (0x80, 0x40, 0x20, 0x10))
     with Chip() as chip:
@@ -262,7 +263,7 @@ def test_old_samples_show_the_rate_of_their_own_time(chip: Chip) -> None:
 
 
 @given(slip_deg=st.floats(-0.8, 0.8), after_ms=st.integers(0, 20), look_first=st.booleans())
-@settings(max_examples=40)
+@examples(14)
 def test_short_knock_is_measured(slip_deg: float, after_ms: int, look_first: bool) -> None:
     with Chip() as chip:
         chip.wake(divider=1, fifo=0x10)
@@ -335,7 +336,7 @@ def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
 
 
 @given(looks_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))
-@settings(max_examples=40)
+@examples(14)
 def test_samples_do_not_depend_on_the_reading_rate(looks_ms: list[int], seed: int) -> None:
     """The same seed gives the same bytes, in whatever portions they are fetched."""
 

@@ -4,14 +4,15 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.motion import rest, to_position, to_velocity
 from sim.noise import NoiseModel
 from sim.world import HISTORY_S, Scene, World
+from tests.fuzzing import examples
 
-quick = settings(max_examples=40, deadline=None)
+quick = examples(14)
 perfect = NoiseModel.none()
 
 

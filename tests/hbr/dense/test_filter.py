@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, tanimoto, update_belief
 from hbr.dense.filter import BINS, Belief
+from tests.fuzzing import examples
 from tests.hbr.dense.searches import belief_after
 
 
@@ -40,7 +41,7 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
     return total
 
 
-@settings(max_examples=12)
+@examples(12)
 @given(
     st.integers(0, 10**6),
     st.floats(0, 8),
@@ -63,7 +64,7 @@ def test_support_is_the_formula_s_at_every_azimuth_of_every_object(
 
 
 @given(st.integers(0, 10**6), st.integers(1, 3))
-@settings(max_examples=20)
+@examples(12)
 def test_those_who_are_kept_are_the_strongest_and_score_as_if_all_were(seed: int, kept: int) -> None:
     views = catalog(seed, objects=6)
     index = DenseIndex(views)

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, next_best_view
 from hbr.dense.filter import BINS, update_belief
 from hbr.dense.next_view import most_informative_rotation
+from tests.fuzzing import examples
 
 STEP = 15
 
@@ -71,7 +72,7 @@ def test_visited_view_has_no_expected_gain() -> None:
     assert look.confusion[visited].min() >= look.confusion.max() - 1e-9
 
 
-@settings(max_examples=10)
+@examples(10)
 @given(st.integers(0, 23), st.floats(5, 100))
 def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> None:
     """Once more from the posterior of single hypotheses that the decision keeps, written out."""

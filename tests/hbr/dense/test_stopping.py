@@ -4,7 +4,7 @@ from math import inf
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Belief, DenseIndex, DenseSession, Outcome, StopReason, Views, leave_one_out, tanimoto, update_belief
@@ -18,6 +18,7 @@ from hbr.dense.stopping import (
     fit_stopping_rule,
     min_confidence_for,
 )
+from tests.fuzzing import examples
 
 BETA = 60.0
 
@@ -36,7 +37,7 @@ def catalog(objects: int = 8, noise: float = 0.15, seed: int = 0) -> Views:
     return Views.concatenate(parts)
 
 
-@settings(max_examples=25)
+@examples(12)
 @given(st.integers(0, 10**6), st.sampled_from([0.01, 0.02, 0.05, 0.2]), st.integers(120, 400))
 def test_conformal_threshold_rejects_the_stated_share_on_average(seed: int, share: float, count: int) -> None:
     rng = np.random.default_rng(seed)

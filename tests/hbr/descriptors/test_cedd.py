@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import cedd, describe
@@ -23,6 +23,7 @@ from hbr.descriptors.cedd import (
     _texture_votes,
 )
 from hbr.descriptors.cedd_tables import VOTE_BINS
+from tests.fuzzing import examples
 from tests.hbr.descriptors.cedd_reference import area, cedd_reference, colours, hsv, texture_classes
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
@@ -71,7 +72,7 @@ def images(draw: st.DrawFn) -> Image:
     return np.ascontiguousarray(image)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(21)
 @given(images())
 def test_equals_the_literal_definition(image: Image) -> None:
     assert cedd(image).tolist() == cedd_reference(image)
@@ -259,7 +260,7 @@ def test_describe_scales_to_covered_sides(size: tuple[int, int], brought_to: tup
     assert (describe(covered) == cedd(covered)).all()
 
 
-@settings(max_examples=50, deadline=None)
+@examples(18)
 @given(st.integers(1, 2000), st.integers(1, 2000))
 def test_scaled_sides_are_covered_and_close(width: int, height: int) -> None:
     covered = _covered_size(width, height)

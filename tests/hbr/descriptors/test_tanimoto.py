@@ -2,18 +2,19 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hbr import tanimoto
+from tests.fuzzing import examples
 
 
 def levels(rows: int) -> st.SearchStrategy[np.ndarray]:
     return arrays(np.uint8, (rows, 144), elements=st.integers(0, 7), fill=st.sampled_from([0, 0, 7]))
 
 
-@settings(max_examples=50)
+@examples(18)
 @given(levels(3), levels(4))
 def test_equals_exact_fractions(a: np.ndarray, b: np.ndarray) -> None:
     found = tanimoto(a, b)

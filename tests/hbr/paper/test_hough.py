@@ -2,10 +2,11 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Extension, Ranking, ViewIndex, Views, retrieve
+from tests.fuzzing import examples
 from tests.hbr.paper.retrieval_reference import Enumeration
 
 EXTENSIONS = get_args(Extension)
@@ -42,7 +43,7 @@ def small_cases(draw: st.DrawFn) -> tuple[np.ndarray, list[float], Views, float,
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-@settings(max_examples=100, deadline=None)
+@examples(35)
 @given(small_cases())
 def test_equals_the_enumeration_of_all_paths(
     extension: Extension, case: tuple[np.ndarray, list[float], Views, float, int]
@@ -63,7 +64,7 @@ def test_equals_the_enumeration_of_all_paths(
     assert order == sorted(order)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(12)
 @given(small_cases(), st.integers(-720, 720))
 def test_zero_of_the_orientations_does_not_matter(
     case: tuple[np.ndarray, list[float], Views, float, int], zero_deg: int

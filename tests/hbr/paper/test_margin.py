@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hbr
+from tests.fuzzing import examples
 
 
 def random_views(rng, objects, per_object):
@@ -19,7 +20,7 @@ def random_views(rng, objects, per_object):
     )
 
 
-@settings(max_examples=60, deadline=None)
+@examples(21)
 @given(seed=st.integers(0, 2**32 - 1), objects=st.integers(2, 6), n=st.integers(1, 3), list_length=st.integers(1, 8))
 def test_no_object_has_a_smaller_margin_even_off_the_lists(seed, objects, n, list_length):
     rng = np.random.default_rng(seed)

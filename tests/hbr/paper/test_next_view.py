@@ -2,14 +2,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Ranking, ViewIndex, Views, next_view, retrieve
+from tests.fuzzing import examples
 from tests.hbr.paper.retrieval_reference import next_view_reference
 
 
-@settings(max_examples=80, deadline=None)
+@examples(28)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 5), st.integers(1, 12), st.integers(1, 12))
 def test_equals_the_literal_definition(seed: int, steps: int, objects: int, list_length: int) -> None:
     rng = np.random.default_rng(seed)

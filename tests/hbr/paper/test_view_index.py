@@ -2,11 +2,12 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import ViewIndex, Views, tanimoto
 from hbr.paper.index import Method, _best, _Bound, _Flat, _promising
+from tests.fuzzing import examples
 
 METHODS = get_args(Method)
 EXACT: tuple[Method, ...] = ("flat", "bound", "kdtree")
@@ -31,7 +32,7 @@ def adversarial(rng: np.random.Generator, count: int) -> np.ndarray:
     return pool[rng.integers(len(pool), size=count)]
 
 
-@settings(max_examples=40, deadline=None)
+@examples(14)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 5, 63, 64, 65, 700, 2600, 2700]), st.integers(1, 40))
 def test_equals_brute_force(seed: int, count: int, k: int) -> None:
     rng = np.random.default_rng(seed)
@@ -58,7 +59,7 @@ def test_bound_compares_few_views_and_equals_brute_force_on_a_large_set() -> Non
         assert found[1].tolist() == expected[1].tolist()
 
 
-@settings(max_examples=25, deadline=None)
+@examples(12)
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 900), min_size=1, max_size=4), st.sampled_from(METHODS))
 def test_extended_index_equals_a_new_one(seed: int, sizes: list[int], method: Method) -> None:
     rng = np.random.default_rng(seed)

@@ -16,6 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from rig.catalog import Catalog, Enrollment, EnrollmentStatus, Provenance, ViewRecord, clean_name
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
 from sim.clock import EPOCH, VirtualClock
+from tests.fuzzing import examples
 from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, plan, record
 
 NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=20)
@@ -44,7 +45,7 @@ def begin(catalog: Catalog, name: str, views: int = 3, **options: object) -> Enr
     return catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **options)  # type: ignore[arg-type]
 
 
-@settings(max_examples=40, deadline=None)
+@examples(14)
 @given(
     name=NAMES.filter(lambda name: clean_name(name) == name),
     commanded_deg=ANGLES,
@@ -377,7 +378,7 @@ class CatalogMachine(RuleBasedStateMachine):
 
 
 TestCatalogMachine = CatalogMachine.TestCase
-TestCatalogMachine.settings = settings(max_examples=20, stateful_step_count=20, deadline=None)
+TestCatalogMachine.settings = settings(examples(12), stateful_step_count=20)
 
 
 def test_discard_rejects_enrollment_with_views(catalog: Catalog) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hbr
@@ -46,6 +46,7 @@ from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ExportFailed, ImportRejected, ObjectExists, UsageError
 from rig.views import image_files as images
 from sim.clock import VirtualClock
+from tests.fuzzing import examples
 from tests.rig.catalog.catalog_samples import (
     PROVENANCE,
     described,
@@ -470,13 +471,13 @@ class TestImages:
         with pytest.raises(images.BadImage, match=reason):
             images.decode(content)
 
-    @settings(max_examples=300)
+    @examples(105)
     @given(st.binary(max_size=64), st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"]))
     def test_arbitrary_bytes_are_rejected(self, content: bytes, head: bytes) -> None:
         with pytest.raises(images.BadImage):
             images.decode(head + content)
 
-    @settings(max_examples=150)
+    @examples(52)
     @given(st.data())
     def test_damaged_image_is_decoded_or_rejected(self, data: st.DataObject) -> None:
         suffix = data.draw(st.sampled_from([".png", ".jpg"]))
@@ -651,7 +652,7 @@ class TestHostileBundles:
         good = (folder / "good.zip").read_bytes()
         victims = [Catalog.open(folder / "victim", clock=VirtualClock(NOW))]
 
-        @settings(max_examples=250)
+        @examples(88)
         @given(data=st.data())
         def spoil(data: st.DataObject) -> None:
             content = bytearray(good)

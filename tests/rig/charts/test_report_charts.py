@@ -5,7 +5,7 @@ from math import atan2, degrees, hypot
 from xml.etree import ElementTree as ET
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.charts.azimuth_ring import RingView, azimuth_ring
@@ -15,6 +15,7 @@ from rig.charts.polar_path import PathStep, polar_path
 from rig.charts.score_chart import score_chart
 from rig.charts.svg import number
 from rig.events.events import Weighed
+from tests.fuzzing import examples
 
 ANGLE = st.floats(-720, 720)
 TURN = st.floats(-360, 360).filter(lambda a: abs(a) > 1)
@@ -54,7 +55,7 @@ class TestPolarPath:
         assert polar(100, 0)[1] < CENTRE[1]
         assert polar(100, 90)[0] < CENTRE[0]
 
-    @settings(max_examples=40)
+    @examples(14)
     @given(start=ANGLE, rotations=st.lists(TURN, max_size=8))
     def test_views_are_at_their_azimuths_and_arcs_connect_them(self, start: float, rotations: list[float]) -> None:
         svg = polar_path(start, [PathStep(r) for r in rotations], scale="azimuth")
@@ -69,7 +70,7 @@ class TestPolarPath:
                 assert way[-1] == pytest.approx(centre(stops[k + 1]), abs=0.02)
                 azimuth += rotations[k]
 
-    @settings(max_examples=40)
+    @examples(14)
     @given(start=ANGLE, rotation=TURN)
     def test_arc_covers_the_whole_rotation_in_its_direction(self, start: float, rotation: float) -> None:
         way = [azimuth_of(*p) for p in points(having(polar_path(start, [PathStep(rotation)], scale=""), "step")[0])]
@@ -81,7 +82,7 @@ class TestPolarPath:
         radii = [hypot(x - CENTRE[0], y - CENTRE[1]) for arc in having(svg, "step") for x, y in points(arc)]
         assert radii == pytest.approx(sorted(radii), abs=0.02)
 
-    @settings(max_examples=40)
+    @examples(14)
     @given(start=ANGLE, rotation=st.floats(30, 300) | st.floats(-300, -30))
     def test_arrow_points_at_the_end_of_the_arc(self, start: float, rotation: float) -> None:
         svg = polar_path(start, [PathStep(rotation)], scale="")
@@ -170,7 +171,7 @@ class TestScoreChart:
         assert rows[0] > 20  # below the axis' title, though all scores are at the top
         assert words(having(svg, "winner", "name")) == ["0.900 n0"]
 
-    @settings(max_examples=60)
+    @examples(21)
     @given(
         rounds=st.lists(
             st.dictionaries(st.sampled_from("abcdefg"), st.floats(-1, 1), min_size=1), min_size=1, max_size=9
@@ -249,7 +250,7 @@ TURNS = tuple(float(turn) for turn in range(-175, 185, 5) if turn)
 
 
 class TestDecisionChart:
-    @settings(max_examples=25)
+    @examples(12)
     @given(here=ANGLE, chosen=st.sampled_from(TURNS), seen=st.lists(ANGLE, min_size=1, max_size=4))
     def test_chosen_rotation_is_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
         away = tuple(abs(turn - chosen) for turn in TURNS)

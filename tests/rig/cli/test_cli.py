@@ -1,11 +1,8 @@
 """The commands on a small catalog, and signals sent to real processes."""
 
 import json
-import os
 import shlex
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,12 +11,12 @@ from typer.testing import CliRunner
 from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.core.clock import SystemClock
+from tests.programs import Program
 
 SMALL = (
     'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
     "[view]\nroi = [40, 0, 240, 240]\n"
 )
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 
 
 @pytest.fixture
@@ -161,14 +158,10 @@ def test_unknown_bench_and_unknown_command_are_rejected(rig):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(rig, number, code):
-    process = subprocess.Popen(
-        [*RIG, "enroll", "dice", "--views", "18", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"],
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),  # as a background job of a script begins
-    )
+    options = ["--views", "18", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"]
+    # as a background job of a script begins
+    ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from rig.cli.main import main; main()"
+    process = Program("enroll", "dice", *options, code=ignored)
     stored = 0
     for line in process.stdout:
         stored += json.loads(line)["event"] == "accepted"
@@ -178,7 +171,6 @@ def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(
     rest, errors = process.communicate(timeout=60)
     stored += sum(json.loads(line).get("event") == "accepted" for line in rest.splitlines())
     assert process.returncode == code
-    options = ["--views", "18", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"]
     again = shlex.split(next(line for line in errors.splitlines() if line.startswith("  rig enroll")))
     assert again == ["rig", "enroll", "dice", "--resume", *options]
     resumed = rig(*again[1:])

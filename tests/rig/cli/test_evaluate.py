@@ -2,11 +2,7 @@
 
 import csv
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -17,12 +13,12 @@ from typer.testing import CliRunner
 
 from rig.catalog import Catalog, Provenance, ViewRecord
 from rig.cli.objects.evaluate import evaluate
+from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 
 app = typer.Typer()
 app.command("eval")(evaluate)
 
-PROGRAM = "import typer; from rig.cli.objects.evaluate import evaluate; typer.run(evaluate)"
 QUICK = ("--methods", "hbr,ahbr", "--trials", "2", "--views", "4", "--jobs", "1")
 NOISY = ("--noise", "mb:5")
 
@@ -104,27 +100,28 @@ def test_equal_commands_give_equal_results_whatever_the_processes(
     assert results(tmp_path / "other")["methods"] != results(evaluated)["methods"]
 
 
-def test_an_interrupted_evaluation_keeps_what_is_done_and_goes_on(photographs: Path, tmp_path: Path) -> None:
-    arguments = [str(photographs), *QUICK, "--json"]
-    command = [sys.executable, "-c", PROGRAM, *arguments, "--trials", "30", "--out", str(tmp_path / "out")]
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if json.loads(line)["event"] == "searched":
-            process.send_signal(signal.SIGINT)
-            break
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "--resume" in errors
+def test_an_interrupted_evaluation_keeps_what_is_done_and_goes_on(
+    photographs: Path, evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really = Settings.print_json
+
+    def interrupt(self: Settings, value: dict) -> None:
+        really(self, value)
+        if value["event"] == "searched":
+            raise KeyboardInterrupt
+
+    command = (photographs, *QUICK, *NOISY, "--json", "--out", tmp_path / "out")
+    with monkeypatch.context() as patch:
+        patch.setattr(Settings, "print_json", interrupt)
+        stopped = run(*command)
+    assert stopped.exit_code == 130
+    assert "--resume" in stopped.stderr
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out/runs").glob("*.npz")}
     assert 1 <= len(kept) < 4
-    more = ("--trials", "30", "--out")
-    assert run(*arguments, *more, tmp_path / "out").exit_code == 2  # not without --resume
-    assert run(*arguments, *more, tmp_path / "out", "--resume").exit_code == 0
+    assert run(*command).exit_code == 2  # not without --resume
+    assert run(*command, "--resume").exit_code == 0
     assert all(path.stat().st_mtime_ns == written for path, written in kept.items())
-    assert run(*arguments, *more, tmp_path / "whole").exit_code == 0
-    assert results(tmp_path / "out") == results(tmp_path / "whole")
+    assert results(tmp_path / "out") == results(evaluated)
 
 
 def test_runs_of_other_settings_are_not_mixed(photographs: Path, evaluated: Path, tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """A program is killed, stopped and terminated during a motion of a servo that is simulated in real time."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
 from sim.realtime.wire import tell
+from tests.programs import Program
 
 CLOCK = SystemClock()
 
@@ -78,12 +78,8 @@ app()
 @pytest.fixture
 def servo(tmp_path):
     """Return the settings of a servo that another process simulates in real time."""
-    start = "from rig.cli.main import main; main()"
     link = tmp_path / "servo"
-    process = subprocess.Popen(
-        [sys.executable, "-c", start, "sim-servo", "--json", "--seconds", "60", "--link", str(link)],
-        stdout=subprocess.PIPE,
-    )
+    process = Program("sim-servo", "--json", "--seconds", "60", "--link", str(link))
     assert json.loads(process.stdout.readline())["ids"] == [1]
     yield [
         f"servo.port={str(link)!r}",
@@ -91,28 +87,20 @@ def servo(tmp_path):
         "table.velocity_dps=60",
         "table.watchdog_s=1.2",
     ]
-    process.kill()
-    process.wait()
-    process.stdout.close()
+    process.close()
 
 
-def moving(settings: list[str], **environment: str) -> tuple[subprocess.Popen, str]:
+def moving(settings: list[str], **variables: str) -> tuple[Program, str]:
     """Start the program; return it while the table moves, with its findings about the servo."""
     options = [word for setting in settings for word in ("--set", setting)]
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *options],
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = Program(*options, code=PROGRAM, **variables)
     findings = process.stdout.readline()
     assert process.stdout.readline() == "moving\n", process.stderr.read()
     CLOCK.sleep(0.8)
     return process, findings
 
 
-def ended(process: subprocess.Popen) -> tuple[int, str]:
+def ended(process: Program) -> tuple[int, str]:
     _, errors = process.communicate(timeout=20)
     return process.returncode, errors
 

@@ -1,7 +1,6 @@
 """The commands identify, replay and report; dry runs, completion, closed pipes, and benches with an operator."""
 
 import json
-import os
 import re
 import shutil
 import sqlite3
@@ -23,8 +22,8 @@ from rig.events.events import SimilarObjects
 from rig.views.object_presence import TableWatcher
 from sim.bench import SimBenchKind
 from sim.objects.shelf import shelf
+from tests.programs import Program
 
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 SMALL = (
     'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
     "[view]\nroi = [40, 0, 240, 240]\n[enroll]\nviews = 8\n"
@@ -346,9 +345,7 @@ def test_enroll_rejects_wrong_options_with_a_next_step(rig, arguments, words):
 
 def test_report_of_a_resumed_enrollment_has_all_views(rig, enrolled):
     folder, _ = enrolled
-    arguments = ["enroll", "candle", "--json"]
-    process = subprocess.Popen([*RIG, *arguments], cwd=folder, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
+    process = Program("enroll", "candle", "--json", folder=folder)
     for line in process.stdout:
         if json.loads(line).get("index") == 4 and "accepted" in line:
             process.kill()
@@ -374,13 +371,10 @@ def test_shell_completes_objects_benches_and_strategies(enrolled):
     folder, _ = enrolled
 
     def complete(*words: str) -> set[str]:
-        environment = {
-            **os.environ, "_RIG_COMPLETE": "complete_bash", "COMP_WORDS": "rig " + " ".join(words),
-            "COMP_CWORD": str(len(words)),
-        }  # fmt: skip
+        variables = {"COMP_WORDS": "rig " + " ".join(words), "COMP_CWORD": str(len(words))}
         code = "from rig.cli.main import app; app(prog_name='rig')"
-        done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=folder, capture_output=True, text=True)
-        return set(done.stdout.split())
+        process = Program(code=code, folder=folder, _RIG_COMPLETE="complete_bash", **variables)
+        return set(process.communicate()[0].split())
 
     assert complete("enroll", "l") == {"lamp"}
     assert complete("enroll", "--bench", "s") == {"sim"}

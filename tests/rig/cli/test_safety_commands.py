@@ -1,10 +1,7 @@
 """`rig home`, `rig stop`, `rig acknowledge`, and the state after a killed program, in real processes."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,10 +13,9 @@ from rig.core.clock import SystemClock
 from rig.core.errors import Stalled
 from rig.motion.stop_request import stop
 from rig.safety.saved_state import FileStore, LatchedFault, holder
+from tests.programs import Program
 
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 SMALL = ("--set", "camera.width=320", "--set", "camera.height=240", "--set", "view.roi=[40, 0, 240, 240]")
-ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
 
 @pytest.fixture
@@ -39,14 +35,8 @@ def running(rig):
     """Return a function that starts an enrollment of many views and returns it when the third is stored."""
     processes = []
 
-    def start() -> subprocess.Popen:
-        process = subprocess.Popen(
-            [*RIG, "enroll", "dice", "--views", "720", "--json", *SMALL],
-            env=ENVIRONMENT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    def start() -> Program:
+        process = Program("enroll", "dice", "--views", "720", "--json", *SMALL)
         processes.append(process)
         accepted = 0
         for line in process.stdout:
@@ -57,10 +47,7 @@ def running(rig):
 
     yield start
     for process in processes:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-        process.stderr.close()
+        process.close()
 
 
 def state() -> dict:
@@ -222,9 +209,7 @@ try:
 finally:
     print("torque off", flush=True)
 """
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
+    process = Program(code=code)
     assert process.stdout.readline() == "held\n"
     done = stop("sim", load_config(None, [f"state_dir={str(tmp_path)!r}"]), SystemClock())
     assert (done.holder.pid, done.signalled, done.ended) == (process.pid, True, True)
@@ -245,7 +230,7 @@ lock = BenchLock(Path({str(tmp_path / "sim")!r}), SystemClock())
 print("held", flush=True)
 time.sleep(60)
 """
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    process = Program(code=code)
     assert process.stdout.readline() == "held\n"
     done = CliRunner().invoke(app, ["stop", "--bench", "sim", "--set", f"state_dir={str(tmp_path)!r}"])
     process.kill()

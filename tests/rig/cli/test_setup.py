@@ -4,8 +4,6 @@ import io
 import json
 import shutil
 import signal
-import subprocess
-import sys
 from contextlib import contextmanager
 
 import pytest
@@ -17,9 +15,8 @@ from rig.cli.bench.setup import setup
 from rig.cli.main import app
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
+from tests.programs import Program
 from tests.rig.doctor.doctor_parts import unopened
-
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 
 
 @pytest.fixture
@@ -199,9 +196,7 @@ def test_ambiguous_adapter_is_found_by_unplugging_it(parts, home, monkeypatch):
 
 def test_ctrl_c_leaves_the_old_file_untouched(home):
     (home / "rig.toml").write_text('default_bench = "sim" # mine\n', encoding="utf-8")
-    process = subprocess.Popen(
-        [*RIG, "setup"], cwd=home, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    process = Program("setup")
     asked = ""
     while "taut" not in asked:
         asked += process.stderr.read(1)

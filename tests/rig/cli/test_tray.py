@@ -1,11 +1,7 @@
 """A tray of objects, enrolled with two interruptions in real processes and then identified."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +12,10 @@ from rig.core.clock import SystemClock
 from rig.search.replay import check
 from rig.search.saved_run import load_run
 from sim.objects.shelf import CONFUSABLE, shelf
+from tests.programs import Program
 
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
-VIEWS = 9
-NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:8]
+VIEWS = 6
+NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:5]
 SMALL = f"""\
 default_bench = "sim"
 [catalog]
@@ -32,32 +28,6 @@ roi = [40, 0, 240, 240]
 [enroll]
 views = {VIEWS}
 """
-
-
-class Process:
-    """A `rig` command in its own process."""
-
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        self._process = subprocess.Popen(
-            [*RIG, *arguments, "--json"],
-            cwd=folder,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def events(self) -> Iterator[dict[str, Any]]:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            yield json.loads(line)
-
-    def end(self, number: int | None = None) -> tuple[int, str]:
-        """Send a signal, if any, and return the exit code and stderr."""
-        if number is not None:
-            self._process.send_signal(number)
-        _, errors = self._process.communicate(timeout=60)
-        return self._process.returncode, errors
 
 
 @pytest.fixture
@@ -73,13 +43,15 @@ def folder(tmp_path):
 
 def enroll_until(folder: Path, views: int, number: int | None) -> tuple[list[dict[str, Any]], int, str]:
     """Enroll the tray and send a signal after so many views; return the events before it, the exit code and stderr."""
-    process = Process(folder, "enroll", "--list", "tray.csv")
+    process = Program("enroll", "--list", "tray.csv", "--json", folder=folder)
     events = []
-    for event in process.events():
-        events.append(event)
+    for line in process.stdout:
+        events.append(json.loads(line))
         if number is not None and sum(e["event"] == "accepted" for e in events) == views:
+            process.send_signal(number)
             break
-    return events, *process.end(number)
+    errors = process.communicate()[1]
+    return events, process.wait(), errors
 
 
 def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
@@ -124,15 +96,17 @@ def test_tray_is_enrolled_with_two_interruptions_and_identified(folder):
                 catalog.read_image(view)  # raises if it is not the stored image
 
     things = f"bench.sim.object={json.dumps(NAMES)}"
-    process = Process(folder, "identify", "--watch", "--save-run", "runs", "--seed", "3", "--set", things)
+    words = ("identify", "--watch", "--save-run", "runs", "--seed", "3", "--json")
+    process = Program(*words, "--set", things, folder=folder)
     answers = []
-    for event in process.events():
+    for event in map(json.loads, process.stdout):
         if event["event"] == "identified":
             answers.append(event["name"])
             if len(answers) == len(NAMES):
+                process.send_signal(signal.SIGINT)
                 break
-    code, _ = process.end(signal.SIGINT)
-    assert code == 130
+    process.communicate()
+    assert process.wait() == 130
     assert answers == NAMES
 
     runs = sorted((folder / "runs").iterdir())

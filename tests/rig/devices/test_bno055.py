@@ -5,7 +5,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
@@ -16,6 +16,7 @@ from sim.imu.bno055 import SILENT_S, SimBno055
 from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
 from sim.world import World
+from tests.fuzzing import examples
 
 AT = 0x28
 
@@ -100,7 +101,7 @@ def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:
 # -- readings ----------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=12)
+@examples(12)
 @given(
     angles=st.lists(st.floats(-300.0, 300.0), min_size=1, max_size=3),
     pause_s=st.floats(0.012, 0.3),

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.clock import SystemClock
@@ -14,6 +14,7 @@ from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table
 from sim.servo import Frame
+from tests.fuzzing import examples
 from tests.rig.bench_parts import open_bus, servo_wires
 
 TABLE = control_table("xl430_w250")
@@ -78,7 +79,7 @@ def test_rejection_names_the_status_error_and_is_not_retried(wires, bus):
     assert bus.statistics.retries == 0
 
 
-@settings(max_examples=40, deadline=None)
+@examples(14)
 @given(noise=st.lists(st.binary(min_size=0, max_size=30), min_size=1, max_size=4))
 def test_garbage_is_never_returned_as_a_value(noise):
     wires = servo_wires()

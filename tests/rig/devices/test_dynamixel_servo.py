@@ -1,7 +1,7 @@
 """The servo driver on the byte-true simulator."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
@@ -9,6 +9,7 @@ from rig.devices.dynamixel.registers import control_table, model_numbers
 from rig.devices.dynamixel.servo import DEG_PER_COUNT, DynamixelServo
 from rig.devices.servo import MotionProfile
 from sim.noise import NoiseModel
+from tests.fuzzing import examples
 from tests.rig.bench_parts import open_bus, open_servo, servo_wires
 
 
@@ -64,7 +65,7 @@ def test_torque_on_sets_the_goal_to_the_present_position_first(wires, servo):
     assert abs(wires.world.shaft()[0] - before) < 0.2
 
 
-@settings(max_examples=15, deadline=None)
+@examples(12)
 @given(goal_deg=st.floats(-700, 700))
 def test_goal_is_reached_within_one_count_over_many_revolutions(goal_deg):
     wires = servo_wires(NoiseModel.none())

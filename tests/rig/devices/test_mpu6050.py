@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
@@ -18,6 +18,7 @@ from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone, SimMpu6500, SimMpu9250
 from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
 from sim.world import World
+from tests.fuzzing import examples
 
 AT = 0x68
 
@@ -270,7 +271,7 @@ def test_rates_are_in_degrees_per_second_up_to_the_end_of_all_ranges(bench: Benc
 
 
 @given(pauses_ms=st.lists(st.integers(0, 300), min_size=2, max_size=10), divider=st.integers(2, 40))
-@settings(max_examples=50)
+@examples(18)
 def test_sample_times_are_even_and_correct(pauses_ms: list[int], divider: int) -> None:
     """Times come out of the count and the rate alone; they must still be those at which the sensor sampled."""
     period_ns = divider * 1_000_000
@@ -380,7 +381,7 @@ def test_fifo_overflow_is_reported_and_cleared(bench: Bench, imu: Mpu6050) -> No
 
 
 @given(frames=st.integers(168, 172), early_us=st.integers(-50, 250))
-@settings(max_examples=100)
+@examples(35)
 def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
     """Another sample may arrive between the reading of the count and that of the data."""
     with Bench() as bench:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import serial
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import rig.devices
@@ -25,7 +25,7 @@ from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import Register, control_table
 from sim.servo import Frame, Source
 from sim.servo.protocol2 import PacketParser, Status, status_packet
-from tests.fuzzing import fuzz_settings
+from tests.fuzzing import examples, fuzz_settings
 from tests.rig.bench_parts import open_bus, servo_wires
 from tests.rig.devices.scripted_serial import scripted_bus
 
@@ -48,7 +48,7 @@ def test_lost_reply_is_not_read_as_zero() -> None:
         DynamixelBus(port).read(1, TABLE["Present Input Voltage"])
 
 
-@settings(max_examples=100)
+@examples(35)
 @given(
     late_ms=st.floats(36.0, 56.0) | st.floats(0.0, 1500.0),  # after the first time-out, while questions go back to back
     pauses_ms=st.just([0.0] * 12) | st.lists(st.floats(0.0, 60.0), min_size=8, max_size=8),

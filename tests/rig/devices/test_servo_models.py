@@ -3,7 +3,7 @@
 from contextlib import closing
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.config import load_config
@@ -21,6 +21,7 @@ from sim.servo.ax12 import DEG_PER_COUNT
 from sim.servo.models import MODELS
 from sim.servo.motor import OVERLOAD_S
 from sim.world import World
+from tests.fuzzing import examples
 
 
 def parts_of(*overrides: str, noise: NoiseModel | None = None) -> SimDevices:
@@ -95,7 +96,7 @@ def test_ax12_is_rejected_as_a_turntable() -> None:
     assert 'In [table] set mode = "pan"' in caught.value.next_step
 
 
-@settings(max_examples=20)
+@examples(12)
 @given(goal_deg=st.floats(0.0, 300.0))
 def test_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
     devices = parts_of(*AX)
@@ -171,7 +172,7 @@ def test_limits_beyond_the_reach_are_rejected_before_anything_moves(simulated) -
 # -- gear and pan ------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=15)
+@examples(12)
 @given(ratio=st.floats(0.3, 12.0), angle_deg=st.floats(20.0, 300.0), sign=st.sampled_from([1, -1]))
 def test_gear_converts_angles_and_rates_to_the_table(ratio: float, angle_deg: float, sign: int) -> None:
     angle_deg *= sign

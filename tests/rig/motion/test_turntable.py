@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NotReady, Stalled
@@ -14,6 +14,7 @@ from rig.motion.turntable import Turntable
 from rig.safety.supervisor import TableState
 from sim.noise import NoiseModel
 from sim.servo import Frame
+from tests.fuzzing import examples
 from tests.rig.bench_parts import motion_bench
 
 
@@ -108,7 +109,7 @@ def test_target_beyond_the_limits_is_rejected_before_anything_moves():
         assert caught.value.evidence == {"from_deg": 0.0, "to_deg": 401.0, "limits_deg": [-400.0, 400.0]}
 
 
-@settings(max_examples=60, deadline=None)
+@examples(21)
 @given(target=st.floats(-3000, 3000), low=st.floats(-800, 0), span=st.floats(360, 1500))
 def test_within_reach_returns_an_equivalent_angle(target, low, span):
     high = low + span

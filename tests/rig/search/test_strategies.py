@@ -4,7 +4,7 @@ from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hbr
@@ -16,6 +16,7 @@ from rig.events.events import RotationReason
 from rig.search import strategies
 from rig.search.session import Search, begin_search
 from rig.search.strategies import Finish, Rotate, SearchState, Strategy, end_by_margin, strategy
+from tests.fuzzing import examples
 
 PAPERS = ["ahbr", "hbr", "sweep", "random"]
 
@@ -51,7 +52,7 @@ def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list
 
 
 @pytest.mark.parametrize("name", PAPERS)
-@settings(max_examples=25)
+@examples(12)
 @given(max_views=st.integers(1, 12), seed=st.integers(0, 3))
 def test_every_strategy_takes_all_allowed_views_without_a_margin(name, max_views, seed):
     rotations, end, _ = run(name, seed=seed, max_views=max_views, min_views=1, margin=1.0)

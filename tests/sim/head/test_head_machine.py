@@ -27,6 +27,7 @@ from sim.head.board import SimHead
 from sim.head.build import missing
 from sim.head.serial_port import HeadSerial
 from sim.world import World
+from tests.fuzzing import examples
 
 MS = 1_000_000
 SLACK_NS = 3 * MS
@@ -182,4 +183,4 @@ class Head(RuleBasedStateMachine):
 
 
 TestHead = pytest.mark.skipif(bool(missing("memory")), reason=missing("memory"))(Head.TestCase)
-TestHead.settings = settings(max_examples=25, stateful_step_count=30, deadline=None)
+TestHead.settings = settings(examples(12), stateful_step_count=30)

@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 import serial
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.servo import Frame, SimSerial, Source
 from sim.servo.bus import ABANDON_S, superpose
 from sim.servo.models import BAUD_RATES
+from tests.fuzzing import examples
 from tests.sim.servo.servo_bench import Line
 
 PING = bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))
@@ -33,7 +34,7 @@ def test_ping_takes_its_bytes_and_the_return_delay(baudrate: int, delay: int) ->
     assert line.clock.now_ns() == pytest.approx(reply.start_ns + 14 * byte_ns, abs=1)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(21)
 @given(baudrate=st.sampled_from(BAUD_RATES), start_ns=st.integers(0, 10**15), now=st.integers(-10, 10**8))
 def test_byte_arrives_at_the_end_of_its_stop_bit(baudrate: int, start_ns: int, now: int) -> None:
     frame = Frame(Source.DEVICE, start_ns, baudrate, bytes(50))
@@ -131,7 +132,7 @@ def test_incomplete_packet_is_dropped_and_does_not_damage_the_next(line: Line) -
     assert results[-1] == COMM_SUCCESS
 
 
-@settings(max_examples=60, deadline=None)
+@examples(21)
 @given(st.binary(min_size=1, max_size=12), st.binary(min_size=1, max_size=12))
 def test_two_simultaneous_senders_can_only_pull_the_bus_low(one: bytes, other: bytes) -> None:
     frames = [Frame(Source.DEVICE, 0, 1_000_000, one), Frame(Source.DEVICE, 0, 1_000_000, other)]

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.servo.base import (
@@ -19,6 +19,7 @@ from sim.servo.base import (
 from sim.servo.models import DEG_PER_COUNT, MODELS
 from sim.servo.motor import OVERLOAD_S, PWM_PER_COUNT
 from sim.servo.protocol2 import StatusError
+from tests.fuzzing import examples
 from tests.sim.servo.servo_bench import ALERT, Line, extended
 
 FOLLOWING_ERROR = 0x08
@@ -28,7 +29,7 @@ FOLLOWING_ERROR = 0x08
 
 
 @given(units=st.integers(1, 127), last_read_s=st.floats(0.0, 1.0))
-@settings(max_examples=20, deadline=None)
+@examples(12)
 def test_watchdog_trips_after_its_time_without_instructions(units: int, last_read_s: float) -> None:
     line = Line()
     servo = line.add()

@@ -3,12 +3,13 @@
 from math import sqrt
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.noise import NoiseModel
 from sim.servo.models import DEG_PER_COUNT, DPS2_PER_UNIT, DPS_PER_UNIT, MODELS
 from sim.servo.motor import FRICTION_LOAD
+from tests.fuzzing import examples
 from tests.sim.servo.servo_bench import Line, extended
 
 XL430 = MODELS["xl430_w250"]
@@ -32,7 +33,7 @@ def arrival_s(line: Line) -> float:
     velocity=st.integers(1, 265),
     acceleration=st.integers(1, 139),
 )
-@settings(max_examples=25, deadline=None)
+@examples(12)
 def test_move_takes_the_profiles_time_and_ends_on_the_count(goal: int, velocity: int, acceleration: int) -> None:
     line = Line()
     line.add()
@@ -178,7 +179,7 @@ def test_position_mode_loses_the_revolutions_when_torque_comes_on(line: Line) ->
 
 
 @given(turns_deg=st.floats(-2000, 2000), center=st.integers(0, 4095))
-@settings(max_examples=25, deadline=None)
+@examples(12)
 def test_power_up_reads_within_one_revolution(turns_deg: float, center: int) -> None:
     line = Line()
     line.add(1, center_counts=center)

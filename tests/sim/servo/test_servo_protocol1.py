@@ -2,7 +2,7 @@
 
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupSyncWrite, Protocol1PacketHandler
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.devices.dynamixel.port import ClockedPort
@@ -15,8 +15,9 @@ from sim.servo.motor import OVERLOAD_S
 from sim.servo.protocol1 import Error, PacketParser1, checksum, status_packet1
 from sim.servo.protocol2 import InstructionPacket, Status
 from sim.world import World
+from tests.fuzzing import examples
 
-quick = settings(max_examples=100)
+quick = examples(35)
 GOAL, SPEED, POSITION, VOLTAGE = 30, 32, 36, 42
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from rig.devices.dynamixel.packets import Packets2
@@ -16,9 +16,10 @@ from sim.servo.protocol2 import (
     status_packet,
     with_crc,
 )
+from tests.fuzzing import examples
 
 SDK = Protocol2PacketHandler()
-quick = settings(max_examples=100, deadline=None)
+quick = examples(35)
 
 # Bytes that make headers, stuffing and near misses of both likely.
 tricky_bytes = st.lists(st.sampled_from([0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x01, 0x55, 0xAB]), max_size=40).map(bytes)

@@ -7,6 +7,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from sim.servo.base import BOOT_S, OVERLOAD_ERROR
 from sim.servo.protocol2 import StatusError
+from tests.fuzzing import examples
 from tests.sim.servo.servo_bench import ALERT, Line
 
 EEPROM = {"Return Delay Time": 250, "Moving Threshold": 10, "Min Position Limit": 0, "Max Position Limit": 4095}
@@ -158,4 +159,4 @@ class ServoMachine(RuleBasedStateMachine):
 
 
 TestServo = ServoMachine.TestCase
-TestServo.settings = settings(max_examples=40, stateful_step_count=30, deadline=None)
+TestServo.settings = settings(examples(14), stateful_step_count=30)

@@ -6,8 +6,6 @@ import pty
 import re
 import select
 import signal
-import subprocess
-import sys
 import termios
 from collections.abc import Callable
 from pathlib import Path
@@ -24,9 +22,9 @@ from rig.core.errors import UsageError, ViewRejected
 from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, SkipReason, Waiting, WaitReason
 from rig.events.wording import angle_words
 from rig.plans.tray import TrayDecision, TrayItem
+from tests.programs import Program
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
-RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 SIMILAR = SimilarObjects("mug-white", 180.0, 0.95, 0.96, (SimilarObject("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
 
@@ -134,14 +132,8 @@ class Keyboard:
         self._master, slave = pty.openpty()
         self.before = termios.tcgetattr(slave)
         self.slave = slave
-        self.process = subprocess.Popen(
-            [*RIG, *arguments],
-            cwd=folder,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "100", "LINES": "40", "TERM": "xterm"},
-            stdin=slave,
-            stdout=slave,
-            stderr=slave,
-        )
+        variables = {"COLUMNS": "100", "LINES": "40", "TERM": "xterm"}
+        self.process = Program(*arguments, folder=folder, terminal=slave, **variables)
         self.seen = ""
 
     def type(self, keys: str) -> None:
@@ -159,8 +151,7 @@ class Keyboard:
         return self.process.wait(timeout=60)
 
     def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
+        self.process.close()
         os.close(self._master)
         os.close(self.slave)
 
@@ -214,10 +205,7 @@ def wait(condition: Callable[[], bool]) -> None:
 
 
 def test_sigtstp_pauses_between_two_views_and_sigcont_resumes(folder):
-    process = subprocess.Popen(
-        [*RIG, "enroll", "dice", "--views", "12"], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
+    process = Program("enroll", "dice", "--views", "12", folder=folder)
     lines = [process.stdout.readline()]
     while not lines[-1].startswith("view 2"):
         lines.append(process.stdout.readline())

@@ -1,0 +1,138 @@
+"""Programs in processes of their own, forked from a server that has imported what they need.
+
+A start takes milliseconds instead of a second of computing. Signals, locks, pipes and exit codes are those of any
+process. Tests of the start or the end of the interpreter start Python instead.
+"""
+
+import os
+import signal
+import sys
+from contextlib import suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from subprocess import TimeoutExpired
+from threading import Thread
+from typing import IO
+
+_SERVER = get_context("forkserver")
+_SERVER.set_forkserver_preload(
+    ["tests.programs", "rig.catalog", "rig.cli.main", "rig.plans.enroll", "rig.plans.identify", "sim.bench"]
+)
+
+
+class Program:
+    """A running `rig ...` or, with ``code``, a piece of Python; used as `subprocess.Popen`.
+
+    Parameters
+    ----------
+    words
+        Arguments of the program.
+    code
+        Run this instead of `rig`.
+    folder
+        Its working directory; None takes the present one.
+    terminal
+        File descriptor of a terminal for input and output; None gives it pipes.
+    variables
+        Changes of the environment.
+    """
+
+    def __init__(
+        self,
+        *words: str,
+        code: str = "from rig.cli.main import main; main()",
+        folder: Path | None = None,
+        terminal: int | None = None,
+        **variables: str,
+    ) -> None:
+        self.stdin: IO[str] | None = None
+        self.stdout: IO[str] | None = None
+        self.stderr: IO[str] | None = None
+        if terminal is None:
+            (theirs_in, ours_in), (ours_out, theirs_out), (ours_err, theirs_err) = (os.pipe() for _ in range(3))
+            self.stdin = os.fdopen(ours_in, "w")
+            self.stdout = os.fdopen(ours_out)
+            self.stderr = os.fdopen(ours_err)
+            ends = [theirs_in, theirs_out, theirs_err]
+        else:
+            ends = [os.dup(terminal) for _ in range(3)]
+        streams = [Connection(end) for end in ends]  # it can be sent to another process
+        environment = {**os.environ, **variables}
+        self._process = _SERVER.Process(target=_run, args=(words, code, folder or Path.cwd(), environment, streams))
+        self._process.start()
+        for stream in streams:
+            stream.close()
+
+    @property
+    def pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
+
+    @property
+    def returncode(self) -> int | None:
+        return self._process.exitcode
+
+    poll = returncode.fget
+
+    def send_signal(self, number: int) -> None:
+        if self.returncode is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def wait(self, timeout: float | None = None) -> int:
+        self._process.join(timeout)
+        if self.returncode is None:
+            raise TimeoutExpired(str(self._process), timeout or 0)
+        return self.returncode
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """Return the rest of the output and the errors when the program has ended."""
+        assert self.stdin is not None
+        with suppress(BrokenPipeError):
+            self.stdin.close()
+        assert self.stdout is not None
+        assert self.stderr is not None
+        rest: list[str] = []
+        errors = self.stderr
+        reader = Thread(target=lambda: rest.append(errors.read()))
+        reader.start()
+        output = self.stdout.read()
+        reader.join()
+        self.wait(timeout)
+        self.close()
+        return output, rest[0]
+
+    def close(self) -> None:
+        """Kill the program if it still runs, and close the pipes."""
+        self.kill()
+        self.wait()
+        for stream in (self.stdin, self.stdout, self.stderr):
+            if stream is not None:
+                with suppress(BrokenPipeError):
+                    stream.close()
+
+
+def _run(
+    words: tuple[str, ...], code: str, folder: Path, environment: dict[str, str], streams: list[Connection]
+) -> None:
+    """Become the program."""
+    for number, stream in enumerate(streams):
+        os.dup2(stream.fileno(), number)
+        stream.close()
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    sys.argv = ["rig", *words]
+    sys.stdin = os.fdopen(0, closefd=False)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        buffering = 1 if os.isatty(number) or name == "stderr" else -1
+        setattr(sys, name, os.fdopen(number, "w", buffering, closefd=False))
+    try:
+        exec(compile(code, "program", "exec"), {"__name__": "__main__"})
+    except KeyboardInterrupt:  # end as the interpreter ends
+        sys.stdout.flush()
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)
