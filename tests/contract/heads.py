@@ -222,7 +222,7 @@ class _PacedWire:
 
     @staticmethod
     def _until(carried: Callable[[], bool]) -> None:
-        for _ in range(50_000):
+        for _ in range(600_000):
             if carried():
                 return
             SystemClock().sleep(0.0001)
