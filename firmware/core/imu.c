@@ -31,13 +31,13 @@
 #define BNO_BURST 20         /* gyro, Euler angles, quaternion */
 #define BNO_PERIOD_US ((uint32_t)10000) /* of its fusion */
 #define BNO_POLL_US ((uint32_t)8000) /* shorter than its period: no sample is missed, repeated ones are recognised */
-#define BNO_FEEL 10          /* samples between two readings of the accelerometer */
-#define BNO_LOOK 100         /* samples between two checks of temperature and mode */
+#define BNO_ACCEL 10         /* samples between two readings of the accelerometer */
+#define BNO_CHECK 100        /* samples between two checks of temperature and mode */
 #define BNO_LEARN_US ((uint32_t)3000000) /* longest wait for the gyro's calibration, which never completes on a moving table */
 
 #define ATTEMPTS 3
 #define TRANSFER_US 5000 /* the longest takes 0.6 ms at 400 kHz; a sensor may stretch the clock */
-#define LOOK_US 50000    /* without an edge, check the FIFO: the pin is not connected, or the sensor is gone */
+#define CHECK_US 50000   /* without an edge, check the FIFO: the pin is not connected, or the sensor is gone */
 #define AGAIN_US 100000  /* between two attempts to get a lost sensor back */
 
 enum phase {
@@ -57,7 +57,7 @@ enum phase {
     BNO_RUN,
     BNO_READ,
     BNO_FELT,
-    BNO_LOOKED,
+    BNO_CHECKED,
     LOST,
 };
 
@@ -208,7 +208,7 @@ static bool settings_kept(const struct imu *imu) {
 
 static void look_at_mode(struct imu *imu) {
     read_registers(imu, BNO_TEMP, BNO_OPR_MODE - BNO_TEMP + 1);
-    imu->phase = BNO_LOOKED;
+    imu->phase = BNO_CHECKED;
 }
 
 static void feel(struct imu *imu) {
@@ -224,7 +224,7 @@ static bool calibrated(struct imu *imu, uint32_t now) {
     if (imu->phase != BNO_LEARNING) {
         imu->learnt_us = now + BNO_LEARN_US;
     }
-    imu->due_us = now + LOOK_US;
+    imu->due_us = now + CHECK_US;
     imu->phase = BNO_LEARN;
     return false;
 }
@@ -248,7 +248,7 @@ static void run(struct imu *imu, struct counters *counters) {
     }
     imu->status = IMU_STATUS_RUNNING;
     imu->last_us = now;
-    imu->due_us = now + LOOK_US;
+    imu->due_us = now + CHECK_US;
     imu->polls = 0;
     imu->phase = MPU_RUN;
     if (!is_mpu(imu)) {
@@ -280,9 +280,9 @@ static void look(struct imu *imu, struct counters *counters) {
         return; /* an edge occurred during the request: the count may include it or not. Ask again */
     }
     if (!frames) {
-        bool silent = edges == imu->edges && passed(now, imu->last_us + LOOK_US + imu->period_us);
+        bool silent = edges == imu->edges && passed(now, imu->last_us + CHECK_US + imu->period_us);
         imu->edges = edges;
-        imu->due_us = now + (imu->edges_come ? LOOK_US : imu->period_us / 2);
+        imu->due_us = now + (imu->edges_come ? CHECK_US : imu->period_us / 2);
         if (silent) {
             lost(imu, IMU_STATUS_SETTINGS_LOST); /* it takes no samples: it fell asleep after a brown-out */
         }
@@ -312,7 +312,7 @@ static void look(struct imu *imu, struct counters *counters) {
     imu->newest = newest;
     imu->edges = edges;
     imu->frames = frames;
-    imu->due_us = now + (imu->edges_come ? LOOK_US : imu->period_us / 2);
+    imu->due_us = now + (imu->edges_come ? CHECK_US : imu->period_us / 2);
     fetch(imu);
 }
 
@@ -343,7 +343,7 @@ static bool bno_sample(struct imu *imu, struct imu_sample *sample) {
     }
     uint32_t gap_us = imu->began_us - imu->last_us;
     if (gap_us > 5 * BNO_PERIOD_US / 2) {
-        imu->newest = (uint16_t)(imu->newest + gap_us / BNO_PERIOD_US - 1); /* the bus was not available for so long */
+        imu->newest = (uint16_t)(imu->newest + gap_us / BNO_PERIOD_US - 1); /* the bus was not available */
     }
     imu->seen = seen;
     imu->newest_us = fresh ? imu->began_us + BNO_PERIOD_US + BNO_POLL_US / 4 : imu->newest_us + BNO_PERIOD_US;
@@ -357,8 +357,8 @@ static bool bno_sample(struct imu *imu, struct imu_sample *sample) {
     sample->words[3] = imu->temperature;
     imu->last_us = imu->began_us;
     imu->sampled = true;
-    imu->polls = (uint8_t)((imu->polls + 1) % BNO_LOOK);
-    if (imu->polls % BNO_FEEL == 0) {
+    imu->polls = (uint8_t)((imu->polls + 1) % BNO_CHECK);
+    if (imu->polls % BNO_ACCEL == 0) {
         feel(imu);
     }
     return true;
@@ -464,7 +464,7 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
             }
         }
         break;
-    case BNO_LOOKED:
+    case BNO_CHECKED:
         if (ended(imu, counters, BNO_RUN)) {
             imu->temperature = (int8_t)imu->got[0];
             imu->phase = BNO_RUN;

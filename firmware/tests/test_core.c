@@ -49,7 +49,7 @@ static void test_every_frame_comes_back(void) {
 static void test_garbage_stays_within_its_bytes(void) {
     for (int round = 0; round < 200000; round++) {
         uint8_t length = (uint8_t)(random_byte() % (FRAME_LINE + 8));
-        uint8_t *line = malloc(length ? length : 1); /* just so long: the sanitizer sees a byte beyond it */
+        uint8_t *line = malloc(length ? length : 1); /* the exact length: the sanitizer detects a byte beyond it */
         for (uint8_t i = 0; i < length; i++) {
             line[i] = random_byte() % 4 ? (uint8_t)(random_byte() % 6) : random_byte();
         }
@@ -107,7 +107,7 @@ static void run_ms(uint64_t ms) {
                     break;
                 }
                 if (!length) {
-                    break; /* the zero that ends what a reset broke off */
+                    break; /* the zero that ends a frame that the reset interrupted */
                 }
                 CHECK(frame_decode(line, length) >= 0);
                 memcpy(line[0] >= MESSAGE_SAMPLE ? event : answer, line, sizeof line);
@@ -182,7 +182,7 @@ static void test_silence_makes_the_bench_safe(void) {
     CHECK(beat(250) == REJECTION_NONE);
     CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_FAULT_LATCHED);
     CHECK(ask_u8(MESSAGE_ACKNOWLEDGE, HEAD_FAULT_DEADMAN) == REJECTION_NONE);
-    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NOT_ACTIVE); /* not by itself: a beat first */
+    CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NOT_ACTIVE); /* only after a heartbeat */
     beat(250);
     CHECK(ask_u8(MESSAGE_RELAY, 1) == REJECTION_NONE && relay == 1);
     board_close(board);

@@ -1,7 +1,8 @@
 /* The flashed binary on an emulated ATmega328P (libsimavr), behind the interface of firmware/boards/host/board.h.
  *
- * The emulator is run from one event to the next: a byte from the host, a data-ready edge, the time asked for. Each
- * takes effect at the first instruction that begins at or after it, so that a run does not depend on how it is cut. */
+ * The emulator runs from one event to the next: a byte from the host, a data-ready edge, the end of the run. An event
+ * takes effect at the first instruction that begins at or after it, so the result does not depend on how a run is
+ * divided. */
 #include "board.h"
 
 #include <stdarg.h>
@@ -37,8 +38,8 @@ struct arriving {
 struct board {
     avr_t *avr;
     struct board_outside outside;
-    uint64_t base; /* cycles before the last reset, where that begins the emulator's count anew (simavr 1.7) */
-    uint64_t last; /* the emulator's count when we last looked */
+    uint64_t base; /* cycles before the last reset, if the reset starts the emulator's count again (simavr 1.7) */
+    uint64_t last; /* the emulator's count at the last check */
     bool was_reset;
     void (*reset)(avr_t *avr); /* the core's own */
     uint32_t flash_size;
@@ -54,7 +55,7 @@ struct board {
     uint8_t stuck;
     int32_t light, relay, trigger;
 
-    /* I2C: the emulator's way of writing to TWCR, which a stuck bus must not reach. */
+    /* I2C: the emulator's function for writes to TWCR, which must not be called while the bus is stuck. */
     avr_io_write_t write_twcr;
     void *write_twcr_param;
     uint8_t address;
@@ -82,7 +83,7 @@ static void emit(struct board *b, uint64_t cycle, enum board_event event, int32_
     }
 }
 
-/* -- what the microcontroller does to its pins --------------------------------------------------------------------- */
+/* -- outputs of the microcontroller -------------------------------------------------------------------------------- */
 
 static void on_byte(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
@@ -145,7 +146,7 @@ static void on_twi(struct avr_irq_t *irq, uint32_t value, void *param) {
     if (condition & TWI_COND_STOP) {
         ask(b, BOARD_I2C_STOP, &b->address, 0);
         b->acknowledged = false;
-        look_for_edges(b); /* what was written may have switched the line on or off */
+        look_for_edges(b); /* the write may have switched the signal on or off */
     }
     if (condition & TWI_COND_START) {
         b->address = (uint8_t)(told.u.twi.addr >> 1);
@@ -166,7 +167,7 @@ static void on_twi(struct avr_irq_t *irq, uint32_t value, void *param) {
     }
 }
 
-/* A start on a stuck bus waits for ever: the hardware never says that it was sent. */
+/* A start on a stuck bus waits without end: the hardware never reports that it was sent. */
 static void on_twcr(struct avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param) {
     struct board *b = param;
     if (b->stuck && value & 0x20 /* TWSTA */) {
@@ -186,7 +187,7 @@ static void drive_bus(struct board *b) {
     avr_raise_irq(b->sda, !b->stuck);
 }
 
-/* Firmware that clocks the bus free drives SCL as a plain pin. */
+/* The firmware frees the bus by clock pulses, with SCL as a plain pin. */
 static void on_scl(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     struct board *b = param;
@@ -218,9 +219,9 @@ static void on_reset(avr_t *avr) {
     b->reset(avr);
 }
 
-/* After a reset, whatever its cause, what is wired from outside is still there. */
+/* After any reset, the external connections still exist. */
 static void wire_up(struct board *b) {
-    /* At reset these pins are level-triggered, and low ones would be polled in every cycle, for ever after. */
+    /* At reset these pins are level-triggered, and simavr would poll low ones in every cycle. */
     avr_extint_set_strict_lvl_trig(b->avr, EXTINT_IRQ_OUT_INT0, 0);
     avr_extint_set_strict_lvl_trig(b->avr, EXTINT_IRQ_OUT_INT1, 0);
     set_external(b, 'D', 1 << D_READY | 1 << D_ESTOP, (uint8_t)(b->estop_open ? 1 << D_ESTOP : 0));
@@ -229,7 +230,7 @@ static void wire_up(struct board *b) {
     b->scl = true;
     drive_bus(b);
     b->edge_falls = BOARD_NEVER;
-    set(b, &b->light, BOARD_LIGHT, 0); /* pins are inputs again, pulled to rest from outside */
+    set(b, &b->light, BOARD_LIGHT, 0); /* pins are inputs again; external resistors pull them to their inactive levels */
     set(b, &b->relay, BOARD_RELAY, 0);
     set(b, &b->trigger, BOARD_TRIGGER, 0);
     look_for_edges(b);
@@ -317,7 +318,7 @@ void board_reset(struct board *b, uint8_t cause) {
                                                      : 0;
 }
 
-/* -- the world's side ------------------------------------------------------------------------------------------------ */
+/* -- interface to the world ------------------------------------------------------------------------------------------ */
 
 void board_set_estop(struct board *b, bool open) {
     b->estop_open = open;
@@ -330,14 +331,14 @@ void board_set_stuck(struct board *b, uint8_t clocks) {
     drive_bus(b);
 }
 
-/* The main loop is sent to the endless loop that avr-libc puts behind every program. */
+/* The main loop jumps to the endless loop that avr-libc appends to every program. */
 void board_hang(struct board *b, bool hangs) {
     if (!hangs) {
         return;
     }
     for (uint32_t at = 0; at + 1 < b->flash_size; at += 2) {
         if ((b->avr->flash[at] | b->avr->flash[at + 1] << 8) == OP_RJMP_SELF) {
-            while (!(b->avr->sreg[S_I] && b->avr->state == cpu_Sleeping)) { /* in the main loop, for sure */
+            while (!(b->avr->sreg[S_I] && b->avr->state == cpu_Sleeping)) { /* until it is in the main loop */
                 avr_run(b->avr);
             }
             b->avr->pc = at;
@@ -351,7 +352,7 @@ void board_receive(struct board *b, uint64_t ns, uint8_t byte) {
     if (b->arriving_count < QUEUE) {
         struct arriving *slot = &b->arriving[(b->arriving_head + b->arriving_count++) % QUEUE];
         uint64_t cycle = to_cycle(ns);
-        slot->cycle = cycle > BYTE_CYCLES ? cycle - BYTE_CYCLES : 0; /* its first bit: the emulator lets it take its time */
+        slot->cycle = cycle > BYTE_CYCLES ? cycle - BYTE_CYCLES : 0; /* its first bit: the emulator simulates the transmission */
         slot->byte = byte;
     }
 }

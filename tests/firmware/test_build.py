@@ -1,4 +1,4 @@
-"""The firmware's sources: generated files are fresh, it builds without a warning, fits, and passes its own tests."""
+"""The firmware: generated files are current, it builds without warnings, fits into the board, and passes its tests."""
 
 import os
 import re
@@ -61,7 +61,7 @@ def test_the_avr_build_fits_its_limits(tmp_path):
     assert (flash_limit, ram_limit) == (8192, 1024)
     assert 0 < flash <= flash_limit
     assert 0 < ram <= ram_limit
-    assert build.avr_image() == (tmp_path / "head.bin").read_bytes()  # what is emulated is what is flashed
+    assert build.avr_image() == (tmp_path / "head.bin").read_bytes()  # the emulator runs the same bytes
 
 
 def test_the_core_needs_no_heap_and_no_floating_point(tmp_path):

@@ -1,7 +1,7 @@
-"""The decoder in C and the one in Python: what one takes for a frame, the other does, and they read the same.
+"""The decoders in C and in Python accept the same frames, with the same content.
 
-In the nightly profile a million lines, in CI some thousands; the C side runs under UBSan, and under ASan where a
-compiler has it (its runtime must be in a process from the start, so that the lines are fed in one of its own).
+The nightly profile decodes a million lines, CI some thousands. The C side runs with UBSan, and with ASan if the
+compiler has it. ASan must be loaded when a process starts, so another process decodes the lines.
 """
 
 import os
@@ -71,7 +71,7 @@ def compiler():
 
 
 def runtime(name: str) -> str:
-    """Return the path of a sanitizer's runtime, empty where the compiler has none."""
+    """Return the path of a sanitizer's runtime; empty if the compiler has none."""
     told = subprocess.run([build.compiler(), f"-print-file-name={name}"], capture_output=True, text=True, check=True)
     path = Path(told.stdout.strip())
     return str(path) if path.is_absolute() else ""

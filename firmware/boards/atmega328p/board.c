@@ -24,10 +24,10 @@
 #define TRIGGER_DELAY_US 20U
 
 static struct head head;
-static volatile bool woken; /* an interrupt has left something to do */
+static volatile bool woken; /* an interrupt has work for the main loop */
 static uint8_t reset_flags __attribute__((section(".noinit")));
 
-/* Before main: after a watchdog reset it still runs, at 16 ms. */
+/* Runs before main: after a watchdog reset the watchdog is still on, with 16 ms. */
 static void keep_reset_flags(void) __attribute__((naked, used, section(".init3")));
 static void keep_reset_flags(void) {
     reset_flags = MCUSR;
@@ -48,7 +48,7 @@ static uint32_t micros_locked(void) {
     uint16_t low = TCNT1;
     uint32_t high = overflows;
     if (TIFR1 & _BV(TOV1) && low < 0x8000) {
-        high++; /* it ran over just before, and nobody counted it yet */
+        high++; /* the timer has just overflowed; the interrupt has not counted it yet */
     }
     return (high << 15) + (low >> 1);
 }
@@ -77,13 +77,13 @@ void hal_feed_watchdog(void) {
 ISR(TIMER0_COMPA_vect) {
     static uint8_t ticks;
     head_tick(&head);
-    if (head.changed || ++ticks >= 1000 / TICK_US) { /* a millisecond is soon enough for the main loop's own waits */
+    if (head.changed || ++ticks >= 1000 / TICK_US) { /* the waits of the main loop need a millisecond only */
         ticks = 0;
         woken = true;
     }
 }
 
-/* -- the line ---------------------------------------------------------------------------------------------------- */
+/* -- serial connection ------------------------------------------------------------------------------------------- */
 
 #define RECEIVER 64U /* powers of two */
 #define TRANSMITTER 128U
@@ -179,7 +179,7 @@ static void i2c_end(enum hal_i2c_result result) {
     woken = true;
 }
 
-/* Acknowledged: go on with the next byte, turn round, or end. */
+/* After an acknowledge: continue with the next byte, change to reading, or end. */
 static void i2c_next(void) {
     if (i2c.to_write) {
         i2c.to_write--;
@@ -245,7 +245,7 @@ enum hal_i2c_result hal_i2c_result(void) {
 bool hal_i2c_free(void) {
     TWCR = 0;
     i2c.result = HAL_I2C_ERROR;
-    PORTC &= (uint8_t) ~(_BV(SDA) | _BV(SCL)); /* a line is driven low or let go */
+    PORTC &= (uint8_t) ~(_BV(SDA) | _BV(SCL)); /* a line is either driven low or released */
     for (uint8_t i = 0; i < 9 && !(PINC & _BV(SDA)); i++) {
         DDRC |= _BV(SCL);
         _delay_us(5);
@@ -326,7 +326,7 @@ ISR(TIMER1_COMPA_vect) {
     }
     TCCR1A = _BV(COM1A1);
     OCR1A += trigger_ticks;
-    /* Late for a short pulse: end it here, or it would last until the timer has gone round. */
+    /* Too late for a short pulse: end it here, otherwise it lasts until the timer wraps around. */
     if (OCR1A - TCNT1 > trigger_ticks) {
         hal_trigger_rest();
     }
@@ -337,7 +337,7 @@ bool hal_estop_open(void) {
     return PIND & _BV(ESTOP);
 }
 
-/* -- who we are -------------------------------------------------------------------------------------------------- */
+/* -- identity ---------------------------------------------------------------------------------------------------- */
 
 uint8_t hal_board(void) {
     return BOARD_ATMEGA328P;
@@ -347,7 +347,7 @@ uint8_t hal_reset_cause(void) {
     if (reset_flags & _BV(WDRF)) {
         return RESET_WATCHDOG;
     }
-    if (reset_flags & _BV(PORF)) { /* with the brown-out flag beside it: the supply rose through the threshold */
+    if (reset_flags & _BV(PORF)) { /* the brown-out flag is set, too, because the supply rose through the threshold */
         return RESET_POWER_ON;
     }
     if (reset_flags & _BV(BORF)) {
@@ -391,7 +391,7 @@ int main(void) {
         cli();
         if (!woken) {
             sleep_enable();
-            sei(); /* takes effect after the next instruction: nothing can come between */
+            sei(); /* takes effect after the next instruction, so no interrupt comes between */
             sleep_cpu();
             sleep_disable();
         }

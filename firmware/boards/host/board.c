@@ -10,10 +10,10 @@
 #define TICK_NS (TICK_US * 1000ULL)
 #define BYTE_NS (10ULL * 1000000000ULL / BAUD)
 #define I2C_BYTE_NS 22500ULL /* nine bits at 400 kHz */
-#define QUEUE 8192U          /* bytes on their way to the board, events on their way out */
-#define TRANSMITTER 128U     /* as on the microcontroller */
+#define QUEUE 8192U          /* bytes to the board, and events from it */
+#define TRANSMITTER 128U     /* like on the microcontroller */
 #define WATCHDOG_NS 120000000ULL
-#define PASSES 3             /* of the main loop after an event: it has nothing left to do then */
+#define PASSES 3             /* of the main loop after an event: enough to do all its work */
 
 struct arriving {
     uint64_t ns;
@@ -36,7 +36,7 @@ struct board {
     uint8_t readable[64];
     uint8_t readable_head, readable_count, overruns;
     uint32_t frame_us;
-    uint64_t line_free; /* when the last queued byte will have left */
+    uint64_t line_free; /* time at which the last queued byte will be sent */
 
     uint64_t i2c_ends;
     enum hal_i2c_result i2c_result, i2c_pending;
@@ -48,7 +48,7 @@ struct board {
     int32_t light, relay;
 };
 
-/* The board that runs: the core knows only one, as on the microcontroller. */
+/* The running board: the core supports only one, like on the microcontroller. */
 static struct board *here;
 
 static void emit(struct board *b, uint64_t ns, int32_t event, int32_t value) {
@@ -150,7 +150,7 @@ void hal_i2c_start(uint8_t address, const uint8_t *write, uint8_t write_length, 
         }
     }
     b->outside.i2c(ns, BOARD_I2C_STOP, &at, 0);
-    b->next_edge = b->outside.edge(b->now); /* what was written may have switched the line on or off */
+    b->next_edge = b->outside.edge(b->now); /* the write may have switched the signal on or off */
     b->i2c_ends = ns;
     b->i2c_pending = well ? HAL_I2C_DONE : HAL_I2C_NACK;
 }
@@ -263,7 +263,7 @@ void board_close(struct board *b) {
 
 void board_reset(struct board *b, uint8_t cause) {
     here = b;
-    hal_light(0); /* pins fall back to inputs, and are pulled to rest from outside */
+    hal_light(0); /* pins become inputs, and external resistors pull them to their inactive levels */
     hal_relay(false);
     hal_trigger_rest();
     emit(b, b->now, BOARD_RESET, cause);

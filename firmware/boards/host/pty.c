@@ -1,9 +1,9 @@
-/* The rig head on a pseudo-terminal, in real time: something to talk to without a board.
+/* A rig head on a pseudo-terminal, in real time, for tests without a board.
  *
  *     head-pty            prints the port to open, then each change of an output with its time in seconds
  *
- * On its standard input it takes, one a line: `estop open`, `estop closed`, `spin DEGREES_PER_SECOND`, `reset`. An
- * MPU-6050 without noise hangs on its bus. */
+ * Commands on its standard input, one in each line: `estop open`, `estop closed`, `spin DEGREES_PER_SECOND`, `reset`.
+ * An MPU-6050 without noise is on its bus. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <poll.h>
@@ -143,7 +143,7 @@ static int open_terminal(void) {
     }
     cfmakeraw(&raw);
     tcsetattr(master, TCSANOW, &raw);
-    /* Kept open, so that the port is there between two programs that use it. */
+    /* Stays open, so that the port exists between two programs that use it. */
     if (open(ptsname(master), O_RDWR | O_NOCTTY) < 0) {
         perror(ptsname(master));
         exit(1);
@@ -174,7 +174,7 @@ static void report(int master, struct board *board) {
             if (outputs[i].event == BOARD_BYTE) {
                 uint8_t byte = (uint8_t)outputs[i].value;
                 if (write(master, &byte, 1) != 1) {
-                    continue; /* nobody reads: the terminal is full */
+                    continue; /* no program reads, and the terminal is full */
                 }
             } else {
                 printf("%.6f %s %d\n", (double)outputs[i].ns * 1e-9, names[outputs[i].event], (int)outputs[i].value);
@@ -207,7 +207,7 @@ int main(void) {
         if (fds[1].revents & (POLLIN | POLLHUP)) {
             char line[80];
             if (!fgets(line, sizeof line, stdin)) {
-                fds[1].fd = -1; /* nobody gives orders any more */
+                fds[1].fd = -1; /* the standard input has ended */
             } else if (!obey(board, line)) {
                 fprintf(stderr, "head-pty: estop open|closed, spin DPS, reset\n");
             }
