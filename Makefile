@@ -6,10 +6,11 @@ READY  := .venv/.ready
 # With several threads small matrix products wait for each other; one is faster here.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test test-nightly test-kills fuzz lint docs wheel bench lock clean help
+.PHONY: demo web test test-nightly test-kills fuzz lint docs wheel bench lock clean help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
+	@echo "make web    show the simulated bench in a browser"
 	@echo "make test   run the tests (about three minutes on two cores)"
 	@echo "make test-nightly  run all tests, with many more cases in each"
 	@echo "make test-kills  kill the program at a hundred points of its work, and check what is left"
@@ -22,6 +23,9 @@ help:
 
 demo: $(READY)
 	@$(BIN)/rig demo
+
+web: $(READY)
+	@$(BIN)/rig serve --bench sim
 
 test: $(READY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs

@@ -337,7 +337,7 @@ def _board(columns: int, rows: int, square_mm: float) -> "Board":
     return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
 
 
-def _in_force(bench: "Bench", name: str) -> "CalibrationResult":
+def in_force(bench: "Bench", name: str) -> "CalibrationResult":
     """Return the result called ``name`` that is in force on the bench. Raises `UsageError` if there is none."""
     from rig.calibrations import CalibrationStatus, CalibrationStore
     from rig.core.errors import UsageError
@@ -360,7 +360,7 @@ def _results(settings: Settings, bench: "Bench", procedure: "Procedure") -> "Ite
     from rig.events.events import event_dict
     from rig.events.lines import line
 
-    required = [_in_force(bench, name) for name in procedure.requires]
+    required = [in_force(bench, name) for name in procedure.requires]
     with closing(procedure.live(bench, *required)) as events:
         event: Any
         for event in events:

@@ -19,7 +19,7 @@ from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.calibration_board import calibration_targets
 from sim.camera import CAMERA_DEVICE
 from sim.change import Change
-from sim.clock import VirtualClock
+from sim.clock import PacedClock, VirtualClock
 from sim.computer import simulated_computer
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults
@@ -40,6 +40,9 @@ class SimOptions(Section):
         None, description="object on the table to identify, or a list that is repeated; default: random, from the seed"
     )
     yaw_deg: float | None = Field(None, ge=-360, le=360, description="its rotation; default: random, from the seed")
+    speed: float | None = Field(
+        None, gt=0, le=1000, description="simulated seconds per second; default: as fast as the computer can"
+    )
     noise: dict[str, float] = Field(default_factory=dict, description="noise model: values to change")
     head: Literal["memory", "avr"] = Field(
         "memory",
@@ -256,7 +259,8 @@ class SimBenchKind:
 
 def new_world(options: SimOptions, seed: int | None, start_deg: float = 0.0) -> World:
     """Return a world whose clock starts at the computer's time."""
-    clock = VirtualClock(start_utc=SystemClock().utc())
+    computer = SystemClock()
+    clock = VirtualClock(computer.utc()) if options.speed is None else PacedClock(options.speed, computer)
     return World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock, start_deg=start_deg)
 
 

@@ -7,6 +7,9 @@ import heapq
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from itertools import count
+from typing import Final
+
+from rig.core.clock import Clock, seconds_between
 
 EPOCH = datetime(2020, 1, 1, tzinfo=UTC)
 """Default civil time at virtual time 0; fixed, so that a run is reproducible to the byte."""
@@ -101,3 +104,32 @@ class VirtualClock:
             self._now_ns = max(self._now_ns, due_ns)
             timer.fire()
         self._now_ns = max(self._now_ns, at_ns)
+
+
+class PacedClock(VirtualClock):
+    """A `VirtualClock` that also takes time: ``speed`` seconds pass in a second of the computer's clock.
+
+    Time that the program spends computing is not added, so a slow computer does not trip the watchdogs.
+    """
+
+    def __init__(self, speed: float, computer: Clock) -> None:
+        super().__init__(computer.utc())
+        self._speed = speed
+        self._computer = computer
+        self._ahead_s = 0.0
+        self._slept_ns = computer.now_ns()
+
+    def utc(self) -> datetime:
+        return self._computer.utc()
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        now_ns = self._computer.now_ns()
+        elapsed_s, self._slept_ns = seconds_between(self._slept_ns, now_ns), now_ns
+        self._ahead_s = max(self._ahead_s - elapsed_s, 0.0) + max(seconds, 0.0) / self._speed
+        if self._ahead_s > _LEAST_SLEEP_S:
+            self._computer.sleep(self._ahead_s)
+
+
+_LEAST_SLEEP_S: Final = 0.002
+"""Shorter waits are added up."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, select, update
+from sqlalchemy import Connection, Row, func, select, update
 
 import hbr
 from rig.catalog import audit
@@ -248,6 +248,18 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Return the objects in use, in the order in which they were added."""
         with self.database.read() as connection:
             return object_summaries(connection, objects.c.deleted_utc.is_(None))
+
+    def first_views(self) -> dict[str, int]:
+        """Return the id of one view of each object in use, to show the object by."""
+        with self.database.read() as connection:
+            rows = connection.execute(
+                select(objects.c.name, func.min(views.c.id).label("id"))
+                .join(enrollments, enrollments.c.object_id == objects.c.id)
+                .join(views, views.c.enrollment_id == enrollments.c.id)
+                .where(objects.c.deleted_utc.is_(None), enrollments.c.status == EnrollmentStatus.COMPLETE)
+                .group_by(objects.c.name)
+            )
+            return {row.name: row.id for row in rows}
 
     def summary(self, name: str) -> ObjectSummary:
         """Return an object without its enrollments and views, whatever their state; errors as for `object`."""

@@ -81,6 +81,18 @@ class OutputFailed(RigError, code=201, title="output"):
     """The standard output cannot be written: its disk is full or fails."""
 
 
+class LoginRequired(RigError, code=202, title="login required"):
+    """A request to the server has no valid token or login."""
+
+
+class Forbidden(RigError, code=203, title="forbidden"):
+    """The token of a request does not allow it."""
+
+
+class JobNotFound(RigError, code=204, title="job not found"):
+    """The server has no job, run or picture with that name."""
+
+
 class ConfigError(RigError, code=300, title="configuration"):
     """The configuration has mistakes; the evidence lists all of them."""
 
@@ -255,3 +267,15 @@ class CatalogBusy(RigError, code=900, title="busy"):
 
 class BenchBusy(RigError, code=901, title="bench in use"):
     """Another process uses the bench."""
+
+
+class LeaseHeld(RigError, code=902, title="lease held"):
+    """Another operator of the server uses the bench."""
+
+
+class JobRejected(RigError, code=903, title="job rejected"):
+    """The job cannot do that in its state, or too many jobs wait."""
+
+
+class TooManyLogins(RigError, code=904, title="too many logins"):
+    """Too many wrong tokens came from one address."""

@@ -293,6 +293,8 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._clock.sleep(config.poll_s)
             self._safety.check_stop_request()
             state = self._servo.read_state()
+            for observer in self._safety.observers:
+                observer(state)
             if self._trusted is None or reachable(self._trusted, state, config.velocity_dps):
                 self._trusted = state
             self._gyro.update()

@@ -27,6 +27,8 @@ LATCH_BYTES = 8192
 """Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
 SESSION = "session.json"
 LOCK_ATTEMPTS = 3
+SERVER_FOLDER = "web"
+SERVER_FILE = "server.json"
 _MAKE_ROOM = "Make room on the disk, or set state_dir to a folder that you may write to."
 
 
@@ -122,6 +124,15 @@ class SavedSession(_Saved):
     ended: SessionEnd | None = None
 
 
+class ServerAddress(_Saved):
+    """The server that uses a bench (`rig serve`): its page, and a token for the commands of the same user."""
+
+    pid: int
+    url: str
+    token: str
+    certificate: str | None = None
+
+
 class StateStore(Protocol):
     """Stores the state of one bench."""
 
@@ -148,6 +159,15 @@ class StateStore(Protocol):
 
     def stop_requested(self) -> bool:
         """Return whether the operator requested a stop; called in each round of the control loop."""
+
+    def request_stop(self) -> None:
+        """Request a stop from the program that uses the bench; may be called from any thread.
+
+        Raises
+        ------
+        StateNotStored
+            The disk is full, or may not be written to.
+        """
 
     def clear_stop(self) -> None:
         """Remove the request: it was carried out, or it is old."""
@@ -193,6 +213,9 @@ class MemoryStore:
 
     def stop_requested(self) -> bool:
         return self.stop
+
+    def request_stop(self) -> None:
+        self.stop = True
 
     def clear_stop(self) -> None:
         self.stop = False
@@ -298,7 +321,6 @@ class FileStore:
         self._stop.unlink(missing_ok=True)
 
     def request_stop(self) -> None:
-        """Request a stop from the program that uses the bench."""
         with _storing(self._stop):
             _make_folder(self.path)
             os.close(no_follow(str(self._stop), os.O_WRONLY | os.O_CREAT))
@@ -408,6 +430,16 @@ def holder(path: Path) -> Holder | None:
         return Holder(pid=0, command="", since_utc="")
 
 
+def server_address(path: Path) -> ServerAddress | None:
+    """Return the running server of the bench with the state folder ``path``; None if there is none."""
+    who = holder(path / SERVER_FOLDER)
+    try:
+        found = ServerAddress.model_validate_json((path / SERVER_FOLDER / SERVER_FILE).read_bytes())
+    except (OSError, ValidationError):
+        return None
+    return found if who is not None and who.pid == found.pid else None
+
+
 def _try_lock(file: TextIO) -> bool:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -421,6 +453,13 @@ def _try_lock(file: TextIO) -> bool:
 def busy(path: Path, who: Holder | None) -> BenchBusy:
     """Return the error that ``who`` uses the bench with the state folder ``path``."""
     name = f"process {who.pid} (`{who.command}`, since {who.since_utc})" if who and who.pid else "another process"
+    server = server_address(path)
+    if server is not None and who is not None and who.pid == server.pid:
+        return BenchBusy(
+            f"The bench is served to browsers by {name}.",
+            next_step=f"Open {server.url} and work there, or end the server first.",
+            evidence={"state": str(path), "page": server.url},
+        )
     return BenchBusy(
         f"The bench is in use by {name}.",
         next_step="Wait until it ends, or run `rig stop` (stops the table, torque off). "

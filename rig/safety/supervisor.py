@@ -89,6 +89,8 @@ class Safety:
         """Called before a fault is acknowledged; each raises a `RigError` if its device has a problem."""
         self.monitors: list[Callable[[], object]] = []
         """Called in each round of the control loop; each raises a `RigError` if its device stopped the bench."""
+        self.observers: list[Callable[[ServoState], object]] = []
+        """Called with each reading of the servo in the control loop: for displays. They must not raise or wait."""
         self.restore_actions: list[Callable[[], object]] = []
         """Called first when a fault is acknowledged: each switches on again what its device switched off."""
 

@@ -12,6 +12,7 @@ from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from rig.motion.turntable import Turntable
+    from rig.safety.saved_state import ServerAddress
     from rig.safety.supervisor import Safety
 
 
@@ -105,7 +106,11 @@ def status(settings: Settings) -> None:
     Example: rig status --bench sim --json
     """
     from rig.events.events import plain
+    from rig.safety.saved_state import server_address
 
+    if server := server_address(settings.load().state_path(settings.bench_name)):
+        _served_status(settings, server)
+        return
     with settings.open_bench(tell=False) as bench:
         state, safety = bench.servo.read_state(), bench.safety
         config = bench.config.table
@@ -139,6 +144,44 @@ def status(settings: Settings) -> None:
         )
     for finding in bench.findings:
         print(f"note     {finding}")
+
+
+def _served_status(settings: Settings, server: "ServerAddress") -> None:
+    """Print the state of a bench that `rig serve` uses, as the server reports it."""
+    import json
+    import ssl
+    from urllib.parse import urlsplit
+    from urllib.request import Request, urlopen
+
+    from rig.core.errors import BenchBusy
+
+    place = urlsplit(server.url)
+    everywhere = place.hostname in ("0.0.0.0", "::")
+    url = f"{place.scheme}://{f'127.0.0.1:{place.port}' if everywhere else place.netloc}/api/v1/status"
+    context = ssl.create_default_context(cafile=server.certificate) if server.certificate else None
+    if context is not None:
+        context.check_hostname = False  # the certificate is the one in the file, whatever name it has
+    request = Request(url, headers={"Authorization": f"Bearer {server.token}"})
+    try:
+        with urlopen(request, timeout=5, context=context) as answer:
+            report = json.load(answer)
+    except (OSError, ValueError) as error:
+        raise BenchBusy(
+            f"The server at {server.url} uses the bench and does not answer.",
+            next_step=f"If it hangs: `rig stop`, or end process {server.pid}.",
+            evidence={"reason": str(error)},
+        ) from error
+    if settings.json:
+        settings.print_json({**report, "page": server.url})
+        return
+    fault, problem = report.get("fault"), report.get("error")
+    print(f"bench    {report['bench']}, served at {server.url}")
+    print(f"state    {report.get('state', 'not open')}" + (f" {fault['code']}: {fault['what']}" if fault else ""))
+    if problem:
+        print(f"error    {problem['code']}: {problem['what']} {problem['next_step']}")
+    if limits := report.get("limits_deg"):
+        print(f"table    {_table_text(report.get('table_deg'), tuple(limits))}")
+    print(f"job      {report.get('job') or 'none'}")
 
 
 def _table_text(angle_deg: float | None, limits_deg: tuple[float, float]) -> str:

@@ -15,7 +15,6 @@ from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from rig.bench import Bench
-    from rig.catalog import Catalog
     from rig.events.events import Event
     from rig.search.model import Model
     from rig.search.saved_run import RunWriter
@@ -80,6 +79,7 @@ def identify(
     from rig.plans.identify import identify as identify_one
     from rig.plans.record import ResultRecorder
     from rig.plans.watch import watch as watch_table
+    from rig.search.current_model import CurrentModel
     from rig.search.strategies import descriptor_for
     from rig.search.strategies import strategy as strategy_named
     from rig.views.description import PAPER_DESCRIPTOR
@@ -95,7 +95,7 @@ def identify(
     answer = None
     events: Generator[Event, None, object]
     with settings.open_catalog(read_only=True) as catalog:
-        model = _Model(catalog, None if chosen is None else descriptor_for(chosen))
+        model = CurrentModel(catalog, None if chosen is None else descriptor_for(chosen))
         known = model()  # report a catalog that cannot be searched before the bench is opened
         if scan and not watch:
             sample = ask_sample()
@@ -162,29 +162,6 @@ def _checked_sample(sample: str | None, *, scan: bool, watch: bool, records: boo
             next_step="allow it: rig config set identify.record image",
         )
     return None if sample is None else clean_text(sample, "sample")
-
-
-class _Model:
-    """Loads the enrolled views, and again after a change of the catalog or of its stopping rule."""
-
-    def __init__(self, catalog: "Catalog", descriptor: str | None = None) -> None:
-        self._catalog = catalog
-        self._descriptor = descriptor
-        self._loaded_state: object = None
-        self._model: Model
-        self.version = ""
-
-    def __call__(self) -> "Model":
-        from rig.search.model import load_model
-        from rig.search.stopping_rules import FILE
-
-        rules = self._catalog.path / FILE
-        version = self._catalog.version()
-        state = version, rules.stat().st_mtime_ns if rules.exists() else None
-        if state != self._loaded_state:
-            self._model, self._loaded_state = load_model(self._catalog, descriptor=self._descriptor), state
-            self.version = version
-        return self._model
 
 
 class _RunSaver:

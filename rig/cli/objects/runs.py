@@ -71,25 +71,12 @@ def report(
 
     Example: rig report runs/1 --out run-1.html
     """
-    from rig.events.wording import answer_words, outcome_words
-    from rig.report import IdentificationRecord, Meta, render_report, write_report
+    from rig.report import write_report
+    from rig.report.run_report import run_report
     from rig.search.saved_run import load_run
 
     load_model_file(model)
-    saved = load_run(run)
-    record = IdentificationRecord(region=saved.config.view.roi)
-    about = saved.about
-    with saved.damage():
-        for event in saved.events():
-            record.add(event)
-        answer = record.answer
-        found = "no answer" if answer is None else outcome_words(answer)
-        summary = answer_words(answer) if answer else "The search ended without an answer."
-        meta = Meta(
-            conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
-            wall_clock={"date": about["started_utc"], "software": about["software"]},
-        )
-        page = render_report(f"Search: {found}", summary, [], [record], meta=meta)
+    page = run_report(load_run(run))
     path = out or run / "report.html"
     write_report(path, page)
     settings.say(f"Report: {path}", {"report": str(path)})

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from rig.bench import ObjectAlreadyPlaced
 from rig.catalog import Catalog
 from rig.cli.main import app
-from rig.cli.objects.identify import _Model
 from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS
 from rig.core.clock import SystemClock
 from rig.events.events import SimilarObjects
+from rig.search.current_model import CurrentModel
 from rig.views.object_presence import TableWatcher
 from sim.bench import SimBenchKind
 from sim.objects.shelf import shelf
@@ -444,7 +444,7 @@ def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
     """The model is loaded again only if the catalog has changed."""
     folder, _ = enrolled
     with Catalog.open(folder / "catalog", clock=SystemClock(), read_only=True) as catalog:
-        model = _Model(catalog)
+        model = CurrentModel(catalog)
         before = model()
         assert model() is before
         assert rig("enroll", "amphora", "--views", "4").exit_code == 0

@@ -1,0 +1,113 @@
+"""`rig serve`."""
+
+import ipaddress
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from rig.web.access import Tokens
+
+DEFAULT_PORT = 8420
+MAX_UPLOAD_BYTES = 500_000_000
+
+
+@command
+def serve(
+    settings: Settings,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Address to listen to. Any but this computer's needs a token.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port to listen to; 0 chooses a free one.")
+    ] = DEFAULT_PORT,
+    allow_host: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Other host name of this server. Repeatable.")
+    ] = None,
+    certfile: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TLS certificate chain, PEM. Needs --keyfile.")
+    ] = None,
+    keyfile: Annotated[Path | None, typer.Option(metavar="FILE", help="Private key of the certificate, PEM.")] = None,
+    new_token: Annotated[
+        str | None, typer.Option("--new-token", metavar="NAME", help="Make a token, print it once, and stop.")
+    ] = None,
+    role: Annotated[str, typer.Option(metavar="watch|operate", help="What the new token allows.")] = "watch",
+    days: Annotated[float | None, typer.Option(min=0.01, max=3650, help="How long the new token is valid.")] = None,
+    remove_token: Annotated[
+        str | None, typer.Option("--remove-token", metavar="NAME", help="Remove a token, and stop.")
+    ] = None,
+) -> None:
+    """Serve the bench to browsers and other programs: pages, REST API and events. Ctrl+C stops the server.
+
+    The server listens to this computer only, unless --host says otherwise. Needs the extra hbr-rig[web].
+
+    Example: rig serve --bench sim
+
+    Example: rig serve --new-token tablet --role operate
+    """
+    try:
+        import fastapi  # noqa: F401
+        import prometheus_client  # noqa: F401
+        import uvicorn  # noqa: F401
+    except ImportError as error:
+        raise UsageError(
+            f"rig serve needs packages that are not installed ({error.name}).",
+            next_step="Install them: pip install 'hbr-rig[web]'",
+        ) from error
+    from rig.core.clock import SystemClock
+    from rig.safety.saved_state import SERVER_FOLDER
+    from rig.web.access import Role, Tokens
+    from rig.web.run import Listening, run_server
+
+    folder = settings.load().state_path(settings.bench_name) / SERVER_FOLDER
+    tokens = Tokens(folder, SystemClock())
+    if new_token is not None:
+        if role not in list(Role):
+            raise UsageError(f"{role!r} is not a role.", next_step="Use --role watch or --role operate.")
+        token = tokens.new(new_token, Role(role), days)
+        settings.say(token, {"name": new_token, "role": role, "token": token})
+        print("This is the only time that the token is shown. Keep it secret.", file=sys.stderr)
+        return
+    if remove_token is not None:
+        if not tokens.remove(remove_token):
+            raise UsageError(f"There is no token {remove_token!r}.", next_step="Check the name.")
+        settings.say(f"Removed the token {remove_token}.", {"removed": remove_token})
+        return
+    if (certfile is None) != (keyfile is None):
+        raise UsageError("TLS needs a certificate and its key.", next_step="Give --certfile and --keyfile.")
+    needs_login = not is_loopback(host)
+    if needs_login:
+        _require_tokens(tokens, host)
+    listening = Listening(host, port, tuple(allow_host or ()), certfile, keyfile, needs_login, MAX_UPLOAD_BYTES)
+    if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
+        settings = settings.merged(None, None, ["bench.sim.speed=1"], None, False)  # people watch it
+    arguments = tuple(settings.arguments())
+    run_server(settings.bench_name, settings.load(), settings.seed, arguments, listening, tokens, _told)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this computer can reach an address."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def _require_tokens(tokens: "Tokens", host: str) -> None:
+    if not tokens.stored():
+        raise UsageError(
+            f"Other computers can reach {host}, so everybody needs a token, and there is none.",
+            next_step="Make one first: rig serve --new-token NAME --role operate",
+        )
+
+
+def _told(url: str) -> None:
+    print(f"The bench is at {url}. Stop with Ctrl+C.", file=sys.stderr, flush=True)

@@ -1,0 +1,310 @@
+"""Who may use the server: tokens, logins, and the lease of the one operator.
+
+Decision: docs/decisions/0039.
+"""
+
+import hashlib
+import hmac
+import json
+import secrets
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import timedelta
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import (
+    ConfigError,
+    LeaseHeld,
+    LoginRequired,
+    StateNotStored,
+    TooManyLogins,
+    os_errors_as,
+)
+from rig.core.files import read, write
+
+TOKENS: Final = "tokens.json"
+PREFIX: Final = "rig_"
+MAX_BYTES: Final = 1_000_000
+SESSION_S: Final = 12 * 3600.0
+"""A login is valid for a working day."""
+MAX_SESSIONS: Final = 1000
+LEASE_S: Final = 45.0
+"""A lease that is not renewed for this time is free: the operator's browser was closed."""
+FREE_ATTEMPTS: Final = 5
+WINDOW_S: Final = 60.0
+"""After `FREE_ATTEMPTS` wrong tokens within this time from one address, logins from it are rejected for a while."""
+MAX_ADDRESSES: Final = 10_000
+
+
+class Role(StrEnum):
+    """What a token allows: to watch, or also to operate the bench."""
+
+    WATCH = "watch"
+    OPERATE = "operate"
+
+
+class StoredToken(BaseModel):
+    """A token as the server stores it: only its hash."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(min_length=1, max_length=50)
+    role: Role
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    created_utc: AwareDatetime
+    expires_utc: AwareDatetime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """Who sends a request: the name of the token, and what it allows. ``client`` distinguishes browser windows."""
+
+    name: str
+    role: Role
+    client: str = ""
+
+    @property
+    def key(self) -> str:
+        return f"{self.name}/{self.client}"
+
+
+LOCAL: Final = "local"
+"""Name of everybody on this computer, if the server listens to this computer only."""
+
+_STORED: Final = TypeAdapter(list[StoredToken])
+
+
+class Tokens:
+    """The tokens of a server, in a file that only its user can read."""
+
+    def __init__(self, folder: Path, clock: Clock) -> None:
+        self._file = folder / TOKENS
+        self._clock = clock
+
+    def new(self, name: str, role: Role, days: float | None = None) -> str:
+        """Make a token, store its hash, and return it; a token of the same name is replaced.
+
+        Raises
+        ------
+        ConfigError
+            The name cannot be used, or the file is damaged.
+        StateNotStored
+            The file cannot be written.
+        """
+        token = PREFIX + secrets.token_urlsafe(32)
+        now = self._clock.utc()
+        try:
+            stored = StoredToken(
+                name=name,
+                role=role,
+                sha256=_hash(token),
+                created_utc=now,
+                expires_utc=None if days is None else now + timedelta(days=days),
+            )
+        except (ValidationError, OverflowError) as error:
+            raise ConfigError(
+                f"{name!r} cannot be the name of a token.", next_step="Use 1 to 50 characters."
+            ) from error
+        self._store([*(other for other in self.stored() if other.name != name), stored])
+        return token
+
+    def remove(self, name: str) -> bool:
+        """Remove a token, and return whether it existed."""
+        before = self.stored()
+        after = [token for token in before if token.name != name]
+        if len(after) != len(before):
+            self._store(after)
+        return len(after) != len(before)
+
+    def stored(self) -> list[StoredToken]:
+        """Return the stored tokens. Raises `ConfigError` if their file is damaged."""
+        try:
+            return _STORED.validate_json(read(self._file, max_bytes=MAX_BYTES))
+        except FileNotFoundError:
+            return []
+        except (OSError, ValidationError) as error:
+            raise ConfigError(
+                f"The tokens in {self._file} cannot be read.",
+                next_step="Delete the file, and make new tokens with rig serve --new-token NAME.",
+            ) from error
+
+    def check(self, token: str) -> StoredToken | None:
+        """Return the token that was given; None if it is unknown or has expired."""
+        digest, found = _hash(token), None
+        for stored in self.stored():
+            if hmac.compare_digest(digest, stored.sha256):
+                found = stored
+        if found is None or (found.expires_utc is not None and found.expires_utc <= self._clock.utc()):
+            return None
+        return found
+
+    def _store(self, tokens: list[StoredToken]) -> None:
+        content = json.dumps([token.model_dump(mode="json") for token in tokens], indent=1).encode()
+        step = "Make room on the disk, or set state_dir to a folder that you may write to."
+        with os_errors_as(StateNotStored, f"The tokens cannot be stored in {self._file}.", next_step=step):
+            self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            write(self._file, content, mode=0o600)
+
+
+@dataclass(slots=True)
+class _Session:
+    person: Person
+    sha256: str
+    since_ns: int
+
+
+@dataclass(slots=True)
+class Sessions:
+    """Logins of browsers, and wrong tokens by address. In memory: after a restart, everybody logs in again."""
+
+    tokens: Tokens
+    clock: Clock
+    local_token: str = field(default_factory=lambda: PREFIX + secrets.token_urlsafe(32), repr=False)
+    """Lets commands of the same user on this computer watch; it ends with the server."""
+    _sessions: dict[str, _Session] = field(default_factory=dict)
+    _failures: dict[str, list[int]] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def login(self, token: str, address: str) -> tuple[str, Person]:
+        """Return the secret of a new session and who it belongs to.
+
+        Raises
+        ------
+        LoginRequired
+            The token is unknown or has expired.
+        TooManyLogins
+            Too many wrong tokens came from this address.
+        """
+        stored = self.verify(token, address)
+        secret = secrets.token_urlsafe(32)
+        person = Person(stored.name, stored.role)
+        with self._lock:
+            while len(self._sessions) >= MAX_SESSIONS:
+                del self._sessions[next(iter(self._sessions))]
+            self._sessions[secret] = _Session(person, stored.sha256, self.clock.now_ns())
+        return secret, person
+
+    def verify(self, token: str, address: str) -> StoredToken:
+        """Return the token that was given; errors as `login`."""
+        now_ns = self.clock.now_ns()
+        if hmac.compare_digest(token.encode(errors="replace"), self.local_token.encode()):
+            return StoredToken(name=LOCAL, role=Role.WATCH, sha256=_hash(token), created_utc=self.clock.utc())
+        with self._lock:
+            recent = [at for at in self._failures.get(address, []) if seconds_between(at, now_ns) < WINDOW_S]
+            if len(recent) >= FREE_ATTEMPTS:
+                raise TooManyLogins(
+                    "Too many wrong tokens came from this address.", next_step=f"Wait {WINDOW_S:.0f} s, then try again."
+                )
+        stored = self.tokens.check(token)
+        if stored is None:
+            with self._lock:
+                if len(self._failures) >= MAX_ADDRESSES:
+                    self._failures.clear()
+                self._failures[address] = [*recent, now_ns]
+            raise LoginRequired(
+                "The token is unknown or has expired.", next_step="Make a new one: rig serve --new-token NAME"
+            )
+        return stored
+
+    def find(self, secret: str) -> Person | None:
+        """Return who a session belongs to; None if it has ended or its token was removed."""
+        with self._lock:
+            session = self._sessions.get(secret)
+        if session is None or seconds_between(session.since_ns, self.clock.now_ns()) > SESSION_S:
+            return None
+        if not any(
+            stored.sha256 == session.sha256 and (stored.expires_utc is None or stored.expires_utc > self.clock.utc())
+            for stored in self.tokens.stored()
+        ):
+            return None
+        return session.person
+
+    def logout(self, secret: str) -> None:
+        with self._lock:
+            self._sessions.pop(secret, None)
+
+
+@dataclass(slots=True)
+class Lease:
+    """The right of one operator to use the bench; all others watch. It ends if it is not renewed."""
+
+    clock: Clock
+    changed: Callable[[dict[str, Any]], None]
+    _holder: Person | None = None
+    _until_ns: int = 0
+    _lock: threading.RLock = field(default_factory=threading.RLock)
+
+    @property
+    def holder(self) -> Person | None:
+        with self._lock:
+            if self._holder is not None and self.clock.now_ns() > self._until_ns:
+                self._holder = None
+            return self._holder
+
+    def take(self, person: Person, *, force: bool = False) -> None:
+        """Take or renew the lease; with ``force`` also from another operator, who is warned.
+
+        Raises
+        ------
+        LeaseHeld
+            Another operator has it.
+        """
+        with self._lock:
+            before = self.holder
+            if before is not None and before.key != person.key and not force:
+                raise LeaseHeld(
+                    f"{before.name} uses the bench now.",
+                    next_step="Wait, ask for it, or take it over. The other operator is then warned.",
+                    evidence={"holder": before.name},
+                )
+            self._holder = person
+            self._until_ns = self.clock.now_ns() + round(LEASE_S * 1e9)
+        if before is None or before.key != person.key:
+            self.changed(self.as_json(taken_from=before.key if before else None))
+
+    def ask(self, person: Person) -> None:
+        """Ask the operator who has the lease to hand it over."""
+        self.changed({**self.as_json(), "asked_by": {"name": person.name, "client": person.client}})
+
+    def hand_over(self, person: Person, to: Person) -> None:
+        """Give the lease to another operator who asked for it.
+
+        Raises
+        ------
+        LeaseHeld
+            ``person`` does not have it.
+        """
+        with self._lock:
+            holder = self.holder
+            if holder is None or holder.key != person.key:
+                raise LeaseHeld("You do not have the lease.", next_step="Take it first.")
+            self._holder = None
+            self.take(to)
+
+    def release(self, person: Person) -> None:
+        """Give the lease back; nothing happens if another operator has it."""
+        with self._lock:
+            if self._holder is None or self._holder.key != person.key:
+                return
+            self._holder = None
+        self.changed(self.as_json(taken_from=None))
+
+    def as_json(self, taken_from: str | None = None) -> dict[str, Any]:
+        holder = self.holder
+        return {
+            "holder": holder.name if holder else None,
+            "client": holder.client if holder else None,
+            "taken_from": taken_from,
+            "seconds": LEASE_S,
+        }
+
+
+def _hash(token: str) -> str:
+    # The token has 256 random bits: a slow hash would protect nothing more.
+    return hashlib.sha256(token.encode(errors="replace")).hexdigest()

@@ -1,0 +1,69 @@
+"""The REST API: logins, the lease, the health of the server."""
+
+from importlib.metadata import version
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from rig.web.access import Person, Role
+from rig.web.server import COOKIE, HandOverBody, LeaseBody, LoginBody, Server, Watcher, require_operate
+
+
+def add_access(api: APIRouter, server: Server) -> None:
+    @api.get("/health", tags=["server"])
+    def health() -> dict[str, Any]:
+        """Return whether the server works; needs no login."""
+        status = server.worker.status
+        return {"status": "ok", "version": version("hbr-rig"), "bench_open": bool(status.get("open"))}
+
+    @api.post("/login", tags=["access"])
+    def login(body: LoginBody, request: Request, response: Response) -> dict[str, Any]:
+        """Log in with a token; the answer sets a cookie."""
+        secret, person = server.sessions.login(body.token, request.client.host if request.client else "")
+        response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=server.secure_cookies, path="/")
+        return {"name": person.name, "role": person.role}
+
+    @api.post("/logout", tags=["access"])
+    def logout(request: Request, response: Response) -> dict[str, Any]:
+        """Log out."""
+        server.sessions.logout(request.cookies.get(COOKIE, ""))
+        response.delete_cookie(COOKIE, path="/")
+        return {}
+
+    @api.get("/me", tags=["access"])
+    def me(person: Watcher) -> dict[str, Any]:
+        """Return who is logged in, and who has the lease."""
+        holder = server.lease.holder
+        mine = holder is not None and holder.key == person.key
+        return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
+
+    @api.get("/lease", tags=["access"])
+    def lease(_person: Watcher) -> dict[str, Any]:
+        """Return who has the lease."""
+        return server.lease.as_json()
+
+    @api.post("/lease", tags=["access"])
+    def take_lease(body: LeaseBody, person: Watcher) -> dict[str, Any]:
+        """Take or renew the lease."""
+        require_operate(person)
+        server.lease.take(person, force=body.force)
+        return server.lease.as_json()
+
+    @api.post("/lease/ask", tags=["access"])
+    def ask_lease(person: Watcher) -> dict[str, Any]:
+        """Ask the operator who has the lease to hand it over."""
+        require_operate(person)
+        server.lease.ask(person)
+        return server.lease.as_json()
+
+    @api.post("/lease/hand-over", tags=["access"])
+    def hand_over(body: HandOverBody, person: Watcher) -> dict[str, Any]:
+        """Give the lease to an operator who asked for it."""
+        server.lease.hand_over(person, Person(body.name, Role.OPERATE, body.client))
+        return server.lease.as_json()
+
+    @api.delete("/lease", tags=["access"])
+    def release(person: Watcher) -> dict[str, Any]:
+        """Give the lease back."""
+        server.lease.release(person)
+        return server.lease.as_json()

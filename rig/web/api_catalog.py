@@ -1,0 +1,174 @@
+"""The REST API: objects, views, import and export."""
+
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import FileResponse
+from pydantic import Field
+from starlette.background import BackgroundTask
+
+from rig.catalog import ObjectSummary
+from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelete
+from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
+from rig.events.events import plain
+from rig.plans.similar_objects import similar_objects
+from rig.web.picture import jpeg
+from rig.web.server import API, Limit, NameBody, ObjectBody, OperatorPerson, Server, Watcher, page_of, time_text
+
+THUMB_PX: Final = 256
+UPLOAD: Final = f"{API}/import"
+
+
+def add_catalog(api: APIRouter, server: Server) -> None:
+    @contextmanager
+    def reading() -> Any:
+        with server.open_catalog(True) as catalog:
+            yield catalog
+
+    @api.get("/objects", tags=["catalog"])
+    def objects(
+        request: Request,
+        _person: Watcher,
+        limit: Limit = 100,
+        after: Annotated[str | None, Query(max_length=100)] = None,
+        search: Annotated[str, Query(max_length=100, description="part of the name, label or note")] = "",
+        deleted: Annotated[bool, Query(description="list the deleted objects that can be restored")] = False,
+    ) -> Response:
+        """List the objects by name."""
+        with reading() as catalog:
+            found = deleted_objects(catalog) if deleted else catalog.objects()
+            pictures = {} if deleted else catalog.first_views()
+        wanted = search.casefold()
+        rows = [
+            {**_summary(one), "picture": pictures.get(one.name)}
+            for one in found
+            if wanted in f"{one.name}\n{one.label}\n{one.note}".casefold()
+        ]
+        return page_of(request, sorted(rows, key=lambda row: row["name"]), "name", limit, after)
+
+    @api.get("/objects/{name:path}", tags=["catalog"])
+    def one_object(name: str, _person: Watcher) -> dict[str, Any]:
+        """Return an object with its enrollments and views."""
+        with reading() as catalog:
+            found = catalog.object(name)
+            similar = similar_objects(catalog.views().views, found.summary.name) if found.views else None
+        return {
+            **_summary(found.summary),
+            "enrollments": [
+                {
+                    "status": one.status,
+                    "started_utc": time_text(one.started_utc),
+                    "finished_utc": time_text(one.finished_utc),
+                    "planned_views": len(one.planned_azimuth_deg),
+                    "stored_views": len(one.present),
+                    "sessions": [plain(session.provenance) for session in one.sessions],
+                }
+                for one in found.enrollments
+            ],
+            "views_taken": [
+                {
+                    "id": view.id,
+                    "index": view.record.index,
+                    "azimuth_deg": view.record.azimuth_deg,
+                    "evidence": view.record.evidence,
+                    "captured_utc": time_text(view.captured_utc),
+                }
+                for view in found.views
+            ],
+            "similar": plain(similar) if similar else None,
+        }
+
+    @api.patch("/objects/{name:path}", tags=["catalog"])
+    def change(name: str, body: ObjectBody, _person: OperatorPerson) -> dict[str, Any]:
+        """Rename or label an object."""
+        with server.open_catalog(False) as catalog:
+            set_texts(catalog, name, label=body.label, note=body.note)
+            if body.name is not None:
+                rename(catalog, name, body.name)
+            return _summary(catalog.summary(body.name or name))
+
+    @api.delete("/objects/{name:path}", tags=["catalog"])
+    def remove(name: str, _person: OperatorPerson) -> dict[str, Any]:
+        """Delete an object. It can be restored until rig catalog gc removes it."""
+        with server.open_catalog(False) as catalog:
+            delete(catalog, name)
+        return {"deleted": name}
+
+    @api.post("/undelete", tags=["catalog"])
+    def restore(body: NameBody, _person: OperatorPerson) -> dict[str, Any]:
+        """Restore a deleted object."""
+        with server.open_catalog(False) as catalog:
+            undelete(catalog, body.name)
+            return _summary(catalog.summary(body.name))
+
+    @api.get("/views/{view_id}/image", tags=["catalog"], response_class=Response)
+    def image(
+        request: Request,
+        _person: Watcher,
+        view_id: Annotated[int, Field(ge=0, lt=2**62)],
+        full: Annotated[bool, Query(description="the stored PNG instead of a small JPEG")] = False,
+    ) -> Response:
+        """Return the image of a view."""
+        with reading() as catalog:
+            view = catalog.view(view_id)
+            etag = f'"{view.image_sha256}-{"full" if full else THUMB_PX}"'
+            if request.headers.get("if-none-match") == etag:
+                return Response(status_code=304, headers={"ETag": etag})
+            pixels = catalog.read_image(view)
+            content = catalog.image_path(view).read_bytes() if full else jpeg(pixels, THUMB_PX)
+        headers = {"ETag": etag, "Cache-Control": "private, max-age=86400"}
+        return Response(content, media_type="image/png" if full else "image/jpeg", headers=headers)
+
+    @api.post("/import", tags=["catalog"])
+    async def import_bundle(
+        request: Request,
+        _person: OperatorPerson,
+        on_conflict: Annotated[str, Query(pattern="^(reject|skip|replace)$")] = "reject",
+    ) -> dict[str, Any]:
+        """Import a bundle (.rigcat.zip); the body is the file. It is checked as rig import checks it."""
+        from anyio import to_thread
+
+        with TemporaryDirectory(prefix="rig-import-") as folder:
+            path = Path(folder) / "upload.rigcat.zip"
+            with path.open("wb") as file:
+                async for chunk in request.stream():
+                    await to_thread.run_sync(file.write, chunk)
+            return await to_thread.run_sync(_import, server, path, on_conflict)
+
+    @api.get("/export", tags=["catalog"], response_class=FileResponse)
+    def export(
+        _person: Watcher, name: Annotated[list[str] | None, Query(description="default: all objects")] = None
+    ) -> FileResponse:
+        """Return a bundle with objects."""
+        folder = TemporaryDirectory(prefix="rig-export-")
+        path = Path(folder.name) / "catalog.rigcat.zip"
+        try:
+            with reading() as catalog:
+                write_bundle(path, read_objects(catalog, name or [one.name for one in catalog.objects()]))
+        except BaseException:
+            folder.cleanup()
+            raise
+        return FileResponse(
+            path, media_type="application/zip", filename="catalog.rigcat.zip", background=BackgroundTask(folder.cleanup)
+        )
+
+
+def _import(server: Server, path: Path, on_conflict: str) -> dict[str, Any]:
+    with server.open_catalog(False) as catalog:
+        plan = plan_import(catalog, read_bundle(path), Conflict(on_conflict))
+        steps = import_objects(catalog, plan, jobs=1)
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                return dict(plain(end.value))
+
+
+def _summary(one: ObjectSummary) -> dict[str, Any]:
+    return {
+        **plain(one),
+        **{key: time_text(getattr(one, key)) for key in ("created_utc", "enrolled_utc", "deleted_utc")},
+    }

@@ -1,0 +1,102 @@
+"""The REST API: runs, calibrations, configuration and log."""
+
+import re
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import HTMLResponse
+
+from rig.calibrations import CalibrationStore
+from rig.core.errors import JobNotFound
+from rig.events.events import plain
+from rig.search.replay import check
+from rig.search.saved_run import SavedRun, load_run
+from rig.web.server import Limit, Server, Watcher, page_of, time_text
+from rig.web.work import calibrations
+
+RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def add_records(api: APIRouter, server: Server) -> None:
+    def load(name: str) -> SavedRun:
+        if not RUN_NAME.fullmatch(name) or not (server.runs / name / "run.json").is_file():
+            raise JobNotFound("There is no run with that name.", next_step="Choose one of GET /api/v1/runs.")
+        return load_run(server.runs / name)
+
+    @api.get("/runs", tags=["runs"])
+    def runs(
+        request: Request,
+        _person: Watcher,
+        limit: Limit = 50,
+        after: Annotated[str | None, Query(max_length=100)] = None,
+    ) -> Response:
+        """List the saved runs, the newest first."""
+        names = [path.parent.name for path in server.runs.glob("*/run.json") if RUN_NAME.fullmatch(path.parent.name)]
+        return page_of(request, [{"name": name} for name in sorted(names, reverse=True)], "name", limit, after)
+
+    @api.get("/runs/{name}", tags=["runs"])
+    def run(name: str, _person: Watcher) -> dict[str, Any]:
+        """Return the events of a saved run."""
+        from rig.events.events import event_dict
+        from rig.events.lines import line
+
+        saved = load(name)
+        with saved.damage():
+            events = [{**event_dict(event), "text": line(event)} for event in saved.events()]
+        return {
+            "name": name,
+            "started_utc": saved.about["started_utc"],
+            "bench": saved.about["bench"],
+            "events": events,
+        }
+
+    @api.get("/runs/{name}/report", tags=["runs"], response_class=HTMLResponse)
+    def report(name: str, _person: Watcher) -> HTMLResponse:
+        """Return the report of a saved run as a page."""
+        from rig.report.run_report import run_report
+
+        return HTMLResponse(run_report(load(name)))
+
+    @api.post("/runs/{name}/check", tags=["runs"])
+    def check_run(name: str, _person: Watcher) -> dict[str, Any]:
+        """Compute every decision of a saved run again from its images."""
+        saved = load(name)
+        with saved.damage():
+            found = check(saved)
+        return {**plain(found), "differences": [str(difference) for difference in found.differences]}
+
+    @api.get("/calibrations", tags=["bench"])
+    def calibration_list(_person: Watcher) -> dict[str, Any]:
+        """Return the calibrations in force, and those that a job can run."""
+        store = CalibrationStore(server.config.calibration_path(server.bench))
+        history = [
+            {
+                "name": one.name,
+                "when_utc": time_text(one.when_utc),
+                "passed": one.passed,
+                "id": one.id,
+                "values": {key: str(value) for key, value in one.estimates.items()},
+            }
+            for one in store.history()
+        ]
+        offered = {name: one.title for name, one in calibrations().items()}
+        return {"history": history[::-1], "available": offered, "unreadable": [str(one) for one in store.unreadable]}
+
+    @api.get("/configuration", tags=["bench"])
+    def configuration(_person: Watcher) -> dict[str, Any]:
+        """Return the configuration in force."""
+        values: dict[str, Any] = server.config.model_dump(mode="json")
+        return values
+
+    @api.get("/log", tags=["bench"])
+    def log(
+        request: Request,
+        _person: Watcher,
+        limit: Limit = 100,
+        after: Annotated[str | None, Query(max_length=20)] = None,
+    ) -> Response:
+        """List the catalog's log, the newest first."""
+        with server.open_catalog(True) as catalog:
+            entries = catalog.log()
+        rows = [{**plain(entry), "id": str(entry.id), "time_utc": time_text(entry.time_utc)} for entry in entries]
+        return page_of(request, rows[::-1], "id", limit, after)

@@ -1,0 +1,268 @@
+"""The queue of jobs: one runs at a time. It survives the server, and a job that the server left is interrupted."""
+
+import json
+import secrets
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from pydantic import ValidationError
+
+from rig.core.clock import Clock
+from rig.core.errors import JobNotFound, JobRejected, RigError, StateNotStored, os_errors_as
+from rig.core.files import read, write
+from rig.web.requests import Choice, EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
+
+FILE: Final = "jobs.json"
+STORED: Final = 200
+"""Jobs that are remembered."""
+MAX_QUEUED: Final = 50
+MAX_BYTES: Final = 50_000_000
+
+
+class JobQueue:
+    """The jobs of one bench; all methods may be called from any thread.
+
+    Parameters
+    ----------
+    folder
+        Where the jobs are stored.
+    clock
+        Dates the jobs.
+    changed
+        Called with each job that has changed.
+    rig_arguments
+        Arguments that let a command of the terminal use the same bench.
+    """
+
+    def __init__(
+        self, folder: Path, clock: Clock, changed: Callable[[Job], None], rig_arguments: tuple[str, ...] = ()
+    ) -> None:
+        self._file = folder / FILE
+        self._clock = clock
+        self._changed = changed
+        self._arguments = rig_arguments
+        self._lock = threading.RLock()
+        self._arrived = threading.Condition(self._lock)
+        self._jobs: dict[str, Job] = {}
+        self._cancelled: set[str] = set()
+        self._pausing: set[str] = set()
+        self._answers: dict[str, Choice] = {}
+        self.problem: RigError | None = None
+        self._load()
+
+    def jobs(self) -> list[Job]:
+        """Return all jobs, the newest first."""
+        with self._lock:
+            return [job.model_copy() for job in reversed(self._jobs.values())]
+
+    def job(self, job_id: str) -> Job:
+        """Return a job. Raises `JobNotFound`."""
+        with self._lock:
+            return self._find(job_id).model_copy()
+
+    def submit(self, request: JobRequest, operator: str) -> Job:
+        """Add a job to the queue and return it.
+
+        Raises
+        ------
+        JobRejected
+            Too many jobs wait.
+        """
+        with self._lock:
+            if sum(job.state is JobState.QUEUED for job in self._jobs.values()) >= MAX_QUEUED:
+                raise JobRejected(
+                    f"{MAX_QUEUED} jobs wait already.", next_step="Wait until some have ended, or cancel some."
+                )
+            job = Job(
+                id=secrets.token_hex(6),
+                request=request,
+                state=JobState.QUEUED,
+                created_utc=self._now(),
+                operator=operator,
+            )
+            self._jobs[job.id] = job
+            for old in [job for job in self._jobs.values() if job.state.ended][: len(self._jobs) - STORED]:
+                del self._jobs[old.id]
+            self._store(job)
+            self._arrived.notify_all()
+            return job.model_copy()
+
+    def cancel(self, job_id: str) -> Job:
+        """Cancel a job; a running one ends at its next step. Raises `JobNotFound`, `JobRejected`."""
+        with self._lock:
+            job = self._unended(job_id)
+            if job.state is JobState.QUEUED:
+                return self._end(job, JobState.CANCELLED).model_copy()
+            self._cancelled.add(job_id)
+            return job.model_copy()
+
+    def cancel_all(self) -> None:
+        """Cancel the running job and all that wait."""
+        with self._lock:
+            for job in [job for job in self._jobs.values() if not job.state.ended]:
+                self.cancel(job.id)
+
+    def pause(self, job_id: str) -> Job:
+        """Pause a running job at its next view. Raises `JobNotFound`, `JobRejected`."""
+        with self._lock:
+            job = self._unended(job_id)
+            if job.state is not JobState.RUNNING:
+                raise JobRejected(f"A {job.state} job cannot be paused.", next_step="Pause a running job.")
+            self._pausing.add(job_id)
+            return job.model_copy()
+
+    def go_on(self, job_id: str) -> Job:
+        """Resume a paused job. Raises `JobNotFound`, `JobRejected`."""
+        with self._lock:
+            job = self._unended(job_id)
+            if job_id not in self._pausing:
+                raise JobRejected("The job is not paused.", next_step="Look at its state.")
+            self._pausing.discard(job_id)
+            return job.model_copy()
+
+    def answer(self, job_id: str, choice: Choice) -> Job:
+        """Answer the question of a job. Raises `JobNotFound`, `JobRejected`."""
+        with self._lock:
+            job = self._unended(job_id)
+            if job.question is None or choice not in job.question.choices:
+                asked = "asks nothing" if job.question is None else f"takes {', '.join(job.question.choices)}"
+                raise JobRejected(f"The job {asked}.", next_step="Load the job again and answer its question.")
+            self._answers[job_id] = choice
+            return job.model_copy()
+
+    # -- for the worker -----------------------------------------------------------------------------------------------
+
+    def next(self, timeout_s: float = 0.0) -> Job | None:
+        """Return the oldest job that waits, now running; None if there is none within the time."""
+        with self._lock:
+            waiting = self._oldest()
+            if waiting is None and timeout_s > 0:
+                self._arrived.wait(timeout_s)
+                waiting = self._oldest()
+            if waiting is not None:
+                waiting.state, waiting.started_utc = JobState.RUNNING, self._now()
+                self._store(waiting)
+            return waiting
+
+    def is_cancelled(self, job: Job) -> bool:
+        with self._lock:
+            return job.id in self._cancelled
+
+    def is_paused(self, job: Job) -> bool:
+        with self._lock:
+            return job.id in self._pausing
+
+    def ask(self, job: Job, question: Question | None) -> None:
+        """Show a question, or with None remove it."""
+        with self._lock:
+            self._answers.pop(job.id, None)
+            job.question = question
+            job.state = JobState.RUNNING if question is None else JobState.WAITING
+            self._store(job)
+
+    def answered(self, job: Job) -> Choice | None:
+        """Return the answer to the job's question, once there is one."""
+        with self._lock:
+            return self._answers.get(job.id)
+
+    def update(self, job: Job, *, durable: bool = False) -> None:
+        """Report that a job has changed; ``durable`` stores it."""
+        with self._lock:
+            if durable:
+                self._store(job)
+            else:
+                self._changed(job.model_copy())
+
+    def end(self, job: Job, state: JobState, error: RigError | None = None) -> None:
+        """End a job; an unfinished one gets the request that continues it."""
+        with self._lock:
+            job.error = None if error is None else _json_error(error)
+            if state is not JobState.DONE:
+                self._offer_to_continue(job)
+            self._end(job, state)
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _end(self, job: Job, state: JobState) -> Job:
+        job.state, job.ended_utc, job.question = state, self._now(), None
+        self._cancelled.discard(job.id)
+        self._pausing.discard(job.id)
+        self._answers.pop(job.id, None)
+        self._store(job)
+        return job
+
+    def _offer_to_continue(self, job: Job) -> None:
+        """Set how to continue the work of a job that ended early."""
+        request = job.request
+        if isinstance(request, EnrollRequest):
+            started = job.views > 0 or request.resume
+            job.resume = request.model_copy(update={"resume": True, "replace": False}) if started else request
+            words = ["rig", "enroll", request.name, *(["--resume"] if started else [])]
+            if not started and request.replace:
+                words.append("--replace")
+            job.command = _shell([*words, *self._arguments])
+        elif isinstance(request, TrayRequest):
+            job.resume = request  # complete objects are skipped, and interrupted ones resumed
+        elif isinstance(request, IdentifyRequest):
+            job.resume = request
+            job.command = _shell(["rig", "identify", *(["--watch"] if request.watch else []), *self._arguments])
+
+    def _find(self, job_id: str) -> Job:
+        if job_id not in self._jobs:
+            raise JobNotFound("There is no job with that id.", next_step="Choose one of GET /api/v1/jobs.")
+        return self._jobs[job_id]
+
+    def _unended(self, job_id: str) -> Job:
+        job = self._find(job_id)
+        if job.state.ended:
+            raise JobRejected(f"The job is {job.state} already.", next_step="Submit a new job.")
+        return job
+
+    def _oldest(self) -> Job | None:
+        return next((job for job in self._jobs.values() if job.state is JobState.QUEUED), None)
+
+    def _now(self) -> str:
+        return self._clock.utc().isoformat(timespec="seconds").replace("+00:00", "Z")
+
+    def _store(self, job: Job) -> None:
+        content = json.dumps([one.model_dump(mode="json") for one in self._jobs.values()], ensure_ascii=False).encode()
+        step = "Make room on the disk. The bench works, but the list of jobs does not survive the server."
+        try:
+            with os_errors_as(StateNotStored, f"The jobs cannot be stored in {self._file}.", next_step=step):
+                self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                write(self._file, content, mode=0o600)
+            self.problem = None
+        except StateNotStored as error:  # a full disk must not stop the bench
+            self.problem = error
+        self._changed(job.model_copy())
+
+    def _load(self) -> None:
+        try:
+            stored = json.loads(read(self._file, max_bytes=MAX_BYTES))
+            jobs = [Job.model_validate(values) for values in stored]
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, ValidationError, RecursionError, TypeError):
+            step = "The old list is in jobs.json.damaged. No views are lost: they are in the catalog."
+            self.problem = StateNotStored(f"The list of jobs in {self._file} is damaged.", next_step=step)
+            with os_errors_as(StateNotStored, f"{self._file} cannot be renamed.", next_step="Delete it."):
+                self._file.replace(self._file.with_suffix(".json.damaged"))
+            return
+        for job in jobs:
+            self._jobs[job.id] = job
+            if not job.state.ended:
+                self._offer_to_continue(job)
+                self._end(job, JobState.INTERRUPTED)
+
+
+def _json_error(error: RigError) -> dict[str, object]:
+    values: dict[str, object] = json.loads(json.dumps(error.as_dict(), default=str))
+    return values
+
+
+def _shell(words: list[str]) -> str:
+    from shlex import join
+
+    return join(words)

@@ -1,0 +1,50 @@
+"""The pages. A script fills them from the REST API, so that pages and integrators use one interface."""
+
+from typing import TYPE_CHECKING, Final
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+if TYPE_CHECKING:
+    from rig.web.server import Server
+
+PAGES: Final = {
+    "": "Bench",
+    "enroll": "Enroll",
+    "identify": "Identify",
+    "catalog": "Catalog",
+    "calibrations": "Calibrations",
+    "runs": "Runs",
+    "log": "Log",
+    "settings": "Settings",
+}
+
+
+def pages(server: "Server") -> APIRouter:
+    """Return the routes of the pages."""
+    environment = Environment(
+        loader=PackageLoader("rig.web", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    router = APIRouter(include_in_schema=False)
+
+    def page(name: str) -> None:
+        template = environment.get_template(f"{name or 'bench'}.html.j2")
+
+        @router.get(f"/{name}", response_class=HTMLResponse, name=f"page-{name or 'bench'}")
+        def show(request: Request) -> HTMLResponse:  # noqa: ARG001
+            content = template.render(pages=PAGES, current=name, title=PAGES[name], bench=server.bench)
+            return HTMLResponse(content, headers={"Cache-Control": "no-cache"})
+
+    for name in PAGES:
+        page(name)
+
+    @router.get("/login", response_class=HTMLResponse)
+    def login() -> HTMLResponse:
+        return HTMLResponse(environment.get_template("login.html.j2").render(bench=server.bench))
+
+    return router

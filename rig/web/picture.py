@@ -1,0 +1,122 @@
+"""The live picture: the newest frame of the camera, encoded once for all viewers."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.core.clock import Clock, seconds_between
+from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
+
+JPEG_QUALITY: Final = 80
+MAX_SIDE_PX: Final = 1280
+BOUNDARY: Final = "frame"
+VIEWER_GONE_S: Final = 30.0
+"""A stream of pictures sends the last one again after this time, to notice a viewer that is gone."""
+
+
+class LivePicture:
+    """Holds the newest frame; viewers never wait for the camera, and the camera never waits for viewers."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._image: NDArray[np.uint8] | None = None
+        self._number = 0
+        self._encoded: tuple[int, bytes] | None = None
+        self._encoding = threading.Lock()
+        self._shown_ns = clock.now_ns()
+        self.viewers = 0
+        self.wanted_until_ns = 0
+
+    def show(self, image_bgr: NDArray[np.uint8]) -> None:
+        """Replace the picture, from the bench's thread; the array must not be changed afterwards."""
+        with self._lock:
+            self._image = image_bgr
+            self._number += 1
+            self._shown_ns = self._clock.now_ns()
+
+    def want(self, seconds: float = 5.0) -> None:
+        """Ask for pictures from an idle camera for the next seconds."""
+        self.wanted_until_ns = self._clock.now_ns() + round(seconds * 1e9)
+
+    @property
+    def wanted(self) -> bool:
+        return self.viewers > 0 or self._clock.now_ns() < self.wanted_until_ns
+
+    @property
+    def number(self) -> int:
+        """Number of the newest frame, from 1; 0 if there is none."""
+        return self._number
+
+    @property
+    def age_s(self) -> float:
+        return seconds_between(self._shown_ns, self._clock.now_ns())
+
+    def jpeg(self) -> tuple[int, bytes] | None:
+        """Return the number of the newest frame and the frame as JPEG; None if there is none yet."""
+        with self._encoding:
+            with self._lock:
+                number, image = self._number, self._image
+            if image is None:
+                return None
+            if self._encoded is None or self._encoded[0] != number:
+                self._encoded = (number, jpeg(image))
+            return self._encoded
+
+    async def stream(self) -> AsyncIterator[bytes]:
+        """Yield the parts of a ``multipart/x-mixed-replace`` response, each frame at most once."""
+        self.viewers += 1
+        sent = -1
+        waited_s = 0.0
+        try:
+            while True:
+                if self._number != sent or waited_s > VIEWER_GONE_S:
+                    found = await asyncio.to_thread(self.jpeg)
+                    if found is not None:
+                        sent, content = found
+                        waited_s = 0.0
+                        head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(content)}\r\n\r\n"
+                        yield head.encode() + content + b"\r\n"
+                await asyncio.sleep(0.05)
+                waited_s += 0.05
+        finally:
+            self.viewers -= 1
+
+
+def jpeg(image_bgr: NDArray[np.uint8], max_side_px: int = MAX_SIDE_PX) -> bytes:
+    """Return an image as JPEG, reduced to at most ``max_side_px``."""
+    scale = max_side_px / max(image_bgr.shape[:2])
+    if scale < 1:
+        image_bgr = cv2.resize(image_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    encoded, content = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not encoded:
+        raise ValueError("the image cannot be encoded")
+    return content.tobytes()
+
+
+class ObservedCamera:
+    """A camera that also shows its frames to an observer."""
+
+    def __init__(self, camera: Camera, observer: Callable[[NDArray[np.uint8]], None]) -> None:
+        self._camera = camera
+        self._observer = observer
+
+    @property
+    def identity(self) -> CameraIdentity:
+        return self._camera.identity
+
+    def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
+        frame = self._camera.capture(after_ns, meanwhile)
+        self._observer(frame.image_bgr)
+        return frame
+
+    def read_locks(self) -> CameraLocks:
+        return self._camera.read_locks()
+
+    def close(self) -> None:
+        self._camera.close()

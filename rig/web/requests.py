@@ -1,0 +1,191 @@
+"""What can be asked of the bench: one model for each kind of job."""
+
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Name = Annotated[str, Field(min_length=1, max_length=100, examples=["mug-white"])]
+Views = Annotated[int | None, Field(ge=4, le=720, description="views in a revolution; default: enroll.views")]
+
+
+class EnrollRequest(_Request):
+    """Enroll the object on the table."""
+
+    kind: Literal["enroll"] = "enroll"
+    name: Name
+    views: Views = None
+    label: Annotated[str | None, Field(max_length=1000)] = None
+    note: Annotated[str | None, Field(max_length=10_000)] = None
+    resume: bool = Field(False, description="take the missing views of an interrupted enrollment")
+    replace: bool = Field(False, description="enroll again; the old views stay in use until the new ones are complete")
+
+
+class TrayObject(_Request):
+    """An object of a tray."""
+
+    name: Name
+    label: Annotated[str | None, Field(max_length=1000)] = None
+    note: Annotated[str | None, Field(max_length=10_000)] = None
+    views: Views = None
+
+
+class TrayRequest(_Request):
+    """Enroll several objects one after the other. The job asks for each object."""
+
+    kind: Literal["tray"] = "tray"
+    objects: Annotated[list[TrayObject], Field(min_length=1, max_length=1000)]
+    views: Views = None
+
+
+class DryRunRequest(_Request):
+    """Compute what an enrollment would do. Moves nothing and stores nothing."""
+
+    kind: Literal["dry-run"] = "dry-run"
+    objects: Annotated[list[TrayObject], Field(min_length=1, max_length=1000)]
+    views: Views = None
+    resume: bool = False
+    replace: bool = False
+
+
+class IdentifyRequest(_Request):
+    """Identify the object on the table."""
+
+    kind: Literal["identify"] = "identify"
+    max_views: Annotated[int | None, Field(ge=1, le=72, description="default: identify.max_views")] = None
+    strategy: Annotated[str | None, Field(max_length=100, description="default: identify.strategy")] = None
+    watch: bool = Field(False, description="wait for the next object after each answer")
+    sample: Annotated[
+        str | None, Field(max_length=100, description="sample on the table, recorded with the answer")
+    ] = None
+
+
+class EmptyTableRequest(_Request):
+    """Take the empty-table image."""
+
+    kind: Literal["empty-table"] = "empty-table"
+    anyway: bool = Field(False, description="store the image although something rotates with the table")
+
+
+class GotoRequest(_Request):
+    """Rotate the table to an angle."""
+
+    kind: Literal["goto"] = "goto"
+    angle_deg: Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False, examples=[90.0])]
+
+
+class HomeRequest(_Request):
+    """Rotate the table to its home."""
+
+    kind: Literal["home"] = "home"
+
+
+class AcknowledgeRequest(_Request):
+    """Acknowledge the latched fault."""
+
+    kind: Literal["acknowledge"] = "acknowledge"
+    reboot: bool = Field(False, description="restart the servo first, which clears its hardware errors")
+
+
+class DoctorRequest(_Request):
+    """Check everything that the bench needs. Moves nothing."""
+
+    kind: Literal["doctor"] = "doctor"
+
+
+class CalibrateRequest(_Request):
+    """Run a calibration."""
+
+    kind: Literal["calibrate"] = "calibrate"
+    name: Annotated[str, Field(max_length=50, description="one of GET /api/v1/calibrations", examples=["servo"])]
+    object: Annotated[str | None, Field(max_length=100, description="object to use, for the calibration noise")] = None
+
+
+JobRequest = Annotated[
+    EnrollRequest
+    | TrayRequest
+    | DryRunRequest
+    | IdentifyRequest
+    | EmptyTableRequest
+    | GotoRequest
+    | HomeRequest
+    | AcknowledgeRequest
+    | DoctorRequest
+    | CalibrateRequest,
+    Field(discriminator="kind"),
+]
+
+
+class Choice(StrEnum):
+    """An answer of the operator to a question of a job."""
+
+    CONTINUE = "continue"
+    RESTART = "restart"
+    SKIP = "skip"
+    STOP = "stop"
+
+
+class Question(_Request):
+    """What a job asks the operator."""
+
+    text: str
+    choices: tuple[Choice, ...]
+
+
+class JobState(StrEnum):
+    """State of a job."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    WAITING = "waiting"
+    PAUSED = "paused"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+    INTERRUPTED = "interrupted"
+
+    @property
+    def ended(self) -> bool:
+        return self in (JobState.DONE, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED)
+
+
+class Progress(_Request):
+    """Progress of a job: steps done of all steps, and the expected time left."""
+
+    done: int
+    total: int
+    seconds_left: float | None = None
+    text: str = ""
+
+
+class Job(BaseModel):
+    """A job of the bench.
+
+    ``error`` has the fields of an error as ``rig --json`` prints them. ``resume`` is the request that continues the
+    job's work, and ``command`` the same for a terminal; both are None if there is nothing to continue. ``result`` is
+    the last important event of the plan.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str
+    request: JobRequest
+    state: JobState
+    created_utc: str
+    operator: str
+    started_utc: str | None = None
+    ended_utc: str | None = None
+    progress: Progress | None = None
+    question: Question | None = None
+    result: dict[str, Any] | None = None
+    result_text: str = ""
+    error: dict[str, Any] | None = None
+    resume: JobRequest | None = None
+    command: str | None = None
+    run: str | None = Field(None, description="saved run of an identification, for GET /api/v1/runs/{run}")
+    views: int = Field(0, description="number of pictures at GET /api/v1/jobs/{id}/views/{n}")

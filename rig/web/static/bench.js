@@ -1,0 +1,103 @@
+import { $, API, act, h, jobTitle, on, request, showJob, start, submit } from "./rig.js";
+
+const polar = (degrees, radius) => {
+  const a = ((degrees - 90) * Math.PI) / 180;
+  return [Math.cos(a) * radius, Math.sin(a) * radius];
+};
+let gyro = null;
+
+function dial(status) {
+  const angle = status.table_deg;
+  const [low, high] = status.limits_deg || [-360, 360];
+  const known = angle !== null && angle !== undefined;
+  const parts = [h("circle", { r: 96, fill: "none", stroke: "currentColor", "stroke-width": 2 })];
+  for (let mark = 0; mark < 360; mark += 30) {
+    const [x1, y1] = polar(mark, 90);
+    const [x2, y2] = polar(mark, 96);
+    const [tx, ty] = polar(mark, 104);
+    parts.push(h("line", { x1, y1, x2, y2, stroke: "currentColor" }));
+    if (mark % 90 === 0) parts.push(h("text", { x: tx, y: ty + 4 }, `${mark}`));
+  }
+  if (known) {
+    const used = Math.min(Math.abs(angle) / Math.max(Math.abs(angle < 0 ? low : high), 1), 1);
+    const circumference = 2 * Math.PI * 72;
+    parts.push(h("circle", { r: 72, fill: "none", stroke: "var(--line)", "stroke-width": 10 }));
+    parts.push(h("circle", { r: 72, fill: "none", stroke: used > 0.9 ? "var(--red)" : "var(--blue)", "stroke-width": 10, "stroke-dasharray": `${circumference * used} ${circumference}`, transform: `rotate(-90) scale(${angle < 0 ? "1 -1" : "1 1"})` }));
+    const needle = (degrees, radius, colour, width) => {
+      const [x2, y2] = polar(degrees, radius);
+      return h("line", { x1: 0, y1: 0, x2, y2, stroke: colour, "stroke-width": width, "stroke-linecap": "round" });
+    };
+    if (gyro !== null) parts.push(needle(gyro, 60, "var(--amber)", 9));
+    parts.push(needle(angle, 88, "currentColor", 4), h("circle", { r: 6, fill: "currentColor" }));
+  }
+  $("dial").replaceChildren(...parts);
+  const moving = status.servo && status.servo.moving ? ` at ${status.velocity_dps.toFixed(0)} °/s` : "";
+  $("dial-text").textContent = known ? `${angle.toFixed(2)}°${moving}` : "angle in doubt";
+}
+
+on("status", (status) => {
+  if (!status.open) return;
+  if (status.limits_deg) dial(status);
+  const values = [["State", status.state], ["Cable budget", status.limits_deg ? `${status.limits_deg[0]}° to ${status.limits_deg[1]}°` : "–"]];
+  if (gyro !== null) values.push(["Gyro at the last rest", `${gyro.toFixed(2)}°`]);
+  if (status.servo) values.push(["Servo", `${status.servo.model}, ${status.servo.temperature_c} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${status.servo.load_percent.toFixed(0)} %`]);
+  if (status.camera) values.push(["Camera", `${status.camera.name}, ${status.camera.width} × ${status.camera.height}`]);
+  for (const finding of status.findings || []) values.push(["Note", finding]);
+  $("values").replaceChildren(...values.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  $("acknowledge").disabled = !status.fault;
+});
+
+on("plan", (event) => {
+  if (event.event === "moved") gyro = event.rotation_imu_deg === null ? null : event.encoder_deg - event.rotation_encoder_deg + event.rotation_imu_deg;
+  if (event.event === "accepted" && event.segmentation && event.segmentation.box_px) outline(event.segmentation.box_px);
+  if (event.event === "moved") $("outline").replaceChildren();
+});
+
+function outline(box) {
+  const image = $("live-image");
+  if (!image.naturalWidth) return;
+  $("outline").setAttribute("viewBox", `0 0 ${image.naturalWidth} ${image.naturalHeight}`);
+  const [x, y, width, height] = box;
+  $("outline").replaceChildren(h("rect", { x, y, width, height, fill: "none", stroke: "#ffd34d", "stroke-width": 3 }));
+}
+
+const jobs = new Map();
+let open = null;
+function showJobs() {
+  const newest = [...jobs.values()].sort((a, b) => (a.created_utc < b.created_utc ? 1 : -1));
+  const active = newest.find((job) => ["running", "paused", "waiting"].includes(job.state));
+  const chosen = (open && jobs.get(open)) || active || newest[0];
+  showJob($("job"), chosen);
+  if (chosen && chosen.request.kind === "doctor" && chosen.result) findings(chosen.result.findings);
+  $("jobs").replaceChildren(
+    ...newest.slice(0, 12).map((job) => h("li", {}, h("button", { class: "quiet", onclick: () => { open = job.id; showJobs(); } }, jobTitle(job)), ` ${job.state}, ${job.operator}, ${job.created_utc}`)),
+  );
+}
+
+function findings(list) {
+  const marks = { fine: "✓", warning: "!", bad: "✗" };
+  $("findings-section").hidden = false;
+  $("findings").replaceChildren(
+    ...list.map((one) => h("li", { class: one.level === "bad" ? "badtext" : "" }, `${marks[one.level]} ${one.topic}: ${one.finding}`, one.fix ? h("p", { class: "soft" }, `Fix: ${one.fix}`) : null)),
+  );
+}
+
+on("job", (job) => {
+  if (!jobs.has(job.id)) open = null;
+  jobs.set(job.id, job);
+  showJobs();
+});
+on("hello", () => act(async () => {
+  for (const job of (await request("GET", "/jobs")).items) jobs.set(job.id, job);
+  showJobs();
+}));
+
+$("goto").addEventListener("submit", (event) => {
+  event.preventDefault();
+  submit({ kind: "goto", angle_deg: Number($("angle").value) });
+});
+for (const [id, kind] of [["home", "home"], ["empty", "empty-table"], ["acknowledge", "acknowledge"], ["doctor", "doctor"]]) {
+  $(id).addEventListener("click", () => submit({ kind }));
+}
+$("live-image").addEventListener("error", () => setTimeout(() => { $("live-image").src = `${API}/live?${Date.now()}`; }, 2000));
+start();

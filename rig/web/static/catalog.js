@@ -1,0 +1,90 @@
+import { $, API, act, canOperate, h, on, request, start } from "./rig.js";
+
+let next = null;
+let shown = 0;
+let opened = null;
+const path = (name) => encodeURIComponent(name);
+
+async function load(more) {
+  const query = new URLSearchParams({ limit: "60", search: $("search").value, deleted: $("deleted").checked });
+  if (more && next) query.set("after", next);
+  const page = await request("GET", `/objects?${query}`);
+  if (!more) { $("objects").replaceChildren(); shown = 0; }
+  shown += page.items.length;
+  next = page.next;
+  $("more").hidden = next === null;
+  $("count").textContent = page.total === 1 ? "1 object" : `${page.total} objects`;
+  $("objects").append(...page.items.map(card));
+}
+
+function card(one) {
+  const views = one.unfinished_views !== null ? `interrupted, ${one.unfinished_views} views` : `${one.views} views`;
+  const image = one.picture === null ? null : h("img", { src: `${API}/views/${one.picture}/image`, alt: "", loading: "lazy" });
+  const action = $("deleted").checked ? () => act(async () => { await request("POST", "/undelete", { name: one.name }); await load(false); }) : () => act(() => open(one.name));
+  return h("li", {}, h("button", { onclick: action }, image, h("strong", {}, one.name), h("br"), h("span", { class: "soft" }, $("deleted").checked ? "Bring back" : `${one.label ? `${one.label}, ` : ""}${views}`)));
+}
+
+async function open(name) {
+  const one = await request("GET", `/objects/${path(name)}`);
+  opened = one.name;
+  $("object-name").textContent = one.name;
+  $("new-name").value = one.name;
+  $("new-label").value = one.label;
+  $("new-note").value = one.note;
+  $("object-export").href = `${API}/export?name=${path(one.name)}`;
+  const similar = one.similar ? one.similar.objects.map((other) => `${other.name} (similarity ${other.similarity.toFixed(2)})`).join(", ") : "";
+  const taken = one.enrollments.map((e) => `${e.status}: ${e.stored_views} of ${e.planned_views} views, ${e.started_utc}${e.sessions.length ? `, bench ${e.sessions[0].bench}, ${e.sessions[0].software}` : ""}`);
+  $("object-body").replaceChildren(
+    h("p", {}, similar ? `Looks like: ${similar}` : "No other object looks like it."),
+    h("ul", { class: "list" }, ...taken.map((words) => h("li", {}, words))),
+    ring(one.views_taken),
+  );
+  for (const element of $("edit").elements) if (element.id !== "close") element.disabled = !canOperate();
+  $("object").show();
+  $("object").scrollTop = 0;
+}
+
+/** The views in a circle, as the camera saw the object. */
+function ring(views) {
+  const step = Math.max(1, Math.ceil(views.length / 24));
+  return h("ol", { class: "thumbs", "aria-label": "Views by azimuth" },
+    ...views.filter((_, k) => k % step === 0).map((view) =>
+      h("li", {}, h("a", { href: `${API}/views/${view.id}/image?full=true`, target: "_blank" }, h("img", { src: `${API}/views/${view.id}/image`, alt: `azimuth ${view.azimuth_deg.toFixed(0)}°`, loading: "lazy" })), `${view.azimuth_deg.toFixed(0)}°`)));
+}
+
+async function upload(file) {
+  const done = await request("POST", "/import", file);
+  $("count").textContent = `Imported ${done.objects} objects with ${done.views} views.`;
+  await load(false);
+}
+
+$("find").addEventListener("submit", (event) => event.preventDefault());
+let timer = null;
+$("search").addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(() => act(() => load(false)), 200); });
+$("deleted").addEventListener("change", () => act(() => load(false)));
+$("more").addEventListener("click", () => act(() => load(true)));
+$("close").addEventListener("click", () => $("object").close());
+$("edit").addEventListener("submit", (event) => {
+  event.preventDefault();
+  act(async () => {
+    await request("PATCH", `/objects/${path(opened)}`, { name: $("new-name").value, label: $("new-label").value, note: $("new-note").value });
+    $("object").close();
+    await load(false);
+  });
+});
+$("delete").addEventListener("click", () => act(async () => {
+  await request("DELETE", `/objects/${path(opened)}`);
+  $("object").close();
+  await load(false);
+}));
+$("bundle").addEventListener("change", () => act(() => upload($("bundle").files[0])));
+document.addEventListener("dragover", (event) => { event.preventDefault(); $("main").classList.add("drop"); });
+document.addEventListener("dragleave", () => $("main").classList.remove("drop"));
+document.addEventListener("drop", (event) => {
+  event.preventDefault();
+  $("main").classList.remove("drop");
+  if (event.dataTransfer.files.length) act(() => upload(event.dataTransfer.files[0]));
+});
+on("hello", () => act(() => load(false)));
+on("plan", (event) => { if (event.event === "enrolled") act(() => load(false)); });
+start();

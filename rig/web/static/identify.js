@@ -1,0 +1,60 @@
+import { $, followJobs, h, on, start, submit, thumb } from "./rig.js";
+
+let current = null;
+
+$("start").addEventListener("submit", (event) => {
+  event.preventDefault();
+  submit({ kind: "identify", watch: $("watch").checked, sample: $("sample").value || null, max_views: $("max-views").value ? Number($("max-views").value) : null });
+});
+
+function answer(words, kind, detail) {
+  $("answer").textContent = words;
+  $("answer").className = `answer ${kind}`;
+  $("answer-detail").textContent = detail;
+}
+
+function clear() {
+  for (const id of ["thumbs", "steps", "candidates"]) $(id).replaceChildren();
+  answer("Looking …", "", "");
+}
+
+function bars(candidates) {
+  const rows = candidates.slice(0, 6).flatMap((one) => {
+    const share = one.probability ?? one.score;
+    const words = one.probability === null ? one.score.toFixed(3) : `${(share * 100).toFixed(1)} %`;
+    const bar = h("div", { "aria-hidden": "true" });
+    bar.style.width = `${Math.max(share, 0) * 100}%`;
+    return [h("span", {}, one.name), h("span", {}, bar), h("span", {}, words)];
+  });
+  $("candidates").replaceChildren(h("div", { class: "bar-chart" }, ...rows));
+}
+
+export function result(event) {
+  const lines = event.text.split("\n");
+  if (event.outcome === "found") answer(event.name, "found", lines[0]);
+  else if (event.outcome === "ambiguous") answer(event.possible.join(" or "), "ambiguous", lines[0]);
+  else answer("Unknown object", "unknown", lines[0]);
+}
+
+on("plan", (event) => {
+  if (event.job !== current) return;
+  if (event.event === "started") clear();
+  if (event.event === "waiting") answer(event.reason === "first-object" ? "Put an object on the table" : "Put the next object on the table", "", "");
+  if (event.event === "accepted") $("thumbs").append(thumb(event.job, event.picture, `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`));
+  if (event.event === "ranked") bars(event.candidates);
+  if (event.event === "identified") result(event);
+  if (event.event === "failed") answer("No answer", "unknown", `${event.what} ${event.next_step}`);
+  if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
+});
+followJobs($("job"), ["identify"], (job) => {
+  if (job.id !== current) {
+    current = job.id;
+    clear();
+    $("thumbs").replaceChildren(...Array.from({ length: job.views }, (_, k) => thumb(job.id, k, `view ${k + 1}`)));
+    if (job.state === "queued") answer("Waiting for the bench …", "", "");
+  }
+  if (job.result && job.result.event === "identified" && !job.request.watch) result({ ...job.result, text: job.result_text });
+  if (job.state === "failed") answer("No answer", "unknown", `${job.error.what} ${job.error.next_step}`);
+  if (["cancelled", "interrupted"].includes(job.state)) answer("Stopped", "", "");
+});
+start();

@@ -1,0 +1,60 @@
+// Calibrations, runs, log and settings: each part runs on the page that has its element.
+import { $, API, act, followJobs, h, on, request, start, submit, table, whoami } from "./rig.js";
+
+let next = null;
+async function more(path, add) {
+  const page = await request("GET", `${path}${next ? `?after=${encodeURIComponent(next)}` : ""}`);
+  next = page.next;
+  $("more").hidden = next === null;
+  add(page.items);
+}
+
+if ($("calibrations")) {
+  const load = async () => {
+    const found = await request("GET", "/calibrations");
+    $("available").replaceChildren(...Object.entries(found.available).map(([name, title]) => h("button", { onclick: () => submit({ kind: "calibrate", name }) }, title)));
+    if (!Object.keys(found.available).length) $("available").replaceChildren(h("p", {}, "No calibrations are installed."));
+    table($("calibrations"), ["Calibration", "Date", "Outcome", "Values"], found.history.map((one) => [one.name, one.when_utc, one.passed ? "passed" : "not passed", Object.entries(one.values).map(([key, value]) => `${key} ${value}`).join("; ")]));
+  };
+  on("hello", () => act(load));
+  followJobs($("job"), ["calibrate"], (job) => { if (job.state === "done") act(load); });
+}
+
+if ($("runs")) {
+  const open = async (name) => {
+    const run = await request("GET", `/runs/${name}`);
+    $("checked").textContent = "";
+    $("run-actions").replaceChildren(
+      h("a", { class: "button", href: `${API}/runs/${name}/report`, target: "_blank" }, "Open the report"),
+      h("button", { onclick: () => act(async () => {
+        $("checked").textContent = "Computing again …";
+        const done = await request("POST", `/runs/${name}/check`);
+        $("checked").textContent = done.differences.length ? `${done.differences.length} numbers differ: ${done.differences.slice(0, 3).join("; ")}` : `Computed again: ${done.views} descriptors and ${done.decisions} decisions. All are as saved.`;
+      }) }, "Compute again"));
+    $("replay").replaceChildren(...run.events.filter((event) => event.text).map((event) => h("li", {}, event.text)));
+  };
+  const add = (items) => {
+    $("runs").append(...items.map((run) => h("li", {}, h("button", { class: "quiet", onclick: () => act(() => open(run.name)) }, run.name))));
+    if (!$("runs").children.length) $("runs").append(h("li", {}, "There are no runs yet. Identify an object."));
+  };
+  $("more").addEventListener("click", () => act(() => more("/runs", add)));
+  on("hello", () => act(() => { next = null; $("runs").replaceChildren(); return more("/runs", add); }));
+}
+
+if ($("log")) {
+  const rows = [];
+  const add = (items) => {
+    rows.push(...items);
+    table($("log"), ["Time (UTC)", "Action", "Object", "User", "Details"], rows.map((one) => [one.time_utc, one.action, one.object_name, `${one.user} on ${one.host}`, JSON.stringify(one.details)]));
+  };
+  $("more").addEventListener("click", () => act(() => more("/log", add)));
+  on("hello", () => act(() => { next = null; rows.length = 0; return more("/log", add); }));
+}
+
+if ($("configuration")) {
+  const flat = (values, prefix = "") => Object.entries(values).flatMap(([key, value]) => (value !== null && typeof value === "object" && !Array.isArray(value) ? flat(value, `${prefix}${key}.`) : [[prefix + key, value === null ? "none" : JSON.stringify(value)]]));
+  on("hello", () => act(async () => table($("configuration"), ["Key", "Value"], flat(await request("GET", "/configuration")))));
+  on("me", () => { $("you").textContent = `${whoami().name}, may ${whoami().role === "operate" ? "operate the bench" : "watch"}.`; $("logout").hidden = whoami().name === "local"; });
+  $("logout").addEventListener("click", () => act(async () => { await request("POST", "/logout"); location.assign("/login"); }));
+}
+start();

@@ -1,0 +1,258 @@
+// What all pages share: requests, events, the state of the bench, the lease and STOP.
+
+export const API = "/api/v1";
+const CLIENT = (() => {
+  let id = sessionStorage.getItem("rig-client");
+  if (!id) {
+    id = Array.from(crypto.getRandomValues(new Uint8Array(12)), (b) => b.toString(16).padStart(2, "0")).join("");
+    sessionStorage.setItem("rig-client", id);
+  }
+  return id;
+})();
+
+export const $ = (id) => document.getElementById(id);
+
+/** Make an element: attributes as an object (on… are listeners), children as nodes or text. */
+export function h(tag, attributes = {}, ...children) {
+  const svg = ["svg", "path", "circle", "line", "text", "rect", "g"].includes(tag);
+  const element = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (value !== false && value !== null && value !== undefined) element.setAttribute(key, value === true ? "" : value);
+  }
+  element.append(...children.filter((child) => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+export class Problem extends Error {
+  constructor(values) {
+    super(values.detail || "The request failed.");
+    Object.assign(this, values);
+  }
+}
+
+/** Send a request; return its JSON. Errors have the fields of the server's problem. */
+export async function request(method, path, body) {
+  const headers = { "X-Rig-Client": CLIENT };
+  const options = { method, headers, credentials: "same-origin" };
+  if (body instanceof Blob) {
+    options.body = body;
+    headers["Content-Type"] = "application/zip";
+  } else if (body !== undefined) {
+    options.body = JSON.stringify(body);
+    headers["Content-Type"] = "application/json";
+  }
+  let answer;
+  try {
+    answer = await fetch(API + path, options);
+  } catch {
+    throw new Problem({ detail: "The server does not answer.", next_step: "Check that rig serve runs." });
+  }
+  if (answer.status === 401 && location.pathname !== "/login") location.assign("/login");
+  const text = await answer.text();
+  let values = {};
+  try {
+    values = text ? JSON.parse(text) : {};
+  } catch {
+    values = { detail: text };
+  }
+  if (!answer.ok) throw new Problem(values);
+  return values;
+}
+
+/** Show an error until the next action. */
+export function show(problem) {
+  const box = $("messages");
+  box.replaceChildren(h("p", {}, `${problem.message} ${problem.next_step || ""}`));
+  const mistakes = problem.evidence && problem.evidence.mistakes;
+  if (mistakes) box.append(h("p", {}, mistakes.join("; ")));
+  if (problem.code === 902) offerLease();
+}
+
+/** Run an action of the operator; show its error. */
+export async function act(action) {
+  $("messages").replaceChildren();
+  try {
+    return await action();
+  } catch (problem) {
+    show(problem);
+    return undefined;
+  }
+}
+
+export const submit = (values) => act(() => request("POST", "/jobs", values));
+
+// -- events -----------------------------------------------------------------------------------------------------------
+
+const listeners = {};
+export function on(kind, listener) {
+  (listeners[kind] ||= []).push(listener);
+}
+const tell = (kind, data) => (listeners[kind] || []).forEach((listener) => listener(data));
+
+/** Listen to the server. The browser reconnects by itself, and sends the last event id. */
+export function listen() {
+  const source = new EventSource(`${API}/events`);
+  for (const kind of ["plan", "job", "status", "lease", "stop"]) {
+    source.addEventListener(kind, (event) => tell(kind, JSON.parse(event.data)));
+  }
+  source.addEventListener("hello", (event) => tell("hello", JSON.parse(event.data)));
+  source.onerror = () => {
+    $("state").textContent = "No connection to the server. Trying again …";
+    $("state").className = "state bad";
+  };
+}
+
+// -- state, lease, STOP -------------------------------------------------------------------------------------------------
+
+let me = null;
+export const whoami = () => me;
+export const canOperate = () => me !== null && me.role === "operate";
+
+export function stateWords(status) {
+  if (!status.open) return [status.error ? `Bench not available: ${status.error.what} ${status.error.next_step}` : "Opening the bench …", "bad"];
+  if (status.fault) return [`Fault ${status.fault.code}: ${status.fault.what}`, "bad"];
+  if (status.doubt) return [`The table's angle is in doubt: ${status.doubt}`, "bad"];
+  const angle = status.table_deg === null || status.table_deg === undefined ? "" : `, table at ${status.table_deg.toFixed(1)}°`;
+  return [`${status.job ? "Working" : "Ready"}${angle}`, "good"];
+}
+
+on("status", (status) => {
+  const [words, kind] = stateWords(status);
+  $("state").textContent = words;
+  $("state").className = `state ${kind}`;
+});
+
+async function loadMe() {
+  me = await request("GET", "/me");
+  showLease(me.lease);
+  tell("me", me);
+}
+
+function showLease(lease) {
+  const mine = lease.client === CLIENT && lease.holder === me.name;
+  $("lease").textContent = mine ? `You operate (${me.name})` : lease.holder ? `${lease.holder} operates` : "No operator";
+  $("lease-button").hidden = !canOperate();
+  $("lease-button").textContent = mine ? "Give back" : "Operate";
+  $("lease-button").dataset.mine = mine ? "1" : "";
+}
+
+on("lease", (lease) => {
+  if (me === null) return;
+  showLease(lease);
+  if (lease.taken_from === `${me.name}/${CLIENT}`) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, next_step: "You can watch." }));
+  if (lease.asked_by && $("lease-button").dataset.mine) {
+    const to = lease.asked_by;
+    const give = h("button", { onclick: () => act(() => request("POST", "/lease/hand-over", to)) }, "Hand it over");
+    $("messages").replaceChildren(h("p", {}, `${to.name} asks for the bench. `, give));
+  }
+});
+
+function offerLease() {
+  $("lease-text").textContent = "Another operator uses the bench. Taking over does not stop a running job; the other operator sees a warning.";
+  const dialog = $("lease-dialog");
+  dialog.onclose = () => {
+    if (dialog.returnValue === "ask") act(() => request("POST", "/lease/ask"));
+    if (dialog.returnValue === "force") act(() => request("POST", "/lease", { force: true }));
+  };
+  dialog.show();
+}
+
+$("lease-button")?.addEventListener("click", () =>
+  act(() => ($("lease-button").dataset.mine ? request("DELETE", "/lease") : request("POST", "/lease", {}))),
+);
+setInterval(() => {
+  if ($("lease-button")?.dataset.mine) request("POST", "/lease", {}).catch(() => {});
+}, 15000);
+
+$("stop")?.addEventListener("click", async () => {
+  const answer = await act(() => request("POST", "/stop"));
+  if (answer) {
+    const words = answer.ended ? "Stopped. All jobs are cancelled." : "The stop is requested, but the job has not ended. If the table still moves, switch off its supply.";
+    $("messages").replaceChildren(h("p", {}, words));
+  }
+});
+
+// -- a job ---------------------------------------------------------------------------------------------------------------
+
+const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", doctor: "Check the bench", calibrate: "Calibrate", "dry-run": "Plan" };
+const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "Stop" };
+
+export function jobTitle(job) {
+  const request_ = job.request;
+  const what = request_.name || (request_.angle_deg !== undefined ? `to ${request_.angle_deg}°` : "");
+  return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
+}
+
+export function duration(seconds) {
+  const s = Math.round(seconds);
+  return s < 90 ? `${s} s` : `${Math.floor(s / 60)} min ${s % 60} s`;
+}
+
+/** Fill a box with a job: progress, question, buttons, outcome. */
+export function showJob(box, job) {
+  if (!job) return box.replaceChildren();
+  const post = (what, body) => () => act(() => request("POST", `/jobs/${job.id}/${what}`, body));
+  const parts = [h("p", {}, h("strong", {}, jobTitle(job)), ` – ${job.state}`)];
+  const ended = ["done", "failed", "cancelled", "interrupted"].includes(job.state);
+  if (job.progress && job.progress.total && !ended) {
+    const left = job.progress.seconds_left;
+    const words = `${job.progress.done} of ${job.progress.total}${left ? `, about ${duration(left)} left` : ""}`;
+    parts.push(h("progress", { max: job.progress.total, value: job.progress.done, "aria-label": words }), h("p", {}, words));
+  }
+  if (job.question) {
+    const buttons = job.question.choices.map((choice) => h("button", { class: choice === "continue" ? "big" : "quiet", onclick: post("answer", { choice }) }, CHOICES[choice]));
+    parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), h("div", { class: "row" }, ...buttons)));
+  }
+  if (!ended) {
+    parts.push(
+      h("div", { class: "row" },
+        job.state === "running" && h("button", { class: "quiet", onclick: post("pause") }, "Pause"),
+        job.state === "paused" && h("button", { onclick: post("resume") }, "Resume"),
+        h("button", { class: "quiet", onclick: post("cancel") }, "Cancel")),
+    );
+  }
+  if (job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
+  if (job.error) parts.push(h("p", { class: "badtext" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, `Next step: ${job.error.next_step}`));
+  if (job.resume) {
+    parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue"), job.command && h("code", {}, job.command)));
+  }
+  box.replaceChildren(...parts);
+  return undefined;
+}
+
+/** Follow the newest job of some kinds in a box; call `changed` with it. */
+export function followJobs(box, kinds, changed = () => {}) {
+  let shown = null;
+  const take = (job) => {
+    if (!kinds.includes(job.request.kind)) return;
+    if (shown && shown.id !== job.id && job.created_utc < shown.created_utc) return;
+    if (shown && shown.id !== job.id && job.state === "queued" && !["done", "failed", "cancelled", "interrupted"].includes(shown.state)) return;
+    shown = job;
+    showJob(box, job);
+    changed(job);
+  };
+  on("job", take);
+  const load = async () => {
+    const { items } = await request("GET", "/jobs");
+    const mine = items.filter((job) => kinds.includes(job.request.kind));
+    const active = mine.find((job) => ["running", "paused", "waiting"].includes(job.state)) || mine[0];
+    if (active) take(active);
+  };
+  on("hello", () => act(load));
+}
+
+export const thumb = (job, number, words) =>
+  h("li", {}, h("img", { src: `${API}/jobs/${job}/views/${number}`, alt: words, loading: "lazy" }), words);
+
+export function table(element, head, rows) {
+  element.replaceChildren(
+    h("thead", {}, h("tr", {}, ...head.map((text) => h("th", { scope: "col" }, text)))),
+    h("tbody", {}, ...rows.map((row) => h("tr", {}, ...row.map((cell) => h("td", {}, cell instanceof Node ? cell : String(cell ?? "")))))),
+  );
+}
+
+export async function start() {
+  on("hello", () => act(async () => { await loadMe(); tell("status", await request("GET", "/status")); }));
+  listen();
+}

@@ -1,0 +1,75 @@
+"""A server in this process: the real application and bench thread, on the simulated bench with its virtual clock."""
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra hbr-rig[web] is not installed")
+
+from fastapi.testclient import TestClient
+
+from rig.config import load_config
+from rig.core.clock import SystemClock
+from rig.web.access import Tokens
+from rig.web.api_catalog import UPLOAD
+from rig.web.app import create_app
+from rig.web.guard import Guard
+from rig.web.run import Listening, make_server
+from rig.web.server import Server
+
+ENDED = ("done", "failed", "cancelled", "interrupted")
+
+
+@dataclass
+class Served:
+    """A running server and a client."""
+
+    server: Server
+    client: TestClient
+    folder: Path
+
+    def run(self, **request: Any) -> dict[str, Any]:
+        """Submit a job, and return it when it has ended."""
+        answer = self.client.post("/api/v1/jobs", json=request)
+        assert answer.status_code == 201, answer.text
+        return self.wait(answer.json()["id"])
+
+    def wait(self, job_id: str, *states: str) -> dict[str, Any]:
+        """Return a job when it has one of the states; by default when it has ended."""
+        for _ in range(6000):
+            job = self.client.get(f"/api/v1/jobs/{job_id}").json()
+            if job["state"] in (states or ENDED):
+                return job
+            assert job["state"] not in ENDED, job
+            threading.Event().wait(0.01)
+        pytest.fail(f"the job is still {job['state']}")
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
+    """Return a function that starts a server: settings as ``KEY=VALUE``."""
+    running: list[tuple[Served, threading.Thread]] = []
+
+    def start(*settings: str, needs_login: bool = False) -> Served:
+        folders = [f"catalog.path='{tmp_path}/catalog'", f"state_dir='{tmp_path}/state'"]
+        config = load_config(None, [*folders, f"calibration_dir='{tmp_path}/cal'", *settings])
+        folder = config.state_path("sim") / "web"
+        listening = Listening("127.0.0.1", 0, (), None, None, needs_login, 2_000_000)
+        tokens = Tokens(folder, SystemClock())
+        server = make_server("sim", config, 1, ("--bench", "sim"), listening, tokens, SystemClock(), folder)
+        guard = Guard(create_app(server), hosts={"127.0.0.1"}, upload_path=UPLOAD, max_upload_bytes=2_000_000)
+        client = TestClient(guard, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
+        thread = threading.Thread(target=server.worker.run, daemon=True)
+        thread.start()
+        running.append((Served(server, client, tmp_path), thread))
+        return running[-1][0]
+
+    yield start
+    for served, thread in running:
+        served.server.worker.end()
+        thread.join(20)
+        assert not thread.is_alive()

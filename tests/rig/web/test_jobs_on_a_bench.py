@@ -1,0 +1,154 @@
+"""Jobs on the simulated bench through the REST API."""
+
+import json
+import threading
+
+import pytest
+
+from rig.catalog import Catalog
+from rig.core.clock import SystemClock
+
+
+def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
+    served = serve("bench.sim.object='mug-white'")
+    for name in ("mug-white", "lamp"):
+        job = served.run(kind="enroll", name=name, views=6, label="kitchen")
+        assert job["state"] == "done", job
+        assert (job["progress"]["done"], job["views"]) == (6, 6)
+    picture = served.client.get(f"/api/v1/jobs/{job['id']}/views/5")
+    assert picture.headers["content-type"] == "image/jpeg"
+    assert picture.content[:2] == b"\xff\xd8"
+    job = served.run(kind="identify")
+    assert job["result"]["outcome"] == "found"
+    assert job["result"]["name"] == "mug-white"
+    run = served.client.get(f"/api/v1/runs/{job['run']}").json()
+    assert run["events"][-1]["event"] == "identified"
+    assert "mug-white" in served.client.get(f"/api/v1/runs/{job['run']}/report").text
+    assert served.client.post(f"/api/v1/runs/{job['run']}/check").json()["differences"] == []
+
+
+def test_name_in_use_is_rejected_before_the_table_moves(serve):
+    served = serve()
+    assert served.run(kind="enroll", name="lamp", views=4)["state"] == "done"
+    angle_deg = served.client.get("/api/v1/status").json()["table_deg"]
+    job = served.run(kind="enroll", name="lamp", views=4)
+    assert (job["state"], job["error"]["code"], job["views"]) == ("failed", 200, 0)
+    assert served.client.get("/api/v1/status").json()["table_deg"] == angle_deg
+
+
+def test_paused_job_resumes_and_a_cancelled_one_can_be_continued(serve):
+    served = serve("bench.sim.speed=100")
+    job = served.client.post("/api/v1/jobs", json={"kind": "enroll", "name": "lamp", "views": 12}).json()
+    served.wait(job["id"], "running")
+    served.client.post(f"/api/v1/jobs/{job['id']}/pause")
+    paused = served.wait(job["id"], "paused")
+    assert 0 < paused["views"] < 12
+    served.client.post(f"/api/v1/jobs/{job['id']}/resume")
+    served.wait(job["id"], "running")
+    served.client.post(f"/api/v1/jobs/{job['id']}/cancel")
+    ended = served.wait(job["id"])
+    assert ended["state"] == "cancelled"
+    assert ended["command"] == "rig enroll lamp --resume --bench sim"
+    done = served.run(**ended["resume"])
+    assert done["state"] == "done"
+    assert ended["views"] + done["views"] == 12
+
+
+def test_tray_asks_for_each_object_and_skips_one(serve):
+    served = serve()
+    tray = {"kind": "tray", "objects": [{"name": "lamp", "views": 4}, {"name": "mug-star", "views": 4}]}
+    job = served.client.post("/api/v1/jobs", json=tray).json()
+    asked = served.wait(job["id"], "waiting")
+    assert "lamp" in asked["question"]["text"]
+    assert served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "restart"}).status_code == 409
+    served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "skip"})
+    while "mug-star" not in (served.wait(job["id"], "waiting")["question"] or {"text": ""})["text"]:
+        pass
+    served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "continue"})
+    assert served.wait(job["id"])["state"] == "done"
+    names = [one["name"] for one in served.client.get("/api/v1/objects").json()["items"]]
+    assert names == ["mug-star"]
+
+
+def test_stop_in_a_motion_stops_the_table_and_cancels_all_jobs(serve):
+    served = serve("bench.sim.speed=2")
+    first = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
+    second = served.client.post("/api/v1/jobs", json={"kind": "home"}).json()
+    while served.client.get("/api/v1/status").json().get("table_deg", 0.0) < 20.0:
+        pass
+    assert served.client.post("/api/v1/stop").json()["ended"]
+    assert served.wait(first["id"])["state"] == "cancelled"
+    assert served.wait(second["id"])["state"] == "cancelled"
+    assert served.client.get("/api/v1/status").json()["table_deg"] < 340.0
+    assert served.run(kind="home")["state"] == "done"
+
+
+def test_fault_is_latched_shown_and_acknowledged(serve):
+    served = serve("bench.sim.faults=['jam@move0+9s']")
+    job = served.run(kind="goto", angle_deg=180)
+    assert job["error"]["code"] in (504, 505, 509), job["error"]
+    status = served.client.get("/api/v1/status").json()
+    assert (status["state"], status["fault"]["code"]) == ("fault", job["error"]["code"])
+    assert served.run(kind="home")["error"]["code"] == 514
+    for _ in range(20):  # until the shaft is free again
+        assert served.run(kind="acknowledge")["state"] == "done"
+        if served.run(kind="home")["state"] == "done":
+            break
+    else:
+        pytest.fail("the table does not move")
+
+
+def test_dry_run_and_doctor_move_nothing(serve):
+    served = serve()
+    job = served.run(kind="dry-run", objects=[{"name": "lamp"}, {"name": "mug-star", "views": 8}])
+    assert [one["views"] for one in job["result"]["dry_run"]] == [72, 8]
+    job = served.run(kind="doctor")
+    assert {"servo", "camera"} <= {one["topic"] for one in job["result"]["findings"]}
+    assert served.client.get("/api/v1/objects").json()["total"] == 0
+
+
+def test_calibrations_are_offered_and_others_rejected(serve):
+    served = serve()
+    offered = served.client.get("/api/v1/calibrations").json()["available"]
+    assert set(offered) == {"servo", "imu", "camera", "table", "noise"}
+    assert served.run(kind="calibrate", name="nothing")["error"]["code"] == 200
+    assert served.run(kind="calibrate", name="noise")["error"]["code"] == 200
+
+
+@pytest.mark.nightly
+def test_calibration_runs_as_a_job(serve):
+    served = serve()
+    job = served.run(kind="calibrate", name="servo")
+    assert [one["name"] for one in job["result"]["calibrations"]] == ["servo.backlash", "servo.encoder", "servo.motion"]
+    history = served.client.get("/api/v1/calibrations").json()["history"]
+    assert {one["name"] for one in history} == {"servo.backlash", "servo.encoder", "servo.motion"}
+
+
+def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(serve, tmp_path):
+    served = serve()
+    assert served.run(kind="enroll", name="lamp", views=6)["state"] == "done"
+    # A kill -9 leaves the stored jobs as they were in the middle of the work.
+    file = tmp_path / "state" / "sim" / "web" / "jobs.json"
+    jobs = json.loads(file.read_text())
+    jobs[0] |= {"state": "running", "ended_utc": None, "result": None, "views": 3}
+    served.server.worker.end()
+    file.write_text(json.dumps(jobs))
+    again = serve()
+    (job,) = again.client.get("/api/v1/jobs").json()["items"]
+    assert job["state"] == "interrupted"
+    assert (job["resume"]["resume"], job["command"]) == (True, "rig enroll lamp --resume --bench sim")
+    with Catalog.open(tmp_path / "catalog", clock=SystemClock(), read_only=True) as catalog:
+        assert [one.views for one in catalog.objects()] == [6]
+
+
+def test_events_continue_after_the_last_one_that_was_received(serve):
+    served = serve()
+    start = served.server.hub.last_id
+    served.run(kind="enroll", name="lamp", views=4)
+    number, lost = served.server.hub.position(start)
+    messages, missing = served.server.hub.since(number)
+    accepted = [json.loads(one.data) for one in messages if one.kind == "plan" and '"accepted"' in one.data]
+    assert not lost
+    assert not missing
+    assert [one["picture"] for one in accepted] == [0, 1, 2, 3]
+    assert threading.active_count() < 50
