@@ -69,4 +69,4 @@ class bench_closed:  # noqa: N801 - a with block
         pass
 
     def __exit__(self, *_: object) -> None:
-        self._bench._torque_off()
+        self._bench.servo.torque_off()
