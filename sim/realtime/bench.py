@@ -11,13 +11,13 @@ from rig.bench import BenchKind
 from rig.bench.computer import Computer
 from rig.bench.hardware import HardwareBench
 from rig.config import RigConfig, Section
-from rig.core.errors import DeviceNotFound
+from rig.core.errors import ConfigError, DeviceNotFound
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.opencv_capture import Capture
 from rig.safety.saved_state import holder
 from sim.camera import CAMERA_DEVICE
 from sim.realtime.client import RemoteCapture, RemoteI2c
-from sim.realtime.wire import COMPUTER, DEFAULT_FOLDER, not_running
+from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, not_running
 
 
 class SimBenchOptions(Section):
@@ -76,11 +76,26 @@ class RunningSimBench(HardwareBench):
 
     @contextmanager
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:  # noqa: ARG002
-        """Yield the computer of the simulated bench. Raises `DeviceNotFound` if the bench is not running."""
+        """Yield the computer of the simulated bench.
+
+        Raises
+        ------
+        DeviceNotFound
+            The bench is not running.
+        ConfigError
+            The configuration is not the one in the bench's folder. It could name the port of a real servo.
+        """
         assert isinstance(options, SimBenchOptions)
-        if holder(options.folder) is None:
-            raise not_running(options.folder)
-        computer = SimBenchComputer(options.folder, config)
+        folder = options.folder.absolute()
+        if holder(folder) is None:
+            raise not_running(folder)
+        if (config.servo.port, config.state_dir) != (str(folder / SERVO), folder / STATE):
+            raise ConfigError(
+                f"This configuration does not belong to the simulated bench in {folder}.",
+                next_step=f"Run the command in that folder, or with --config {folder / CONFIG}.",
+                evidence={"servo.port": config.servo.port, "state_dir": config.state_dir},
+            )
+        computer = SimBenchComputer(folder, config)
         try:
             yield computer
         finally:

@@ -52,6 +52,7 @@ class RemoteCapture:
         return bool(self._ask("set", property=propId, value=value)[0].get("ok"))
 
     def release(self) -> None:
+        self._ask("release")  # when it has returned, another program can open the camera
         self._wire.close()
 
     def _ask(self, call: str, **values: Any) -> tuple[dict[str, Any], bytes]:

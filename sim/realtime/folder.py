@@ -16,7 +16,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, UsageError, os_errors_as
 from rig.safety.saved_state import BenchLock, holder
 from sim.bench import SimOptions
-from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, HEAD, SERVO, SOCKET
+from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, HEAD, SERVO, SOCKET, STATE
 
 LOCK = "lock"
 
@@ -82,7 +82,7 @@ def configure(folder: Path, settings: Settings) -> tuple[RigConfig, SimOptions]:
         changes["bench", "sim", "objects"] = str(Path(objects).absolute())
     changes |= {
         ("default_bench",): "sim-bench",
-        ("state_dir",): str(folder / "state"),
+        ("state_dir",): str(folder / STATE),
         ("calibration_dir",): str(folder / "calibration"),
         ("catalog", "path"): str(folder / "catalog"),
         ("servo", "port"): str(folder / SERVO),

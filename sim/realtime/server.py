@@ -62,7 +62,7 @@ class Session:
         raise NotARequest
 
     def close(self) -> None:
-        """End what the connection has open."""
+        """Close the camera if the connection has it open."""
         with self._time.present():
             if self._bench.camera_user is self:
                 self._bench.camera_user = None
@@ -83,6 +83,9 @@ class Session:
         camera = self._devices.camera
         if call == "grab":
             return {"ok": self._grab()}, b""
+        if call == "release":
+            self.close()
+            return {"ok": True}, b""
         with self._time.present():
             match call, rest:
                 case "isOpened", {}:

@@ -15,8 +15,8 @@ from typing import Any, Final
 from rig.core.errors import DeviceNotFound, UsageError
 
 DEFAULT_FOLDER: Final = Path("sim-bench")
-SOCKET, SERVO, HEAD, COMPUTER, CONFIG = "socket", "servo", "head", "computer", "rig.toml"
-"""Names in the folder of a simulated bench: its socket, its ports, the files of its computer, its configuration."""
+SOCKET, SERVO, HEAD, COMPUTER, CONFIG, STATE = "socket", "servo", "head", "computer", "rig.toml", "state"
+"""Names in the folder of a simulated bench: socket, ports, files of its computer, configuration, the bench's state."""
 PATIENCE_S: Final = 15.0
 """How long an answer may take. A camera that hangs takes longest: OpenCV waits 10 s for a frame."""
 

@@ -69,7 +69,7 @@ def process(*words: str, cwd: Path) -> subprocess.Popen[str]:
         [sys.executable, "-c", START, *words],
         cwd=cwd,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "500"},
-        stdin=subprocess.DEVNULL,
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -86,6 +86,10 @@ def test_trainee_sees_what_the_page_says(in_depth, tmp_path, monkeypatch):
     try:
         assert bench.stdout is not None
         first.check("".join(bench.stdout.readline() for _ in range(3)))
+        bench.stdin.write("put\nclear\n")
+        bench.stdin.flush()
+        said = [bench.stdout.readline() for _ in range(2)]
+        assert said == ["'put' does not take 0 words. Write: put NAME [DEGREES]\n", "The table is empty.\n"]
         monkeypatch.chdir(folder)
         monkeypatch.setenv("COLUMNS", "500")
         walked = [typed for typed in rest if in_depth or typed.section not in IN_DEPTH]
@@ -104,9 +108,11 @@ def test_trainee_sees_what_the_page_says(in_depth, tmp_path, monkeypatch):
                 typed.check(CliRunner().invoke(app, words).output)
         for typed, other in others:
             typed.check(other.communicate(timeout=PATIENCE_S)[0])
-        bench.send_signal(signal.SIGINT)
-        assert bench.communicate(timeout=PATIENCE_S)[0].endswith("The simulated bench has ended.\n")
-        assert bench.returncode == 0
+        bench.send_signal(signal.SIGTERM if in_depth else signal.SIGINT)
+        said = bench.communicate(timeout=PATIENCE_S)[0]
+        assert "Traceback" not in said
+        assert in_depth or said.endswith("The simulated bench has ended.\n")
+        assert bench.returncode == (143 if in_depth else 0)
         assert {path.name for path in folder.iterdir()} <= {"lock", "rig.toml", "state", "catalog", "calibration"}
     finally:
         for other in (bench, *(other for _, other in others)):

@@ -15,10 +15,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
+from rig.bench import open_bench
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import BenchBusy, DeviceNotFound, UsageError
+from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, UsageError
 from rig.core.files import json_values
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
@@ -142,6 +143,14 @@ def test_default_folder_is_the_first_that_is_not_in_use(start, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     run_bench(Settings(), None, 0.0)
     assert str(tmp_path / "sim-bench-2") in capsys.readouterr().out
+
+
+def test_configuration_of_another_bench_is_rejected(start, tmp_path):
+    """It could name the port of a real servo."""
+    folder = start()
+    with pytest.raises(ConfigError, match="does not belong") as error:
+        open_bench("sim-bench", load_config(None, [f"bench.sim-bench.folder='{folder}'", "servo.port=/dev/ttyUSB0"]))
+    assert f"--config {folder / 'rig.toml'}" in error.value.next_step
 
 
 # -- its ports --------------------------------------------------------------------------------------------------------
