@@ -6,6 +6,8 @@ READY  := .venv/.ready
 # With several threads small matrix products wait for each other; one is faster here.
 export OPENBLAS_NUM_THREADS ?= 1
 
+LIBRARY := hbr/kernels/_kernels.so
+
 .PHONY: demo web test test-nightly test-kills fuzz lint docs wheel bench lock clean help
 
 help:
@@ -21,25 +23,25 @@ help:
 	@echo "make bench  speed, as ratios against named peers"
 	@echo "make clean  remove what the others made"
 
-demo: $(READY)
+demo: $(READY) $(LIBRARY)
 	@$(BIN)/rig demo
 
-web: $(READY)
+web: $(READY) $(LIBRARY)
 	@$(BIN)/rig serve --bench sim
 
-test: $(READY)
+test: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs
 
 # The empty -m selects the tests marked nightly, too.
-test-nightly: $(READY)
+test-nightly: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly
 
 # A hundred kills of the program at different points of eleven kinds of work; a thousand with KILLS=90.
 KILLS ?= 8
-test-kills: $(READY)
+test-kills: $(READY) $(LIBRARY)
 	@RIG_TEST_KILLS=$(KILLS) $(BIN)/python -m pytest -n auto --dist worksteal --timeout 3600 tests/faults/test_kill*.py
 
-fuzz: $(READY)
+fuzz: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly tests/fuzz
 
 lint: $(READY)
@@ -56,7 +58,7 @@ docs: $(READY)
 wheel: $(READY)
 	@sh .ci/wheel
 
-bench: $(READY)
+bench: $(READY) $(LIBRARY)
 	@for file in benchmarks/bench_*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
 
 # Locked versions with their hashes, for every platform and Python that the project supports (docs/decisions/0006).
@@ -70,6 +72,10 @@ $(READY): requirements.lock pyproject.toml
 	@sh .ci/setup "$(PYTHON)"
 	@touch $@
 
+# Compiled kernels, if there is a C compiler; NumPy does their work without (docs/decisions/0040).
+$(LIBRARY): $(wildcard hbr/kernels/*.c hbr/kernels/*.h) | $(READY)
+	@$(BIN)/python hbr/kernels/compile.py
+
 clean:
-	rm -rf .venv .tools rig-demo site dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(LIBRARY) .venv .tools rig-demo site dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -14,6 +14,7 @@ Decision: docs/decisions/0025.
 
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -21,7 +22,9 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.core.segments import lengths, ranges
 from hbr.descriptors import descriptor
+from hbr.kernels import calls
 from hbr.model.views import Views
 
 #: As for `Belief.posterior`: fits the similarities of the bench's own descriptor.
@@ -65,23 +68,12 @@ class DenseIndex:
         self.views = views
         self.omega = omega
         self.power = power
-        self.object_index: IndexArray = np.unique(views.object_index)
+        self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
         self.compared = descriptor(views.descriptor).prepared(views.descriptors)
-        rows, begin = views.of_each(self.object_index)
-        count = np.diff(begin, append=len(rows))
-        inside = np.arange(count.max()) < count[:, None]
-        rows = rows[np.lexsort((views.azimuth_deg[rows], np.repeat(np.arange(len(count)), count)))]
-        #: Rows of each object's views by rising azimuth, padded by the first of them.
-        self.rows = np.repeat(rows[begin][:, None], count.max(), axis=1)
-        self.rows[inside] = rows
-        #: Where `rows` is padding, or a view that was left out.
-        self.left_out = ~inside
-        self.azimuth_deg: FloatArray = views.azimuth_deg[self.rows]
-        #: The usual spacing of each object's views.
-        self.spacing_deg: FloatArray = np.array(
-            [_spacing(own[ok]) for own, ok in zip(self.azimuth_deg, inside, strict=True)]
-        )
-        self._arrange()
+        order, begin = views.of_each(self.object_index)
+        count = lengths(begin, len(order))
+        order = order[np.lexsort((views.azimuth_deg[order], np.repeat(np.arange(len(count)), count)))]
+        self._set_segments(order, begin, count)
 
     def __len__(self) -> int:
         return len(self.object_index)
@@ -89,27 +81,66 @@ class DenseIndex:
     def without(self, views: IndexArray) -> "DenseIndex":
         """Return an index that leaves out some views; each object must keep at least one."""
         fewer = copy(self)
-        fewer.left_out = self.left_out | np.isin(self.rows, views)
-        if fewer.left_out.all(axis=1).any():
+        kept = ~np.isin(self._order, views)
+        count = np.add.reduceat(kept, self._begin)
+        if not count.all():
             raise ValueError("an object would be left without any view; leave out fewer")
-        fewer._arrange()
+        fewer._set_segments(self._order[kept], np.cumsum(count) - count, count)
         return fewer
 
     def only(self, places: IndexArray) -> "DenseIndex":
         """Return an index of some objects alone, whose later steps do not look at the others."""
         fewer = copy(self)
-        rows = np.unique(self.rows[places])
+        own, begin = ranges(self._begin[places], self._count[places])
+        rows = np.sort(self._order[own])
         fewer.views = self.views.select(rows)
         fewer.compared = self.compared.only(rows)
         fewer.object_index = self.object_index[places]
-        fewer.rows = np.searchsorted(rows, self.rows[places])
-        fewer.left_out, fewer.azimuth_deg = self.left_out[places], self.azimuth_deg[places]
-        fewer.spacing_deg = self.spacing_deg[places]
-        fewer._arrange()
+        fewer._set_segments(np.searchsorted(rows, self._order[own]), begin, self._count[places])
         return fewer
 
-    def _arrange(self) -> None:
-        """Lay two turns of every object's views out in rows, each with the arc on which it is the nearest.
+    def _set_segments(self, order: IndexArray, begin: IndexArray, count: IndexArray) -> None:
+        """Set the views of each object: ``count`` of the rows ``order`` from ``begin`` on, by rising azimuth."""
+        self._order, self._begin, self._count = order, begin, count
+        for name in ("rows", "left_out", "azimuth_deg", "spacing_deg", "_ring"):
+            self.__dict__.pop(name, None)  # those of the index that this one was copied from
+
+    @cached_property
+    def rows(self) -> IndexArray:
+        """Rows of each object's views by rising azimuth, padded by the first of them."""
+        columns = np.arange(self._count.max())
+        rows: IndexArray = self._order[self._begin[:, None] + np.where(columns < self._count[:, None], columns, 0)]
+        return rows
+
+    @cached_property
+    def left_out(self) -> NDArray[np.bool_]:
+        """Where `rows` is padding."""
+        padding: NDArray[np.bool_] = np.arange(self._count.max()) >= self._count[:, None]
+        return padding
+
+    @cached_property
+    def azimuth_deg(self) -> FloatArray:
+        """Azimuths of `rows`."""
+        return self.views.azimuth_deg[self.rows]
+
+    @cached_property
+    def spacing_deg(self) -> FloatArray:
+        """The usual step between neighbouring views of each object; 360 of a single one."""
+        spacing_deg = np.empty(len(self))
+        for count in np.unique(self._count).tolist():  # of objects with as many views
+            ring_deg = self.azimuth_deg[self._count == count, :count]
+            steps_deg = np.diff(ring_deg, axis=1, append=ring_deg[:, :1] + 360)
+            spacing_deg[self._count == count] = np.median(steps_deg, axis=1)
+        return spacing_deg
+
+    def best(self, similar: FloatArray) -> FloatArray:
+        """Return the largest similarity of each object's views, (k,), of those of all views, (n,)."""
+        best: FloatArray = np.maximum.reduceat(similar[self._order], self._begin)
+        return best
+
+    @cached_property
+    def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:
+        """Two turns of every object's views in rows, where their arcs end, and the penalty there.
 
         From half a turn before 0 on: a copy of each view is within half a turn of any azimuth.
         """
@@ -118,16 +149,15 @@ class DenseIndex:
         unrolled_deg = np.concatenate([first_deg, first_deg + 360], axis=1)
         places = np.argsort(unrolled_deg, axis=1, kind="stable")
         ring_deg = np.take_along_axis(unrolled_deg, places, axis=1)
-        with np.errstate(invalid="ignore"):  # what was left out stands at infinity, behind all others
+        with np.errstate(invalid="ignore"):  # padding stands at infinity, behind all views
             middle_deg = (ring_deg[:, 1:] + ring_deg[:, :-1]) / 2
-        count = 2 * (~self.left_out).sum(axis=1)
-        own = np.arange(places.shape[1]) < count[:, None]
-        #: The view at each place of the two turns; behind them one beyond all.
-        self._ring = np.where(own, np.take_along_axis(self.rows, places % self.rows.shape[1], axis=1), len(self.views))
-        #: Where the arc of each view ends and the next one's begins; far away behind the last.
+        own = np.arange(places.shape[1]) < 2 * self._count[:, None]
+        # the view at each place of the two turns; behind them one beyond all
+        ring = np.where(own, np.take_along_axis(self.rows, places % self.rows.shape[1], axis=1), len(self.views))
+        # where the arc of each view ends and the next one's begins; far away behind the last
         ends_deg = np.where(own[:, 1:], middle_deg, _FAR_DEG)
-        self._keys = (ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
-        self._penalty = (ends_deg * (self.omega / 360)).astype(np.float32)
+        keys = (ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
+        return ring, keys, (ends_deg * (self.omega / 360)).astype(np.float32)
 
     def support(self, similar: FloatArray, turned_deg: float) -> Floats:
         """Return what one query adds to every hypothesis.
@@ -145,13 +175,21 @@ class DenseIndex:
             For azimuths 0, 5, 10, ... at the first query.
         """
         whole, part_deg = divmod(turned_deg % 360.0, _BIN_DEG)
+        levels = self._raised(similar)
+        slope = self.omega / 360
+        azimuth_deg = self.views.azimuth_deg
+        compiled = calls.support(
+            self._order, self._begin, self._count, azimuth_deg, levels, slope, part_deg, int(whole)
+        )
+        if compiled is not None:
+            return compiled
+        ring, keys, penalty = self._ring
         seen_deg = part_deg + np.arange(BINS) * _BIN_DEG  # in this order the search below is quicker
-        slope_at = (seen_deg * (self.omega / 360)).astype(np.float32)
-        levels = np.append(np.maximum(similar, 0) ** self.power, -np.inf).astype(np.float32)
-        own, penalty = levels[self._ring], self._penalty
+        slope_at = (seen_deg * slope).astype(np.float32)
+        own = np.append(levels, np.float32(-np.inf))[ring]
         place = np.arange(len(self))[:, None]
         # the view on whose arc the azimuth lies, among all objects' rows
-        nearest = np.searchsorted(self._keys, seen_deg + 2 * _FAR_DEG * place) + place
+        nearest = np.searchsorted(keys, seen_deg + 2 * _FAR_DEG * place) + place
         # of the views before and behind a running maximum knows the best: the penalty is a straight line from its arc
         before, behind = np.full((2, *own.shape), -np.inf, np.float32)
         np.maximum.accumulate(own[:, :-1] + penalty, axis=1, out=before[:, 1:])
@@ -159,6 +197,12 @@ class DenseIndex:
         best: Floats = np.maximum(before.ravel()[nearest] - slope_at, behind.ravel()[nearest] + slope_at)
         np.maximum(best, own.ravel()[nearest], out=best)
         return np.roll(best, -int(whole), axis=1)
+
+    def _raised(self, similar: FloatArray) -> Floats:
+        """Return the similarities to the power p; for 4 by products, which are the same on every computer."""
+        similar = np.maximum(similar, 0)
+        raised: FloatArray = np.square(np.square(similar)) if self.power == 4 else similar**self.power
+        return raised.astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,8 +335,7 @@ def update_belief(
         support = so_far.support + index.support(similar, turned_deg)
         return Belief(index, support, np.append(so_far.orientation_deg, orientation_deg))
     if len(index) > kept:
-        best = np.where(index.left_out, -np.inf, similar[index.rows]).max(axis=1)
-        index = index.only(np.sort(np.argsort(-best, kind="stable")[:kept]))
+        index = index.only(np.sort(np.argsort(-index.best(similar), kind="stable")[:kept]))
         similar = index.compared.similarity(query[None])[0]
     return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64))
 
@@ -304,9 +347,3 @@ def _between(support: FloatArray, bins: FloatArray) -> FloatArray:
     at = low.astype(int)
     value: FloatArray = support[rows, at % BINS] * (1 - share) + support[rows, (at + 1) % BINS] * share
     return value
-
-
-def _spacing(azimuth_deg: FloatArray) -> float:
-    """The usual step between neighbouring views; 360 of a single one."""
-    ring = np.sort(azimuth_deg)
-    return float(np.median(np.diff(ring, append=ring[0] + 360)))

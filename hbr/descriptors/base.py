@@ -5,6 +5,8 @@ from typing import Protocol
 import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.kernels import library
+from hbr.kernels.calls import Measure, PackedRows
 from hbr.segmentation import Segmentation
 
 
@@ -75,13 +77,23 @@ class Descriptor(Protocol):
         """
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
-        """Prepare rows, uint8 (m, length), for comparison with many queries; takes several times their memory.
+        """Prepare rows, uint8 (m, length), for comparison with many queries.
 
         Raises
         ------
         TypeError, ValueError
             The rows are no levels of this descriptor.
         """
+
+    def opened(self, packed: LevelArray, /) -> Comparison:
+        """Prepare packed rows, uint8 (m, size_bytes), for comparison with many queries.
+
+        Raises
+        ------
+        ValueError
+            The rows have another size.
+        """
+        return self.prepared(self.unpack_rows(packed.tobytes()))
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         """Return the similarity of every row of `a`, (n, length), to every row of `b`, (m, length).
@@ -108,7 +120,18 @@ class Descriptor(Protocol):
             They are no levels of this descriptor.
         """
         self.check_rows(levels)
-        return levels.tobytes()
+        return self.pack_rows(levels[None]).tobytes()
+
+    def pack_rows(self, rows: LevelArray) -> LevelArray:
+        """Return the packed levels of many views, (n, length), as rows of bytes, uint8 (n, size_bytes).
+
+        Raises
+        ------
+        ValueError
+            A level is too large.
+        """
+        self.check_levels(rows)
+        return rows
 
     def unpack(self, packed: bytes) -> LevelArray:
         """Return the levels of one packed view, uint8 (length,); the inverse of `pack`.
@@ -173,3 +196,43 @@ class Descriptor(Protocol):
             raise ValueError(
                 f"a level of {rows.max()}; {self.name} has levels 0..{self.max_level}, unpack packed descriptors first"
             )
+
+
+class CompiledDescriptor(Descriptor):
+    """A descriptor whose packed rows the compiled kernels compare where they lie, without a copy.
+
+    A class that inherits from this one implements `compared` and `measure` instead of `prepared`.
+    """
+
+    def compared(self, rows: LevelArray, /) -> Comparison:
+        """Prepare rows, uint8 (m, length), for comparison in NumPy; takes several times their memory."""
+
+    def measure(self) -> Measure | None:
+        """Return how the kernels compare packed rows, with the same result; None if they cannot."""
+
+    def prepared(self, rows: LevelArray, /) -> Comparison:
+        self.check_rows(rows)
+        measure = None if library() is None else self.measure()
+        return self.compared(rows) if measure is None else Packed(self, PackedRows(measure, self.pack_rows(rows)))
+
+    def opened(self, packed: LevelArray, /) -> Comparison:
+        measure = None if library() is None else self.measure()
+        if measure is None or packed.shape[1:] != (self.size_bytes,):
+            return super().opened(packed)
+        return Packed(self, PackedRows(measure, packed))
+
+
+class Packed:
+    """Packed rows, compared by the compiled kernels."""
+
+    def __init__(self, kind: Descriptor, rows: PackedRows) -> None:
+        self._kind, self._rows = kind, rows
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        return self._rows.similarity(self._kind.pack_rows(queries))
+
+    def only(self, rows: IndexArray, /) -> "Packed":
+        return Packed(self._kind, self._rows.only(rows))
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        return self._rows.among(rows)

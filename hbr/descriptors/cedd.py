@@ -15,6 +15,7 @@ import numpy as np
 from hbr.core.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray
 from hbr.core.validation import check_image
 from hbr.descriptors.cedd_tables import HUE_WEIGHT, REPRESENTATIVES, SATURATION, VALUE, VOTE_BINS
+from hbr.kernels import calls
 
 #: Bins of the descriptor: 6 texture classes of 24 colours, bin = 24 * texture + colour.
 BINS: Final = 144
@@ -32,6 +33,14 @@ _GREYS: Final = (0.114 * np.arange(256) + 0.587 * np.arange(256)) + 0.299 * np.a
 _SQRT2: Final = np.sqrt(2.0)
 #: Non-directional, horizontal and vertical edge, of the quarters a, b, c, d.
 _FILTERS: Final = np.array([[2.0, -2.0, -2.0, 2.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
+#: For the kernel: the rules padded to the width of vectors, and the first bins of the two colours of each hue.
+_TABLES: Final = calls.Addresses(
+    HUE_WEIGHT,
+    np.ascontiguousarray(VOTE_BINS[:360, 3::3].T, np.int64),
+    np.pad(SATURATION, ((0, 0), (0, 2))),
+    np.pad(VALUE, ((0, 0), (0, 2))),
+    REPRESENTATIVES,
+)
 
 
 def cedd(image_bgr: ImageArray) -> LevelArray:
@@ -56,10 +65,13 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
         The image is not a uint8 array of shape (H, W, 3).
     """
     check_image(image_bgr)
-    image = np.ascontiguousarray(image_bgr)
-    grid = _grid(*image.shape[:2])
+    grid = _grid(*image_bgr.shape[:2])
     if 0 in grid[:2]:
         return np.zeros(BINS, np.uint8)
+    compiled = calls.cedd(image_bgr, grid, _TABLES)
+    if compiled is not None:
+        return compiled
+    image = np.ascontiguousarray(image_bgr)
     row_sums = _row_sums(image, grid)
     textures, blocks = _texture_votes(_areas(image, _luminance(row_sums, grid), grid))
     hue, outputs = _colour_outputs(_block_colours(row_sums, grid))

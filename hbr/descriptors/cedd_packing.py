@@ -38,8 +38,13 @@ def pack(levels: LevelArray) -> bytes:
         raise ValueError(
             f"the levels span {levels.min()}..{levels.max()}, not 0..7; pass a descriptor, not a histogram"
         )
-    bits = np.unpackbits(levels.astype(np.uint8)[:, None], axis=1)[:, -BITS:]
-    return np.packbits(bits).tobytes()
+    return pack_rows(levels.astype(np.uint8)[None]).tobytes()
+
+
+def pack_rows(levels: LevelArray) -> LevelArray:
+    """Return packed descriptors, uint8 (n, 54), of levels 0..7, uint8 (n, 144)."""
+    bits = np.unpackbits(levels.reshape(len(levels), BINS, 1), axis=2)[:, :, -BITS:]
+    return np.packbits(bits.reshape(len(levels), BITS * BINS), axis=1)
 
 
 def unpack(packed: bytes) -> LevelArray:

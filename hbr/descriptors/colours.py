@@ -4,6 +4,7 @@ Decision: docs/decisions/0023.
 """
 
 from dataclasses import dataclass
+from math import exp
 from typing import Final
 
 import cv2
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.descriptors.base import Descriptor
+from hbr.descriptors.base import CompiledDescriptor
+from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
 _CELLS: Final = 8
@@ -28,6 +30,14 @@ _OPPONENT: Final = np.array([[1 / 3, 0.0, 1.0], [1 / 3, -1.0, -0.5], [1 / 3, 1.0
 _STEP: Final = np.repeat([0.04, 0.03, 0.03], _KEPT)
 #: Distance at which the similarity is exp(-1/2).
 _WIDTH: Final = 2.5
+#: Weights of squared differences of levels: squared distances are whole numbers of 1/10,000.
+_WEIGHTS: Final = np.rint(_STEP**2 * 10_000).astype(np.int32)
+#: The kernel at squared distances 4096 i, and at i below 4096. Their product is the kernel at the sum of both, the same
+#: on every computer.
+_NEAR_ENTRIES: Final = 4096
+_LARGEST: Final = int(_WEIGHTS.sum()) * 255**2
+_FAR: Final = np.array([exp(-i * _NEAR_ENTRIES / (20_000 * _WIDTH**2)) for i in range(_LARGEST // _NEAR_ENTRIES + 1)])
+_NEAR: Final = np.array([exp(-i / (20_000 * _WIDTH**2)) for i in range(_NEAR_ENTRIES)])
 #: Cells of which the object covers less are left out.
 _MIN_COVERED: Final = 0.1
 
@@ -44,7 +54,7 @@ _ZIGZAG: Final = [_zigzag(kept) for kept in _KEPT]
 
 
 @dataclass(frozen=True)
-class Colours(Descriptor):
+class Colours(CompiledDescriptor):
     """Low-frequency cosine coefficients of brightness and two opponent colours, compared by a Gaussian kernel.
 
     After the colour layout of MPEG-7 (ISO/IEC 15938-3): the mean colours of 8 x 8 cells and the first coefficients of
@@ -64,32 +74,40 @@ class Colours(Descriptor):
         levels: FloatArray = np.clip(steps + 128, 0, 255)
         return levels.astype(np.uint8)
 
-    def prepared(self, rows: LevelArray, /) -> "_Kernel":
-        self.check_rows(rows)
-        return _Kernel(rows * _STEP)
+    def compared(self, rows: LevelArray, /) -> "_Kernel":
+        return _Kernel(rows.astype(np.float64))
+
+    def measure(self) -> Measure:
+        return Measure(colours_at=0, colour_weights=_WEIGHTS, far=_FAR, near=_NEAR)
 
 
 class _Kernel:
     def __init__(self, rows: FloatArray) -> None:
         self._rows = rows
-        self._squares = np.einsum("ij,ij->i", rows, rows)
+        self._squares = _squares(rows)
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
-        own = queries * _STEP
-        apart = np.einsum("ij,ij->i", own, own)[:, None] + self._squares - 2 * own @ self._rows.T
-        return _kernel(apart)
+        own = queries.astype(np.float64)
+        return _kernel(_squares(own)[:, None] + self._squares - 2 * (own * _WEIGHTS) @ self._rows.T)
 
     def only(self, rows: IndexArray, /) -> "_Kernel":
         return _Kernel(self._rows[rows])
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         part, squares = self._rows[rows], self._squares[rows]
-        return _kernel(squares[:, :, None] + squares[:, None, :] - 2 * part @ part.transpose(0, 2, 1))
+        dots = (part * _WEIGHTS) @ part.transpose(0, 2, 1)
+        return _kernel(squares[:, :, None] + squares[:, None, :] - 2 * dots)
+
+
+def _squares(rows: FloatArray) -> FloatArray:
+    squares: FloatArray = (rows * rows) @ _WEIGHTS.astype(np.float64)
+    return squares
 
 
 def _kernel(squares: FloatArray) -> FloatArray:
-    """Return the kernel at these squared distances."""
-    similar: FloatArray = np.exp(np.maximum(squares, 0) / (-2 * _WIDTH**2))
+    """Return the kernel at these squared distances, whole numbers of 1/10,000."""
+    far, near = np.divmod(squares.astype(np.intp), _NEAR_ENTRIES)
+    similar: FloatArray = _FAR[far] * _NEAR[near]
     return similar
 
 

@@ -12,6 +12,8 @@ Rows = NDArray[np.float32]
 
 #: Products are added up in blocks of this many columns.
 _BLOCK: Final = 64
+#: Into so much and the rest the values of a query are split: 64 products of 4095 and 63 are below 2**24.
+_UNIT: Final = 64.0
 #: Rows that are converted to float at once.
 _CHUNK: Final = 256
 #: Cosines that are computed at once, so that they stay in the processor's cache between blocks.
@@ -67,8 +69,73 @@ class Cosine:
         return similar
 
 
+class WholeCosine:
+    """A `Comparison` of rows of whole numbers, exact up to the division by the lengths: the same on every computer.
+
+    The products are added up in float32, in blocks of columns whose sums are below 2**24. For that, the values of a
+    query are split into two parts, of 64 and of 1.
+
+    Parameters
+    ----------
+    values : int32 array (levels,)
+        Value of each level, at most 4095.
+    blocks : float32 array (blocks, n, 64)
+        Values of the rows.
+    squares : float64 array (n,)
+        Squared lengths of the rows.
+    """
+
+    def __init__(self, values: NDArray[np.int32], blocks: Rows, squares: FloatArray) -> None:
+        self._values, self._blocks, self._squares = values, blocks, squares
+
+    @classmethod
+    def of(cls, rows: LevelArray, values: NDArray[np.int32]) -> "WholeCosine":
+        """Prepare rows of levels, uint8 (n, length)."""
+        table = values.astype(np.float32)
+        return cls(values, _blocks(rows, table.take), _whole_squares(rows, values))
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        parts = [_blocks(queries, part.take) for part in _split(self._values.astype(np.float32))]
+        dots = np.zeros((len(queries), self._blocks.shape[1]))
+        for rows, *own in zip(self._blocks, *parts, strict=True):
+            for query, unit in zip(own, (_UNIT, 1.0), strict=True):
+                dots += unit * (query @ rows.T).astype(np.float64)
+        return _cosine(dots, _whole_squares(queries, self._values)[:, None], self._squares)
+
+    def only(self, rows: IndexArray, /) -> "WholeCosine":
+        return WholeCosine(self._values, np.take(self._blocks, rows, axis=1), self._squares[rows])
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        dots = np.zeros((*rows.shape, rows.shape[-1]))
+        for block in self._blocks:
+            columns = block[rows].transpose(0, 2, 1)
+            for query, unit in zip(_split(block[rows]), (_UNIT, 1.0), strict=True):
+                dots += unit * (query @ columns).astype(np.float64)
+        lengths = self._squares[rows]
+        return _cosine(dots, lengths[:, :, None], lengths[:, None, :])
+
+
+def _split(values: Rows) -> tuple[Rows, Rows]:
+    """Return values as multiples of 64, and the rest."""
+    high = np.floor(values / np.float32(_UNIT))
+    return high, values - np.float32(_UNIT) * high
+
+
+def _whole_squares(rows: LevelArray, values: NDArray[np.int32]) -> FloatArray:
+    squares = np.empty(len(rows))
+    table = values.astype(np.float64) ** 2
+    for start in range(0, len(rows), _CHUNK):
+        squares[start : start + _CHUNK] = table[rows[start : start + _CHUNK]].sum(axis=1)
+    return squares
+
+
+def _cosine(dots: FloatArray, squares_a: FloatArray, squares_b: FloatArray) -> FloatArray:
+    similar: FloatArray = np.minimum(dots / np.sqrt(squares_a * squares_b), 1)
+    return similar
+
+
 def _blocks(rows: LevelArray, to_unit: Callable[[LevelArray], Rows]) -> Rows:
-    """Return rows of unit length in blocks of columns; the last one is filled with zeros."""
+    """Return what rows become, in blocks of columns; the last one is filled with zeros."""
     length = rows.shape[1]
     blocks = np.zeros((-(-length // _BLOCK), len(rows), _BLOCK), np.float32)
     for start in range(0, len(rows), _CHUNK):

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, LevelArray
-from hbr.descriptors.base import Descriptor
-from hbr.descriptors.cosine import Cosine
+from hbr.descriptors.base import CompiledDescriptor
+from hbr.descriptors.cosine import WholeCosine
+from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
 _CELLS: Final = 8
@@ -22,9 +23,9 @@ _PIXELS: Final = CROP_PX // 2
 _BLUR: Final = 1.25
 #: Largest share of the whole length that one direction of a cell may have.
 _CLIP: Final = 0.25
-#: Values of the four levels: square roots of a normalised histogram's entries, quantised by Lloyd's method.
-_REPRESENTATIVES: Final = np.array([0.0114, 0.1062, 0.2173, 0.3713])
-_TABLE: Final = np.pad(_REPRESENTATIVES, (0, 252)).astype(np.float32)
+#: Values of the four levels in 1/10,000: square roots of a normalised histogram's entries, quantised by Lloyd's method.
+_VALUES: Final = np.array([114, 1062, 2173, 3713], np.int32)
+_REPRESENTATIVES: Final = _VALUES / 10_000
 _BORDERS: Final = ((_REPRESENTATIVES[1:] + _REPRESENTATIVES[:-1]) / 2).astype(np.float32)
 
 
@@ -39,7 +40,7 @@ _SHARES: Final = _shares()
 
 
 @dataclass(frozen=True)
-class Edges(Descriptor):
+class Edges(CompiledDescriptor):
     """Histograms of 8 unsigned edge directions in 8 x 8 cells of the object, compared by cosine.
 
     After N. Dalal and B. Triggs, "Histograms of Oriented Gradients for Human Detection", CVPR 2005. Three differences:
@@ -57,16 +58,18 @@ class Edges(Descriptor):
         image = (view if isinstance(view, Segmentation) else segment(view)).alone
         return np.searchsorted(_BORDERS, _histogram(image)).astype(np.uint8)
 
-    def prepared(self, rows: LevelArray, /) -> Cosine:
-        self.check_rows(rows)
-        return Cosine.of(rows, _unit)
+    def compared(self, rows: LevelArray, /) -> WholeCosine:
+        return WholeCosine.of(rows, _VALUES)
 
-    def pack(self, levels: LevelArray) -> bytes:
+    def measure(self) -> Measure:
+        return Measure(edges_at=0, edge_values=_VALUES)
+
+    def pack_rows(self, rows: LevelArray) -> LevelArray:
         """Pack four levels into each byte, the first one in the highest bits."""
-        self.check_rows(levels)
-        self.check_levels(levels)
-        parts = levels.reshape(-1, 4)
-        return (parts[:, 0] << 6 | parts[:, 1] << 4 | parts[:, 2] << 2 | parts[:, 3]).astype(np.uint8).tobytes()
+        self.check_levels(rows)
+        parts = np.ascontiguousarray(rows).reshape(len(rows), self.size_bytes, 4)
+        packed = parts[:, :, 0] << 6 | parts[:, :, 1] << 4 | parts[:, :, 2] << 2 | parts[:, :, 3]
+        return packed.astype(np.uint8, copy=False)
 
     def unpack_rows(self, packed: bytes) -> LevelArray:
         rows = self.packed_rows(packed)
@@ -96,10 +99,3 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
     clipped /= np.sqrt((clipped * clipped).sum())
     roots: NDArray[np.float32] = np.sqrt(clipped).ravel()
     return roots
-
-
-def _unit(levels: LevelArray) -> NDArray[np.float32]:
-    # several times as fast as NumPy's indexing for a large catalog
-    rows = cv2.LUT(np.ascontiguousarray(levels), _TABLE).astype(np.float32, copy=False).reshape(levels.shape)
-    rows /= np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))[:, None]
-    return rows

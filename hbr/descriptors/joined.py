@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.descriptors.base import Comparison, Descriptor
+from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor
+from hbr.kernels.calls import Measure
 from hbr.segmentation import Segmentation, segment
 
 
 @dataclass(frozen=True)
-class Joined(Descriptor):
+class Joined(CompiledDescriptor):
     """Descriptors side by side. The similarity is the mean of theirs, with weights that add up to 1."""
 
     name: str = ""
@@ -31,15 +32,29 @@ class Joined(Descriptor):
         found = view if isinstance(view, Segmentation) else segment(view)
         return np.concatenate([part.describe(found) for part in self.parts])
 
-    def prepared(self, rows: LevelArray, /) -> "_Average":
-        self.check_rows(rows)
+    def compared(self, rows: LevelArray, /) -> "_Average":
         columns = self._columns()
         parts = [part.prepared(rows[:, own]) for part, own in zip(self.parts, columns, strict=True)]
         return _Average(parts, self.weights, columns)
 
-    def pack(self, levels: LevelArray) -> bytes:
-        self.check_rows(levels)
-        return b"".join(part.pack(levels[columns]) for part, columns in zip(self.parts, self._columns(), strict=True))
+    def measure(self) -> Measure | None:
+        """Return how edges and colours, in this order, are compared; other pairs are left to NumPy."""
+        measures = [part.measure() if isinstance(part, CompiledDescriptor) else None for part in self.parts]
+        edges, colours = measures if len(measures) == 2 else (None, None)
+        if edges is None or colours is None or edges.edges_at or colours.colours_at:
+            return None
+        edges_share, colours_share = self.weights
+        return colours._replace(
+            edges_at=0,
+            colours_at=self.parts[0].size_bytes,
+            edge_values=edges.edge_values,
+            edges_share=edges_share,
+            colours_share=colours_share,
+        )
+
+    def pack_rows(self, rows: LevelArray) -> LevelArray:
+        columns = zip(self.parts, self._columns(), strict=True)
+        return np.concatenate([part.pack_rows(rows[:, own]) for part, own in columns], axis=1)
 
     def unpack_rows(self, packed: bytes) -> LevelArray:
         rows = self.packed_rows(packed)

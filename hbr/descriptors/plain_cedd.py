@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.cedd import BINS, cedd, covered, describe
-from hbr.descriptors.cedd_packing import PACKED_BYTES, pack, unpack_rows
+from hbr.descriptors.cedd_packing import PACKED_BYTES, pack, pack_rows, unpack_rows
 from hbr.descriptors.tanimoto import squares, tanimoto, tanimoto_of_dots
 from hbr.segmentation import Segmentation
 
@@ -55,6 +55,10 @@ class Cedd(Descriptor):
 
     def pack(self, levels: LevelArray) -> bytes:
         return pack(levels)
+
+    def pack_rows(self, rows: LevelArray) -> LevelArray:
+        self.check_levels(rows)
+        return pack_rows(rows)
 
     def unpack_rows(self, packed: bytes) -> LevelArray:
         return unpack_rows(packed)

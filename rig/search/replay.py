@@ -14,7 +14,7 @@ from rig.views.description import ViewDescriber
 TOLERANCE: Final = 1e-9
 """Numbers that differ less are equal: another machine may sum in another order."""
 EARLIER_TOLERANCE: Final = 1e-3
-"""For runs of formats 1 and 2: similarities had errors of up to 5e-6 then, which exponents in the belief multiply."""
+"""For runs of formats 1 to 3: similarities had errors of up to 5e-6 then, which exponents in the belief multiply."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
         The run cannot be read, or its strategy is not known.
     """
     started = run.started
-    tolerance = TOLERANCE if run.is_current else EARLIER_TOLERANCE
+    tolerance = EARLIER_TOLERANCE if run.format_version < 4 else TOLERANCE
     found = Check(is_complete=run.error is not None and not run.is_cut)
     search: Search | None = None
     describe = ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)

@@ -38,8 +38,9 @@ from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
-VERSION: Final = 3
-"""Version 2 added the dense search; version 3 stores codes instead of sentences, and the terms of the glossary."""
+VERSION: Final = 4
+"""Version 2 brought the dense search; version 3 stores codes instead of sentences, and terms of the glossary.
+Since version 4 similarities are the same on every computer."""
 EMPTY_TABLE: Final = "empty_table.png"
 
 MAX_FRAME_PIXELS: Final = 64_000_000
@@ -193,7 +194,7 @@ class SavedRun:
         """
         for number, line in enumerate(self._lines, 1):
             try:
-                event = event_of(line if self.is_current else upgraded(line), self._frame)
+                event = event_of(upgraded(line) if self.format_version < 3 else line, self._frame)
                 _check_event(event)
             except _DAMAGE as error:
                 raise _damaged(self.folder, f"events.jsonl, line {number}: {_reason(error)}") from error
@@ -231,12 +232,12 @@ class SavedRun:
 
     def not_saved(self, event: Event) -> tuple[str, ...]:
         """Return the fields of an event that the run's format does not have."""
-        return () if self.is_current else NOT_SAVED.get(type(event), ())
+        return NOT_SAVED.get(type(event), ()) if self.format_version < 3 else ()
 
     @property
-    def is_current(self) -> bool:
-        """Whether the run has the format of this program version."""
-        return bool(self.about["version"] == VERSION)
+    def format_version(self) -> int:
+        """The version of the run's format."""
+        return int(self.about["version"])
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
         frame = _image(self.folder, frame_path(self.folder, index))

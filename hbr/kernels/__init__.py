@@ -1,0 +1,8 @@
+"""Compiled kernels in C, with the same bits as their references in NumPy, which stay the fallback.
+
+Decision: docs/decisions/0040.
+"""
+
+from hbr.kernels.library import library, without_library
+
+__all__ = ["library", "without_library"]

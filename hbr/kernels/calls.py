@@ -1,0 +1,184 @@
+"""The kernels as functions of arrays. Each returns None without the compiled library: the caller has the reference."""
+
+import ctypes
+import threading
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.kernels.library import address, library
+
+
+class Addresses:
+    """Addresses of arrays, for a kernel that reads a struct of them."""
+
+    def __init__(self, *arrays: NDArray[Any]) -> None:
+        self._arrays = arrays  # keeps them alive
+        self._struct = (ctypes.c_void_p * len(arrays))(*map(address, arrays))
+        self.address = ctypes.addressof(self._struct)
+
+
+class _Workspace(threading.local):
+    """Memory for short calls, one for each thread: NumPy takes microseconds to say where an array lies."""
+
+    def __init__(self) -> None:
+        self.array: FloatArray = np.empty(0)
+        self.address = 0
+
+    def grown(self, size: int) -> "_Workspace":
+        if size > len(self.array):
+            self.array = np.empty(size)
+            self.address = address(self.array)
+        return self
+
+
+_WORKSPACE = _Workspace()
+
+
+def cedd(image: ImageArray, grid: tuple[int, int, int, int], tables: Addresses) -> LevelArray | None:
+    """Return the CEDD levels of an image, (144,); ``grid`` and ``tables`` as in `hbr.descriptors.cedd`."""
+    found = library()
+    rows, columns, height, width = grid
+    if found is None or height > 257 or height * width > 8000:
+        return None
+    if image.strides[1:] != (3, 1):
+        image = np.ascontiguousarray(image)
+    work = _WORKSPACE.grown(18 + 16 * columns + 2 * columns * width)
+    found.hbr_cedd(
+        address(image), image.strides[0], rows, columns, height, width, tables.address, work.address + 144, work.address
+    )
+    return work.array[:18].view(np.uint8).copy()
+
+
+class _Measure(ctypes.Structure):
+    _fields_ = (
+        ("edges_at", ctypes.c_int64),
+        ("colours_at", ctypes.c_int64),
+        ("edges_share", ctypes.c_double),
+        ("colours_share", ctypes.c_double),
+        ("edge_values", ctypes.c_void_p),
+        ("colour_weights", ctypes.c_void_p),
+        ("far", ctypes.c_void_p),
+        ("near", ctypes.c_void_p),
+    )
+
+
+class Measure(NamedTuple):
+    """How packed rows of edges, colours, or both are compared.
+
+    Attributes
+    ----------
+    edges_at, colours_at
+        First byte of each part in a row; -1 without it.
+    edges_share, colours_share
+        Weights of the two similarities, if there are both.
+    edge_values : int32 array (4,)
+        Value of each level of the edges.
+    colour_weights : int32 array (32,)
+        Weight of the squared difference of each level of the colours.
+    far, near : float64 arrays
+        Similarity of colours at distances 4096 i, and at distances i below 4096.
+    """
+
+    edges_at: int = -1
+    colours_at: int = -1
+    edges_share: float = 1.0
+    colours_share: float = 1.0
+    edge_values: NDArray[np.int32] = np.zeros(4, np.int32)
+    colour_weights: NDArray[np.int32] = np.zeros(32, np.int32)
+    far: FloatArray = np.ones(1)
+    near: FloatArray = np.ones(1)
+
+    def struct(self) -> ctypes.Structure:
+        """Return the struct that the kernels read; the arrays must live as long as it."""
+        return _Measure(*self[:4], *(address(array) for array in self[4:]))
+
+
+class PackedRows:
+    """Packed rows, prepared for the kernels.
+
+    Parameters
+    ----------
+    measure : Measure
+        How they are compared.
+    rows : uint8 array (n, bytes)
+        The bytes of a row lie side by side.
+    squares : float64 array (n,), optional
+        Squared lengths of their edges, if they are known.
+    places : integer array (m,), optional
+        Only these of the rows, in this order.
+    """
+
+    def __init__(
+        self,
+        measure: Measure,
+        rows: LevelArray,
+        squares: FloatArray | None = None,
+        places: IndexArray | None = None,
+    ) -> None:
+        found = library()
+        assert found is not None
+        self._library, self._measure, self._struct = found, measure, measure.struct()
+        self._by_address = ctypes.addressof(self._struct)
+        self.rows = rows if rows.strides[1:] == (1,) else np.ascontiguousarray(rows)
+        self._at = address(self.rows), self.rows.strides[0]
+        self._places = places
+        if squares is None:
+            squares = np.zeros(len(rows))
+            if measure.edges_at >= 0:
+                found.hbr_squares(self._by_address, *self._at, len(rows), address(squares))
+        self.squares = squares
+
+    def __len__(self) -> int:
+        return len(self.rows) if self._places is None else len(self._places)
+
+    def similarity(self, queries: LevelArray) -> FloatArray:
+        """Return the similarity of packed queries, (n, bytes), to all rows, (n, m)."""
+        queries = np.ascontiguousarray(queries)
+        similar = np.empty((len(queries), len(self)))
+        places = 0 if self._places is None else address(self._places)
+        self._library.hbr_similarity(
+            self._by_address, address(queries), queries.strides[0], len(queries),
+            *self._at, address(self.squares), places, len(self), address(similar),
+        )  # fmt: skip
+        return similar
+
+    def among(self, rows: IndexArray) -> FloatArray:
+        """Return the similarity of rows to each other within groups: indices (g, k) in, (g, k, k) out."""
+        places = np.ascontiguousarray(rows if self._places is None else self._places[rows], np.int64)
+        similar = np.empty((*places.shape, places.shape[1]))
+        self._library.hbr_among(
+            self._by_address, *self._at, address(self.squares), address(places), *places.shape, address(similar)
+        )
+        return similar
+
+    def only(self, rows: IndexArray) -> "PackedRows":
+        """Return some of the rows, in this order; nothing is copied."""
+        places = np.ascontiguousarray(rows if self._places is None else self._places[rows], np.int64)
+        return PackedRows(self._measure, self.rows, self.squares, places)
+
+
+def support(
+    rows: IndexArray,
+    begin: IndexArray,
+    count: IndexArray,
+    azimuth_deg: FloatArray,
+    levels: NDArray[np.float32],
+    slope: float,
+    part_deg: float,
+    whole: int,
+) -> NDArray[np.float32] | None:
+    """Return what one query adds to every azimuth of each object, (objects, 72); see `hbr.dense.filter`."""
+    found = library()
+    if found is None:
+        return None
+    room = 2 * int(count.max())
+    scratch = np.empty(3 * room + 1)
+    added = np.empty((len(count), 72), np.float32)
+    found.hbr_support(
+        address(rows), address(begin), address(count), len(count), address(azimuth_deg), address(levels),
+        slope, part_deg, whole, address(scratch), room, address(added),
+    )  # fmt: skip
+    return added

@@ -1,0 +1,75 @@
+"""The compiled library, if there is one that fits."""
+
+import ctypes
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hbr.kernels.compile import LIBRARY, sources_digest
+
+#: Set to ``numpy``, this variable of the environment switches the compiled part off.
+SWITCH: Final = "HBR_KERNELS"
+
+_POINTER, _INTEGER, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+_SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
+    "hbr_cedd": (_POINTER, *[_INTEGER] * 5, _POINTER, _POINTER, _POINTER),
+    "hbr_squares": (_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),
+    "hbr_similarity": (
+        *[_POINTER] * 2, _INTEGER, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _POINTER,
+    ),
+    "hbr_among": (_POINTER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),
+    "hbr_support": (
+        *[_POINTER] * 3, _INTEGER, _POINTER, _POINTER, _REAL, _REAL, _INTEGER, _POINTER, _INTEGER, _POINTER,
+    ),
+}  # fmt: skip
+
+_forced_off = False
+
+
+def library() -> ctypes.CDLL | None:
+    """Return the compiled kernels; None if NumPy does their work."""
+    return None if _forced_off else _loaded()
+
+
+@lru_cache(maxsize=1)
+def _loaded() -> ctypes.CDLL | None:
+    return None if os.environ.get(SWITCH) == "numpy" else load(LIBRARY)
+
+
+def load(path: Path) -> ctypes.CDLL | None:
+    """Load a library; None if it is missing, of another machine, or not compiled from the sources beside it."""
+    if not path.exists():
+        return None
+    try:
+        found = ctypes.CDLL(str(path))
+        compiled_from = ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(found, "hbr_sources"))).decode()
+        if compiled_from != sources_digest(path.parent):
+            return None
+        for name, types in _SIGNATURES.items():
+            function = getattr(found, name)
+            function.argtypes, function.restype = types, None
+    except (OSError, ValueError, AttributeError):
+        return None
+    return found
+
+
+@contextmanager
+def without_library() -> Iterator[None]:
+    """Let NumPy do the work in a ``with`` block: for tests and benchmarks."""
+    global _forced_off
+    before, _forced_off = _forced_off, True
+    try:
+        yield
+    finally:
+        _forced_off = before
+
+
+def address(array: "np.ndarray[Any, Any]") -> int:
+    """Return where the data of an array begins; the array must live as long as the pointer is used."""
+    found: int = array.__array_interface__["data"][0]
+    return found

@@ -1,0 +1,254 @@
+/* Similarity of packed views in integers, with the same bits as hbr/descriptors/cosine.py and colours.py. */
+#include "kernels.h"
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+#define EDGE_BYTES 128
+#define EDGE_LEVELS (4 * EDGE_BYTES)
+#define COLOUR_BYTES 32
+#define CHUNK 128 /* rows whose intermediate results stay in the cache */
+
+/* How packed rows are compared. */
+struct measure {
+    int64_t edges_at, colours_at; /* first byte of each part in a row; -1 without it */
+    double edges_share, colours_share;
+    const int32_t *edge_values;    /* (4): value of each level, below 4096 */
+    const int32_t *colour_weights; /* (32): weight of each squared difference, below 128 */
+    const double *far, *near;      /* the similarity at distances 4096 * i, and at i below 4096 */
+};
+
+struct query {
+    const struct measure *measure;
+    int16_t edges[EDGE_LEVELS] __attribute__((aligned(32))); /* values, in the order in which a row is read */
+    int16_t colours[COLOUR_BYTES] __attribute__((aligned(32)));
+    int16_t weights[COLOUR_BYTES] __attribute__((aligned(32)));
+    double square;
+};
+
+/* The loops over rows: products of edges, squared distances of colours. */
+struct loops {
+    void (*expand)(const int32_t v[4], const uint8_t *edges, int16_t *values); /* of a query, in the order of a row */
+    void (*edges)(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots);
+    void (*colours)(const struct query *q, const uint8_t *const *rows, int64_t count, int32_t *distances);
+};
+
+/* In the plain order, all levels in the two highest bits of the bytes come first, then those in the next two. */
+static void expand_plain(const int32_t v[4], const uint8_t *edges, int16_t *values) {
+    for (int field = 0; field < 4; field++)
+        for (int i = 0; i < EDGE_BYTES; i++) *values++ = (int16_t)v[edges[i] >> (6 - 2 * field) & 3];
+}
+
+static void edges_plain(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots) {
+    /* any function of two bits is linear in the bits and their product */
+    const int32_t *v = q->measure->edge_values;
+    const int16_t base = (int16_t)v[0], low = (int16_t)(v[1] - v[0]), high = (int16_t)(v[2] - v[0]),
+                  both = (int16_t)(v[3] - v[1] - v[2] + v[0]);
+    for (int64_t k = 0; k < count; k++) {
+        const uint8_t *row = rows[k] + q->measure->edges_at;
+        int64_t total = 0;
+        for (int field = 0; field < 4; field++) {
+            const int16_t *own = q->edges + field * EDGE_BYTES;
+            int32_t sum = 0; /* 128 products below 2^24 */
+            for (int i = 0; i < EDGE_BYTES; i++) {
+                const int16_t level = (int16_t)(row[i] >> (6 - 2 * field));
+                const int16_t l = level & 1, h = (level >> 1) & 1;
+                sum += own[i] * (int16_t)(base + low * l + high * h + both * (l & h));
+            }
+            total += sum;
+        }
+        dots[k] = (double)total;
+    }
+}
+
+static void colours_plain(const struct query *q, const uint8_t *const *rows, int64_t count, int32_t *distances) {
+    for (int64_t k = 0; k < count; k++) {
+        const uint8_t *row = rows[k] + q->measure->colours_at;
+        int32_t distance = 0;
+        for (int i = 0; i < COLOUR_BYTES; i++) {
+            const int32_t apart = q->colours[i] - row[i];
+            distance += q->weights[i] * apart * apart;
+        }
+        distances[k] = distance;
+    }
+}
+
+static const struct loops PLAIN = {expand_plain, edges_plain, colours_plain};
+
+#if defined(__x86_64__)
+#define AVX2 __attribute__((target("avx2")))
+
+/* One byte of the value of the first or second level in each of the 16 half bytes, twice. */
+AVX2 static inline __m256i values_of_halves(const int32_t v[4], int second, int shift) {
+    uint8_t table[32];
+    for (int i = 0; i < 32; i++) table[i] = (uint8_t)(v[second ? i & 3 : i >> 2 & 3] >> shift);
+    return _mm256_loadu_si256((const __m256i *)table);
+}
+
+AVX2 static inline int64_t sum_of(__m256i a, __m256i b) {
+    const __m256i low = _mm256_add_epi64(_mm256_cvtepi32_epi64(_mm256_castsi256_si128(a)),
+                                         _mm256_cvtepi32_epi64(_mm256_extracti128_si256(a, 1)));
+    const __m256i high = _mm256_add_epi64(_mm256_cvtepi32_epi64(_mm256_castsi256_si128(b)),
+                                          _mm256_cvtepi32_epi64(_mm256_extracti128_si256(b, 1)));
+    const __m256i four = _mm256_add_epi64(low, high);
+    const __m128i two = _mm_add_epi64(_mm256_castsi256_si128(four), _mm256_extracti128_si256(four, 1));
+    return _mm_extract_epi64(two, 0) + _mm_extract_epi64(two, 1);
+}
+
+AVX2 static void expand_avx2(const int32_t v[4], const uint8_t *edges, int16_t *values) {
+    const __m256i half = _mm256_set1_epi8(15);
+    __m256i *own = (__m256i *)values;
+    for (int vector = 0; vector < EDGE_BYTES / 32; vector++) {
+        const __m256i packed = _mm256_loadu_si256((const __m256i *)edges + vector);
+        for (int field = 0; field < 4; field++, own += 2) {
+            const __m256i halves = _mm256_and_si256(field < 2 ? _mm256_srli_epi16(packed, 4) : packed, half);
+            const __m256i l = _mm256_shuffle_epi8(values_of_halves(v, field % 2, 0), halves);
+            const __m256i h = _mm256_shuffle_epi8(values_of_halves(v, field % 2, 8), halves);
+            own[0] = _mm256_unpacklo_epi8(l, h);
+            own[1] = _mm256_unpackhi_epi8(l, h);
+        }
+    }
+}
+
+AVX2 static void edges_avx2(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots) {
+    const int32_t *v = q->measure->edge_values;
+    const __m256i half = _mm256_set1_epi8(15);
+    const __m256i low[2] = {values_of_halves(v, 0, 0), values_of_halves(v, 1, 0)};
+    const __m256i high[2] = {values_of_halves(v, 0, 8), values_of_halves(v, 1, 8)};
+    for (int64_t k = 0; k < count; k++) {
+        const __m256i *row = (const __m256i *)(rows[k] + q->measure->edges_at), *own = (const __m256i *)q->edges;
+        __m256i one = _mm256_setzero_si256(), two = one; /* each of their sums is of 32 products below 2^24 */
+#pragma GCC unroll 4
+        for (int vector = 0; vector < EDGE_BYTES / 32; vector++) {
+            const __m256i packed = _mm256_loadu_si256(row + vector);
+            const __m256i halves[2] = {_mm256_and_si256(_mm256_srli_epi16(packed, 4), half),
+                                       _mm256_and_si256(packed, half)};
+#pragma GCC unroll 4
+            for (int field = 0; field < 4; field++, own += 2) {
+                const __m256i l = _mm256_shuffle_epi8(low[field % 2], halves[field / 2]);
+                const __m256i h = _mm256_shuffle_epi8(high[field % 2], halves[field / 2]);
+                one = _mm256_add_epi32(one, _mm256_madd_epi16(_mm256_unpacklo_epi8(l, h), own[0]));
+                two = _mm256_add_epi32(two, _mm256_madd_epi16(_mm256_unpackhi_epi8(l, h), own[1]));
+            }
+        }
+        dots[k] = (double)sum_of(one, two);
+    }
+}
+
+AVX2 static void colours_avx2(const struct query *q, const uint8_t *const *rows, int64_t count, int32_t *distances) {
+    const __m256i *own = (const __m256i *)q->colours, *weights = (const __m256i *)q->weights;
+    for (int64_t k = 0; k < count; k++) {
+        const __m256i row = _mm256_loadu_si256((const __m256i *)(rows[k] + q->measure->colours_at));
+        const __m256i a = _mm256_sub_epi16(own[0], _mm256_cvtepu8_epi16(_mm256_castsi256_si128(row)));
+        const __m256i b = _mm256_sub_epi16(own[1], _mm256_cvtepu8_epi16(_mm256_extracti128_si256(row, 1)));
+        const __m256i sums = _mm256_add_epi32(_mm256_madd_epi16(a, _mm256_mullo_epi16(a, weights[0])),
+                                              _mm256_madd_epi16(b, _mm256_mullo_epi16(b, weights[1])));
+        __m128i four = _mm_add_epi32(_mm256_castsi256_si128(sums), _mm256_extracti128_si256(sums, 1));
+        four = _mm_add_epi32(four, _mm_shuffle_epi32(four, 0x4E));
+        four = _mm_add_epi32(four, _mm_shuffle_epi32(four, 0xB1));
+        distances[k] = _mm_cvtsi128_si32(four);
+    }
+}
+
+static const struct loops WITH_AVX2 = {expand_avx2, edges_avx2, colours_avx2};
+#endif
+
+static const struct loops *fastest(void) {
+#if defined(__x86_64__)
+    if (__builtin_cpu_supports("avx2")) return &WITH_AVX2;
+#endif
+    return &PLAIN;
+}
+
+FOR_EVERY_PROCESSOR
+static double square_of(const int16_t *values) {
+    int64_t total = 0;
+    for (int i = 0; i < EDGE_LEVELS; i++) total += values[i] * values[i];
+    return (double)total;
+}
+
+static void begin_query(struct query *q, const struct measure *m, const uint8_t *packed, const struct loops *loops) {
+    q->measure = m;
+    if (m->edges_at >= 0) loops->expand(m->edge_values, packed + m->edges_at, q->edges);
+    if (m->colours_at >= 0)
+        for (int i = 0; i < COLOUR_BYTES; i++) {
+            q->colours[i] = packed[m->colours_at + i];
+            q->weights[i] = (int16_t)m->colour_weights[i];
+        }
+}
+
+/* Store the similarity of a query to at most CHUNK rows. */
+FOR_EVERY_PROCESSOR
+static void compare(const struct query *q, const struct loops *loops, const uint8_t *const *rows, const double *squares,
+                    int64_t count, double *similar) {
+    const struct measure *m = q->measure;
+    double dots[CHUNK];
+    int32_t distances[CHUNK];
+    if (m->edges_at >= 0) {
+        loops->edges(q, rows, count, dots);
+        for (int64_t i = 0; i < count; i++) {
+            const double cosine = dots[i] / __builtin_sqrt(q->square * squares[i]);
+            similar[i] = cosine < 1 ? cosine : 1;
+        }
+    }
+    if (m->colours_at < 0) return;
+    loops->colours(q, rows, count, distances);
+    if (m->edges_at < 0)
+        for (int64_t i = 0; i < count; i++) similar[i] = m->far[distances[i] >> 12] * m->near[distances[i] & 4095];
+    else
+        for (int64_t i = 0; i < count; i++)
+            similar[i] = m->edges_share * similar[i] +
+                         m->colours_share * (m->far[distances[i] >> 12] * m->near[distances[i] & 4095]);
+}
+
+/* Store the squared length of the edges of packed rows, which are `stride` bytes apart. */
+EXPORT void hbr_squares(const struct measure *m, const uint8_t *rows, int64_t stride, int64_t count, double *squares) {
+    const struct loops *loops = fastest();
+    struct query q;
+    for (int64_t i = 0; i < count; i++) {
+        begin_query(&q, m, rows + i * stride, loops);
+        squares[i] = square_of(q.edges);
+    }
+}
+
+/* Store the similarity of packed queries to packed rows, (queries, count): to those at `places`, or to the first ones
+   if it is null. */
+EXPORT void hbr_similarity(const struct measure *m, const uint8_t *queries, int64_t query_stride, int64_t query_count,
+                           const uint8_t *rows, int64_t stride, const double *squares, const int64_t *places,
+                           int64_t count, double *similar) {
+    const struct loops *loops = fastest();
+    struct query q = {0};
+    const uint8_t *chosen[CHUNK];
+    double lengths[CHUNK];
+    for (int64_t k = 0; k < query_count; k++, similar += count) {
+        begin_query(&q, m, queries + k * query_stride, loops);
+        q.square = square_of(q.edges);
+        for (int64_t first = 0; first < count; first += CHUNK) {
+            const int64_t some = count - first < CHUNK ? count - first : CHUNK;
+            for (int64_t i = 0; i < some; i++) {
+                const int64_t place = places ? places[first + i] : first + i;
+                chosen[i] = rows + place * stride;
+                lengths[i] = squares[place];
+            }
+            compare(&q, loops, chosen, lengths, some, similar + first);
+        }
+    }
+}
+
+/* Store the similarity of rows to each other within groups: places (groups, size) -> (groups, size, size). */
+EXPORT void hbr_among(const struct measure *m, const uint8_t *rows, int64_t stride, const double *squares,
+                      const int64_t *places, int64_t groups, int64_t size, double *similar) {
+    const struct loops *loops = fastest();
+    struct query q;
+    for (int64_t g = 0; g < groups; g++, places += size, similar += size * size)
+        for (int64_t a = 0; a < size; a++) {
+            begin_query(&q, m, rows + places[a] * stride, loops);
+            q.square = squares[places[a]];
+            for (int64_t b = a; b < size; b++) {
+                const uint8_t *other = rows + places[b] * stride;
+                compare(&q, loops, &other, squares + places[b], 1, similar + a * size + b);
+                similar[b * size + a] = similar[a * size + b];
+            }
+        }
+}

@@ -1,0 +1,55 @@
+/* The support of the dense filter, with the same bits as hbr/dense/filter.py, which explains it. */
+#include "kernels.h"
+
+#define BINS 72
+#define FAR_DEG 2000.0
+
+static inline float larger(float a, float b) { return a > b ? a : b; }
+
+/* Store what one query adds to every azimuth of each object, (objects, 72).
+
+   Object j has the `count[j]` rows from `rows[begin[j]]` on, by rising azimuth. `levels` are the powers of the
+   similarities of all rows. `scratch` has room for 5 floats and a double for each of twice the largest count. */
+FOR_EVERY_PROCESSOR
+EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t *count, int64_t objects,
+                        const double *azimuth_deg, const float *levels, double slope, double part_deg, int64_t whole,
+                        double *scratch, int64_t room, float *support) {
+    double *ring_deg = scratch;
+    float *own = (float *)(ring_deg + room), *penalty = own + room, *before = penalty + room, *behind = before + room;
+    const float none = -__builtin_inff();
+    double seen_deg[BINS];
+    float slope_at[BINS], best[BINS];
+    for (int b = 0; b < BINS; b++) {
+        seen_deg[b] = part_deg + b * 5.0;
+        slope_at[b] = (float)(seen_deg[b] * slope);
+    }
+    for (int64_t j = 0; j < objects; j++, support += BINS) {
+        const int64_t n = count[j], two = 2 * n;
+        const int64_t *mine = rows + begin[j];
+        int64_t first = 0; /* two turns, from half a turn before 0 on */
+        while (first < n && azimuth_deg[mine[first]] < 180) first++;
+        for (int64_t i = 0; i < n; i++) {
+            const int64_t k = first + i < n ? first + i : first + i - n, row = mine[k];
+            const double deg = azimuth_deg[row] < 180 ? azimuth_deg[row] : azimuth_deg[row] - 360;
+            ring_deg[i] = deg;
+            ring_deg[n + i] = deg + 360;
+            own[i] = own[n + i] = levels[row];
+        }
+        for (int64_t i = 0; i + 1 < two; i++) {
+            ring_deg[i] = (ring_deg[i + 1] + ring_deg[i]) / 2;
+            penalty[i] = (float)(ring_deg[i] * slope);
+        }
+        before[0] = none;
+        for (int64_t i = 0; i + 1 < two; i++) before[i + 1] = larger(before[i], own[i] + penalty[i]);
+        behind[two - 1] = none;
+        for (int64_t i = two - 2; i >= 0; i--) behind[i] = larger(behind[i + 1], own[i + 1] - penalty[i]);
+        const double shift = 2 * FAR_DEG * (double)j; /* as the reference searches all objects at once */
+        int64_t nearest = 0;
+        for (int b = 0; b < BINS; b++) {
+            while (nearest + 1 < two && ring_deg[nearest] + shift < seen_deg[b] + shift) nearest++;
+            const float beside = larger(before[nearest] - slope_at[b], behind[nearest] + slope_at[b]);
+            best[b] = larger(beside, own[nearest]);
+        }
+        for (int b = 0; b < BINS; b++) support[b] = best[(b + whole) % BINS];
+    }
+}

@@ -1,0 +1,96 @@
+/* Prints checksums of what the kernels compute of pseudo-random numbers: they must be equal on every processor. */
+#include "kernels.h"
+
+#include <stdio.h>
+
+struct measure {
+    int64_t edges_at, colours_at;
+    double edges_share, colours_share;
+    const int32_t *edge_values, *colour_weights;
+    const double *far, *near;
+};
+
+void hbr_squares(const struct measure *, const uint8_t *, int64_t, int64_t, double *);
+void hbr_similarity(const struct measure *, const uint8_t *, int64_t, int64_t, const uint8_t *, int64_t, const double *,
+                    const int64_t *, int64_t, double *);
+void hbr_support(const int64_t *, const int64_t *, const int64_t *, int64_t, const double *, const float *, double,
+                 double, int64_t, double *, int64_t, float *);
+void hbr_cedd(const uint8_t *, int64_t, int64_t, int64_t, int64_t, int64_t, const void *, double *, uint8_t *);
+
+static uint64_t state = 88172645463325252ULL, sum = 1469598103934665603ULL;
+
+static uint64_t random_bits(void) {
+    state ^= state << 13;
+    state ^= state >> 7;
+    state ^= state << 17;
+    return state;
+}
+
+static void add(const void *data, size_t size) {
+    for (const uint8_t *byte = data; size--; byte++) sum = (sum ^ *byte) * 1099511628211ULL;
+}
+
+static void similarity(void) {
+    static uint8_t rows[300 * 160];
+    static int32_t values[4] = {114, 1062, 2173, 3713}, weights[32];
+    static double far[6000], near[4096], squares[300], similar[3 * 300];
+    for (size_t i = 0; i < sizeof rows; i++) rows[i] = (uint8_t)(random_bits() >> 20);
+    for (int i = 0; i < 32; i++) weights[i] = i < 12 ? 16 : 9;
+    for (int i = 0; i < 6000; i++) far[i] = 1.0 / (1 + i * .3);
+    for (int i = 0; i < 4096; i++) near[i] = 1 - 1e-5 * i;
+    const struct measure measure = {0, 128, .6, .4, values, weights, far, near};
+    hbr_squares(&measure, rows, 160, 300, squares);
+    hbr_similarity(&measure, rows, 160, 3, rows, 160, squares, 0, 300, similar);
+    add(squares, sizeof squares);
+    add(similar, sizeof similar);
+}
+
+static void support(void) {
+    static int64_t order[300], begin[10], count[10];
+    static double azimuth_deg[300], scratch[1000];
+    static float levels[300], found[720];
+    for (int i = 0; i < 300; i++) {
+        order[i] = i;
+        azimuth_deg[i] = (i % 30) * 12 + (double)(random_bits() % 1000) * .01;
+        levels[i] = (float)(random_bits() % 10000) / 1e4f;
+    }
+    for (int i = 0; i < 10; i++) begin[i] = i * 30, count[i] = 30;
+    hbr_support(order, begin, count, 10, azimuth_deg, levels, 2 / 360., 1.7, 13, scratch, 60, found);
+    add(found, sizeof found);
+}
+
+static void cedd(void) {
+    static double hues[720], saturation[256 * 12], value[256 * 12], representatives[144 * 8], scratch[20000];
+    static int64_t bins[720];
+    static uint8_t image[480 * 640 * 3], levels[144];
+    static const int64_t sizes[][6] = {{160, 160, 40, 40, 2, 2}, {480, 640, 40, 40, 6, 8}, {90, 100, 40, 40, 1, 1}};
+    for (int i = 0; i < 720; i++) {
+        hues[i] = (double)(random_bits() % 100) / 100.;
+        bins[i] = 3 + 3 * (i % 7);
+    }
+    for (int i = 0; i < 256 * 12; i++) {
+        saturation[i] = (double)(random_bits() % 100) / 100.;
+        value[i] = (double)(random_bits() % 100) / 100.;
+    }
+    for (int i = 0; i < 144 * 8; i++) representatives[i] = (i % 8) * .05;
+    const void *tables[5] = {hues, bins, saturation, value, representatives};
+    for (int mode = 0; mode < 3; mode++) { /* noise, noise of six greys, flat */
+        for (size_t i = 0; i < sizeof image; i++)
+            image[i] = (uint8_t)(mode == 0 ? random_bits() >> 9 : mode == 1 ? (random_bits() % 6) * 48 : 127);
+        for (int k = 0; k < 3; k++) {
+            const int64_t *size = sizes[k];
+            hbr_cedd(image, size[1] * 3, size[2], size[3], size[4], size[5], tables, scratch, levels);
+            add(levels, sizeof levels);
+        }
+    }
+}
+
+int main(void) {
+    similarity();
+    printf("similarity %016llx\n", (unsigned long long)sum);
+    support();
+    printf("support %016llx\n", (unsigned long long)sum);
+    cedd();
+    printf("cedd %016llx\n", (unsigned long long)sum);
+    return 0;
+}

@@ -1,0 +1,175 @@
+"""The compiled kernels have the bits of their references, on every processor, and are used only if they fit."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from shutil import copytree, which
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hbr
+from hbr.dense.filter import DenseIndex
+from hbr.kernels import compile as compiling
+from hbr.kernels import library, without_library
+from hbr.kernels.library import load
+
+compiled = pytest.mark.skipif(library() is None, reason="the kernels are not compiled: there is no C compiler")
+seeds = st.integers(0, 2**32 - 1)
+
+
+@st.composite
+def images(draw: st.DrawFn) -> np.ndarray:
+    """Noise, few greys, patches and flat images of any size, also as views with other strides."""
+    rng = np.random.default_rng(draw(seeds))
+    height, width = (draw(st.one_of(st.integers(1, 90), st.sampled_from([159, 160, 241, 640]))) for _ in range(2))
+    patch, channels = draw(st.sampled_from([1, 2, 8, 50])), draw(st.sampled_from([1, 3]))
+    levels = rng.choice(256, draw(st.sampled_from([1, 2, 6, 256])))
+    pixels = rng.choice(levels, (height // patch + 1, width // patch + 1, channels)).astype(np.uint8)
+    image = np.kron(pixels, np.ones((patch, patch, 3 // channels), np.uint8))[:height, :width]
+    match draw(st.sampled_from(["whole", "flipped", "every other row", "columns first"])):
+        case "flipped":
+            return image[::-1, ::-1]
+        case "every other row":
+            return np.repeat(image, 2, axis=0)[::2]
+        case "columns first":
+            return np.asfortranarray(image)
+    return image
+
+
+@compiled
+@settings(max_examples=150)
+@given(images())
+def test_cedd_has_the_bits_of_the_reference(image: np.ndarray) -> None:
+    with without_library():
+        reference = hbr.cedd(image)
+    np.testing.assert_array_equal(hbr.cedd(image), reference)
+
+
+@compiled
+def test_cedd_has_the_bits_of_the_reference_for_every_colour() -> None:
+    steps = np.stack(np.meshgrid(*[np.arange(0, 256, 5)] * 3), axis=-1).reshape(-1, 3)
+    for start in range(0, len(steps) - 1600, 8 * 1600):  # each colour fills a block of its own
+        image = np.kron(steps[start : start + 1600].reshape(40, 40, 3).astype(np.uint8), np.ones((2, 2, 1), np.uint8))
+        with without_library():
+            reference = hbr.cedd(image)
+        np.testing.assert_array_equal(hbr.cedd(image), reference)
+
+
+def rows_of(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return levels of views, with equal, smallest and largest ones among them."""
+    edges = rng.integers(0, 4, (count, 512))
+    colours = np.clip(128 + rng.normal(0, rng.choice([2, 20, 200]), (count, 32)), 0, 255)
+    extreme = rng.integers(0, 4, count)
+    for levels, largest in ((edges, 3), (colours, 255)):
+        levels[extreme == 1], levels[extreme == 2] = 0, largest
+    parts = {"edges": (edges,), "colours": (colours,), "edges+colours": (edges, colours)}[kind]
+    return np.concatenate(parts, axis=1).astype(np.uint8)
+
+
+@compiled
+@settings(max_examples=60)
+@given(st.sampled_from(["edges", "colours", "edges+colours"]), st.integers(0, 5), st.integers(0, 300), seeds)
+def test_similarity_has_the_bits_of_the_reference(kind: str, queries: int, count: int, seed: int) -> None:
+    rng, descriptor = np.random.default_rng(seed), hbr.descriptor(kind)
+    asked, rows = rows_of(kind, queries, rng), rows_of(kind, count, rng)
+    some = rng.permutation(count)[: count // 2]
+    groups = rng.integers(0, count, (3, 4)) if count else np.empty((0, 4), np.intp)
+    packed = np.pad(descriptor.pack_rows(rows), ((0, 0), (3, 8)))[:, 3:-8]  # rows that do not lie side by side
+
+    with without_library():
+        reference = descriptor.prepared(rows)
+        expected = reference.similarity(asked), reference.only(some).similarity(asked), reference.among(groups)
+    for found in (descriptor.prepared(rows), descriptor.opened(packed)):
+        assert type(found) is not type(reference)
+        np.testing.assert_array_equal(found.similarity(asked), expected[0])
+        np.testing.assert_array_equal(found.only(some).similarity(asked), expected[1])
+        np.testing.assert_array_equal(found.only(some).only(np.arange(len(some))).similarity(asked), expected[1])
+        np.testing.assert_array_equal(found.among(groups), expected[2])
+
+
+@compiled
+@settings(max_examples=60)
+@given(
+    counts=st.lists(st.integers(1, 40), min_size=1, max_size=6),
+    step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),
+    omega=st.sampled_from([0.0, 0.5, 2.0, 10.0]),
+    power=st.sampled_from([1.0, 2.5, 4.0]),
+    rotation_deg=st.one_of(st.floats(-720, 720), st.sampled_from([0.0, -90.0, 2.5])),
+    seed=seeds,
+)
+def test_support_has_the_bits_of_the_reference(
+    counts: list[int], step_deg: float, omega: float, power: float, rotation_deg: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    total = sum(counts)
+    azimuth_deg = rng.uniform(0, 360, total)
+    if step_deg:  # several views at one azimuth, and azimuths half-way between bins
+        azimuth_deg = azimuth_deg // step_deg * step_deg
+    objects = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    levels = np.zeros((total, 512), np.uint8)
+    index = DenseIndex(
+        hbr.Views(levels, azimuth_deg, objects, tuple(map(str, range(len(counts)))), "edges"), omega=omega, power=power
+    )
+    similar = rng.uniform(-0.1, 1, total)
+    with without_library():
+        reference = index.support(similar, rotation_deg)
+    np.testing.assert_array_equal(index.support(similar, rotation_deg), reference)
+
+
+@pytest.mark.parametrize(
+    ("compiler", "emulators"),
+    [
+        (["cc"], [[], ["qemu-x86_64", "-cpu", "Nehalem"]]),  # the latter has no vectors of 256 bits
+        (["aarch64-linux-gnu-gcc", "-static"], [["qemu-aarch64"]]),
+    ],
+    ids=["this machine", "aarch64"],
+)
+def test_every_processor_computes_the_same_bits(
+    compiler: list[str], emulators: list[list[str]], tmp_path: Path
+) -> None:
+    """The sums were printed by an AMD EPYC."""
+    emulators = [words for words in emulators if not words or which(words[0])]
+    if not which(compiler[0]) or not emulators:
+        pytest.skip("this compiler or the emulator of its processor is not installed")
+    parts = [str(path) for path in compiling.sources() if path.suffix == ".c"]
+    flags = [flag for flag in compiling.FLAGS.split() if flag not in ("-shared", "-s", "-fvisibility=hidden")]
+    include = ['-DHBR_SOURCES=""', f"-I{compiling.FOLDER}", str(Path(__file__).with_name("checksums.c"))]
+    subprocess.run([*compiler, *flags, *include, *parts, "-o", str(tmp_path / "sums")], check=True)
+    for words in emulators:
+        done = subprocess.run([*words, str(tmp_path / "sums")], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == [
+            *("similarity", "542eb7f2cb30d834"),
+            *("support", "ed89ce9843a4048f"),
+            *("cedd", "dbb7e2153b86eaf9"),
+        ]
+
+
+@pytest.mark.parametrize("state", ["intact", "missing", "damaged", "of other sources"])
+def test_a_library_is_used_only_if_it_fits(state: str, tmp_path: Path) -> None:
+    path = Path(copytree(compiling.FOLDER, tmp_path / "kernels")) / compiling.LIBRARY.name
+    match state:
+        case "missing":
+            path.unlink(missing_ok=True)
+        case "damaged":
+            path.unlink(missing_ok=True)
+            path.write_bytes(b"\x7fELF" + bytes(1000))
+        case "of other sources":
+            (path.parent / "cedd.c").write_text("/* changed */")
+    assert (load(path) is not None) == (state == "intact" and library() is not None)
+
+
+def test_the_environment_switches_the_library_off() -> None:
+    code = "from hbr.kernels import library; assert library() is None"
+    subprocess.run([sys.executable, "-c", code], env=os.environ | {"HBR_KERNELS": "numpy"}, check=True)
+
+
+def test_a_machine_without_compiler_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert compiling.compile_kernels(tmp_path / "library.so") is None
+    monkeypatch.setenv("CC", "false")  # a compiler that fails
+    assert compiling.compile_kernels(tmp_path / "library.so") is None
+    assert list(tmp_path.iterdir()) == []
