@@ -1,5 +1,6 @@
 """The interface of descriptors, and what they share."""
 
+from abc import abstractmethod
 from typing import Protocol
 
 import numpy as np
@@ -204,9 +205,11 @@ class CompiledDescriptor(Descriptor):
     A class that inherits from this one implements `compared` and `measure` instead of `prepared`.
     """
 
+    @abstractmethod
     def compared(self, rows: LevelArray, /) -> Comparison:
         """Prepare rows, uint8 (m, length), for comparison in NumPy; takes several times their memory."""
 
+    @abstractmethod
     def measure(self) -> Measure | None:
         """Return how the kernels compare packed rows, with the same result; None if they cannot."""
 
