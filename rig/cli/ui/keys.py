@@ -48,20 +48,25 @@ class Pause(AbstractContextManager["Pause"]):
         """Whether the pause keys work."""
         return self._terminal is not None
 
-    def point(self, tell: Callable[[str], None]) -> None:
-        """Pause here if the operator asked for it; the table holds its angle. ``tell`` shows a line."""
+    def point(self, show: Callable[[str], None]) -> None:
+        """Pause here if the operator asked for it; the table holds its angle.
+
+        ``show`` gets the words for the state: how to resume, and an empty text when the pause is over.
+        """
         if self._suspend:
             self._suspend = False
-            tell("Paused. To resume: fg (or SIGCONT).")
+            show("Paused. To resume: fg (or SIGCONT).")
             self._release()
             os.kill(os.getpid(), signal.SIGSTOP)
             self._listen()
-            tell("Resumed.")
+            show("")
         if self._pressed():
-            tell("Paused. The table holds its angle. p: resume, Ctrl+C: stop (the views stay stored).")
-            while os.read(sys.stdin.fileno(), 1) not in (bytes([key]) for key in PAUSE_KEYS):
-                pass
-            tell("Resumed.")
+            show("Paused. The table holds its angle. p: resume, Ctrl+C: stop")
+            try:
+                while os.read(sys.stdin.fileno(), 1) not in (bytes([key]) for key in PAUSE_KEYS):
+                    pass
+            finally:
+                show("")
 
     def _pressed(self) -> bool:
         if self._terminal is None:

@@ -67,6 +67,7 @@ class LiveView(AbstractContextManager["LiveView"]):
         self._console = console
         self._live: Live | None = None
         self._pause = Pause(keys=keys and console.is_terminal)
+        self._paused = ""
 
     def __enter__(self) -> Self:
         self._pause.__enter__()
@@ -81,7 +82,7 @@ class LiveView(AbstractContextManager["LiveView"]):
     def add(self, event: Event) -> None:
         """Show the next event; if the operator pauses the plan here, return when the operator resumes it."""
         if self.show(event):
-            self._pause.point(self.note)
+            self._pause.point(self._show_pause)
 
     def show(self, event: Event) -> bool:
         """Show an event and return whether the plan can pause after it."""
@@ -95,6 +96,14 @@ class LiveView(AbstractContextManager["LiveView"]):
     def render(self) -> RenderableType:
         """Return the present content of the live table."""
         raise NotImplementedError
+
+    def _show_pause(self, words: str) -> None:
+        """Show in the live table that the plan pauses and how to resume it; in a pipe print a line."""
+        self._paused = words
+        if self._live is not None:
+            self._live.refresh()
+        else:
+            self.note(words or "Resumed.")
 
     def _start(self) -> None:
         if self._console.is_terminal and self._live is None:
@@ -114,9 +123,12 @@ class LiveView(AbstractContextManager["LiveView"]):
             self._live = None
 
     @property
-    def _hint(self) -> str:
+    def _hint(self) -> Text:
+        """What the operator can do now: how to resume a pause, or the keys."""
+        if self._paused:
+            return Text(self._paused, style="bold yellow")
         stop = "Ctrl+C: stop"
-        return f"{HINT}, {stop}" if self._pause.listens else stop
+        return Text(f"{HINT}, {stop}" if self._pause.listens else stop, style="dim")
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,9 +255,10 @@ class EnrollView(LiveView):
             ),
             f"{self._taken}/{self._of}",
             left,
-            Text(self._hint, style="dim") if width >= WIDE else "",
+            self._hint if width >= WIDE and not self._paused else "",
         )
-        return Group(table, bar) if self._rows else Group(bar)
+        state = [self._hint] if self._paused else []
+        return Group(table, bar, *state) if self._rows else Group(bar, *state)
 
 
 class IdentifyView(LiveView):
@@ -357,6 +370,8 @@ class IdentifyView(LiveView):
         where = f", azimuth {azimuth_words(self._azimuth_deg)}°" if self._taken else ""
         lead = f", margin {signed(self._ranked.margin, 3)}" if self._ranked else ""
         status = Text(f"view {self._taken} of {self._of} at most{where}{lead}", style="bold")
-        status.append(f"   {self._hint}", style="dim")
-        decision = [Text(self._decision)] if self._decision else []
-        return Group(table, *decision, status) if candidates else Group(status)
+        if not self._paused:
+            status.append("   ").append_text(self._hint)
+        lines = [Text(self._decision)] if self._decision else []
+        lines += [status, self._hint] if self._paused else [status]
+        return Group(table, *lines) if candidates else Group(*lines)

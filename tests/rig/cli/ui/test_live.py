@@ -8,6 +8,7 @@ import select
 import signal
 import termios
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -125,6 +126,27 @@ def test_dense_search_in_a_pipe_is_printed_as_lines():
     assert lines[5].startswith("  left 80.0°: distinguishes mug-white from mug-star")
 
 
+@pytest.mark.parametrize("width", [40, 100])
+@pytest.mark.parametrize("kind", [EnrollView, IdentifyView])
+def test_live_table_shows_whether_the_plan_pauses(kind, width):
+    console = screen(width)
+    view = kind(console, load_config()) if kind is EnrollView else kind(console)
+
+    def content() -> str:
+        lines = console.render_lines(view.render(), pad=False)
+        return " ".join("".join(segment.text for segment in line) for line in lines)
+
+    with view:
+        for event in islice(enrolling(views=8) if kind is EnrollView else identifying(), 3):
+            view.show(event)
+        view._show_pause("Paused. p: resume")
+        assert "Paused. p: resume" in content()
+        assert "Ctrl+C: stop" not in content()  # the hint of the keys that work otherwise
+        view._show_pause("")
+        assert "Paused" not in content()
+    assert "Paused" not in ESCAPE.sub("", console.file.getvalue()).splitlines()[-1]
+
+
 class Keyboard:
     """A terminal with a program in it; what it prints is gathered."""
 
@@ -179,10 +201,12 @@ def test_key_pauses_and_resumes_and_the_terminal_is_restored(keyboard):
     keyboard.type(" ")
     keyboard.until("Paused. The table holds its angle.")
     assert "24 views enrolled" not in keyboard.seen
+    keyboard.until("p: resume, Ctrl+C: stop")
+    before = len(keyboard.seen)
     keyboard.type("xyzp")
     keyboard.until("24 views enrolled")
     assert keyboard.end() == 0
-    assert "Resumed." in keyboard.seen
+    assert "p: pause" in keyboard.seen[before:]  # again
     assert termios.tcgetattr(keyboard.slave) == keyboard.before
 
 
