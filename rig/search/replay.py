@@ -16,6 +16,9 @@ TOLERANCE: Final = 1e-9
 EARLIER_TOLERANCE: Final = 1e-3
 """For runs of formats 1 to 3: similarities had errors of up to 5e-6 then, which exponents in the belief multiply."""
 
+SHOWN_CHARACTERS: Final = 60
+"""Of a value in the summary of a difference."""
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -28,6 +31,15 @@ class Difference:
 
     def __str__(self) -> str:
         return f"view {self.view}, {self.what}: saved {self.saved}, computed {self.computed}"
+
+    def summary(self) -> str:
+        """Return the difference on one line; long values are cut."""
+        return str(replace(self, saved=_cut(self.saved), computed=_cut(self.computed)))
+
+
+def _cut(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 1]}…"
 
 
 @dataclass(slots=True)

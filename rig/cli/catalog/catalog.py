@@ -73,13 +73,20 @@ def list_(
 
 @app.command("show")
 @command
-def show(settings: Settings, name: NameArgument) -> None:
+def show(
+    settings: Settings,
+    name: NameArgument,
+    full: Annotated[
+        bool, typer.Option("--full", help="Also show all settings of the devices and conditions of each session.")
+    ] = False,
+) -> None:
     """Show an object: its enrollments with their sessions, and the angles of its views.
 
     Columns: index of the view, azimuth of the camera, table angle by the servo's encoder and by the IMU, and sharpness.
 
     Example: rig catalog show mug-white --bench sim
     """
+    from rig.events.wording import counted
     from rig.views.segmentation_evidence import SegmentationSummary
 
     with settings.open_catalog(read_only=True) as catalog:
@@ -106,9 +113,13 @@ def show(settings: Settings, name: NameArgument) -> None:
         )
         for session in enrollment.sessions:
             provenance = session.provenance
-            source = {"bench": provenance.bench, "software": provenance.software, **provenance.devices}
+            devices = provenance.devices if full else {part: _model(one) for part, one in provenance.devices.items()}
+            source = {"bench": provenance.bench, "software": provenance.software, **devices}
             print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: {_in_one_line(source)}")
-            print(f"    {_in_one_line(provenance.conditions)}")
+            if full:
+                print(*(f"    {key}: {_in_one_line(value)}" for key, value in provenance.conditions.items()), sep="\n")
+            elif provenance.conditions:
+                print(f"    {counted(_count(provenance.conditions), 'setting')}: --full")
     if not details.views:
         return
     if segmentation := SegmentationSummary.of(view.record.segmentation for view in details.views).text:
@@ -290,6 +301,17 @@ def report_other_regions(settings: Settings, catalog: "Catalog", bench: "Bench")
 
 def _number(value: Any, width: int, digits: int) -> str:
     return f"{value:{width}.{digits}f}" if isinstance(value, int | float) else "–".rjust(width)
+
+
+def _model(identity: Any) -> Any:
+    """Return the short name of a device."""
+    named = identity if isinstance(identity, dict) else {}
+    return next((named[key] for key in ("model", "device", "name") if named.get(key)), identity)
+
+
+def _count(values: Any) -> int:
+    """Return the number of single values in nested ones."""
+    return sum(map(_count, values.values())) if isinstance(values, dict) else 1
 
 
 def _in_one_line(values: Any) -> str:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from rig.search.saved_run import SavedRun
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")]
-SHOWN: Final = 20
-"""Differences that an error lists."""
+SHOWN: Final = 3
+"""Differences that an error lists without --all."""
 
 
 @command
@@ -24,6 +24,9 @@ def replay(
     check: Annotated[
         bool,
         typer.Option("--check", help="Compute every decision again from the images; exit code 6 if one differs."),
+    ] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="With --check: list all differences in full, not only the first three.")
     ] = False,
     model: ModelOption = None,
 ) -> None:
@@ -36,7 +39,7 @@ def replay(
     load_model_file(model)
     saved = load_run(run)
     if check:
-        _check(settings, saved)
+        _check(settings, saved, every=every or settings.json)
         return
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
@@ -82,7 +85,7 @@ def report(
     settings.say(f"Report: {path}", {"report": str(path)})
 
 
-def _check(settings: Settings, saved: "SavedRun") -> None:
+def _check(settings: Settings, saved: "SavedRun", *, every: bool) -> None:
     from rig.core.errors import ReplayMismatch, RunIncomplete
     from rig.events.events import plain
     from rig.events.wording import counted
@@ -92,13 +95,13 @@ def _check(settings: Settings, saved: "SavedRun") -> None:
         found = check(saved)
     done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."
     if found.differences:
-        more = len(found.differences) - SHOWN
-        listed = [str(difference) for difference in found.differences[:SHOWN]]
+        more = 0 if every else len(found.differences) - SHOWN
+        listed = [str(one) if every else one.summary() for one in found.differences[: None if every else SHOWN]]
         raise ReplayMismatch(
             f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {done}",
             next_step="Check whether the files of the run were changed. If not, this version of the program decides "
             f"differently from {saved.about['software']}, which saved the run.",
-            evidence={"differences": [*listed, f"and {more} more"] if more > 0 else listed},
+            evidence={"differences": [*listed, f"and {more} more: --all"] if more > 0 else listed},
         )
     if not found.is_complete:
         raise RunIncomplete(

@@ -78,7 +78,22 @@ class Settings:
         from rig.core.clock import SystemClock
 
         path = self.load().catalog_path(self.bench_name)
+        if not create and self.load().catalog.path is None and not path.exists():
+            raise self._no_catalog(path)
         return Catalog.open(path, clock=clock or SystemClock(), create=create, read_only=read_only)
+
+    def _no_catalog(self, path: Path) -> RigError:
+        """Return the error that the bench has no catalog; it names the benches that have one."""
+        from rig.bench import bench_names
+        from rig.core.errors import CatalogError
+
+        others = [name for name in bench_names() if (self.load().catalog_path(name) / "catalog.sqlite").exists()]
+        enroll = f"Enroll an object: rig enroll NAME --bench {self.bench_name}"
+        return CatalogError(
+            f"The bench {self.bench_name} has no catalog yet.",
+            next_step=f"Add --bench {others[0]} to use the catalog of that bench. {enroll}" if others else enroll,
+            evidence={"folder": str(path), "benches with a catalog": others},
+        )
 
     def catalog_there(self) -> "Catalog | None":
         """Return the bench's catalog, opened for reading; None if there is none yet."""

@@ -47,6 +47,10 @@ def test_enroll_list_show_identify(rig):
     }
     shown = rig("catalog", "show", "mug-dots")
     assert "8 of 8 views" in shown.stdout
+    assert max(map(len, shown.stdout.splitlines())) < 200
+    assert "simulated camera" in shown.stdout
+    assert "placement_mm" not in shown.stdout
+    assert "placement_mm" in rig("catalog", "show", "mug-dots", "--full").stdout
     assert Path("catalog/images").is_dir()
 
     found = rig("identify", "--set", "bench.sim.object=lamp", "--json", "--seed", "5", "--strategy", "ahbr")
@@ -92,6 +96,24 @@ def test_identify_without_a_catalog_has_a_next_step(rig):
     done = rig("identify")
     assert done.exit_code == 7
     assert "Next step:" in done.stderr
+
+
+def test_missing_catalog_names_the_bench_that_has_one(rig, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    Path("rig.toml").unlink()
+    small = [word for line in ("width=320", "height=240") for word in ("--set", f"camera.{line}")]
+    none = rig("catalog", "list")
+    assert none.exit_code == 7
+    assert "Enroll an object: rig enroll NAME --bench hardware" in none.stderr
+    roi = ("--set", "view.roi=[40, 0, 240, 240]")
+    assert rig("enroll", "dice", "--views", "4", "--bench", "sim", *small, *roi).exit_code == 0
+    for arguments in (("catalog", "list"), ("identify",), ("export", "all.zip"), ("log",)):
+        done = rig(*arguments)
+        assert done.exit_code == 7
+        assert "The bench hardware has no catalog yet." in done.stderr
+        assert "Add --bench sim to use the catalog of that bench." in done.stderr
+    assert "dice" in rig("catalog", "list", "--bench", "sim").stdout
+    assert "near:" not in rig("catalog", "show", "zzz", "--bench", "sim").stderr
 
 
 def test_second_enrollment_of_a_name_needs_replace(rig):

@@ -19,6 +19,7 @@ from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS
 from rig.core.clock import SystemClock
 from rig.events.events import SimilarObjects
 from rig.search.current_model import CurrentModel
+from rig.search.replay import Difference
 from rig.views.object_presence import TableWatcher
 from sim.bench import SimBenchKind
 from sim.objects.shelf import shelf
@@ -211,6 +212,27 @@ def test_replay_check_finds_a_changed_decision(rig, tmp_path):
     assert "view 1, rotation_deg: saved -90.0, computed 90.0" in done.stderr
 
 
+def test_replay_check_sums_differences_up(rig, tmp_path):
+    shutil.copytree("runs/1", tmp_path / "run")
+    text = (tmp_path / "run" / "events.jsonl").read_text()
+    (tmp_path / "run" / "events.jsonl").write_text(text.replace('"score": 0.', '"score": 0.1'))
+    run = str(tmp_path / "run")
+    differences = json.loads(rig("replay", run, "--check", "--json").stdout)["evidence"]["differences"]
+    count = len(differences)
+    assert count > 3
+    short = rig("replay", run, "--check").stderr
+    assert f"{count} numbers in the saved run differ" in short
+    assert short.count("    view ") == 3
+    assert f"and {count - 3} more: --all" in short
+    assert rig("replay", run, "--check", "--all").stderr.count("    view ") == count
+
+
+def test_difference_of_long_values_is_cut():
+    one = Difference(2, "candidates", ["mug-white"] * 50, 1)
+    assert len(one.summary()) < 120
+    assert str(one).count("mug-white") == 50
+
+
 def test_missing_runs_and_existing_folders_are_rejected(rig):
     assert rig("replay", "nowhere").exit_code == 2
     assert rig("report", "nowhere").exit_code == 2
@@ -377,7 +399,7 @@ def test_shell_completes_objects_benches_and_strategies(enrolled):
         return set(process.communicate()[0].split())
 
     assert complete("enroll", "l") == {"lamp"}
-    assert complete("enroll", "--bench", "s") == {"sim"}
+    assert complete("enroll", "--bench", "s") == {"sim", "sim-bench"}
     assert complete("identify", "--strategy", "s") == {"sweep"}
     assert complete("ide") == {"identify"}
     assert complete("config", "set", "camera.e") == {"camera.exposure_us"}
