@@ -1,6 +1,6 @@
 """The catalog of enrolled objects: an SQLite file, and the images as files beside it."""
 
-from rig.catalog.audit import AuditEntry
+from rig.catalog.audit import Action, AuditEntry
 from rig.catalog.catalog import Catalog, ModelSet
 from rig.catalog.enrollment import Enrollment
 from rig.catalog.migrate import Migration, migrate
@@ -17,6 +17,7 @@ from rig.catalog.records import (
 )
 
 __all__ = [
+    "Action",
     "AuditEntry",
     "Catalog",
     "Enrollment",

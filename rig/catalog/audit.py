@@ -8,6 +8,7 @@ import pwd
 import socket
 from dataclasses import dataclass
 from datetime import datetime
+from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import Connection, insert, select
@@ -16,6 +17,30 @@ from rig.catalog.records import JsonObject, as_json, this_software
 from rig.catalog.schema import audit
 from rig.catalog.seal import seal_appended
 from rig.core.clock import Clock
+
+
+class Action(StrEnum):
+    """The actions in the log. The values are stored."""
+
+    ENROLLMENT_STARTED = "enrollment started"
+    ENROLLMENT_RESUMED = "enrollment resumed"
+    ENROLLMENT_ABANDONED = "enrollment abandoned"
+    ENROLLMENT_DISCARDED = "enrollment discarded"
+    ENROLLED = "enrolled"
+    IDENTIFIED = "identified"
+    RESULT_CORRECTED = "result corrected"
+    RENAMED = "renamed"
+    LABELLED = "labelled"
+    DELETED = "deleted"
+    UNDELETED = "undeleted"
+    IMPORTED = "imported"
+    MIGRATED = "migrated"
+    ROW_REMOVED = "orphaned row removed"
+    REPAIRED = "verified and repaired"
+    GARBAGE_COLLECTED = "collected garbage"
+    DESCRIBED_AGAIN = "described again"
+    MOVED = "moved"
+    TABLE_PHOTOGRAPHED = "photographed the empty table"
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +53,14 @@ class AuditEntry:
     host: str
     software: str
     action: str
+    """An `Action`, or an action of another program version."""
     object_name: str | None
     details: JsonObject
 
 
-def append(connection: Connection, clock: Clock, action: str, object_name: str | None = None, **details: Any) -> None:
+def append(
+    connection: Connection, clock: Clock, action: Action, object_name: str | None = None, **details: Any
+) -> None:
     """Add an action to the log, in the transaction of the action itself."""
     connection.execute(
         insert(audit).values(

@@ -209,7 +209,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             )
             seal_enrollments(connection, [enrollment_id])
             details = {"enrollment_id": enrollment_id, "views": len(plan), "replace": replace}
-            audit.append(connection, self.clock, "enrollment started", name, **details)
+            audit.append(connection, self.clock, audit.Action.ENROLLMENT_STARTED, name, **details)
             return self._start_session(connection, enrollment_id, object_id, name, plan, provenance)
 
     def resumable(self, name: str) -> EnrollmentSummary | None:
@@ -241,7 +241,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             object_id, name = find(connection, name)
             unfinished = _unfinished(connection, object_id, name)
             plan = tuple(unfinished.planned_azimuth_deg)
-            audit.append(connection, self.clock, "enrollment resumed", name, enrollment_id=unfinished.id)
+            audit.append(connection, self.clock, audit.Action.ENROLLMENT_RESUMED, name, enrollment_id=unfinished.id)
             return self._start_session(connection, unfinished.id, object_id, name, plan, provenance)
 
     def objects(self) -> list[ObjectSummary]:
@@ -306,8 +306,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.read() as connection:
             return ModelSet(*model_set(connection, kind))
 
-    def note(self, action: str, object_name: str | None = None, **details: Any) -> None:
-        """Add an action on the bench, such as "moved", to the audit log; details are JSON values."""
+    def note(self, action: audit.Action, object_name: str | None = None, **details: Any) -> None:
+        """Add an action to the audit log; details are JSON values."""
         with self.database.write() as connection:
             audit.append(connection, self.clock, action, object_name, **details)
 

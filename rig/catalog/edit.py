@@ -30,7 +30,7 @@ def rename(catalog: Catalog, name: str, new_name: str) -> None:
         check_free(connection, new_name)
         with changing_object(connection, object_id):
             connection.execute(update(objects).where(objects.c.id == object_id).values(name=new_name))
-        audit.append(connection, catalog.clock, "renamed", new_name, before=name)
+        audit.append(connection, catalog.clock, audit.Action.RENAMED, new_name, before=name)
 
 
 def set_texts(catalog: Catalog, name: str, *, label: str | None = None, note: str | None = None) -> None:
@@ -49,7 +49,7 @@ def set_texts(catalog: Catalog, name: str, *, label: str | None = None, note: st
         if texts:
             with changing_object(connection, object_id):
                 connection.execute(update(objects).where(objects.c.id == object_id).values(texts))
-            audit.append(connection, catalog.clock, "labelled", name, **texts)
+            audit.append(connection, catalog.clock, audit.Action.LABELLED, name, **texts)
 
 
 def delete(catalog: Catalog, *names: str) -> None:
@@ -65,7 +65,7 @@ def delete(catalog: Catalog, *names: str) -> None:
         for object_id, name in [find(connection, name) for name in dict.fromkeys(names)]:
             with changing_object(connection, object_id):
                 connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=now))
-            audit.append(connection, catalog.clock, "deleted", name)
+            audit.append(connection, catalog.clock, audit.Action.DELETED, name)
 
 
 def undelete(catalog: Catalog, name: str) -> None:
@@ -83,7 +83,7 @@ def undelete(catalog: Catalog, name: str) -> None:
         check_free(connection, name)
         with changing_object(connection, object_id):
             connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=None))
-        audit.append(connection, catalog.clock, "undeleted", name)
+        audit.append(connection, catalog.clock, audit.Action.UNDELETED, name)
 
 
 def deleted_objects(catalog: Catalog) -> list[ObjectSummary]:

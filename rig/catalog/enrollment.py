@@ -152,7 +152,7 @@ class Enrollment:
                 supersede(connection, self.object_id)
                 self._close(connection, EnrollmentStatus.COMPLETE)
             details = {"enrollment_id": self.id, "views": len(self.planned_azimuth_deg)}
-            audit.append(connection, self._clock, "enrolled", self.object_name, **details)
+            audit.append(connection, self._clock, audit.Action.ENROLLED, self.object_name, **details)
 
     def abandon(self) -> None:
         """Abandon the enrollment. Its images stay, and the complete enrollment before it stays in use."""
@@ -160,7 +160,9 @@ class Enrollment:
             self._check_in_progress(connection)
             with changing_enrollments(connection, [self.id]):
                 self._close(connection, EnrollmentStatus.ABANDONED)
-            audit.append(connection, self._clock, "enrollment abandoned", self.object_name, enrollment_id=self.id)
+            audit.append(
+                connection, self._clock, audit.Action.ENROLLMENT_ABANDONED, self.object_name, enrollment_id=self.id
+            )
 
     def discard(self) -> None:
         """Delete an enrollment without views, and its object if it has no other enrollment.
@@ -182,7 +184,9 @@ class Enrollment:
             others = select(enrollments.c.id).where(enrollments.c.object_id == self.object_id)
             if connection.scalar(others) is None:
                 connection.execute(delete(objects).where(objects.c.id == self.object_id))
-            audit.append(connection, self._clock, "enrollment discarded", self.object_name, enrollment_id=self.id)
+            audit.append(
+                connection, self._clock, audit.Action.ENROLLMENT_DISCARDED, self.object_name, enrollment_id=self.id
+            )
         for folder in (self.folder, self.folder.parent):
             with suppress(OSError):  # it has images of other enrollments
                 image_file(self._database.root, folder.as_posix()).rmdir()

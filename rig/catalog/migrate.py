@@ -91,7 +91,7 @@ def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Mi
             evidence={"tables": sorted({row[0] for row in broken})},
         )
     connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
-    audit.append(connection, clock, "migrated", before=before, after=SCHEMA_VERSION, backup=backup.name)
+    audit.append(connection, clock, audit.Action.MIGRATED, before=before, after=SCHEMA_VERSION, backup=backup.name)
     return Migration(before, SCHEMA_VERSION, backup)
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import and_, bindparam, delete, insert, select, update
 
+from rig.catalog.audit import Action
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import EmptyTable, known_descriptor, pack, region_of, settings_of, stored_describer
 from rig.catalog.jobs import JobProgress, portions, processes
@@ -126,7 +127,9 @@ def redescribe(
         yield JobProgress(done, len(items))
     if items:
         described = done - len(failed)
-        catalog.note("described again", descriptor=kind.name, version=kind.version, views=described, failed=len(failed))
+        catalog.note(
+            Action.DESCRIBED_AGAIN, descriptor=kind.name, version=kind.version, views=described, failed=len(failed)
+        )
     return Redescribed(kind.name, kind.version, done - len(failed), unchanged, tuple(failed))
 
 

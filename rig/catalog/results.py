@@ -220,7 +220,7 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
             )
         )
         seal_appended(connection, results)
-        _note(catalog, connection, "identified", new.answered._replace(sample=sample), result_id, operator)
+        _note(catalog, connection, audit.Action.IDENTIFIED, new.answered._replace(sample=sample), result_id, operator)
     return result_id
 
 
@@ -316,7 +316,7 @@ def correct(
         )
         seal_appended(connection, corrections)
         _note(
-            *(catalog, connection, "result corrected", now, result_id, operator),
+            *(catalog, connection, audit.Action.RESULT_CORRECTED, now, result_id, operator),
             before=[part for part in before if part is not None],
             reason=reason,
         )
@@ -324,7 +324,13 @@ def correct(
 
 
 def _note(
-    catalog: Catalog, connection: Connection, action: str, now: Answer, result_id: int, operator: str, **details: Any
+    catalog: Catalog,
+    connection: Connection,
+    action: audit.Action,
+    now: Answer,
+    result_id: int,
+    operator: str,
+    **details: Any,
 ) -> None:
     details = {"result": result_id, "outcome": now.outcome, "sample": now.sample, "operator": operator, **details}
     given = {key: value for key, value in details.items() if value is not None}

@@ -183,7 +183,11 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
             _remove(catalog.path, paths)
         if ids or deleted or paths:
             catalog.note(
-                "collected garbage", objects=list(deleted), enrollments=len(ids), views=view_count, freed_bytes=size
+                audit.Action.GARBAGE_COLLECTED,
+                objects=list(deleted),
+                enrollments=len(ids),
+                views=view_count,
+                freed_bytes=size,
             )
     return collected
 

@@ -191,7 +191,7 @@ def verify(
     _report_digests(state)
     if repair and state.findings:
         repaired = [f"{one.problem}: {one.path}, {one.repair}" for one in state.findings if one.repair is not None]
-        catalog.note("verified and repaired", found=len(state.findings), repaired=repaired)
+        catalog.note(audit.Action.REPAIRED, found=len(state.findings), repaired=repaired)
     return Verification(
         object_count,
         sum(item.view_id is not None for item in items),
@@ -224,7 +224,7 @@ def _check_rows(state: _State) -> bool:
                 if state.repair:
                     if row and "id" in row:
                         connection.exec_driver_sql(f"DELETE FROM {table} WHERE rowid = ?", (rowid,))
-                    audit.append(connection, state.catalog.clock, "orphaned row removed", table=table, row=row)
+                    audit.append(connection, state.catalog.clock, audit.Action.ROW_REMOVED, table=table, row=row)
                     finding = replace(finding, repair=Repair.REMOVED)
                 state.findings.append(finding)
             if not state.repair:

@@ -1,6 +1,6 @@
 """Export a catalog to open formats, and import objects from them."""
 
-from rig.catalog.exchange.batch import Gap, ImportBatch, RejectedFile
+from rig.catalog.exchange.batch import Gap, ImportBatch, ImportProblem, RejectedFile
 from rig.catalog.exchange.bundle import read_bundle, read_unpacked, write_bundle
 from rig.catalog.exchange.catalog_reader import read_catalog, read_objects
 from rig.catalog.exchange.folder import DEFAULT_PATTERN, read_folder, write_folder
@@ -13,6 +13,7 @@ __all__ = [
     "Conflict",
     "Gap",
     "ImportBatch",
+    "ImportProblem",
     "Imported",
     "Plan",
     "RejectedFile",

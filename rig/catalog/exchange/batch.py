@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from enum import Enum, unique
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -214,12 +215,45 @@ ExportedObject = tuple[Object, dict[str, Path]]
 """An object, and the files of its images by their paths in the export."""
 
 
+@unique
+class ImportProblem(Enum):
+    """A reason why a file is not imported: the name is its code, the value the template of its text."""
+
+    NOT_A_FILE = "is not a file"
+    LINK_OUTSIDE = "is a link to a file outside the folder"
+    NAME_PATTERN = "does not match the pattern {pattern}"
+    SAME_AZIMUTH = "shows {name!r} from the same azimuth as {other}"
+    INVALID_VALUE = "{error}"
+    UNREADABLE = "cannot be read: {error}"
+    INVALID_IMAGE = "cannot be used: {error}"
+    OTHER_IMAGE = "is not the stored image"
+    NOT_DESCRIBED = "cannot be described: {error}"
+    DESCRIPTOR_NOT_CHECKED = "its descriptor {name} cannot be checked: {error}"
+    OTHER_DESCRIPTOR = "its descriptor {name} is not that of the image"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """An `ImportProblem` with the values of its text."""
+
+    code: ImportProblem
+    values: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return self.code.value.format_map(self.values)
+
+
 @dataclass(frozen=True, slots=True)
 class RejectedFile:
     """A file that is not imported, and why."""
 
     path: str
-    reason: str
+    reason: Reason
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the file with the code and the text of the reason."""
+        code = self.reason.code.name.lower()
+        return {"path": self.path, "code": code, "values": self.reason.values, "reason": str(self.reason)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,12 +322,15 @@ def assemble(
             name = clean_name(photograph.name)
             check_azimuth(photograph.azimuth_deg)
         except UsageError as error:
-            all_rejected.append(RejectedFile(str(photograph.path), error.what))
+            all_rejected.append(
+                RejectedFile(str(photograph.path), Reason(ImportProblem.INVALID_VALUE, {"error": error.what}))
+            )
             continue
         taken = by_name.setdefault(name, {})
         if photograph.azimuth_deg in taken:
             other = taken[photograph.azimuth_deg].path.name
-            all_rejected.append(RejectedFile(str(photograph.path), f"shows {name!r} from the same azimuth as {other}"))
+            reason = Reason(ImportProblem.SAME_AZIMUTH, {"name": name, "other": other})
+            all_rejected.append(RejectedFile(str(photograph.path), reason))
             continue
         taken[photograph.azimuth_deg] = photograph
     objects = tuple(

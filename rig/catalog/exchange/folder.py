@@ -13,7 +13,9 @@ from hbr.core.angles import wrap360
 from rig.catalog.exchange.batch import (
     ExportedObject,
     ImportBatch,
+    ImportProblem,
     Photograph,
+    Reason,
     RejectedFile,
     assemble,
     parse_region,
@@ -70,11 +72,11 @@ def read_folder(
             continue
         shown = path.relative_to(folder)
         if not path.is_file():
-            rejected.append(RejectedFile(str(shown), "is not a file"))
+            rejected.append(RejectedFile(str(shown), Reason(ImportProblem.NOT_A_FILE)))
         elif not _stays(path, real, inside):
-            rejected.append(RejectedFile(str(shown), "is a link to a file outside the folder"))
+            rejected.append(RejectedFile(str(shown), Reason(ImportProblem.LINK_OUTSIDE)))
         elif (found := named.fullmatch(shown.with_suffix("").as_posix())) is None:
-            rejected.append(RejectedFile(str(shown), f"does not match the pattern {pattern}"))
+            rejected.append(RejectedFile(str(shown), Reason(ImportProblem.NAME_PATTERN, {"pattern": pattern})))
         else:
             angle_deg = float(found["angle"])
             azimuth_deg = float(wrap360(-angle_deg if table_angles else angle_deg))

@@ -60,7 +60,7 @@ def insert_objects(
             audit.append(
                 connection,
                 catalog.clock,
-                "imported",
+                audit.Action.IMPORTED,
                 origin=plan.batch.origin,
                 objects=[item.name for item in wanted],
                 views=sum(len(enrollment.views) for item in wanted for enrollment in item.enrollments),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hbr.descriptors import descriptor
 from rig.catalog.describing import is_current, matches, pack, region_of
-from rig.catalog.exchange.batch import ImageSource, Session
+from rig.catalog.exchange.batch import ImageSource, ImportProblem, Reason, Session
 from rig.catalog.exchange.plan import Plan
 from rig.catalog.places import file_mode, folder_mode
 from rig.catalog.records import PackedDescriptor, Region
@@ -22,6 +22,8 @@ from rig.core.errors import CatalogError, UsageError
 from rig.core.files import open_new
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
+
+_READ_ERRORS = (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error)
 
 
 class Item(NamedTuple):
@@ -40,14 +42,14 @@ class Item(NamedTuple):
 
 
 class StagedImage(NamedTuple):
-    """An image that is staged as ``file``, with its descriptors, or the reason why it is rejected."""
+    """An image that is staged as ``file`` with its descriptors, or the reason for its rejection."""
 
     file: str
     sha256: str = ""
     size: int = 0
     packed: tuple[PackedDescriptor, ...] = ()
     segmentation: dict[str, Any] | None = None
-    reason: str = ""
+    reason: Reason | None = None
 
 
 def items_of(plan: Plan, descriptors: tuple[str, ...] = ()) -> Iterator[Item]:
@@ -94,15 +96,15 @@ def _stage_one(root: Path | None, item: Item, mode: int) -> StagedImage:
         content = _read(item.source)
         image = images.decode(content)
     except images.BadImage as error:
-        return StagedImage("", reason=str(error))
-    except (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
-        return StagedImage("", reason=f"cannot be read: {error}")
+        return _rejected(ImportProblem.INVALID_IMAGE, error=str(error))
+    except _READ_ERRORS as error:
+        return _rejected(ImportProblem.UNREADABLE, error=str(error))
     sha256 = images.digest(content)
     if item.sha256 is not None and sha256 != item.sha256:
-        return StagedImage("", reason="is not the stored image")
+        return _rejected(ImportProblem.OTHER_IMAGE)
     for given in item.given:
-        if why := _is_wrong(given, image, item.empty_table):
-            return StagedImage("", reason=why)
+        if wrong := _check_descriptor(given, image, item.empty_table):
+            return wrong
     if root is None:
         return StagedImage("", sha256, len(content))
     packed: list[PackedDescriptor] = []
@@ -110,10 +112,8 @@ def _stage_one(root: Path | None, item: Item, mode: int) -> StagedImage:
     if item.descriptors:
         try:
             described = ViewDescriber(ViewConfig(roi=item.region), item.descriptors)(image)
-        except UsageError as error:
-            return StagedImage("", reason=error.what)
-        except ValueError as error:
-            return StagedImage("", reason=str(error))
+        except (UsageError, ValueError) as error:
+            return _rejected(ImportProblem.NOT_DESCRIBED, error=str(error))
         packed = pack(described.levels, item.region)
         segmentation = described.segmentation
     file = f"{item.folder}/{item.stem}{images.suffix(content)}"
@@ -123,20 +123,22 @@ def _stage_one(root: Path | None, item: Item, mode: int) -> StagedImage:
     return StagedImage(file, sha256, len(content), tuple(packed), segmentation)
 
 
-def _is_wrong(
+def _rejected(code: ImportProblem, **values: Any) -> StagedImage:
+    return StagedImage("", reason=Reason(code, values))
+
+
+def _check_descriptor(
     given: PackedDescriptor, image: NDArray[np.uint8], empty_table: tuple[ImageSource, str | None] | None
-) -> str:
-    """Return why a descriptor cannot be that of its image; empty if it is."""
+) -> StagedImage | None:
+    """Return a rejected image if the descriptor is not that of the image, or if that cannot be checked."""
     kind = descriptor(given.name)
     try:
         table = None if empty_table is None or kind.whole_image else _table(*empty_table)
         config = ViewConfig(roi=region_of(given.settings))
         levels = ViewDescriber(config, (given.name,), table)(image).levels[given.name]
-    except (CatalogError, UsageError) as error:
-        return error.what
-    except (OSError, BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
-        return f"its descriptor {given.name} cannot be checked: {error}"
-    return "" if matches(kind, given.packed, levels) else f"its descriptor {given.name} is not that of the image"
+    except (CatalogError, UsageError, *_READ_ERRORS) as error:
+        return _rejected(ImportProblem.DESCRIPTOR_NOT_CHECKED, name=given.name, error=str(error))
+    return None if matches(kind, given.packed, levels) else _rejected(ImportProblem.OTHER_DESCRIPTOR, name=given.name)
 
 
 @lru_cache(maxsize=4)

@@ -14,8 +14,10 @@ from rig.catalog.exchange.batch import (
     Enrollment,
     ExportedObject,
     ImportBatch,
+    ImportProblem,
     Object,
     Photograph,
+    Reason,
     RejectedFile,
     View,
     assemble,
@@ -69,7 +71,8 @@ def read_table(path: Path, *, now: datetime) -> ImportBatch:
                 try:
                     photographs.append(_photograph(row, folder))
                 except ValueError as error:
-                    rejected.append(RejectedFile(f"{path.name}, line {rows.line_num}", str(error)))
+                    reason = Reason(ImportProblem.INVALID_VALUE, {"error": str(error)})
+                    rejected.append(RejectedFile(f"{path.name}, line {rows.line_num}", reason))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ImportRejected(f"{path} cannot be read: {error}", next_step="save it as CSV in UTF-8") from error
     if not photographs:

@@ -82,6 +82,7 @@ def home(
 
 def _rotate(settings: Settings, table: "Turntable", angle_deg: float) -> None:
     """Rotate the table, and report the events of the rotation."""
+    from rig.catalog import Action
     from rig.core.errors import RigError
     from rig.events.events import Event, event_dict
     from rig.events.lines import line
@@ -94,9 +95,9 @@ def _rotate(settings: Settings, table: "Turntable", angle_deg: float) -> None:
         for event in steps():
             settings.say(line(event), event_dict(event))
     except RigError as error:
-        settings.note("moved", to_deg=angle_deg, ended=error.what)
+        settings.note(Action.MOVED, to_deg=angle_deg, ended=error.what)
         raise
-    settings.note("moved", to_deg=angle_deg)
+    settings.note(Action.MOVED, to_deg=angle_deg)
 
 
 @command

@@ -1,6 +1,7 @@
 """`rig import` and `rig export`."""
 
 import sys
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -159,7 +160,8 @@ def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bo
     if settings.json:
         from rig.events.events import plain
 
-        settings.print_json({"dry_run": dry_run, "seconds": round(seconds, 3), **plain(done)})
+        values = {**plain(replace(done, rejected=())), "rejected": [file.as_json() for file in done.rejected]}
+        settings.print_json({"dry_run": dry_run, "seconds": round(seconds, 3), **values})
         return
     per_second = f", {done.views / seconds:.0f} images a second" if seconds > 0 and not dry_run else ""
     print(

@@ -37,6 +37,7 @@ def empty_table(
 
     Example: rig empty-table --show empty.png
     """
+    from rig.catalog import Action
     from rig.core.errors import UsageError
 
     if show is not None and anyway:
@@ -46,7 +47,7 @@ def empty_table(
             _show(settings, bench, show)
             return
         _take(settings, bench, anyway=anyway)
-        settings.note("photographed the empty table", anyway=anyway)
+        settings.note(Action.TABLE_PHOTOGRAPHED, anyway=anyway)
 
 
 def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, then: str | None = None) -> None:

@@ -13,7 +13,7 @@ from rig.core.errors import RigError
 
 if TYPE_CHECKING:
     from rig.bench import Bench
-    from rig.catalog import Catalog
+    from rig.catalog import Action, Catalog
     from rig.config import RigConfig
     from rig.core.clock import Clock
 
@@ -100,7 +100,7 @@ class Settings:
         path = self.load().catalog_path(self.bench_name)
         return self.open_catalog(read_only=True) if (path / "catalog.sqlite").exists() else None
 
-    def note(self, action: str, **details: Any) -> None:
+    def note(self, action: "Action", **details: Any) -> None:
         """Write an action on the bench into the log of its catalog (`rig log`), if it has one."""
         path = self.load().catalog_path(self.bench_name)
         if not (path / "catalog.sqlite").exists():

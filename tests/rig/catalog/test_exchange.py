@@ -27,6 +27,7 @@ from rig.catalog.exchange import (
     Conflict,
     ImportBatch,
     Imported,
+    ImportProblem,
     import_objects,
     plan_import,
     preview_import,
@@ -275,9 +276,9 @@ class TestFolders:
         photograph(tmp_path / "in" / "IMG_0001.png", 9)
         catalog = open_catalog("catalog")
         done = run_import(catalog, read_folder(tmp_path / "in", now=NOW), label="coil")
-        assert [(file.path, file.reason) for file in done.rejected] == [
-            ("IMG_0001.png", "does not match the pattern {object}__{angle}")
-        ]
+        (rejected,) = done.rejected
+        assert (rejected.path, rejected.reason.code) == ("IMG_0001.png", ImportProblem.NAME_PATTERN)
+        assert str(rejected.reason) == "does not match the pattern {object}__{angle}"
         views = catalog.views().views
         assert views.object_names == ("mug", "obj2", "obj10")
         assert views.azimuth_deg.tolist() == [10.0, 0.0, 355.0, 0.0, 90.5]
@@ -358,13 +359,13 @@ class TestFolders:
         catalog = open_catalog("catalog")
         checked = finished(preview_import(plan_import(None, batch)))
         done = run_import(catalog, batch)
-        assert {(Path(file.path).name, file.reason) for file in done.rejected} == {
-            ("mug__90.png", "truncated or damaged"),
-            ("tin__0.png", "neither a PNG nor a JPEG file"),
-            ("mug__180.png", "shows 'mug' from the same azimuth as mug__180.0.png"),
-            ("mug__45.png", "is a link to a file outside the folder"),
-            ("mug__46.png", "is not a file"),
-            ("mug__47.png", "is not a file"),
+        assert {(Path(file.path).name, file.reason.code) for file in done.rejected} == {
+            ("mug__90.png", ImportProblem.INVALID_IMAGE),
+            ("tin__0.png", ImportProblem.INVALID_IMAGE),
+            ("mug__180.png", ImportProblem.SAME_AZIMUTH),
+            ("mug__45.png", ImportProblem.LINK_OUTSIDE),
+            ("mug__46.png", ImportProblem.NOT_A_FILE),
+            ("mug__47.png", ImportProblem.NOT_A_FILE),
         }
         assert (done.objects, done.views) == (checked.objects, checked.views) == (1, 3)
         assert checked.rejected == done.rejected
@@ -414,7 +415,7 @@ class TestTables:
         catalog = open_catalog("catalog")
         done = run_import(catalog, read_table(table, now=NOW))
         assert catalog.views().views.azimuth_deg.tolist() == [0.0, 270.0]
-        assert [file.reason for file in done.rejected] == [
+        assert [str(file.reason) for file in done.rejected] == [
             "azimuth_deg is 'north', not an angle in degrees",
             "azimuth_deg missing",
             "there is no image 7.png",

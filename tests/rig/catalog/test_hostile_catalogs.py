@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.catalog import Catalog, migrate
+from rig.catalog import Action, Catalog, migrate
 from rig.catalog.edit import delete
 from rig.catalog.exchange import import_objects, plan_import, read_bundle, read_catalog, read_objects, write_bundle
 from rig.catalog.redescribe import redescribe
@@ -296,7 +296,7 @@ def test_edited_log_is_found(root: Path, statement: str) -> None:
             connection.execute(source)
     with opened(root) as catalog:
         assert {one.problem for one in finished(verify(catalog, quick=True, jobs=1)).findings} == {"log changed"}
-        catalog.note("moved")
+        catalog.note(Action.MOVED)
         assert finished(verify(catalog, quick=True, jobs=1)).findings
 
 

@@ -12,7 +12,7 @@ import pytest
 import hbr
 from hbr.descriptors import descriptor, registry
 from hbr.descriptors.plain_cedd import Cedd
-from rig.catalog import Catalog
+from rig.catalog import Action, Catalog
 from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelete
 from rig.catalog.redescribe import redescribe
 from rig.catalog.seal import seal_enrollments
@@ -159,7 +159,7 @@ class TestLog:
         clock.sleep(3600)
         rename(catalog, "mug", "cup")
         delete(catalog, "cup")
-        catalog.note("moved", to_deg=90.0)
+        catalog.note(Action.MOVED, to_deg=90.0)
         log = catalog.log()
         assert [entry.action for entry in log] == ["enrollment started", "enrolled", "renamed", "deleted", "moved"]
         assert {entry.time_utc - begun for entry in log} == {timedelta(0), timedelta(hours=1)}
