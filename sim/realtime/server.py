@@ -50,7 +50,9 @@ class Session:
         match request:
             case {"ask": "do", "words": [*words]} if all(isinstance(word, str) for word in words):
                 with self._time.present():
-                    return run(self._bench.commands, words), b""
+                    answer = run(self._bench.commands, words)
+                with self._time.present():  # a port that was unplugged has disappeared before the answer
+                    return answer, b""
             case {"ask": "i2c", "address": int(address), **rest}:
                 return self._i2c(address, rest)
             case {"ask": "camera", "call": "open"}:

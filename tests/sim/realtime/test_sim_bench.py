@@ -19,10 +19,11 @@ from rig.bench import open_bench
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, UsageError
+from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, EmergencyStop, UsageError
 from rig.core.files import json_values
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
+from rig.motion.turntable import Turntable
 from sim.bench import ShelfOperator
 from sim.devices import SimDevices
 from sim.faults import Faults
@@ -34,6 +35,7 @@ from sim.realtime.run import run_bench
 from sim.realtime.server import MAX_CONNECTIONS, MAX_LINE, Server, Session
 from sim.realtime.wire import SOCKET, Wire, short_path, tell
 from sim.world import World
+from tests.contract.heads import needs
 from tests.fuzzing import fuzz_settings
 
 CLOCK = SystemClock()
@@ -188,6 +190,29 @@ def test_garbage_does_not_end_the_bench(start):
         client.close()
     until(lambda: answers(folder))
     assert ping(folder) == 1
+
+
+def test_servo_and_rig_head_are_parts_of_one_world(start):
+    needs("memory")
+    folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5", "table.velocity_dps=120")
+    config = load_config(folder / "rig.toml")
+    assert not tell(folder, "status")["world"]["light"][0]
+    with open_bench("sim-bench", config) as bench:
+        assert tell(folder, "status")["world"]["light"][0] == pytest.approx(1.0, abs=0.01)
+        bench.safety.set_revolutions(0)
+        with Turntable(bench) as table:
+            move = table.goto(60.0)
+        assert move.gyro.angle_deg == pytest.approx(60.0, abs=3.0)
+        assert move.rotation_encoder_deg == pytest.approx(60.0, abs=1.0)
+        assert tell(folder, "status")["world"]["table_deg"] == pytest.approx(60.0, abs=1.0)
+        tell(folder, "estop", "press")
+        with pytest.raises(EmergencyStop):
+            until(lambda: bool(bench.head.check()))
+        tell(folder, "estop", "release")
+    tell(folder, "head", "unplug")
+    assert not os.path.lexists(folder / "head")
+    with pytest.raises(DeviceNotFound, match="Cannot open the head's port"):
+        open_bench("sim-bench", config)
 
 
 # -- its camera and its I2C bus ---------------------------------------------------------------------------------------
