@@ -13,11 +13,10 @@ _INNER: Final = 34.0
 _OUTER: Final = 118.0
 _BARS: Final = (124.0, 154.0)
 _STOP_PX: Final = 7.0
-_LIST_X: Final = SIZE + 14
-_LIST_WIDTH: Final = 206.0
-_LIST_TOP: Final = 66.0
+_LIST_TOP: Final = SIZE + 14
+_COLUMN: Final = SIZE / 2
 _ROW: Final = 17.0
-_LETTERS: Final = 30
+_LETTERS: Final = 28
 
 
 def decision_chart(
@@ -76,47 +75,45 @@ def decision_chart(
         parts.append(svg.text(str(k + 1), (x, y + 4), "stop-number"))
     side = "left" if rotation_deg >= 0 else "right"
     chosen_words = f"{side} {abs(rotation_deg):.0f}°, to {azimuth_words(azimuth_deg[chosen])}°"
-    lines = [
-        (f"view {number} → {number + 1}", "small"),
-        (chosen_words, "step-name"),
-        *_reasons(weighed, chosen, candidates),
-    ]
+    why, numbers = _reasons(weighed, chosen, candidates)
+    columns = ([(f"view {number} → {number + 1}", "small"), (chosen_words, "step-name"), *why], numbers)
     listed = [
-        svg.text(words, (_LIST_X, _LIST_TOP + _ROW * row), class_, anchor="start")
+        svg.text(words, (4 + _COLUMN * column, _LIST_TOP + _ROW * row), class_, anchor="start")
+        for column, lines in enumerate(columns)
         for row, (words, class_) in enumerate(lines)
     ]
-    label = f"Decision after view {number}: " + ", ".join(words for words, _ in lines[1:] if words)
-    height = max(SIZE, _LIST_TOP + _ROW * len(lines))
-    return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *listed])
+    label = f"Decision after view {number}: " + ", ".join(words for words, _ in [*columns[0][1:], *numbers])
+    height = _LIST_TOP + _ROW * max(map(len, columns))
+    return svg.drawing(SIZE, height, label, [*parts, *listed])
 
 
-def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> list[tuple[str, str]]:
+_Lines = list[tuple[str, str]]
+"""Lines of text with their classes."""
+
+
+def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> tuple[_Lines, _Lines]:
+    """Return what the rotation is for, and the numbers behind it."""
+    cost = [
+        ("cost of the motion", "small"),
+        (f"{weighed.cost[chosen]:.2f}, at most {max(weighed.cost):.2f}", "small"),
+    ]
     if len(candidates) < 2 or weighed.similarity is None:
-        reason = [("only one object is likely:", "small"), ("a new side improves its pose", "small")]
-        return [*reason, *_cost(weighed, chosen)]
+        return [("only one object is likely:", "small"), ("a new side improves its pose", "small")], cost
     least, most = min(weighed.similarity), max(weighed.similarity)
     left, worst = (percent_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
-    return [
-        ("", "small"),
+    why = [
         ("separates", "small"),
         (short(candidates[0], _LETTERS), "step-name"),
         ("and", "small"),
         (short(candidates[1], _LETTERS), "step-name"),
+    ]
+    numbers = [
         (f"similarity there {weighed.similarity[chosen]:.2f}", "small"),
         (f"({least:.2f} to {most:.2f} all around)", "small"),
-        ("", "small"),
         ("chance of confusion left", "small"),
         (f"{left} there, {worst} at worst", "small"),
-        *_cost(weighed, chosen),
     ]
-
-
-def _cost(weighed: Weighed, chosen: int) -> list[tuple[str, str]]:
-    return [
-        ("", "small"),
-        ("cost of the motion", "small"),
-        (f"{weighed.cost[chosen]:.2f}, at most {max(weighed.cost):.2f}", "small"),
-    ]
+    return why, [*numbers, *cost]
 
 
 def _words(weighed: Weighed, i: int, azimuth_deg: float) -> str:

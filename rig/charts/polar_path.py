@@ -17,10 +17,10 @@ _ARC_STEP_DEG: Final = 4.0
 _LABEL_PX: Final = (46.0, 17.0)
 _LABEL_SPOTS: Final = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 _LABEL_ASIDE_PX: Final = (22.0, -22.0)
-_LIST_X: Final = SIZE + 14
-_LIST_WIDTH: Final = 206.0
-_LIST_TOP: Final = 66.0
+_CAPTION_Y: Final = SIZE + 12
+_LIST_TOP: Final = SIZE + 40
 _LIST_ROW: Final = 38.0
+_LIST_COLUMN: Final = SIZE / 2
 _NOTE_LETTERS: Final = 28
 
 
@@ -74,12 +74,13 @@ def polar_path(start_deg: float, steps: Sequence[PathStep], *, scale: str) -> st
         words = svg.title(f"view {k + 1} at {azimuth_words(azimuth_deg[k])}°")
         parts.append(svg.circle((x, y), _STOP_PX, f"stop{last}", words))
         parts.append(svg.text(str(k + 1), (x, y + 4), f"stop-number{last}"))
-    for step, (x, y) in zip(steps, _label_spots(arcs, stops), strict=True):
-        parts.append(svg.text(f"{abs(step.rotation_deg):.1f}°", (x, y + 4), "step-label"))
+    for step, spot in zip(steps, _label_spots(arcs, stops), strict=True):
+        if spot is not None:  # the list has all rotations
+            parts.append(svg.text(f"{abs(step.rotation_deg):.1f}°", (spot[0], spot[1] + 4), "step-label"))
     where = ", ".join(f"{azimuth_words(a)}°" for a in azimuth_deg)
     label = f"Camera positions seen from above, in the order of the views: {where}"
-    height = max(SIZE, _LIST_TOP + _LIST_ROW * len(steps))
-    return svg.drawing(_LIST_X + _LIST_WIDTH, height, label, [*parts, *_list(steps, scale)])
+    height = _CAPTION_Y + 12 + _LIST_ROW * _rows(steps)
+    return svg.drawing(SIZE, height, label, [*parts, *_list(steps, scale)])
 
 
 def _radii(n: int) -> list[float]:
@@ -108,14 +109,18 @@ def _arrowhead(arc: Sequence[Point]) -> str:
     return svg.path([at(_STOP_PX, 0), at(tail, _ARROW_PX / 2), at(tail, -_ARROW_PX / 2)], "arrow", close=True)
 
 
-def _label_spots(arcs: Sequence[Sequence[Point]], stops: Sequence[Point]) -> list[Point]:
-    """Return a position for the label of each arc that covers no view and no other label, if there is one."""
+def _label_spots(arcs: Sequence[Sequence[Point]], stops: Sequence[Point]) -> list[Point | None]:
+    """Return a position for the label of each arc, on which no view, other label or other arc is; None without one."""
     taken = [*stops, CENTRE]
-    for arc in arcs:
+    spots: list[Point | None] = []
+    for k, arc in enumerate(arcs):
         wanted = [arc[round(share * (len(arc) - 1))] for share in _LABEL_SPOTS]
         wanted += [_outwards(wanted[0], aside) for aside in _LABEL_ASIDE_PX]
-        taken.append(next((p for p in wanted if not any(_covers(p, other) for other in taken)), wanted[0]))
-    return taken[len(stops) + 1 :]
+        others = [point for other in (*arcs[:k], *arcs[k + 1 :]) for point in other]
+        free = (p for p in wanted if not any(_covers(p, other) for other in taken))
+        spots.append(next((p for p in free if not any(_touches(p, other) for other in others)), None))
+        taken += [spot for spot in spots[-1:] if spot is not None]
+    return spots
 
 
 def _outwards(point: Point, by: float) -> Point:
@@ -128,20 +133,26 @@ def _covers(a: Point, b: Point) -> bool:
     return abs(a[0] - b[0]) < _LABEL_PX[0] and abs(a[1] - b[1]) < _LABEL_PX[1]
 
 
+def _touches(label: Point, point: Point) -> bool:
+    return abs(label[0] - point[0]) < _LABEL_PX[0] / 2 and abs(label[1] - point[1]) < _LABEL_PX[1] / 2
+
+
+def _rows(steps: Sequence[PathStep]) -> int:
+    return ceil(len(steps) / 2)
+
+
 def _list(steps: Sequence[PathStep], scale: str) -> list[str]:
-    """List the rotations, each with its reason."""
-    parts = [
-        svg.text(scale, (_LIST_X, 16), "small", anchor="start"),
-        svg.text("left is counter-clockwise", (_LIST_X, 31), "small", anchor="start"),
-    ]
+    """List the rotations in two columns, each with its reason."""
+    parts = [svg.text(f"{scale}; left is counter-clockwise", (CENTRE[0], _CAPTION_Y), "small")]
     for k, step in enumerate(steps):
-        y = _LIST_TOP + _LIST_ROW * k
-        parts.append(svg.text(f"{k + 1} → {k + 2}", (_LIST_X, y), "small", anchor="start"))
-        parts.append(svg.text(step.words, (_LIST_X + 44, y), "step-name", anchor="start"))
+        column, row = divmod(k, _rows(steps))
+        x, y = 4 + _LIST_COLUMN * column, _LIST_TOP + _LIST_ROW * row
+        parts.append(svg.text(f"{k + 1} → {k + 2}", (x, y), "small", anchor="start"))
+        parts.append(svg.text(step.words, (x + 44, y), "step-name", anchor="start"))
         if step.s_left is None or step.s_right is None:
             why = short(" or ".join(step.candidates), _NOTE_LETTERS) or "fixed"
         else:
             left, right = distinct(step.s_left, step.s_right)
             why = f"S left {left}, right {right}"
-        parts.append(svg.text(why, (_LIST_X + 44, y + 15), "small", anchor="start"))
+        parts.append(svg.text(why, (x, y + 15), "small", anchor="start"))
     return parts

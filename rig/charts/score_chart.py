@@ -8,12 +8,14 @@ from typing import Final
 from rig.charts import svg
 from rig.charts.svg import Point
 
-_WIDTH: Final = 520.0
+_WIDTH: Final = 400.0
 _HEIGHT: Final = 290.0
-_LEFT, _TOP, _RIGHT, _BOTTOM = 44.0, 22.0, 340.0, 244.0
-_NAME_X: Final = _RIGHT + 34
+_LEFT, _TOP, _RIGHT, _BOTTOM = 44.0, 22.0, 226.0, 244.0
+_NAME_X: Final = _RIGHT + 28
 _LINE_HEIGHT: Final = 16.0
-_NAME_LETTERS: Final = 17
+_NAME_LETTERS: Final = 12
+_TICK_PX: Final = 18.0
+"""Room for the number of a view."""
 _FAR: Final = 3.0
 """A threshold is off the scale if its distance from the scores exceeds their range by this factor."""
 _STEPS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
@@ -38,7 +40,8 @@ def score_chart(
     truth
         The object on the table; its name has a mark.
     min_score
-        An object with a lower score is unknown. The line is dashed; it is at the edge if it is far from the scores.
+        An object with a lower score is unknown. The line is dashed, and named beside the plot; without a line if it is
+        far from the scores.
     top
         Number of candidates to draw: the best of the last round.
 
@@ -74,21 +77,15 @@ def score_chart(
                 f"{tick:.3f}" if ticks[1] - low < 0.009 else f"{tick:.2f}", (_LEFT - 6, y + 4), "axis", anchor="end"
             )
         )
-    parts += [svg.text(str(v + 1), (at(v, low)[0], _BOTTOM + 18), "axis") for v in range(len(rounds))]
+    every = ceil(_TICK_PX * len(rounds) / (_RIGHT - _LEFT))
+    parts += [svg.text(str(v + 1), (at(v, low)[0], _BOTTOM + 18), "axis") for v in range(0, len(rounds), every)]
     parts.append(svg.text("views taken", ((_LEFT + _RIGHT) / 2, _BOTTOM + 38), "small"))
-    if min_score is not None:
-        y = at(0, min(max(min_score, low), high))[1]
-        words = f"threshold {round(min_score, 3):g}"
-        if min_score < low:
-            words += ", below the scale ↓"
-        elif min_score > high:
-            words += ", above the scale ↑"
-        parts.append(svg.line((_LEFT, y), (_RIGHT, y), "threshold"))
-        above = y - 5 if min_score <= high else y + 13
-        parts.append(svg.text(words, (_LEFT + 3, above), "threshold-label", anchor="start"))
+    if min_score is not None and low <= min_score <= high:
+        y = at(0, min_score)[1]
+        parts.append(svg.line((_LEFT, y), (_RIGHT + 8, y), "threshold"))
     for rank in reversed(range(len(names))):  # the best is drawn last, on top
         parts.extend(_line(rounds, names[rank], _class(rank, names[rank] == winner), at))
-    parts.extend(_legend(rounds, names, winner, truth, at))
+    parts.extend(_legend(rounds, names, winner, truth, min_score, (low, high), at))
     finals = ", ".join(f"{name} {rounds[-1][name]:.3f}" for name in names)
     label = f"Scores per view of the leading candidates after {len(rounds)} views: {finals}"
     return svg.drawing(_WIDTH, _HEIGHT, label, parts)
@@ -133,12 +130,28 @@ def _legend(
     names: Sequence[str],
     winner: str | None,
     truth: str | None,
+    min_score: float | None,
+    span: tuple[float, float],
     at: Callable[[int, float], Point],
 ) -> list[str]:
     """Draw names and last scores beside the plot, best first, each connected with the end of its line."""
     ends = [at(len(rounds) - 1, rounds[-1][name]) for name in names]
-    rows = _spread([y for _, y in ends])
     parts = []
+    if min_score is None:
+        rows = _spread([y for _, y in ends])
+    else:  # the threshold has a row among the names, so that no line is drawn over its label
+        low, high = span
+        y = at(0, min(max(min_score, low), high))[1]
+        place = sum(end[1] <= y for end in ends)
+        rows = _spread([*(end[1] for end in ends[:place]), y, *(end[1] for end in ends[place:])])
+        row = rows.pop(place)
+        arrow, where = (" ↓", ", below the scale") if min_score < low else (" ↑", ", above the scale")
+        if low <= min_score <= high:
+            arrow = where = ""
+            parts.append(svg.path([(_RIGHT + 8, y), (_NAME_X - 5, row)], "threshold leader"))
+        words = f"threshold {round(min_score, 3):g}"
+        label = svg.text(f"{words}{arrow}", (_NAME_X, row + 4), "threshold-label", anchor="start")
+        parts.append(svg.element("g", svg.title(f"{words}{where}"), label))
     for rank, (name, end, y) in enumerate(zip(names, ends, rows, strict=True)):
         class_ = _class(rank, name == winner)
         parts.append(svg.path([(end[0] + 5, end[1]), (_RIGHT + 8, end[1]), (_NAME_X - 5, y)], f"{class_} leader"))

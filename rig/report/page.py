@@ -3,6 +3,7 @@
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -11,6 +12,7 @@ import cv2
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
+from hbr import Outcome
 from hbr.core.angles import wrap360
 from rig.charts.azimuth_ring import RingView, azimuth_ring
 from rig.charts.decision_chart import decision_chart
@@ -44,17 +46,33 @@ _FEW: Final = 3
 """Up to this number of searches or objects are all expanded; of more, only the first and the wrong ones."""
 
 
+_HEADS: Final = (
+    ("#", "number of the search; it leads to its details", "n"),
+    ("on the table", "the object that is really on the table", ""),
+    ("found as", "the answer of the search", ""),
+    ("correct?", "whether the answer is that object, or unknown for one that was never enrolled; or ambiguous", ""),
+    ("views", "number of views that the search took", "n"),
+    ("rotation", "how far the table rotated in all", "n"),
+    ("pose error", "distance of the answered rotation from the true one; – if it is not determined", "n"),
+    ("score", "similarity of the views to the enrolled views of the answer, per view; 1 is a perfect match", "n"),
+    ("margin", "how far the score leads that of every other enrolled object at least, per view", "n"),
+)
+"""Heads of the columns of the results, their meanings and classes."""
+_WITH_TRUTH: Final = ("on the table", "correct?", "pose error")
+
+
 @dataclass(frozen=True, slots=True)
 class Meta:
     """Circumstances of a run.
 
     ``conditions`` determine the run (noise model, seed, versions): equal conditions give equal pages. ``wall_clock``
-    has the values that differ between equal runs (date, duration, host); they are at the foot of the page. A value that
-    is a mapping becomes a group of rows.
+    has the values that differ between equal runs (duration, host); they are at the foot of the page. A value that is a
+    mapping becomes a group of rows. ``date`` is at the top.
     """
 
     conditions: Mapping[str, Any] = field(default_factory=dict)
     wall_clock: Mapping[str, Any] = field(default_factory=dict)
+    date: datetime | None = None
 
 
 def render_report(
@@ -76,8 +94,10 @@ def render_report(
     meta
         Conditions and wall-clock times.
     """
+    with_truth = any(record.truth is not None for record in identifications)
     return _template().render(
         title=title,
+        date="" if meta.date is None else f"{meta.date.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
         summary=summary,
         totals=totals(enrollments, identifications),
         retrievals=[
@@ -88,7 +108,8 @@ def render_report(
             _object(number, record, unfold=number == 1 or len(enrollments) <= _FEW)
             for number, record in enumerate(enrollments, 1)
         ],
-        with_truth=any(record.truth is not None for record in identifications),
+        with_truth=with_truth,
+        heads=[head for head in _HEADS if with_truth or head[0] not in _WITH_TRUTH],
         conditions=_groups(meta.conditions),
         wall_clock=_groups(meta.wall_clock),
     )
@@ -139,6 +160,7 @@ class _Retrieval(NamedTuple):
     truth: str
     answer: str
     correct: bool | None
+    ambiguous: bool
     views: str
     travelled: str
     pose_error: str
@@ -191,6 +213,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         truth=_truth(record),
         answer=outcome_words(answer) if answer else "no answer",
         correct=record.correct,
+        ambiguous=answer is not None and answer.outcome is Outcome.AMBIGUOUS,
         views=f"{answer.views if answer else len(views)}",
         travelled=f"{answer.travelled_deg:.0f}°" if answer else "–",
         pose_error="–" if error_deg is None else f"{error_deg:.1f}°",

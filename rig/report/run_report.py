@@ -1,5 +1,7 @@
 """The report of a saved run."""
 
+from datetime import datetime
+
 from rig.events.wording import answer_words, outcome_words
 from rig.report.page import Meta, render_report
 from rig.report.records import IdentificationRecord
@@ -24,6 +26,7 @@ def run_report(saved: SavedRun) -> str:
         summary = answer_words(answer) if answer else "The search ended without an answer."
         meta = Meta(
             conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
-            wall_clock={"date": about["started_utc"], "software": about["software"]},
+            wall_clock={"software": about["software"]},
+            date=datetime.fromisoformat(about["started_utc"]),
         )
         return render_report(f"Search: {found}", summary, [], [record], meta=meta)

@@ -40,7 +40,7 @@ def totals(
         items.append(SummaryItem("found", f"{right}/{len(known)}", "enrolled objects identified correctly"))
     if unknown:
         right = sum(record.correct is True for record in unknown)
-        items.append(SummaryItem("unknown objects recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
+        items.append(SummaryItem("unknown objects recognized", f"{right}/{len(unknown)}", "objects never enrolled"))
     if answered:
         views_taken = [record.answer.views for record in answered if record.answer]
         travelled = [record.answer.travelled_deg for record in answered if record.answer]
@@ -50,7 +50,7 @@ def totals(
             )
         )
         items.append(
-            SummaryItem("travelled", f"{fmean(travelled):.0f}°", f"mean a retrieval; {sum(travelled):.0f}° in all")
+            SummaryItem("rotation", f"{fmean(travelled):.0f}°", f"mean of a search; {sum(travelled):.0f}° in all")
         )
     errors = [record.pose_error_deg for record in answered if record.pose_error_deg is not None]
     if errors:
@@ -124,6 +124,6 @@ def _answer_items(record: IdentificationRecord) -> list[SummaryItem]:
         ),
         SummaryItem("score", f"{answer.score:.3f}", f"per view; margin {answer.margin:.3f}"),
         SummaryItem("views", f"{answer.views}"),
-        SummaryItem("travelled", f"{answer.travelled_deg:.0f}°"),
+        SummaryItem("rotation", f"{answer.travelled_deg:.0f}°"),
         SummaryItem("bench time", f"{answer.seconds:.1f} s"),
     ]

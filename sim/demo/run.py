@@ -178,7 +178,8 @@ def run_demo(
             **({} if change is None else {"changed between enrollment and query": asdict(change)}),
             **{f"device: {name}": identity for name, identity in devices.items()},
         },
-        wall_clock={"run at": f"{begun:%Y-%m-%d %H:%M} UTC", "took": f"{wall_s:.1f} s"},
+        wall_clock={"took": f"{wall_s:.1f} s"},
+        date=begun,
     )
     totals = result.as_dict()
     summary = (

@@ -220,7 +220,7 @@ class _Job:
 
         names = ", ".join(record.name for record in self._records[:3])
         title = names if len(self._records) <= 3 else counted(len(self._records), "object")
-        meta = Meta(conditions=self._records[-1].conditions, wall_clock={"date": f"{self._bench.clock.utc():%Y-%m-%d}"})
+        meta = Meta(conditions=self._records[-1].conditions, date=self._bench.clock.utc())
         write_report(path, render_report(f"Enrolled: {title}", "", self._records, [], meta=meta))
         print(f"Report: {path}", file=sys.stderr)
 

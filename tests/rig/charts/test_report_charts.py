@@ -49,6 +49,28 @@ def words(elements: list[ET.Element]) -> list[str]:
     return ["".join(e.itertext()) for e in elements]
 
 
+@pytest.mark.parametrize(
+    "svg",
+    [
+        polar_path(0, [PathStep(40, 1, 2)] * 7, scale="azimuth on the table"),
+        score_chart([{"a" * 60: 0.9, "b": 0.8}] * 8, min_score=0.5),
+        decision_chart(0, Weighed((60.0, -60.0), (-2.0, -1.0), (0.1, 0.2), (0.5, 0.7)), 60, candidates=("a" * 60, "b")),
+        azimuth_ring([RingView(0, 10.0)]),
+    ],
+    ids=["path", "scores", "decision", "ring"],
+)
+def test_charts_are_readable_at_the_width_of_a_phone(svg: str) -> None:
+    root = ET.fromstring(svg)
+    _, _, width, height = map(float, root.get("viewBox", "").split())
+    assert width <= 400  # letters of 13.5 units are 11 px high on a phone of 375 px
+    for e in root.iter("text"):
+        drawn = 6.4 * len("".join(e.itertext()))  # about, at 12 units
+        x, anchor = float(e.get("x", "")), e.get("text-anchor")
+        assert x - (drawn / 2 if anchor == "middle" else drawn if anchor == "end" else 0) >= -2
+        assert x + (drawn / 2 if anchor == "middle" else drawn if anchor == "start" else 0) <= width + 10
+        assert float(e.get("y", "")) <= height
+
+
 class TestPolarPath:
     def test_left_is_on_the_left_of_the_page(self) -> None:
         assert polar(100, 0)[0] == pytest.approx(CENTRE[0])
@@ -105,9 +127,12 @@ class TestPolarPath:
         assert words(having(svg, "step-label")) == ["90.0°", "47.3°", "120.5°"]
         assert words(having(svg, "step-name")) == ["left 90.0°", "left 47.3°", "right 120.5°"]
         # equal at two decimals: as many more as tell them apart
-        assert {"as enrolled", "fixed", "S left 0.41, right 0.66", "S left 0.997, right 0.996"} <= set(
-            words(having(svg, "small"))
-        )
+        assert {
+            "as enrolled; left is counter-clockwise",
+            "fixed",
+            "S left 0.41, right 0.66",
+            "S left 0.997, right 0.996",
+        } <= set(words(having(svg, "small")))
         assert words(having(svg, "stop-number")) == ["1", "2", "3", "4"]
 
     def test_labels_do_not_cover_views_or_each_other(self) -> None:
@@ -117,6 +142,17 @@ class TestPolarPath:
         for k, a in enumerate(labels):
             for b in others + labels[:k]:
                 assert abs(a[0] - b[0]) >= 46 or abs(a[1] - b[1]) >= 17
+
+    def test_labels_do_not_cover_other_arcs(self) -> None:
+        svg = polar_path(270, [PathStep(r) for r in (90, -45, 90, 90, -270, -90, -45)], scale="")
+        labels = having(svg, "step-label")
+        assert len(labels) >= 4
+        for label in labels:
+            x, y = float(label.get("x", "")), float(label.get("y", "")) - 4
+            near = [
+                arc for arc in having(svg, "step") if any(abs(a - x) < 23 and abs(b - y) < 8.5 for a, b in points(arc))
+            ]
+            assert len(near) <= 1
 
     def test_long_search_has_room_for_every_step(self) -> None:
         svg = polar_path(0, [PathStep(7.0, 1, 2)] * 40, scale="")
@@ -143,17 +179,33 @@ class TestScoreChart:
 
     def test_threshold_is_at_its_score(self) -> None:
         svg = score_chart(self.ROUNDS, winner="a", min_score=0.75)
-        (threshold,) = having(svg, "threshold")
+        threshold, _ = having(svg, "threshold")  # the second one leads to its label
         y = float(threshold.get("y1", ""))
         (_, y_high), (_, y_low), _ = map(centre, having(svg, "winner", "dot"))
         assert y == pytest.approx(y_low + (y_high - y_low) * (0.75 - 0.7) / (0.9 - 0.7), abs=0.05)
         assert words(having(svg, "threshold-label")) == ["threshold 0.75"]
 
+    def test_threshold_has_a_row_of_its_own_among_the_names(self) -> None:
+        svg = score_chart([{"a": 0.9, "b": 0.8999, "c": 0.8998}], winner="a", min_score=0.8999)
+        (label,) = having(svg, "threshold-label")
+        rows = sorted(float(e.get("y", "")) for e in [label, *having(svg, "name")])
+        assert all(b - a >= 15.9 for a, b in pairwise(rows))
+        drawn = [float(e.get(key, 0)) for e in ET.fromstring(svg).iter() for key in ("x1", "x2", "cx")]
+        assert max(drawn) < float(label.get("x", ""))  # no line crosses it
+
+    def test_numbers_of_many_views_do_not_pile_up(self) -> None:
+        svg = score_chart([{"a": 0.9 - 0.001 * view} for view in range(72)])
+        below = max(float(e.get("y", "")) for e in having(svg, "axis"))
+        at = [float(e.get("x", "")) for e in having(svg, "axis") if float(e.get("y", "")) == below]
+        assert len(at) >= 6
+        assert all(b - a >= 15 for a, b in pairwise(at))
+
     def test_distant_threshold_is_marked_as_off_the_scale(self) -> None:
         svg = score_chart([{"a": 0.99, "b": 0.985}, {"a": 0.988, "b": 0.986}], min_score=0.5)
-        assert words(having(svg, "threshold-label")) == ["threshold 0.5, below the scale ↓"]
+        assert words(having(svg, "threshold-label")) == ["threshold 0.5 ↓"]
+        assert having(svg, "threshold") == []
         svg = score_chart([{"a": 0.49, "b": 0.485}], min_score=0.9)
-        assert words(having(svg, "threshold-label")) == ["threshold 0.9, above the scale ↑"]
+        assert words(having(svg, "threshold-label")) == ["threshold 0.9 ↑"]
 
     def test_line_has_a_gap_while_a_candidate_was_not_leading(self) -> None:
         rounds = [{"a": 0.9, "b": 0.8}, {"a": 0.9}, {"a": 0.9, "b": 0.8}]

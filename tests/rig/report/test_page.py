@@ -3,6 +3,7 @@
 import re
 from base64 import b64decode
 from dataclasses import replace
+from datetime import datetime, timedelta, timezone
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hbr import Outcome
 from rig.core.errors import UsageError
 from rig.events.events import Accepted
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
@@ -17,7 +19,11 @@ from rig.report.contact_sheet import CAPTION_PX, GAP_PX
 from tests.rig.report.report_samples import NAMES, enrolled, enrolling, identified, identifying, searching_densely
 
 VOID = {"meta", "link", "img", "br", "path", "circle", "line"}
-META = Meta({"seed": 7, "noise": {"backlash_deg": 0.25, "camera": {"gain": None}}}, {"written": "2026-01-02 03:04"})
+META = Meta(
+    {"seed": 7, "noise": {"backlash_deg": 0.25, "camera": {"gain": None}}},
+    {"written": "2026-01-02 03:04"},
+    datetime(2026, 1, 2, 4, 4, tzinfo=timezone(timedelta(hours=1))),
+)
 
 
 class Page(HTMLParser):
@@ -81,7 +87,7 @@ def test_page_shows_the_content_of_the_records() -> None:
     page = Page(demo())
     results = page.tables[0]
     assert results[0] == [
-        "#", "on the table", "found as", "correct?", "views", "travelled", "pose error", "score", "margin"
+        "#", "on the table", "found as", "correct?", "views", "rotation", "pose error", "score", "margin"
     ]  # fmt: skip
     assert results[1:] == [
         ["1", "mug-white", "mug-white", "✓ correct", "4", "258°", "2.0°", "0.930", "+0.100"],
@@ -90,11 +96,38 @@ def test_page_shows_the_content_of_the_records() -> None:
         ["4", "mug-white", "mug-white", "✓ correct", "2", "90°", "–", "0.910", "+0.100"],
     ]
     assert "found 2/3" in page.text
-    assert "unknown objects recognised 1/1" in page.text
+    assert "unknown objects recognized 1/1" in page.text
     assert "S_left 0.41 < S_right 0.66" in page.text
     assert len([a for a in page.all("svg") if "Camera positions" in a["aria-label"]]) == 4
     assert len([a for a in page.all("svg") if "Scores per view" in a["aria-label"]]) == 4
     assert len([a for a in page.all("svg") if "Ring of 8 views" in a["aria-label"]]) == 2
+
+
+def test_date_is_at_the_top() -> None:
+    page = Page(demo())
+    assert page.text.startswith("Demo Demo 2026-01-02 03:04 UTC Two objects.")
+    assert not Page(render_report("t", "s", [], [], meta=Meta())).all("time")
+
+
+def test_heads_of_tables_are_explained() -> None:
+    html = demo()
+    explained = dict(re.findall(r'<abbr title="([^"]+)">([^<]+)</abbr>', html))
+    heads = [attributes for attributes in Page(html).all("th") if attributes.get("scope") == "col"]
+    assert len(heads) >= 9 + 2 * 4
+    legend = dict(re.findall(r"<dt>([^<]+)</dt><dd>([^<]+)</dd>", html))
+    for head in ("#", "on the table", "found as", "correct?", "views", "rotation", "pose error", "score", "margin"):
+        assert legend[head] in explained
+    # without the heads, on a phone, each cell says what it is
+    labels = {attributes["data-label"] for attributes in Page(html).all("td") if "data-label" in attributes}
+    assert labels >= {"found as", "views", "rotation", "pose error", "score", "margin"}
+
+
+def test_ambiguous_answer_is_neither_correct_nor_wrong() -> None:
+    record = identified(NAMES[0], (90.0,), truth=Truth(NAMES[0]))
+    assert record.answer is not None
+    record.answer = replace(record.answer, outcome=Outcome.AMBIGUOUS, possible=NAMES[:2])
+    page = Page(render_report("t", "s", [], [record, record], meta=Meta()))
+    assert page.tables[0][1][2:4] == ["mug-white or mug-star", "? ambiguous"]
 
 
 def test_azimuths_are_relative_to_the_enrollment_of_a_found_object() -> None:
@@ -151,7 +184,7 @@ def test_links_lead_to_their_searches() -> None:
     ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
     assert len(ids) == len(set(ids))
     links = [attributes["href"] for attributes in page.all("a")]
-    assert links == [f"#retrieval-{k}" for k in (1, 2, 3, 4)]
+    assert links == [f"#search-{k}" for k in (1, 2, 3, 4)]
     assert {link[1:] for link in links} <= set(ids)
 
 
@@ -199,7 +232,7 @@ def test_single_enrollment_has_its_own_page() -> None:
 
 def test_single_search_has_its_own_page() -> None:
     page = Page(render_report("Identification", "", [], [identified()], meta=Meta()))
-    assert {attributes.get("id") for attributes in page.all("h2")} == {"retrievals"}
+    assert {attributes.get("id") for attributes in page.all("h2")} == {"searches"}
     assert "outcome" not in {attributes.get("class") for attributes in page.all("span")}
     assert "answer mug-white" in page.text
     assert "score 0.930 per view; margin 0.100" in page.text
