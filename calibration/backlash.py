@@ -1,7 +1,7 @@
 """Measure the backlash between servo shaft and platter, and the sense and ratio of the servo, with the platter's gyro.
 
 The table rotates up and down alternately. At each reversal the shaft first crosses the backlash while the platter
-stands still. The gyro therefore sees less than the encoder by the full backlash b, whatever the length of the leg:
+stands still. The gyro therefore measures less than the encoder by the full backlash b, for any length of the leg:
 
     E = s·G + b·sign(E)
 
@@ -43,7 +43,7 @@ MAX_UNCERTAINTY_DEG = 0.03
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the rotation that each reversal lost beyond the fitted ratio: the backlash, whatever the leg's length."""
+    """Return the rotation that each reversal lost beyond the fitted ratio: the backlash, for any length of the leg."""
     if "backlash" not in result.estimates:
         return None
     backlash, ratio = result.estimates["backlash"], result.estimates["ratio"].value

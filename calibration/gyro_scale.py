@@ -8,7 +8,7 @@ bias:
 
 with the rotations E by the encoder and G by the gyro as it reads, without a scale. The tilt of the sensor against the
 axis (a factor of its cosine) and the error of its sample clock are part of s. A platter that slips by the same share on
-every leg looks like a scale: whole revolutions cannot tell the two apart.
+every leg looks like a scale: whole revolutions do not distinguish the two.
 """
 
 from collections.abc import Sequence

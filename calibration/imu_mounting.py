@@ -1,7 +1,7 @@
 """Measure the mounting of the IMU on the platter: its tilt against the table's axis, its level, and its delay.
 
 While the table rotates, the rate is along its axis: the direction of the integrated rate in the sensor's frame is the
-axis, whatever the direction of gravity. At rest the accelerometer shows gravity. The part of its mean over a revolution
+axis, in any direction of gravity. At rest the accelerometer shows gravity. The part of its mean over a revolution
 that is not along the axis is its own zero error; the part that rotates with the table is the deviation of the table's
 axis from the vertical. During a rotation with the backlash taken up, the encoder is ahead of the gyro by the rate times
 the delay.

@@ -104,7 +104,7 @@ def predicted_s(result: CalibrationResult, distance_deg: float) -> float:
 def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
     """Fit the model to ``moves`` robustly.
 
-    Steep ramps end before they can be timed and told from the delay: the wind-up of the ``nominal`` profile enters the
+    Steep ramps are too short to be distinguished from the delay: the wind-up of the ``nominal`` profile enters the
     fit as known to 30 %.
     """
     found = Evaluation(name=NAME, residual_unit="s", limit=MAX_RESIDUAL_S)

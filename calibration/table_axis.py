@@ -52,7 +52,7 @@ CORNER_PX = 0.1
 PIVOT_MM = 80.0
 """Typical distance of the bearing below the board's middle."""
 BIAS_PX = 0.02
-"""Common error of OpenCV's corners, whatever their number."""
+"""Common error of OpenCV's corners; more corners do not reduce it."""
 FIRST_POSE = 15
 """Parameters before the poses of the board: direction, point and lean (two each), the pivot, and the camera."""
 

@@ -249,7 +249,7 @@ class Belief:
         """Azimuth at the first query of these objects, finer than the bins and than the enrolled views.
 
         In the dead zone around an enrolled view all bins are equal: first their middle, the mean weighted by the
-        support. Then the support a step to either side tells to which of the neighbours it leans, as if it fell off
+        support. Then the support a step to either side shows to which of the neighbours it leans, as if it fell off
         evenly on both sides of the true azimuth.
         """
         support = self.support[which].astype(np.float64)

@@ -1,4 +1,4 @@
-"""The pose of a found object: its uncertainty, and the poses that its views cannot tell apart.
+"""The pose of a found object: its uncertainty, and the poses that its views do not distinguish.
 
 The support of the object's azimuths is turned into a posterior, p(φ) ∝ exp(κ A(φ) / √n). The standard uncertainty is a
 half-width of this posterior around the estimated azimuth; two constants, fitted on objects 1-50 of COIL-100, make 68 %

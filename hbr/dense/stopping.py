@@ -60,7 +60,7 @@ class StopDecision:
     outcome, reason
         What to do, and why.
     object_index : int
-        The leading candidate, whatever the outcome.
+        The leading candidate, for every outcome.
     confidence, min_confidence : float
         Its probability among the enrolled objects, and the one that ends a search.
     open_set_score, open_set_threshold : float
@@ -178,7 +178,7 @@ def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
     """Return the score below which no more than this share of further scores of the same kind fall.
 
     The ⌊α(n + 1)⌋-th smallest of n scores; -inf if n is too small, that is, below 1/α - 1. The guarantee holds on
-    average for scores that are exchangeable with these, whatever their distribution.
+    average for scores that are exchangeable with these, for any distribution.
 
     Source: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World", Springer 2005.
 

@@ -94,7 +94,7 @@ class Disk:
 
 @dataclass
 class Computer:
-    """A computer with Linux, as far as its files below ``root`` tell; the one that the program runs on by default.
+    """A computer with Linux, described by its files below ``root``; default: the computer that runs the program.
 
     It finds and opens devices. ``simulated`` says whether they are simulated.
     """

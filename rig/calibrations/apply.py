@@ -53,5 +53,5 @@ def _written(config: RigConfig, path: list[str]) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it, which has no tuples."""
+    """Return a value as in JSON: lists instead of tuples."""
     return list(value) if isinstance(value, tuple) else value

@@ -262,7 +262,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             return {row.name: row.id for row in rows}
 
     def summary(self, name: str) -> ObjectSummary:
-        """Return an object without its enrollments and views, whatever their state; errors as for `object`."""
+        """Return an object without its enrollments and views, in any state; errors as for `object`."""
         with self.database.read() as connection:
             object_id, _ = find(connection, name)
             (summary,) = object_summaries(connection, objects.c.id == object_id)

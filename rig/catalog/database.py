@@ -146,11 +146,11 @@ class Database:
     def _create(self) -> None:
         """Create the database under another name and rename it when it is complete.
 
-        Changing the journal mode of a file that other processes have open sometimes fails, whatever the timeout.
+        Changing the journal mode of a file that other processes have open sometimes fails, with any timeout.
         """
         with TemporaryDirectory(prefix=".new-", dir=self.root) as folder:
             made = Path(folder, DATABASE_NAME)
-            made.touch(0o600)  # private; whoever shares a catalog changes the permissions of its database
+            made.touch(0o600)  # private; to share a catalog, users change the permissions of its database
             engine = create_engine("sqlite://", creator=partial(sqlite3.connect, made), poolclass=NullPool)
             with engine.connect() as connection:
                 connection.exec_driver_sql("PRAGMA journal_mode = WAL")

@@ -11,7 +11,7 @@ from rig.catalog.seal import changing_object
 
 
 def rename(catalog: Catalog, name: str, new_name: str) -> None:
-    """Give an object another name. Its images stay where they are.
+    """Give an object another name. Its images keep their files.
 
     Raises
     ------

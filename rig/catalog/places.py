@@ -63,7 +63,7 @@ def files_within(folder: Path) -> Iterator[Path]:
 
 
 def file_mode(root: Path) -> int:
-    """Return the permissions of new files: those of the database, so that whoever shares a catalog shares it all."""
+    """Return the permissions of new files: those of the database, so that a shared catalog is shared completely."""
     return stat.S_IMODE((root / DATABASE_NAME).stat().st_mode) & 0o666
 
 

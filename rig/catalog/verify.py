@@ -313,7 +313,7 @@ def _check(root: Path, item: _Item, quick: bool) -> _Checked:
         try:
             describe = stored_describer(root, (name,), region, item.empty_table)
         except CatalogError:
-            continue  # the empty-table image is damaged: an item of its own
+            continue  # the empty-table image is damaged: it is another item
         levels: NDArray[np.uint8] | None = None
         with suppress(UsageError, ValueError):
             levels = describe(image).levels[name]

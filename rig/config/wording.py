@@ -130,7 +130,7 @@ def _mistake(model: type[BaseModel], values: Mapping[str, Any], key: Key, field:
         found = found[part] if isinstance(found, Mapping) and part in found else error["input"]
     shown = "" if isinstance(found, Mapping | BaseModel) else f" (found {found!r})"
     if error["type"] == "value_error" or field is None:
-        return str(error["msg"]).removeprefix("Value error, ") + shown
+        return str(error.get("ctx", {}).get("error", error["msg"])) + shown
     return f"must be {_with_unit(allowed(field), unit(key[-1]))}{shown}"
 
 

@@ -22,7 +22,7 @@ MOVED: Final = {
     "rig.turntable": "rig.motion.turntable",
     "rig.view": "rig.views.capture",
 }
-"""Modules that the documentation of version 0.1 names, and where they are now."""
+"""Modules in the documentation of version 0.1, and their present names."""
 
 
 class _MovedModules(MetaPathFinder, Loader):

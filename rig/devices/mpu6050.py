@@ -174,7 +174,7 @@ class Mpu6050:
         got = {register: self._registers.read(register, len(values)) for register, values in self._settings.items()}
         if got == self._settings:
             return
-        # After a reset an MPU-6050 is asleep. An MPU-6500 is awake, so all its settings tell.
+        # After a reset an MPU-6050 is asleep. An MPU-6500 is awake, so the check compares all settings.
         asleep = got[_USER_CTRL][1] & _ASLEEP
         reset = asleep or not any(got[register][0] for register in self._settings)
         raise DeviceFault(

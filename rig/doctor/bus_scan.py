@@ -228,7 +228,7 @@ def _answers_corrupt(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
 class FoundImu:
     """A device at an IMU address; ``driver``, the ``imu.model``, is None if there is no driver, or if it is unknown.
 
-    ``note`` tells more about it: the note of its row, registers of an unknown chip, or a kernel driver that uses the
+    ``note`` has more about it: the note of its row, registers of an unknown chip, or a kernel driver that uses the
     address.
     """
 

@@ -305,7 +305,7 @@ class Waiting:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """An object could not be identified, and the plan goes on with the next one; the fields are the error's."""
+    """An object could not be identified, and the plan continues with the next one; the fields are the error's."""
 
     error: str
     code: int
@@ -396,7 +396,7 @@ def event_dict(event: Event) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` as JSON has it: dataclasses as dicts, tuples as lists, what is not finite (unknown) as None.
+    """Return ``value`` as JSON values: dataclasses as dicts, tuples as lists, numbers that are not finite as None.
 
     Fields marked ``json=False`` are left out.
     """

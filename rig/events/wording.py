@@ -336,17 +336,17 @@ def symmetry_words(similar: SimilarObjects) -> str:
 
 
 def similar_object_words(one: SimilarObject) -> str:
-    """Return from which sides an object looks like another one: "looks like mug-03 from 120–200°"."""
+    """Return a similar object and the azimuths of the similar views: "mug-03 from 120–200°"."""
     if one.arcs_deg == ((0.0, 360.0),):
-        return f"looks like {one.name} from all sides"
+        return f"{one.name} from all sides"
     arcs = [f"{a:.0f}°" if a == b else f"{a:.0f}–{b:.0f}°" for a, b in one.arcs_deg]
-    return f"looks like {one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {joined(arcs)}"
+    return f"{one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {joined(arcs)}"
 
 
 def similar_objects_words(similar: SimilarObjects) -> list[str]:
     """Return what an object can be confused with, a line for each finding."""
     lines = [words] if (words := symmetry_words(similar)) else []
-    lines += [f"{similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects]
+    lines += [f"looks like {similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects]
     return lines if similar.objects else [*lines, "looks like no other enrolled object"]
 
 
@@ -396,7 +396,7 @@ def listed(items: Iterable[str]) -> str:
 
 
 def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:
-    """Return two numbers with as many decimals as tell them apart: ``decimals`` at least, five at most."""
+    """Return two numbers with enough decimals to show their difference: at least ``decimals``, at most five."""
     enough = next((d for d in range(decimals, 5) if f"{a:.{d}f}" != f"{b:.{d}f}"), 5) if a != b else decimals
     return f"{a:.{enough}f}", f"{b:.{enough}f}"
 

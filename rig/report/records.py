@@ -216,7 +216,7 @@ class IdentificationRecord:
     def steps(self) -> list[PathStep]:
         """The camera's rotations between the views, as the table made them.
 
-        The cable's limits may send the table the long way round: the azimuths tell where a rotation ended, the encoder
+        The cable's limits may make the table rotate the long way: the azimuths show where a rotation ended, the encoder
         how many times around it went.
         """
         steps = []

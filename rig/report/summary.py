@@ -93,7 +93,7 @@ def enrollment_items(record: EnrollmentRecord) -> list[SummaryItem]:
         )
     if record.similar:
         items.append(_symmetry(record.similar))
-        similar = [similar_object_words(one).removeprefix("looks like ") for one in record.similar.objects]
+        similar = [similar_object_words(one) for one in record.similar.objects]
         items.append(SummaryItem("looks like", similar[0] if similar else "no other", "; ".join(similar[1:])))
     if record.result:
         items.append(SummaryItem("bench time", f"{record.result.seconds:.0f} s"))
@@ -102,7 +102,7 @@ def enrollment_items(record: EnrollmentRecord) -> list[SummaryItem]:
 
 def _symmetry(similar: SimilarObjects) -> SummaryItem:
     if similar.period_deg is None or similar.neighbour_similarity is None or similar.period_similarity is None:
-        return SummaryItem("symmetry", "–", "too few views to tell")
+        return SummaryItem("symmetry", "–", "too few views")
     note = f"similarity {similar.period_similarity:.3f}, of neighbouring views {similar.neighbour_similarity:.3f}"
     if similar.period_deg == 360:
         return SummaryItem("symmetry", "none", note)

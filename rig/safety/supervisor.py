@@ -143,7 +143,7 @@ class Safety:
         return self.state
 
     def prepare(self) -> None:
-        """Make sure that the table may move now; call it before torque goes on.
+        """Make sure that the table may move now; call it before the torque is switched on.
 
         Raises
         ------

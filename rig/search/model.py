@@ -115,7 +115,7 @@ def _dense(catalog: Catalog) -> Model:
         notes += (Note(NoteCode.MIXED_EMPTY_TABLE, {"objects": list(others), "with_image": not with_image}),)
     table = None
     if with_image and before.newest is not None:
-        with suppress(CatalogError):  # rig catalog verify reports it; the bench has an image of its own
+        with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
             table = read_empty_table(catalog, before.newest)
     return Model(index, rule, notes, with_image, table)
 

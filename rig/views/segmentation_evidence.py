@@ -114,7 +114,7 @@ _OLD: Final = {
 
 
 def upgrade_evidence(evidence: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored segmentation evidence with ``method`` and ``issues``, whatever version of the program wrote it.
+    """Return stored segmentation evidence with ``method`` and ``issues``, from any version of the program.
 
     Version 0.1 stored English sentences under ``refused``. Unknown sentences become issues of code "other". The method
     was not stored: a box that was not guessed comes from the empty-table image if that agreed.

@@ -270,7 +270,7 @@ def _with_similar_objects(catalog: Catalog, events: Generator[Event, None, objec
 def _saved(
     context: Context, runs: Path, events: Generator[Event, None, object], model: Callable[[], Model]
 ) -> Generator[Event, None, None]:
-    """Yield the events of searches, and save each search in a folder of its own."""
+    """Yield the events of searches, and save each search in its own folder."""
     writer: RunWriter | None = None
     with closing(events):
         try:

@@ -1,4 +1,4 @@
-"""A simulated bench with a life of its own: one world in real time, which several programs use at once.
+"""A simulated bench in its own process: one world in real time, which several programs use at once.
 
 Decision: docs/decisions/0037.
 """

@@ -161,7 +161,7 @@ def _served_status(settings: Settings, server: "ServerAddress") -> None:
     url = f"{place.scheme}://{f'127.0.0.1:{place.port}' if everywhere else place.netloc}/api/v1/status"
     context = ssl.create_default_context(cafile=server.certificate) if server.certificate else None
     if context is not None:
-        context.check_hostname = False  # the certificate is the one in the file, whatever name it has
+        context.check_hostname = False  # the certificate is the one in the file, with any name
     request = Request(url, headers={"Authorization": f"Bearer {server.token}"})
     try:
         with urlopen(request, timeout=5, context=context) as answer:

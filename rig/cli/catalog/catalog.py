@@ -187,7 +187,7 @@ def delete_(
     ],
     yes: YesOption = False,
 ) -> None:
-    """Delete objects. `rig catalog undelete` restores them until `rig catalog gc` removes them for good.
+    """Delete objects. `rig catalog undelete` restores them until `rig catalog gc` removes them permanently.
 
     Example: rig catalog delete mug-white --yes --bench sim
     """

@@ -169,7 +169,7 @@ def correct(
         str | None, typer.Option(metavar="NAME", help="Who corrects it (default: the user's account).")
     ] = None,
 ) -> None:
-    """Correct the object or the sample of a result. The recorded answer stays, and the log tells of the correction.
+    """Correct the object or the sample of a result. The recorded answer stays, and the log contains the correction.
 
     Example: rig results correct 12 --object mug-star --reason "read the label" --bench sim
     """

@@ -115,7 +115,7 @@ def gc(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be removed.")] = False,
     yes: YesOption = False,
 ) -> None:
-    """Remove deleted objects for good, files that verify moved to lost+found, and files of interrupted imports.
+    """Remove deleted objects permanently, files that verify moved to lost+found, and files of interrupted imports.
 
     Example: rig catalog gc --dry-run --bench sim
     """
@@ -136,7 +136,7 @@ def gc(
         nothing = found == GarbageReport((), 0, 0, 0, 0)
         if not dry_run:
             if not nothing:
-                confirm(f"Remove {words(found)} for good?", yes=yes, settings=settings)
+                confirm(f"Remove {words(found)} permanently?", yes=yes, settings=settings)
             # Levels by earlier versions of a descriptor are removed without a question: they can be computed again.
             found = collect_garbage(catalog, old=old)
     text = f"{'Would remove' if dry_run else 'Removed'} {words(found)}."

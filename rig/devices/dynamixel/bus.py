@@ -59,7 +59,7 @@ class DynamixelBus:
     are distinguished by their length: reads in a row ask for different numbers of bytes (some more, below the address),
     and while a reply is still owed, no other read asks for its number. The replies to all writes are equal. So while a
     reply is owed, and for `DOUBT_S` after a reply that belongs to no request, each write is read back, and each reading
-    is confirmed. In Protocol 1.0, where no reading shows its age, all readings are.
+    is confirmed. In Protocol 1.0 no reading contains its age, so all readings are confirmed.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """A small process that switches the torque off if the program dies without doing it, for example by `kill -9`.
 
 The program holds one end of a pipe. When the program dies, the system closes that end, and the guardian opens the
-servo's port. It has a session of its own, so Ctrl+C at the terminal does not end it. A simulated servo in the memory of
+servo's port. It has its own session, so Ctrl+C at the terminal does not end it. A simulated servo in the memory of
 the program dies with it and needs no guardian. With `-P`, Python imports nothing from the working directory.
 """
 
@@ -32,7 +32,7 @@ class Guardian:
         self._process: subprocess.Popen[bytes] | None = None
 
     def arm(self) -> None:
-        """Have the torque switched off if this program dies from now on; call it before the torque goes on."""
+        """Let the guardian switch the torque off if this program dies; call it before switching the torque on."""
         if self._process is None or self._process.poll() is not None:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", __name__, *self._arguments],

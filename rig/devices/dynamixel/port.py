@@ -65,7 +65,7 @@ def open_serial(path: str, baud: int, device: str = "servo") -> SerialConnection
 class ClockedPort(PortHandler):  # type: ignore[misc]
     """A `PortHandler` for an open connection, with timeouts on an injected clock.
 
-    Unlike the SDK's own, it uses no CPU time while it waits, and it gives up when bytes without a packet keep
+    Unlike the SDK's own, it uses no CPU time while it waits, and it stops when bytes without a packet keep
     arriving. `reconnect` opens a ``lost`` connection (its adapter was unplugged) again by ``reopen``.
     """
 

@@ -177,7 +177,7 @@ class HeadLink:
     def _guarded(self, use: Callable[[], A]) -> A:
         try:
             return use()
-        except (OSError, termios.error) as gone:  # pyserial's exceptions are OSErrors, but for those of termios
+        except (OSError, termios.error) as gone:  # pyserial's exceptions are OSErrors, except those of termios
             raise DeviceUnplugged(
                 f"The rig head's port {self.name} is gone.",
                 next_step="Plug its USB cable in, then run the command again.",
