@@ -346,7 +346,9 @@ def similar_object_words(one: SimilarObject) -> str:
 def similar_objects_words(similar: SimilarObjects) -> list[str]:
     """Return what an object can be confused with, a line for each finding."""
     lines = [words] if (words := symmetry_words(similar)) else []
-    lines += [f"looks like {similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects]
+    lines += [
+        f"looks like {similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects
+    ]
     return lines if similar.objects else [*lines, "looks like no other enrolled object"]
 
 

@@ -161,7 +161,7 @@ def test_integral_between_two_rests_is_the_rotation(sensor: Sensor, angle_deg: f
     assert turned == pytest.approx(angle_deg, abs=0.02)
 
 
-def test_times_tell_when_the_table_turned(sensor: Sensor) -> None:
+def test_sample_times_are_those_of_the_rotation(sensor: Sensor) -> None:
     sensor.imu.read_samples()
     sensor.clock.sleep(0.1)
     begun_ns = sensor.clock.now_ns()
@@ -192,7 +192,7 @@ def test_gravity_points_up_with_its_norm(sensor: Sensor) -> None:
     assert 10 < sensor.imu.temperature_c() < 50
 
 
-def test_noise_stays_below_what_the_identity_states(
+def test_noise_is_below_the_density_of_the_identity(
     open_sensor: Callable[[NoiseModel], Opened],
 ) -> None:
     with open_sensor(NoiseModel()) as sensor:

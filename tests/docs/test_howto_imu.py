@@ -64,7 +64,7 @@ def test_new_imu_passes_the_contract():
     passes(contract.test_samples_come_once_in_order_at_the_rate_of_the_identity)
     passes(contract.test_counter_clockwise_is_positive, -100.0)
     passes(contract.test_integral_between_two_rests_is_the_rotation, 37.0)
-    passes(contract.test_times_tell_when_the_table_turned)
+    passes(contract.test_sample_times_are_those_of_the_rotation)
     passes(contract.test_late_read_reports_lost_samples)
     passes(contract.test_gravity_points_up_with_its_norm)
     passes(contract.test_pulled_cable_is_an_error_and_closing_twice_is_harmless)

@@ -98,7 +98,7 @@ def stepper(monkeypatch, tmp_path):
     return load_config(None, ["servo.model=stepper", "table.zero_deg=0"])
 
 
-def test_servo_of_another_make_turns_the_table_for_an_enrollment(stepper, tmp_path):
+def test_servo_of_another_make_rotates_the_table_for_an_enrollment(stepper, tmp_path):
     world = World(seed=1)
     with SimDevices.connected(load_config(None, []), world) as devices:
         bench = assemble(

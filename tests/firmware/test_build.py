@@ -29,14 +29,14 @@ def compiler():
         pytest.skip(lacking)
 
 
-def test_generated_files_are_what_the_table_says():
+def test_generated_files_agree_with_the_table():
     done = subprocess.run(
         [sys.executable, str(FIRMWARE / "generate.py"), "--check"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout
 
 
-def test_the_core_passes_its_own_tests_under_sanitizers(compiler, tmp_path):
+def test_core_passes_its_own_tests_under_sanitizers(compiler, tmp_path):
     probe = tmp_path / "probe.c"
     probe.write_text("int main(void) { return 0; }\n")
     flags = ["-fsanitize=address,undefined", "-o", str(tmp_path / "probe"), str(probe)]
@@ -45,13 +45,13 @@ def test_the_core_passes_its_own_tests_under_sanitizers(compiler, tmp_path):
     assert "all well" in make(tmp_path, "test")
 
 
-def test_the_core_builds_without_a_warning_on_this_machine(compiler, tmp_path):
+def test_core_builds_without_a_warning_on_this_machine(compiler, tmp_path):
     make(tmp_path, "host")
     assert (tmp_path / "libhead.so").is_file()
     assert os.access(tmp_path / "head-pty", os.X_OK)
 
 
-def test_the_avr_build_fits_its_limits(tmp_path):
+def test_avr_build_fits_its_limits(tmp_path):
     if lacking := build.missing("avr"):
         pytest.skip(lacking)
     told = make(tmp_path, "avr", "size")
@@ -64,7 +64,7 @@ def test_the_avr_build_fits_its_limits(tmp_path):
     assert build.avr_image() == (tmp_path / "head.bin").read_bytes()  # the emulator runs the same bytes
 
 
-def test_the_core_needs_no_heap_and_no_floating_point(tmp_path):
+def test_core_needs_no_heap_and_no_floating_point(tmp_path):
     if lacking := build.missing("avr"):
         pytest.skip(lacking)
     make(tmp_path, "avr")
@@ -84,7 +84,7 @@ def test_the_core_needs_no_heap_and_no_floating_point(tmp_path):
     }
 
 
-def test_a_machine_without_a_compiler_is_told_what_to_install(monkeypatch):
+def test_missing_compiler_is_reported_with_the_packages_to_install(monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda _name: None)
     monkeypatch.delenv("CC", raising=False)
     assert "apt-get install" in build.missing("memory")

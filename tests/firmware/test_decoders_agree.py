@@ -77,7 +77,7 @@ def runtime(name: str) -> str:
     return str(path) if path.is_absolute() else ""
 
 
-def test_both_sides_take_the_same_lines_for_frames(compiler):
+def test_both_decoders_accept_the_same_frames(compiler):
     nightly = settings.get_current_profile_name() == "nightly"
     asan = runtime("libasan.so")
     flags = "-g -fsanitize=address,undefined -fno-sanitize-recover" if asan else "-g"

@@ -79,7 +79,7 @@ def host(port: str, deadman_s: float, how: str) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
-def test_a_stream_in_real_time(terminal):
+def test_stream_runs_in_real_time(terminal):
     terminal.say("spin 20")
     program = host(terminal.port, 2.0, "leave")
     told, _ = program.communicate(timeout=60)
@@ -93,7 +93,7 @@ def test_a_stream_in_real_time(terminal):
 
 
 @pytest.mark.parametrize("deadman_s", [0.25, 1.0])
-def test_a_killed_program_leaves_the_bench_dark_and_unpowered(terminal, deadman_s):
+def test_killed_program_leaves_the_bench_dark_and_unpowered(terminal, deadman_s):
     program = host(terminal.port, deadman_s, "stay")
     assert program.stdout.readline() == "on\n"
     terminal.wait_for("light", 128)
@@ -107,7 +107,7 @@ def test_a_killed_program_leaves_the_bench_dark_and_unpowered(terminal, deadman_
     assert took_s < deadman_s + 0.5  # the deadman, and a busy machine
 
 
-def test_the_estop_in_real_time(terminal):
+def test_estop_works_in_real_time(terminal):
     program = host(terminal.port, 2.0, "stay")
     assert program.stdout.readline() == "on\n"
     terminal.wait_for("light", 128)

@@ -143,7 +143,7 @@ IN_CATALOG = ["show mug", "show mug-white", "list", "verify --jobs 1", "verify -
     st.data(),
 )
 @cases(9)
-def test_any_catalog_ends_in_order(
+def test_any_catalog_ends_with_a_documented_exit_code(
     commands: Commands, catalogs: list[tuple[int, Path]], number: int, kind: str, command: str, data: st.DataObject
 ) -> None:
     version, folder = catalogs[number]
@@ -210,7 +210,7 @@ def test_bundle_with_any_value_is_imported_or_rejected(
     captured_ns=st.one_of(st.none(), st.integers(-(10**20), 10**20)),
 )
 @fuzz_settings(0.03)
-def test_whatever_the_catalog_accepts_survives_export_and_import(
+def test_everything_that_the_catalog_accepts_survives_export_and_import(
     tmp_path_factory: pytest.TempPathFactory,
     name: str,
     texts: tuple[str, str],

@@ -26,13 +26,13 @@ GOOD = Done(0, '{"a": 1}\n', "", 1, 0.1)
         replace(GOOD, out="3\n"),
     ],
 )
-def test_what_must_not_happen_is_noticed(bad):
+def test_fuzz_check_detects_each_forbidden_end(bad):
     check(GOOD, ("--json",))
     with pytest.raises((AssertionError, ValueError)):
         check(bad, ("--json",))
 
 
-def test_a_file_that_changes_outside_is_noticed(tmp_path):
+def test_change_of_the_file_by_another_program_is_noticed(tmp_path):
     (tmp_path / "secret").write_text("a", encoding="utf-8")
     before = tree(tmp_path)
     assert tree(tmp_path) == before

@@ -93,7 +93,7 @@ def spoil(file: Path, kind: str, data: Any) -> None:
     st.sampled_from(["replay", "replay --json", "replay --check", "replay --check --json", "report"]),
     st.data(),
 )
-def test_any_saved_run_ends_in_order(commands, runs, number, name, kind, command, data):
+def test_any_saved_run_ends_with_a_documented_exit_code(commands, runs, number, name, kind, command, data):
     run = Path(shutil.copytree(runs[number], commands.fresh() / "run"))
     assume((run / name).exists())
     spoil(run / name, kind, data)
@@ -119,7 +119,7 @@ def images(draw: st.DrawFn) -> bytes:
 @fuzz_settings(0.4)
 @given(images())
 @example(b"")
-def test_any_image_is_decoded_or_bad(content):
+def test_any_image_is_decoded_or_rejected(content):
     try:
         image = decode(content)
     except BadImage:

@@ -62,7 +62,7 @@ def test_any_edit_changes_one_key_or_is_a_config_error(text, key, value):
 
 @cases(6)
 @given(FILES, st.lists(SETTINGS, max_size=2), st.sampled_from([["config", "check"], ["config", "show"], ["status"]]))
-def test_any_configuration_ends_in_order(commands, text, overrides, command):
+def test_any_configuration_ends_with_a_documented_exit_code(commands, text, overrides, command):
     (commands.fresh() / "fuzzed.toml").write_text(text, encoding="utf-8", errors="surrogateescape", newline="")
     options = [word for one in overrides if "\0" not in one for word in ("--set", one)]
     commands.run(*command, "--config", "fuzzed.toml", "--bench", "sim", *options)
@@ -100,7 +100,7 @@ OPTIONS = ["--json", "--yes", "--seed", "--views", "--turns", "--config", "--lis
 @example("home", ["--here", "--turns", "-99999999", "--json"])
 @example("replay", ["/dev/zero", "--json"])
 @example("status", ["--seed", "9" * 4000])
-def test_any_arguments_end_in_order(commands, command, arguments):
+def test_any_arguments_end_with_a_documented_exit_code(commands, command, arguments):
     commands.fresh()
     commands.run(*command.split(), "--bench", "sim", *arguments)
 
@@ -114,7 +114,7 @@ NAMES = st.one_of(
 @cases(5)
 @given(NAMES, st.sampled_from(["catalog show", "enroll --dry-run", "enroll --dry-run --json", "catalog delete --yes"]))
 @example("\udcff", "enroll --dry-run --json")  # a byte that is not UTF-8
-def test_any_name_ends_in_order(commands, name, command):
+def test_any_name_ends_with_a_documented_exit_code(commands, name, command):
     commands.fresh()
     commands.run(*command.split(), "--bench", "sim", "--", name)
 
@@ -137,6 +137,6 @@ LISTS = st.one_of(
 @example(b"name\n" + b'"' * 200_000, False)
 @example(b"name\n" + b"a\0b\n", True)
 @example(b"name\n" + b"x" * 140_000, False)
-def test_any_list_ends_in_order(commands, content, json):
+def test_any_list_ends_with_a_documented_exit_code(commands, content, json):
     (commands.fresh() / "list.csv").write_bytes(content)
     commands.run("enroll", "--list", "list.csv", "--dry-run", "--bench", "sim", *["--json"] * json)

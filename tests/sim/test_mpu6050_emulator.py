@@ -167,7 +167,7 @@ def test_temperature_follows_the_datasheets_formula(chip: Chip) -> None:
     wait_ms=st.integers(1, 80),
 )
 @examples(21)
-def test_fifo_fills_at_the_sample_rate_with_what_was_chosen(divider: int, dlpf: int, fifo: int, wait_ms: int) -> None:
+def test_fifo_fills_at_the_sample_rate_with_the_chosen_words(divider: int, dlpf: int, fifo: int, wait_ms: int) -> None:
     words = 3 * bool(fifo & 0x08) + sum(bool(fifo & bit) for bit in (0x80, 0x40, 0x20, 0x10))
     with Chip() as chip:
         chip.wake(divider=divider, dlpf=dlpf, fifo=fifo)

@@ -54,7 +54,7 @@ DIE = solid(box((80, 80, 80), (RED, BLUE, paint.GREEN, paint.YELLOW), top=paint.
 
 
 @pytest.mark.parametrize("azimuth_deg", [-60.0, -30.0, 0.0, 30.0, 60.0, 390.0])
-def test_mark_on_a_turned_body_is_where_the_projection_says(azimuth_deg: float) -> None:
+def test_mark_on_a_rotated_body_is_where_the_projection_puts_it(azimuth_deg: float) -> None:
     a = np.radians(azimuth_deg)
     x, y = middle(render(CYLINDER, azimuth_deg), RED)
     assert x == pytest.approx(CENTRE_PX[0] + 50 * np.sin(a) * PX_PER_MM, abs=1.5)
@@ -82,7 +82,7 @@ def test_offset_moves_an_object_across_the_platter() -> None:
         assert (x - x0, y - y0) == pytest.approx(move, abs=0.3)
 
 
-def test_turned_body_moves_by_fractions_of_a_pixel() -> None:
+def test_rotated_body_moves_by_fractions_of_a_pixel() -> None:
     weight = np.arange(640)
 
     def position(offset: float) -> float:

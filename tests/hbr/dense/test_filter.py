@@ -48,7 +48,7 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
     st.sampled_from([1.0, 2.5, 4.0]),
     st.lists(st.floats(-720, 720), min_size=1, max_size=3),
 )
-def test_support_is_the_formula_s_at_every_azimuth_of_every_object(
+def test_support_follows_the_formula_at_every_azimuth_of_every_object(
     seed: int, omega: float, power: float, angles: list[float]
 ) -> None:
     views = catalog(seed, objects=3)
@@ -65,7 +65,7 @@ def test_support_is_the_formula_s_at_every_azimuth_of_every_object(
 
 @given(st.integers(0, 10**6), st.integers(1, 3))
 @examples(12)
-def test_those_who_are_kept_are_the_strongest_and_score_as_if_all_were(seed: int, kept: int) -> None:
+def test_kept_objects_are_the_strongest_and_their_scores_do_not_change(seed: int, kept: int) -> None:
     views = catalog(seed, objects=6)
     index = DenseIndex(views)
     queries = catalog(seed + 1, ragged=False).descriptors[:2]
@@ -91,7 +91,7 @@ def test_left_out_view_does_not_count() -> None:
         index.without(views.of(2))
 
 
-def test_turned_queries_agree_on_an_azimuth_and_its_mean_lies_between_the_bins() -> None:
+def test_rotated_queries_agree_on_an_azimuth_between_the_bins() -> None:
     views = catalog(7, ragged=False)
     rows = views.of(2)
     belief = belief_after(views.descriptors[rows[[1, 3, 6]]], [10.0, 100.0, 235.0], DenseIndex(views))
@@ -100,7 +100,7 @@ def test_turned_queries_agree_on_an_azimuth_and_its_mean_lies_between_the_bins()
     assert abs((ranking.pose_deg[0] - views.azimuth_deg[rows[6]] + 180) % 360 - 180) < 2.5
 
 
-def test_turning_the_zero_of_the_orientations_changes_nothing() -> None:
+def test_another_zero_of_the_orientations_changes_nothing() -> None:
     views = catalog(9)
     queries = catalog(10, ragged=False).descriptors[:3]
     index = DenseIndex(views)

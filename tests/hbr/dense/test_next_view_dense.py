@@ -38,7 +38,7 @@ def looked(azimuth: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("azimuth", "low", "high"), [(30.0, 145, 185), (300.0, -125, -85)])
-def test_twins_are_told_apart_where_they_differ(azimuth: float, low: float, high: float) -> None:
+def test_twins_are_distinguished_at_the_azimuth_of_their_difference(azimuth: float, low: float, high: float) -> None:
     look = next_best_view(update_belief(looked(azimuth), 0.0, INDEX), beta=60.0)
     assert low <= look.rotation_deg <= high
     assert look.pair in ((0, 1), (1, 0))
@@ -47,7 +47,7 @@ def test_twins_are_told_apart_where_they_differ(azimuth: float, low: float, high
     assert low <= most_informative_rotation(update_belief(looked(azimuth), 0.0, INDEX), beta=60.0) <= high
 
 
-def test_only_turns_that_the_cable_allows_are_chosen() -> None:
+def test_only_rotations_that_the_cable_allows_are_chosen() -> None:
     belief = update_belief(looked(30.0), 0.0, INDEX)
     allowed = np.array([-90.0, -40.0, 20.0, 70.0])
     look = next_best_view(belief, beta=60.0, rotations_deg=allowed)
@@ -55,7 +55,7 @@ def test_only_turns_that_the_cable_allows_are_chosen() -> None:
     assert len(look.confusion) == len(look.cost) == 4
 
 
-def test_time_that_a_turn_takes_is_weighed_against_what_it_tells() -> None:
+def test_next_view_weighs_information_against_motion_time() -> None:
     belief = update_belief(looked(30.0), 0.0, INDEX)
     turns = np.arange(-175.0, 181.0, 5)
     quick = next_best_view(belief, beta=60.0, rotations_deg=turns, seconds=np.zeros(len(turns)))
@@ -98,7 +98,7 @@ def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> 
         )
 
 
-def test_one_object_alone_is_looked_at_from_a_new_side() -> None:
+def test_single_object_is_viewed_from_a_new_side() -> None:
     alone = DenseIndex(VIEWS.select(VIEWS.of(0)))
     look = next_best_view(update_belief(looked(30.0), 0.0, alone), beta=60.0)
     assert look.pair is None

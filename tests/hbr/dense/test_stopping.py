@@ -70,7 +70,7 @@ def test_min_confidence_is_the_smallest_that_keeps_the_error_rate() -> None:
     assert min_confidence_for(confidence[:40], np.ones((40, 1), bool), 0.05) < 1
 
 
-def test_leave_one_out_searches_for_each_object_beside_its_own_views() -> None:
+def test_leave_one_out_searches_for_each_object_between_its_own_views() -> None:
     views = catalog()
     index = DenseIndex(views)
     found = leave_one_out(index, beta=BETA, views=3, searches=2)

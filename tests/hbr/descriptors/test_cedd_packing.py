@@ -8,7 +8,7 @@ from hbr import pack, unpack, unpack_rows
 
 
 @given(arrays(np.uint8, 144, elements=st.integers(0, 7)))
-def test_unpack_restores_what_pack_wrote(levels: np.ndarray) -> None:
+def test_unpack_restores_the_packed_levels(levels: np.ndarray) -> None:
     packed = pack(levels)
     assert len(packed) == 54
     assert (unpack(packed) == levels).all()

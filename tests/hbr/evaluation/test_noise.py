@@ -55,7 +55,7 @@ def test_gaussian_noise_has_the_variance_of_intensities_and_is_clipped() -> None
 
 
 @pytest.mark.parametrize("text", ["none", "gn:0.012", "mb:15:20", "gn:0.05+mb:9:45", "gn:0.012+mb:15:20"])
-def test_noise_reads_what_it_writes(text: str) -> None:
+def test_noise_is_read_from_its_own_text(text: str) -> None:
     assert str(Noise.parse(text)) == text
     assert Noise.parse("gn+mb") == Noise(0.012, 15, 20)  # the short forms have the values of the paper
     assert str(Noise.parse("mb:7")) == "mb:7:20"
@@ -103,7 +103,7 @@ def test_rotated_query_shows_the_object_rotated() -> None:
     assert direction == pytest.approx(np.random.default_rng(3).uniform(-180, 180) % 180, abs=1.5)
 
 
-def test_sizes_and_prefilter_are_of_both_sides_and_noise_of_queries_alone() -> None:
+def test_size_and_prefilter_apply_to_all_images_and_noise_to_queries_only() -> None:
     condition = Condition(size_px=96, noise=Noise.parse("gn"), prefilter_px=2.0)
     image = ball()
     enrolled, query = condition.enrolled(image).image, condition.query(image, np.random.default_rng(0)).image

@@ -88,7 +88,7 @@ def test_trial_equals_the_literal_protocol(name: str, removal: Removal) -> None:
             seen.append(following)
 
 
-def test_methods_meet_the_same_trials_whatever_else_is_run() -> None:
+def test_methods_have_the_same_trials_in_any_selection() -> None:
     together, alone = run(1), run(1, (METHODS["ahbr"],))
     m = [method.name for method in ALL].index("ahbr")
     np.testing.assert_array_equal(together.rank[m], alone.rank[0])

@@ -149,7 +149,7 @@ def test_every_processor_computes_the_same_bits(
 
 
 @pytest.mark.parametrize("state", ["intact", "missing", "damaged", "of other sources"])
-def test_a_library_is_used_only_if_it_fits(state: str, tmp_path: Path) -> None:
+def test_library_is_used_only_if_it_fits(state: str, tmp_path: Path) -> None:
     path = Path(copytree(compiling.FOLDER, tmp_path / "kernels")) / compiling.LIBRARY.name
     match state:
         case "missing":
@@ -162,12 +162,12 @@ def test_a_library_is_used_only_if_it_fits(state: str, tmp_path: Path) -> None:
     assert (load(path) is not None) == (state == "intact" and library() is not None)
 
 
-def test_the_environment_switches_the_library_off() -> None:
+def test_environment_switches_the_library_off() -> None:
     code = "from hbr.kernels import library; assert library() is None"
     subprocess.run([sys.executable, "-c", code], env=os.environ | {"HBR_KERNELS": "numpy"}, check=True)
 
 
-def test_a_machine_without_compiler_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_compiler_keeps_the_earlier_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
     assert compiling.compile_kernels(tmp_path / "library.so") is None
     monkeypatch.setenv("CC", "false")  # a compiler that fails

@@ -401,7 +401,7 @@ def test_wrong_descriptors_of_another_catalog_are_rejected(root: Path, tmp_path:
         'UPDATE descriptors SET settings = \'{"region": "evil"}\'',
     ],
 )
-def test_spoiled_values_end_in_an_error(root: Path, tmp_path: Path, statement: str) -> None:
+def test_invalid_values_end_in_an_error(root: Path, tmp_path: Path, statement: str) -> None:
     sql(root, "PRAGMA ignore_check_constraints = ON", statement)
     with pytest.raises(RigError):
         told(root)

@@ -132,7 +132,7 @@ def test_results_outlive_their_objects_and_stay_out_of_bundles(catalog: Catalog,
     write_bundle(tmp_path / "a.zip", read_objects(catalog))  # it would reject an image that belongs to no view
 
 
-def test_version_of_the_catalog_follows_what_searches_compare_with(catalog: Catalog) -> None:
+def test_version_of_the_catalog_changes_with_the_views_of_searches(catalog: Catalog) -> None:
     first = catalog.version()
     record(catalog, new_result(), None)
     assert catalog.version() == first

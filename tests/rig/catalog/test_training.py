@@ -213,7 +213,7 @@ def link_images(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("spoil", [remove_index, change_index, link_image, link_images])
-def test_spoiled_training_set_is_not_imported(catalog: Catalog, tmp_path: Path, spoil: Callable[[Path], None]) -> None:
+def test_damaged_training_set_is_not_imported(catalog: Catalog, tmp_path: Path, spoil: Callable[[Path], None]) -> None:
     export(catalog, tmp_path / "out")
     spoil(tmp_path / "out")
     with pytest.raises(ImportRejected):

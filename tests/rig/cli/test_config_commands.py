@@ -79,7 +79,7 @@ def load_config_text(text, folder):
     return load_config(path)
 
 
-def test_show_is_toml_and_says_where_each_value_comes_from(rig, tmp_path):
+def test_show_prints_toml_with_the_source_of_each_value(rig, tmp_path):
     (tmp_path / "rig.toml").write_text('[servo]\nid = 4\n[bench.sim]\nobject = "dice"\n', encoding="utf-8")
     done = rig("config", "show", "--set", "servo.baud=115200")
     assert done.exit_code == 0
@@ -99,7 +99,7 @@ def test_show_is_toml_and_says_where_each_value_comes_from(rig, tmp_path):
     assert "Did you mean servo.port?" in rig("config", "show", "servo.prot").stderr
 
 
-def test_show_reports_calibrations_and_what_each_value_overrides(rig, tmp_path):
+def test_show_reports_calibrations_and_the_overridden_values(rig, tmp_path):
     """The gyro's scale of a calibration is in force; the file overrides that of the backlash, and --set the file."""
     folder = tmp_path / "calibrations"
     (tmp_path / "rig.toml").write_text(

@@ -61,7 +61,7 @@ def results(folder: Path) -> dict:
     return found
 
 
-def test_an_evaluation_leaves_its_results_in_every_form(photographs: Path, tmp_path: Path) -> None:
+def test_evaluation_writes_its_results_in_every_format(photographs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = run(photographs, "--noise", "gn", "--methods", "all,omega-sweep", *QUICK[2:], "--out", out)
     assert done.exit_code == 0, done.output
@@ -89,7 +89,7 @@ def test_an_evaluation_leaves_its_results_in_every_form(photographs: Path, tmp_p
     assert "http://" not in page.replace("http://www.w3.org/", "")  # but for the names of XML namespaces
 
 
-def test_equal_commands_give_equal_results_whatever_the_processes(
+def test_equal_commands_give_equal_results_with_any_number_of_processes(
     photographs: Path, evaluated: Path, tmp_path: Path
 ) -> None:
     command = (photographs, *QUICK, *NOISY)
@@ -100,7 +100,7 @@ def test_equal_commands_give_equal_results_whatever_the_processes(
     assert results(tmp_path / "other")["methods"] != results(evaluated)["methods"]
 
 
-def test_an_interrupted_evaluation_keeps_what_is_done_and_goes_on(
+def test_interrupted_evaluation_continues_with_its_stored_runs(
     photographs: Path, evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     really = Settings.print_json
@@ -132,9 +132,7 @@ def test_runs_of_other_settings_are_not_mixed(photographs: Path, evaluated: Path
     assert "condition" in done.output
 
 
-def test_some_objects_are_reported_alone_though_all_are_enrolled(
-    photographs: Path, evaluated: Path, tmp_path: Path
-) -> None:
+def test_report_of_some_objects_searches_among_all(photographs: Path, evaluated: Path, tmp_path: Path) -> None:
     out = shutil.copytree(evaluated, tmp_path / "out")
     whole = results(out)
     assert run(photographs, *QUICK, *NOISY, "--out", out, "--resume", "--report", "3-4").exit_code == 0
@@ -181,7 +179,7 @@ def test_wrong_options_end_with_a_next_step(photographs: Path, tmp_path: Path, o
     assert "Next step" in done.output
 
 
-def test_a_broken_photograph_is_named(photographs: Path, tmp_path: Path) -> None:
+def test_damaged_photograph_is_reported_by_its_name(photographs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(photographs, tmp_path / "photographs")
     broken = folder / "obj3__60.png"
     broken.write_bytes(broken.read_bytes()[:200])
@@ -194,7 +192,7 @@ def test_a_broken_photograph_is_named(photographs: Path, tmp_path: Path) -> None
     assert "nowhere is not a folder" in done.output
 
 
-def test_the_catalog_is_evaluated_where_no_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_catalog_is_evaluated_where_no_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n[view]\nroi = [4, 0, 40, 40]\n')
     with Catalog.open("catalog", clock=SystemClock()) as catalog:
@@ -212,7 +210,7 @@ def test_the_catalog_is_evaluated_where_no_folder_is_named(tmp_path: Path, monke
     assert results(Path("out"))["methods"][0]["curve"][0]["hit_rate"] > 0.5
 
 
-def test_the_matrix_has_every_perturbation_at_three_strengths(photographs: Path, tmp_path: Path) -> None:
+def test_matrix_has_every_perturbation_at_three_strengths(photographs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     few = ("--enrolled", "6", "--trials", "1", "--views", "2", "--jobs", "1", "--objects", "1-2")
     done = run(photographs, "--matrix", "--descriptor", "edges+colours", *few, "--out", out)

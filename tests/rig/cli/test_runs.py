@@ -474,7 +474,7 @@ def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
         assert "amphora" in model().views.object_names
 
 
-def test_ambiguous_object_has_an_exit_code_of_its_own(rig):
+def test_ambiguous_object_ends_with_exit_code_10(rig):
     assert rig("catalog", "calibrate").exit_code == 0
     path = Path("catalog/search_rules.json")
     before = path.read_text(encoding="utf-8")

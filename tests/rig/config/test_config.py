@@ -99,7 +99,7 @@ def test_mistakes_in_bench_options_name_their_key():
 
 
 @pytest.mark.parametrize("setting", ["servo.port=nowhere", "servo.port=/dev/null"])
-def test_real_bench_without_servo_names_what_to_check(setting):
+def test_missing_servo_of_a_real_bench_is_reported_with_the_parts_to_check(setting):
     with pytest.raises(DeviceNotFound, match="servo") as caught:
         open_bench("hardware", load_config(None, [setting]))
     assert caught.value.next_step

@@ -82,7 +82,7 @@ def test_unchanged_values_stay_as_written():
 
 
 @pytest.mark.parametrize("text", ["[[servo]]\nid = 1\n", "servo = 3\n"])
-def test_uneditable_form_is_rejected_with_the_line_to_write(text):
+def test_form_that_cannot_be_edited_is_rejected_with_the_line_to_write(text):
     with pytest.raises(ConfigError, match=r"Cannot set servo\.id") as caught:
         with_values(text, {("servo", "id"): 2})
     assert "id = 2" in caught.value.next_step

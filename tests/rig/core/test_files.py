@@ -35,6 +35,6 @@ def test_lists_of_objects_are_regular_files(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["[" * 100_000, "9" * 5000, "[NaN]", "[-Infinity]", b"\xff", "[1"])
-def test_what_is_not_strict_json_is_a_value_error(content):
+def test_nonstandard_json_is_a_value_error(content):
     with pytest.raises(ValueError, match=r"."):
         json_values(content)

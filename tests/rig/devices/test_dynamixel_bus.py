@@ -81,7 +81,7 @@ def test_rejection_names_the_status_error_and_is_not_retried(wires, bus):
 
 @examples(14)
 @given(noise=st.lists(st.binary(min_size=0, max_size=30), min_size=1, max_size=4))
-def test_garbage_is_never_returned_as_a_value(noise):
+def test_random_bytes_are_never_returned_as_a_value(noise):
     wires = servo_wires()
     bus = open_bus(wires, retries=len(noise))
     garbage = iter(noise)
@@ -122,7 +122,7 @@ def test_adapter_unplugged_while_draining_raises_device_silent(monkeypatch, wire
         bus.ping(1)
 
 
-def test_reply_to_an_interrupted_request_is_never_taken_for_the_next_one(wires, bus):
+def test_reply_to_an_interrupted_request_never_answers_the_next_one(wires, bus):
     """Ctrl+C in the middle of a transaction, and then torque off with its own questions: Protocol 2.0 numbers none."""
 
     def interrupt() -> None:

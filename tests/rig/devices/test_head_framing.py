@@ -41,7 +41,7 @@ def test_flipped_bit_is_always_detected(frame, data):
 
 @fuzz_settings()
 @given(st.binary(max_size=3 * LONGEST))
-def test_garbage_raises_only_frame_errors(line):
+def test_random_bytes_raise_only_frame_errors(line):
     try:
         frame = decode(line)
     except FrameError:

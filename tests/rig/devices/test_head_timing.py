@@ -80,7 +80,7 @@ def test_times_continue_after_the_clock_wraps():
     assert abs(error_ns) < 10_000
 
 
-def test_earlier_time_is_not_taken_for_a_wrap():
+def test_earlier_time_is_not_a_wrap():
     clock = HeadClock(LINE_NS)
     assert clock.unwrap(1000) == 1000
     assert clock.unwrap(5000) == 5000

@@ -28,7 +28,7 @@ NIGHTLY = [0.008, 0.011, 0.015, 0.022, 0.08, 0.12, 0.16, 0.2, 0.3, 0.32, 0.64, 1
 @pytest.mark.parametrize(
     "delay_s", [0.005, 0.04, 0.045, 0.5, 2.5, *(pytest.param(d, marks=pytest.mark.nightly) for d in NIGHTLY)]
 )
-def test_no_old_answer_is_taken_for_a_reading(delay_s, spread, poll_s):
+def test_old_answers_are_never_readings(delay_s, spread, poll_s):
     wires, rng = servo_wires(), random.Random(1)
     servo, clock = open_servo(wires), wires.world.clock
     servo.torque_on()

@@ -226,7 +226,7 @@ def test_failed_port_is_released() -> None:
     assert bus.ping(1) == 1060
 
 
-def test_threads_take_turns_on_the_bus() -> None:
+def test_threads_use_the_bus_one_after_the_other() -> None:
     """The SDK tells a second thread that the port is busy, or mixes up their packets."""
     wires = servo_wires()
     bus = open_bus(wires, retries=0)

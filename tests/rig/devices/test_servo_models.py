@@ -120,7 +120,7 @@ def test_missing_features_of_the_ax12_are_reported() -> None:
     assert "supply" in caught.value.next_step
 
 
-def test_ax12_holds_its_position_when_torque_goes_on() -> None:
+def test_ax12_holds_its_position_when_torque_is_switched_on() -> None:
     devices = parts_of(*AX)
     servo = servo_of(devices, *AX)
     devices.servo.rotate_by_hand(40.0)
@@ -145,7 +145,7 @@ def test_ax12_overload_is_read_from_its_error_byte() -> None:
         servo.torque_on()
 
 
-def test_echo_is_not_taken_for_a_protocol_1_reply() -> None:
+def test_echo_is_not_a_protocol_1_reply() -> None:
     """An echoed instruction that reads two bytes is a valid status packet: address and length for a value."""
     devices = parts_of(*AX)
     devices.servo_bus.echo = True
@@ -221,7 +221,7 @@ def test_pan_servo_stays_within_one_revolution() -> None:
 
 
 @pytest.mark.parametrize(("carries", "sign"), [("object", -1), ("camera", 1)])
-def test_orientation_follows_what_the_servo_carries(carries: str, sign: int) -> None:
+def test_sign_of_the_orientation_depends_on_what_the_servo_rotates(carries: str, sign: int) -> None:
     assert load_config(None, [f"table.carries={carries}"]).table.orientation_sign == sign
 
 

@@ -42,7 +42,7 @@ def bench():
         yield bench
 
 
-def test_sound_bench_lacks_only_its_calibration(bench):
+def test_only_the_missing_calibration_of_a_new_bench_is_reported(bench):
     set_up(bench)
     findings = bench.findings()
     assert {f.topic for f in findings} == {check.topic for check in CHECKS}

@@ -142,7 +142,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
 @pytest.mark.parametrize(
     "wrong", [{"index": 1.5}, {"agrees": 1}, {"seconds": None}, {"commanded_deg": "90"}, {"rotation_imu_deg": True}]
 )
-def test_the_check_itself_fails_on_a_wrong_type(wrong):
+def test_type_check_fails_for_a_wrong_type(wrong):
     values = dict.fromkeys(SCHEMAS["moved"], 0.5) | {"index": 1, "agrees": True}
     check_fields(values, "moved", "moved")
     with pytest.raises(AssertionError):

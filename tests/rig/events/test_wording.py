@@ -126,7 +126,7 @@ def test_answers_begin_with_the_result() -> None:
     )
 
 
-def test_the_end_of_a_search_has_a_reason() -> None:
+def test_end_of_a_search_has_a_reason() -> None:
     known = identified("mug-white").answer
     assert isinstance(known, Identified)
     assert reason_words(replace(known, reason=StopReason.MAX_VIEWS)) == "the search took all 4 views that are allowed"

@@ -78,7 +78,7 @@ def test_stop_stays_within_the_limits_after_a_pause_of_the_computer(speed, pause
         assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_reading_that_jumps_by_a_turn_does_not_become_a_goal():
+def test_reading_that_jumps_by_a_revolution_does_not_become_a_goal():
     for jump_deg in (360.0, -360.0, 180.0, -90.0):
         for wrong_reads in (1, 2, 3):
             with motion_bench() as (bench, wires):
@@ -163,7 +163,7 @@ def test_instruction_that_arrives_damaged_is_repeated(damaged, monkeypatch):
     assert servo.bus.statistics.corrupt == damaged
 
 
-def test_line_that_damages_every_instruction_counts_as_silent(monkeypatch):
+def test_bus_that_damages_every_instruction_counts_as_silent(monkeypatch):
     wires = servo_wires()
     servo = open_servo(wires)
     write = wires.serial.write

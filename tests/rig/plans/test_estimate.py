@@ -46,7 +46,7 @@ def test_plan_of_another_bench_is_shifted_by_revolutions_or_rejected():
     assert "--replace" in caught.value.next_step
 
 
-def test_enrollment_with_a_short_cable_stays_within_it_and_sees_all_sides(simulated, tmp_path):
+def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulated, tmp_path):
     s = simulated(*SMALL, "table.limits_deg=[-180, 185]")
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         moves = [e for e in enroll(s.bench, catalog, "dice", views=6) if isinstance(e, Moved)]

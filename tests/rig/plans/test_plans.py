@@ -73,7 +73,7 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
     assert torque(s) == 0
 
 
-def test_each_view_is_stored_before_the_table_rotates_on(simulated, catalog):
+def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):
     s = simulated()
     stored = 0
     for event in enroll(s.bench, catalog, "dice", views=6):

@@ -265,7 +265,7 @@ TestBench = Bench.TestCase
 TestBench.settings = settings(fuzz_settings(0.2), stateful_step_count=30)
 
 
-def test_only_an_acknowledgement_leaves_a_fault():
+def test_only_an_acknowledgement_clears_a_fault():
     leaving = [(s, h, to) for s, ways in TRANSITIONS.items() for h, to in ways.items() if s is not to]
     assert {h for s, h, _ in leaving if s is TableState.FAULT} == {StateEvent.ACKNOWLEDGE}
     assert {(s, h) for s, h, to in leaving if to is TableState.MOVING} == {(TableState.READY, StateEvent.START)}

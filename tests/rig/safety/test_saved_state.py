@@ -170,7 +170,7 @@ def test_fault_larger_than_its_file_is_stored_without_evidence(tmp_path):
 @pytest.mark.parametrize("name", ["state.json", "latch"])
 @pytest.mark.parametrize("spoil", ["delete", "truncate", "half", "flip", "unreadable"])
 @pytest.mark.parametrize("fault", [None, STALLED], ids=["no fault", "fault"])
-def test_spoiled_state_counts_as_latched(tmp_path, name, spoil, fault):
+def test_damaged_state_counts_as_latched(tmp_path, name, spoil, fault):
     store = FileStore(tmp_path)
     store.save(BenchState(table=TABLE, fault=fault))
     path = tmp_path / name
@@ -202,7 +202,7 @@ def test_deleted_state_is_not_a_new_bench(tmp_path, whole_folder):
     assert FileStore(tmp_path / "bench").load().fault == state.fault
 
 
-def test_second_program_is_told_which_one_uses_the_bench(tmp_path, other_program):
+def test_second_program_reports_the_one_that_uses_the_bench(tmp_path, other_program):
     who = holder(tmp_path)
     assert who.pid == other_program.pid
     assert "teapot" in who.command

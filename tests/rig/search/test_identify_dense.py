@@ -58,7 +58,7 @@ def test_objects_enrolled_without_an_empty_table_image_are_searched_without(simu
     assert all(e.segmentation["agreement"] is None for e in events if isinstance(e, Accepted))
 
 
-def test_the_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_path):
+def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_path):
     s = simulated(*SMALL)
     list(photograph_table(s.bench))
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
@@ -83,7 +83,7 @@ def test_the_image_of_today_comes_before_the_image_of_the_enrollment(simulated, 
 
 
 @pytest.mark.parametrize("shape", [(10, 10, 3), (480, 640, 3)])
-def test_an_image_of_another_size_is_rejected_and_the_search_continues(simulated, shelf, shape):
+def test_image_of_another_size_is_rejected_and_the_search_continues(simulated, shelf, shape):
     s = simulated(*SMALL)
     events, answer = search(s, shelf, "lamp", empty_table=np.full(shape, 90, np.uint8))
     assert answer.name == "lamp"
@@ -91,7 +91,7 @@ def test_an_image_of_another_size_is_rejected_and_the_search_continues(simulated
     assert all(issue in e.segmentation["issues"] for e in events if isinstance(e, Accepted))
 
 
-def test_an_image_of_another_bench_is_reported_once_and_not_used(simulated, shelf):
+def test_image_of_another_bench_is_reported_once_and_not_used(simulated, shelf):
     s = simulated(*SMALL, "identify.max_views=5")
     other = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
     events, answer = search(s, shelf, "radio", empty_table=other)

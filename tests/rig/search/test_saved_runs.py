@@ -93,7 +93,7 @@ def place(saved, kind: type) -> int:
 
 
 @pytest.mark.parametrize("strategy", ["ahbr", "hbr", "sweep", "random"])
-def test_a_run_is_computed_again_to_the_same_decisions(saved, strategy):
+def test_run_is_computed_again_to_the_same_decisions(saved, strategy):
     folder, events = saved[strategy]
     found = check(load_run(folder))
     assert found.differences == []
@@ -113,7 +113,7 @@ def test_events_are_read_as_they_were_written(saved, strategy):
             assert (one.image_bgr == other.image_bgr).all()
 
 
-def test_the_folder_has_open_formats(saved):
+def test_saved_run_has_open_formats(saved):
     folder, _ = saved["ahbr"]
     assert sorted(path.name for path in folder.iterdir()) == ["events.jsonl", "frames", "model.jsonl", "run.json"]
     assert [path.name for path in sorted((folder / "frames").iterdir())] == [f"{i:03d}.png" for i in range(4)]
@@ -123,7 +123,7 @@ def test_the_folder_has_open_formats(saved):
     assert json.loads((folder / "run.json").read_text())["devices"]["servo"]["model"] == "xl430_w250"
 
 
-def test_a_dense_search_is_computed_again_from_its_folder(saved, tmp_path):
+def test_dense_search_is_computed_again_from_its_folder(saved, tmp_path):
     folder, events = saved["dense"]
     run = load_run(folder)
     found = check(run)
@@ -191,7 +191,7 @@ def test_every_decision_has_a_reason(saved):
     assert [e.rotation_deg for e in saved["sweep"][1] if isinstance(e, Decided)] == [90.0] * 3
 
 
-def test_a_changed_frame_is_noticed(saved, tmp_path):
+def test_replay_reports_a_changed_frame(saved, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(saved["ahbr"][0], folder)
     frame = folder / "frames" / "002.png"
@@ -203,19 +203,19 @@ def test_a_changed_frame_is_noticed(saved, tmp_path):
     assert all(d.view >= 3 for d in differences)
 
 
-def test_a_changed_decision_is_noticed(saved, tmp_path):
+def test_replay_reports_a_changed_decision(saved, tmp_path):
     folder = changed(saved, tmp_path, place(saved, Decided), rotation_deg=12.0)
     (difference,) = check(load_run(folder)).differences
     assert (difference.view, difference.what, difference.saved) == (3, "rotation_deg", 12.0)
 
 
-def test_a_changed_answer_is_noticed(saved, tmp_path):
+def test_replay_reports_a_changed_answer(saved, tmp_path):
     folder = changed(saved, tmp_path, place(saved, Identified), name="lamp")
     (difference,) = check(load_run(folder)).differences
     assert str(difference) == f"view 4, name: saved lamp, computed {saved['ahbr'][1][-1].name}"
 
 
-def test_an_interrupted_run_is_read_to_its_last_event(saved, tmp_path):
+def test_interrupted_run_is_read_to_its_last_event(saved, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(saved["ahbr"][0], folder)
     path = folder / "events.jsonl"
@@ -242,7 +242,7 @@ def test_an_interrupted_run_is_read_to_its_last_event(saved, tmp_path):
         ("frames/001.png", b"no picture", "cannot be read"),
     ],
 )
-def test_a_damaged_run_is_rejected(saved, tmp_path, name, content, words):
+def test_damaged_run_is_rejected(saved, tmp_path, name, content, words):
     folder = tmp_path / "run"
     shutil.copytree(saved["ahbr"][0], folder)
     (folder / name).write_bytes(content)
@@ -271,7 +271,7 @@ def huge_png(side: int) -> bytes:
 
 @pytest.mark.parametrize("frame", [b"", png(1, 1), png(320, 1), png(239, 239), huge_png(60_000), huge_png(19_000)])
 @pytest.mark.parametrize(("strategy", "name"), [("ahbr", "frames/000.png"), ("dense", "empty_table.png")])
-def test_a_frame_of_another_size_is_damage(saved, tmp_path, frame, strategy, name):
+def test_frame_of_another_size_is_reported_as_damage(saved, tmp_path, frame, strategy, name):
     folder = spoiled(saved, tmp_path, strategy)
     (folder / name).write_bytes(frame)
     try:
@@ -296,7 +296,7 @@ SPOILED_EVENTS = {
 
 
 @pytest.mark.parametrize(("kind", "values"), SPOILED_EVENTS.values(), ids=SPOILED_EVENTS)
-def test_a_spoiled_event_is_damage(saved, tmp_path, kind, values):
+def test_invalid_event_is_reported_as_damage(saved, tmp_path, kind, values):
     with pytest.raises(UsageError) as caught:
         check(load_run(changed(saved, tmp_path, place(saved, kind), **values)))
     assert caught.value.evidence["reason"]
@@ -315,7 +315,7 @@ def test_json_of_another_kind_is_damage(saved, tmp_path, name, content):
         assert error.evidence  # noqa: PT017
 
 
-def test_a_run_opens_no_file_outside_its_folder(saved, tmp_path, monkeypatch):
+def test_run_opens_no_file_outside_its_folder(saved, tmp_path, monkeypatch):
     folder = spoiled(saved, tmp_path)
     secret = tmp_path / "secret.png"
     shutil.copy(folder / "frames/000.png", secret)
@@ -331,7 +331,7 @@ def test_a_run_opens_no_file_outside_its_folder(saved, tmp_path, monkeypatch):
     assert "not a regular file" in caught.value.evidence["reason"]
 
 
-def test_a_run_names_a_network_by_its_digest(saved, tmp_path):
+def test_run_names_a_network_by_its_digest(saved, tmp_path):
     folder = spoiled(saved, tmp_path)
     about = json.loads((folder / "run.json").read_text())
     os.mkfifo(tmp_path / "pipe")
@@ -343,7 +343,7 @@ def test_a_run_names_a_network_by_its_digest(saved, tmp_path):
         assert "--model" in caught.value.next_step
 
 
-def test_a_name_with_a_line_separator_is_read_again(saved, tmp_path):
+def test_name_with_a_line_separator_is_read_again(saved, tmp_path):
     folder = spoiled(saved, tmp_path)
     for name in ("model.jsonl", "events.jsonl"):
         text = (folder / name).read_text(encoding="utf-8").replace("mug-star", "mug\u2028star")
@@ -352,7 +352,7 @@ def test_a_name_with_a_line_separator_is_read_again(saved, tmp_path):
     assert (found.differences, found.is_complete) == ([], True)
 
 
-def test_a_run_without_its_end_is_noticed(saved, tmp_path):
+def test_replay_reports_a_run_without_its_end(saved, tmp_path):
     folder = spoiled(saved, tmp_path)
     assert check(load_run(folder)).is_complete
     events = folder / "events.jsonl"
@@ -369,7 +369,7 @@ def test_a_run_without_its_end_is_noticed(saved, tmp_path):
     assert load_run(folder).error is not None
 
 
-def test_a_folder_without_a_run_or_not_empty_is_rejected(saved, tmp_path, simulated):
+def test_folder_without_a_run_or_not_empty_is_rejected(saved, tmp_path, simulated):
     with pytest.raises(UsageError, match="no saved run"):
         load_run(tmp_path)
     folder, _ = saved["ahbr"]
@@ -380,7 +380,7 @@ def test_a_folder_without_a_run_or_not_empty_is_rejected(saved, tmp_path, simula
         RunWriter(Path("/proc/run"), bench, hbr.ViewIndex(hbr.Views.empty()))
 
 
-def test_a_number_that_was_not_finite_is_read_as_nan(saved):
+def test_number_that_was_not_finite_is_read_as_nan(saved):
     accepted = next(e for e in saved["ahbr"][1] if isinstance(e, Accepted))
     values = event_dict(Rejected(0, 1, ("gyro",), accepted.evidence))
     values["evidence"]["stillness"]["peak_rate_dps"] = None

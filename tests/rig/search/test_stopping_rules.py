@@ -186,7 +186,7 @@ def test_rules_of_version_1_are_read(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b'{"format": "other"}', b'{"format": "hbr-rig search rules"}', b"\xff"]
 )
-def test_a_damaged_rule_is_reported_and_not_used(tmp_path, content):
+def test_damaged_rule_is_reported_and_not_used(tmp_path, content):
     index = shelf(8, 8, 8)
     (tmp_path / FILE).write_bytes(content)
     with pytest.raises(CatalogError, match="cannot be read"):
@@ -196,7 +196,7 @@ def test_a_damaged_rule_is_reported_and_not_used(tmp_path, content):
     assert notes[0].code is NoteCode.STOPPING_RULE_UNREADABLE
 
 
-def test_the_rule_of_a_changed_catalog(tmp_path, monkeypatch):
+def test_rule_of_a_changed_catalog_is_calibrated_again_or_used_with_a_note(tmp_path, monkeypatch):
     before, after = shelf(*[18] * 8), shelf(*[18] * 9)
     stored = hbr.calibrate_stopping_rule(before, error_rate=0.05, false_reject=0.1).rule
     write_stopping_rule(tmp_path / FILE, stored, before, made_utc=NOW)
@@ -222,7 +222,7 @@ def test_the_rule_of_a_changed_catalog(tmp_path, monkeypatch):
     assert (own.error_rate, own.false_reject) == (0.05, 0.1)
 
 
-def test_the_digest_covers_everything_that_decides():
+def test_digest_changes_with_everything_that_the_rule_depends_on():
     index = shelf(8, 8)
     views = index.views
     moved = hbr.Views(views.descriptors, views.azimuth_deg + 1, views.object_index, views.object_names, KIND.name)
@@ -258,7 +258,7 @@ class Around:
         return Finish(note="enough") if state.views == 3 else Rotate(180.0, note=state.decision.reason)
 
 
-def test_a_custom_strategy_decides_on_the_dense_search():
+def test_custom_strategy_decides_on_the_dense_search():
     index = shelf(12, 12, 12)
     model = Model(index, hbr.calibrate_stopping_rule(index).rule)
     search, chosen = begin_search(model, RigConfig(), Around())
@@ -270,7 +270,7 @@ def test_a_custom_strategy_decides_on_the_dense_search():
     assert sum(c.probability or nan for c in ranked.candidates) == pytest.approx(1)
 
 
-def test_a_strategy_that_does_not_fit_the_model_is_rejected():
+def test_strategy_that_does_not_fit_the_model_is_rejected():
     index = shelf(8, 8)
     dense, papers = (
         Model(index, hbr.calibrate_stopping_rule(index).rule),
@@ -292,7 +292,7 @@ def _cedd() -> tuple[np.ndarray, np.ndarray]:
     return np.random.default_rng(0).integers(0, 8, (4, 144), np.uint8), np.arange(4) * 90.0
 
 
-def test_a_search_ends_if_the_cable_allows_no_rotation():
+def test_search_ends_if_the_cable_allows_no_rotation():
     index = shelf(8, 8, 8)
     config = RigConfig.model_validate({"table": {"mode": "pan", "limits_deg": [-1, 1]}})
     search, _ = begin_search(Model(index, hbr.calibrate_stopping_rule(index).rule), config)

@@ -77,7 +77,7 @@ def test_rotations_of_each_strategy():
 
 
 @pytest.mark.parametrize(("name", "views"), [("ahbr", 2), ("sweep", 2), ("random", 2), ("hbr", 5)])
-def test_a_large_margin_ends_all_but_the_passive_search(name, views):
+def test_large_margin_ends_all_but_the_passive_search(name, views):
     known = model()
     search = searching(known, name, max_views=5)
     for number in range(views):
@@ -86,7 +86,7 @@ def test_a_large_margin_ends_all_but_the_passive_search(name, views):
     assert ranked.candidates[0].name == "o0"
 
 
-def test_a_score_below_min_score_ends_no_search_early():
+def test_score_below_min_score_ends_no_search_early():
     known = model()
     search = searching(known, "sweep", max_views=5, min_score=1.0, margin=0.0)
     other = np.roll(known.descriptors[0], 1)
@@ -102,7 +102,7 @@ def test_top_limits_the_named_candidates():
         assert len(ranked.candidates) == top
 
 
-def test_an_empty_catalog_and_an_unknown_strategy_are_rejected():
+def test_empty_catalog_and_an_unknown_strategy_are_rejected():
     with pytest.raises(CatalogError, match="empty"):
         searching(hbr.Views.empty(), "ahbr")
     with pytest.raises(UsageError) as caught:

@@ -7,7 +7,7 @@ from rig.web.access import Role
 API = "/api/v1"
 
 
-def test_other_hosts_and_origins_are_refused(serve):
+def test_other_hosts_and_origins_are_rejected(serve):
     client = serve().client
     assert client.get(f"{API}/status", headers={"Host": "evil.example"}).status_code == 421
     assert client.get(f"{API}/status", headers={"Host": "127.0.0.1.evil.example"}).status_code == 421
@@ -76,7 +76,7 @@ def test_path_of_a_request_reaches_no_file(serve, path):
     assert "import" not in answer.text.replace("/import", "")
 
 
-def test_large_bodies_are_refused(serve):
+def test_large_bodies_are_rejected(serve):
     client = serve().client
     assert (
         client.post(
@@ -107,7 +107,7 @@ def test_large_bodies_are_refused(serve):
         {"kind": "tray", "objects": []},
     ],
 )
-def test_impossible_requests_are_refused_with_their_mistakes(serve, body):
+def test_impossible_requests_are_rejected_with_their_mistakes(serve, body):
     import json
 
     text = json.dumps(body).replace("Infinity", "1e400")
@@ -117,7 +117,7 @@ def test_impossible_requests_are_refused_with_their_mistakes(serve, body):
     assert answer.json()["evidence"]["mistakes"]
 
 
-def test_error_of_a_job_names_the_next_step_and_the_server_goes_on(serve):
+def test_error_of_a_job_names_the_next_step_and_the_server_continues(serve):
     served = serve()
     job = served.run(kind="goto", angle_deg=5000)
     assert job["error"]["code"] == 500

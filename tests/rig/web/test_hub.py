@@ -55,7 +55,7 @@ def test_stream_resumes_after_the_last_event_id_and_says_hello_first():
     assert [one.splitlines()[0] for one in got[1:]] == ["id: e-3", "id: e-4", "id: e-5", "id: e-6"]
 
 
-def test_message_cannot_break_out_of_its_line():
+def test_message_stays_in_its_line():
     async def first() -> str:
         hub = Hub("e")
         hub.publish("plan", {"text": "a\nevent: stop\r\ndata: x\u2028"})

@@ -77,7 +77,7 @@ def process(*words: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("in_depth", [False, pytest.param(True, marks=pytest.mark.nightly)])
-def test_trainee_sees_what_the_page_says(in_depth, tmp_path, monkeypatch):
+def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
     first, *rest = commands()
     assert {typed.section for typed in rest} > set(IN_DEPTH)
     folder = tmp_path / "sim-bench"

@@ -113,7 +113,7 @@ def test_benches_have_their_own_folders_and_clean_them(start, tmp_path, capsys):
         tell(one, "status")
 
 
-def test_bench_recognizes_what_a_killed_one_left(start, tmp_path):
+def test_bench_recognizes_the_state_of_a_killed_program(start, tmp_path):
     folder = start("bench", "servo.id=7", "table.limits_deg=[-500, 500]")
     tell(folder, "quit")
     until(lambda: {path.name for path in folder.iterdir()} == LEFT)
@@ -133,7 +133,7 @@ def test_bench_recognizes_what_a_killed_one_left(start, tmp_path):
 
 
 @pytest.mark.parametrize("content", ["thesis.txt", "rig.toml"])
-def test_folder_of_something_else_is_left_alone(tmp_path, content):
+def test_folder_with_other_files_is_not_changed(tmp_path, content):
     (tmp_path / content).write_text("default_bench = 'hardware'")
     with pytest.raises(UsageError, match="other files"):
         run_bench(Settings(), tmp_path, None)

@@ -20,7 +20,7 @@ PING = bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))
 
 
 @pytest.mark.parametrize(("baudrate", "delay"), [(57_600, 250), (57_600, 0), (1_000_000, 10), (9_600, 254)])
-def test_ping_takes_its_bytes_and_the_return_delay(baudrate: int, delay: int) -> None:
+def test_time_of_a_ping_is_that_of_its_bytes_and_the_return_delay(baudrate: int, delay: int) -> None:
     line = Line(baudrate)
     line.add()
     line.put(Return_Delay_Time=delay)

@@ -105,7 +105,7 @@ def test_registers_of_every_size_are_written_and_read(line: Line) -> None:
         (100, word(886), StatusError.DATA_LIMIT),  # PWM Limit
     ],
 )
-def test_invalid_writes_return_the_emanuals_error(line: Line, address: int, data: list[int], error: int) -> None:
+def test_invalid_writes_return_the_error_of_the_emanual(line: Line, address: int, data: list[int], error: int) -> None:
     before = bytes(line.servos[1].memory.read(0, 662))
     assert line.sdk.writeTxRx(line.port, 1, address, len(data), data) == (COMM_SUCCESS, error)
     assert line.servos[1].memory.read(0, 662) == before
@@ -290,7 +290,7 @@ def test_reboot_loses_the_revolutions(line: Line) -> None:
 
 
 @pytest.mark.parametrize(("option", "bus_id", "baudrate"), [(0xFF, 1, 57_600), (0x01, 5, 57_600), (0x02, 5, 1_000_000)])
-def test_factory_reset_keeps_what_the_option_says(option: int, bus_id: int, baudrate: int) -> None:
+def test_factory_reset_keeps_the_registers_of_its_option(option: int, bus_id: int, baudrate: int) -> None:
     line = Line()
     line.add(5)
     line.put(5, Return_Delay_Time=7, Operating_Mode=4)

@@ -170,7 +170,7 @@ def test_extended_position_counts_revolutions_also_with_torque_off(line: Line) -
     assert line.read("Goal Position") == line.read("Present Position") == round(2048 - 800 / DEG_PER_COUNT)
 
 
-def test_position_mode_loses_the_revolutions_when_torque_comes_on(line: Line) -> None:
+def test_position_mode_loses_the_revolutions_when_torque_is_switched_on(line: Line) -> None:
     seconds = line.servos[1].rotate_by_hand(720.0 + 90.0)
     line.sleep(seconds)
     assert line.read("Present Position") == 2048 + 2 * 4096 + 1024
@@ -242,7 +242,7 @@ def test_goal_written_while_torque_is_off_is_ignored(line: Line) -> None:
     assert line.read("Goal Position") == 2048
 
 
-def test_goal_enables_torque_if_the_drive_mode_says_so(line: Line) -> None:
+def test_goal_enables_torque_in_the_drive_mode_torque_by_goal(line: Line) -> None:
     line.put(Drive_Mode=8, Goal_Position=3000)
     assert line.read("Torque Enable") == 1
     line.sleep(2.0)

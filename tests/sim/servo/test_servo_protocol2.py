@@ -119,7 +119,7 @@ def test_byte_stuffing_removes_headers_and_can_be_undone(bus_id: int, error: int
 
 @quick
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
-def test_sdk_unstuffs_what_the_servo_stuffs(bus_id: int, error: int, data: bytes) -> None:
+def test_sdk_unstuffs_the_bytes_that_the_servo_stuffs(bus_id: int, error: int, data: bytes) -> None:
     body = bytes((0x55, error)) + data
     # After one stuffed byte it takes FF FD FD for another: rig.devices.dynamixel has its own function.
     assume(b"\xff\xfd\xfd" not in body.partition(b"\xff\xff\xfd")[2])
