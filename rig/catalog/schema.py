@@ -252,7 +252,7 @@ EARLIER: Final = {
 
 
 def schema_digest(connection: sqlite3.Connection) -> str:
-    """Return the SHA-256 of the definitions of all tables, indexes, triggers and views, without regard to white space."""
+    """Return the SHA-256 of the definitions of all tables, indexes, triggers and views, without their white space."""
     rows = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchall()
     definitions = sorted(ascii((*row[:3], re.sub(r'[\s"]+', "", str(row[3])))) for row in rows)
     return hashlib.sha256("\n".join(definitions).encode()).hexdigest()
