@@ -1,6 +1,7 @@
 """What the trainee does to the simulated world: words such as ``put mug-white``, ``jam`` or ``turn 90``."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from rig.core.errors import RigError, UsageError
@@ -8,6 +9,7 @@ from sim.bench import ShelfOperator
 from sim.calibration_board import calibration_targets
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults, fault_kinds
+from sim.faults.schedule import Trigger
 
 HELP: Final = """\
 put NAME [DEGREES]  Put an object on the table, rotated by so many degrees (default: at random). Clears the table first.
@@ -18,7 +20,7 @@ light FACTOR        Change the light: 1 is the normal light, 0.5 half of it.
 power-cycle         Switch the servo's supply off and on.
 estop press         Press the emergency stop of the rig head; estop release releases it.
 head unplug         Unplug the rig head's USB cable; head plug plugs it in again.
-FAULT               Start a simulated fault, for example jam, unplug, imu.off, camera.off or jam@move0+2s.
+FAULT               Start a simulated fault: jam, unplug, imu.off, ...; jam@3s+2s starts in 3 s and ends 2 s later.
 end [FAULT]         End a simulated fault; without a name, all. For example: end unplug
 faults              List the simulated faults.
 status              Show the world as it really is.
@@ -157,9 +159,12 @@ class Commands:
                 f"{name} happens to the computer of one program, not to this bench.",
                 next_step=f"Use it on the bench sim: rig demo --fault {name}",
             )
+        if fault.trigger is not Trigger.AT:
+            step = f"Give the time from now on: {name}@5s"
+            raise UsageError("Programs, not this bench, count their moves and views.", next_step=step)
         if any(active.kind is fault.kind for active in self._faults.active):
             raise UsageError(f"The fault {name} is already there.", next_step=f"End it: end {name}")
-        self._faults.schedule(fault)
+        self._faults.schedule(replace(fault, mark=fault.mark + self._world.clock.now_ns() * 1e-9))
         return f"{fault.kind.what} To end it: end {name}"
 
     def _end(self, name: str | None = None) -> str:

@@ -338,7 +338,9 @@ def test_each_command_changes_the_world(commands):
     commands.do(["turn", "-30"])
     commands._world.clock.sleep(2.0)
     commands.do(["jam"])
-    commands.do(["camera.off@0s"])
+    commands.do(["camera.off@3s+2s"])
+    assert commands.state()["faults"] == ["jam"]
+    commands._world.clock.sleep(3.5)
     assert commands.state() == {
         "object": "lamp",
         "object_deg": 30.0,
@@ -366,6 +368,7 @@ def test_each_command_changes_the_world(commands):
         (["light", "-1"], "0 (dark) or more"),
         (["jamm"], "Did you mean jam? For a list of all commands: rig sim-bench help"),
         (["jam:x=1"], "Remove the parameter"),
+        (["jam@move3"], "jam@5s"),
         (["disk_full"], "rig demo --fault disk_full"),
         (["end", "jam"], "No simulated fault is there"),
         (["estop", "press"], "imu.connection=head"),
