@@ -3,16 +3,22 @@
 import os
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing.util import get_temp_dir
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import typer.testing
 from hypothesis import settings
+from typer.testing import CliRunner, Result
 
 from rig.bench import Bench
+from rig.cli.main import app
 from rig.config import load_config
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
@@ -40,12 +46,28 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 @pytest.fixture(autouse=True, scope="session")
 def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the tests and the catalogs, calibrations and benches of whoever runs them apart."""
+    """Keep the tests apart from the data of whoever runs them, and remove what they leave."""
     home = tmp_path_factory.mktemp("home")
-    with pytest.MonkeyPatch.context() as patch:
+    get_temp_dir()  # Python removes this one at its own end
+    with (
+        TemporaryDirectory(prefix="rig-tests-", ignore_cleanup_errors=True) as temporary,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("TMPDIR", temporary)  # for what killed programs leave
+        patch.setattr(tempfile, "tempdir", temporary)
         for folder in ("CONFIG", "DATA", "STATE", "CACHE"):
             patch.setenv(f"XDG_{folder}_HOME", str(home / folder.lower()))
         yield
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    """Return a function that runs `rig ...` on the simulated bench in an empty folder, where all its data are."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text(
+        'default_bench = "sim"\nstate_dir = "state"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
+    )
+    return lambda *words, **options: CliRunner().invoke(app, [str(word) for word in words], **options)
 
 
 @dataclass(frozen=True)

@@ -48,17 +48,6 @@ def results_in(folder) -> list[CalibrationResult]:
     return [CalibrationResult.from_file(path) for path in sorted((folder / "sim").iterdir())]
 
 
-@pytest.fixture
-def rig(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "rig.toml").write_text(CONFIG, encoding="utf-8")
-
-    def run(*arguments: str):
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
-
-
 def test_help_has_an_example_and_lists_the_procedures(rig):
     assert "Example: rig calibrate imu" in " ".join(rig("calibrate", "imu", "--help").output.split())
     assert "imu" in rig("calibrate", "--help").output

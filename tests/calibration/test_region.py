@@ -4,12 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from calibration import camera_model, table_axis
 from rig.bench import open_bench
 from rig.calibrations import CalibrationStore
-from rig.cli.main import app
 from rig.config import load_config
 
 MOVED = "bench.sim.noise={camera_mount=1.0}"
@@ -17,18 +15,11 @@ BEFORE = [80, 0, 480, 480]
 
 
 @pytest.fixture
-def rig(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    config = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
-    (tmp_path / "rig.toml").write_text(config, encoding="utf-8")
+def rig(rig, monkeypatch):
     # Fewer sides: other tests show what the procedures find.
     monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::3])
     monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
-
-    def run(*arguments: str, seed: int = 2):
-        return CliRunner().invoke(app, [*arguments, "--seed", str(seed), "--set", MOVED])
-
-    return run
+    return lambda *words, seed=2: rig(*words, "--seed", seed, "--set", MOVED)
 
 
 def region(rig, name: str) -> list[int]:

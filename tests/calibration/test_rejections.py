@@ -3,25 +3,17 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
 from calibration import camera_light, camera_model
 from rig.calibrations import CalibrationStore, RejectionCode
-from rig.cli.main import app
 
 
 @pytest.fixture
-def rig(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "rig.toml").write_text('default_bench = "sim"\ncalibration_dir = "calibrations"\n', encoding="utf-8")
+def rig(rig, monkeypatch):
     monkeypatch.setattr(camera_model, "ANGLES_DEG", (-40.0, 0.0, 40.0))
     for other in (camera_light.CameraNoise, camera_light.CameraCard):
         monkeypatch.setattr(other, "measure", lambda *_: (event for event in ()))
-
-    def run(*arguments: str):
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
+    return rig
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
@@ -10,12 +9,16 @@ from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilso
 @given(st.integers(1, 2000), st.data())
 def test_wilson_equals_scipy(trials: int, data: st.DataObject) -> None:
     hits = data.draw(st.integers(0, trials))
+    from scipy import stats  # takes a second to load
+
     expected = stats.binomtest(hits, trials).proportion_ci(method="wilson")
     assert wilson(hits, trials) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
 @given(st.integers(0, 300), st.integers(0, 300))
 def test_mcnemar_equals_the_binomial_test(a: int, b: int) -> None:
+    from scipy import stats
+
     expected = stats.binomtest(a, a + b).pvalue if a + b else 1.0
     assert mcnemar_exact(a, b) == pytest.approx(expected, rel=1e-9)
 

@@ -33,18 +33,6 @@ COIL = Path(os.environ.get("RIG_TEST_DATA", Path(__file__).parents[3] / ".." / "
 Rig = Callable[..., Result]
 
 
-@pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
-    """Return a function that runs `rig ...` in an empty folder with its own catalog."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n', encoding="utf-8")
-
-    def run(*arguments: str) -> Result:
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
-
-
 def result(done: Result) -> Any:
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)

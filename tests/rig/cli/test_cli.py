@@ -6,10 +6,8 @@ import signal
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from rig.catalog import Catalog
-from rig.cli.main import app
 from rig.core.clock import SystemClock
 from tests.programs import Program
 
@@ -20,15 +18,9 @@ SMALL = (
 
 
 @pytest.fixture
-def rig(tmp_path, monkeypatch):
-    """Return a function that runs `rig ...` in an empty folder."""
-    monkeypatch.chdir(tmp_path)
+def rig(rig, tmp_path):
     (tmp_path / "rig.toml").write_text(SMALL, encoding="utf-8")
-
-    def run(*arguments: str):
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
+    return rig
 
 
 def lines(output: str) -> list[dict]:

@@ -5,11 +5,9 @@ import tomllib
 from datetime import timedelta
 
 import pytest
-from typer.testing import CliRunner
 
 from rig.bench import bench_kind, bench_names, check_config
 from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
-from rig.cli.main import app
 from rig.config import RigConfig, load_config
 from rig.config.values import read_values
 from rig.config.wording import key_info
@@ -17,15 +15,11 @@ from rig.core.clock import SystemClock
 
 
 @pytest.fixture
-def rig(tmp_path, monkeypatch):
+def rig(rig, tmp_path, monkeypatch):
     """Return a function that runs `rig ...` in an empty folder, with no configuration of the user's."""
-    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").unlink()
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "home"))
-
-    def run(*arguments: str):
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
+    return rig
 
 
 def test_check_lists_all_mistakes_with_their_lines(rig, tmp_path):

@@ -108,7 +108,7 @@ def moving(settings: list[str], **variables: str) -> tuple[Program, str]:
 
 
 def ended(process: Program) -> tuple[int, str]:
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=60)
     return process.returncode, errors
 
 

@@ -19,18 +19,6 @@ SMALL = ("--set", "camera.width=320", "--set", "camera.height=240", "--set", "vi
 
 
 @pytest.fixture
-def rig(tmp_path, monkeypatch):
-    """Return a function that runs `rig ...` on one and the same simulated bench, which remembers."""
-    monkeypatch.chdir(tmp_path)
-    Path("rig.toml").write_text('default_bench = "sim"\nstate_dir = "state"\n[catalog]\npath = "catalog"\n')
-
-    def run(*arguments: str):
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
-
-
-@pytest.fixture
 def running(rig):
     """Return a function that starts an enrollment of many views and returns it when the third is stored."""
     processes = []
@@ -168,7 +156,7 @@ def test_running_plan_blocks_the_bench_and_stop_ends_it(rig, running):
     assert done.exit_code == 0, done.stderr
     report = json.loads(done.stdout)
     assert report == {"bench": "sim", "pid": process.pid, "ended": True, "torque_was_on": False}
-    rest, errors = process.communicate(timeout=30)
+    rest, errors = process.communicate(timeout=60)
     assert process.returncode == 5
     assert "Error 512 (stopped)" in errors
     assert "--resume" in errors
@@ -213,7 +201,7 @@ finally:
     assert process.stdout.readline() == "held\n"
     done = stop("sim", load_config(None, [f"state_dir={str(tmp_path)!r}"]), SystemClock())
     assert (done.holder.pid, done.signalled, done.ended) == (process.pid, True, True)
-    assert process.communicate(timeout=10)[0] == "torque off\n"
+    assert process.communicate(timeout=60)[0] == "torque off\n"
     assert process.returncode == (143 if handler else -number)
 
 

@@ -201,7 +201,7 @@ def test_ctrl_c_leaves_the_old_file_untouched(home):
     while "taut" not in asked:
         asked += process.stderr.read(1)
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=30)
+    process.communicate(timeout=60)
     assert process.returncode == 130
     assert (home / "rig.toml").read_text(encoding="utf-8") == 'default_bench = "sim" # mine\n'
 

@@ -8,11 +8,9 @@ from typing import Any
 
 import cv2
 import pytest
-from typer.testing import CliRunner
 
 from rig.bench import ObjectAlreadyPlaced, open_bench
 from rig.catalog import Catalog
-from rig.cli.main import app
 from rig.cli.objects.empty_table import ensure_empty_table_image
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
@@ -21,17 +19,6 @@ from rig.plans.enroll import enroll
 from rig.views.empty_table import empty_table_status
 
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
-
-
-@pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    monkeypatch.chdir(tmp_path)
-    Path("rig.toml").write_text('default_bench = "sim"\nstate_dir = "state"\n[catalog]\npath = "catalog"\n')
-
-    def run(*arguments: str) -> Any:
-        return CliRunner().invoke(app, list(arguments))
-
-    return run
 
 
 def test_empty_table_image_is_taken_and_shown(rig: Callable[..., Any]) -> None:
