@@ -1,4 +1,4 @@
-"""Rig heads for the contract of an IMU: the firmware in memory, its AVR binary, and a pseudo-terminal in real time."""
+"""Rig heads for the contract of an IMU: the firmware in memory, its AVR binary, and a pseudo-terminal."""
 
 import fcntl
 import sys
@@ -6,7 +6,6 @@ import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
 
 import pytest
 import serial
@@ -16,7 +15,6 @@ from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
 from rig.devices.head.sensors import HeadSensor, head_sensor
-from sim.clock import VirtualClock
 from sim.head.board import SimHead
 from sim.head.build import missing
 from sim.head.serial_port import HeadSerial
@@ -99,55 +97,16 @@ def opened_head(
 
 
 PUMP_S = 0.001
-LONGEST_STEP_NS = 20_000_000
-"""Longest time step: after a pause (a debugger, a busy computer) host and head must both catch up."""
-
-
-class PacedClock:
-    """A real-time clock: each time it is read, a virtual clock catches up with the computer's clock.
-
-    Simulated activity on ``virtual`` happens when a program reads this clock or sleeps.
-
-    Parameters
-    ----------
-    virtual
-        The simulated world's clock.
-    speed
-        Virtual seconds for each second of the computer.
-    """
-
-    def __init__(self, virtual: VirtualClock, speed: float = 1.0) -> None:
-        self._virtual = virtual
-        self._speed = speed
-        self._system = SystemClock()
-        self._real_ns = self._system.now_ns()
-
-    def now_ns(self) -> int:
-        real_ns = self._system.now_ns()
-        step_ns = min(round((real_ns - self._real_ns) * self._speed), LONGEST_STEP_NS)
-        self._real_ns = real_ns
-        self._virtual.advance_to(self._virtual.now_ns() + step_ns)
-        return self._virtual.now_ns()
-
-    def sleep(self, seconds: float) -> None:
-        until_ns = self.now_ns() + round(seconds * 1e9)
-        while (now_ns := self.now_ns()) < until_ns:
-            self._system.sleep(min(PUMP_S, (until_ns - now_ns) * 1e-9 / self._speed))
-
-    def utc(self) -> datetime:
-        return self._virtual.utc()
-
-    def every(self, seconds: float, action: Callable[[], None]) -> Callable[[], None]:
-        """Call ``action`` every ``seconds`` while a program sleeps or reads the time; return what stops it."""
-        return self._virtual.every(seconds, action)
+READ_S = 0.002
+"""How long a read waits for the first byte, as the timeout of the real port."""
 
 
 @contextmanager
-def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterator[Head]:
-    """Yield a driver with pyserial on a pseudo-terminal, ``speed`` times as fast as real time."""
+def head_on_a_pty(noise: NoiseModel | None = None) -> Iterator[Head]:
+    """Yield a driver with pyserial on a pseudo-terminal."""
     needs("memory")
     world = World(noise=noise, seed=1)
-    clock = PacedClock(world.clock, speed)
+    clock = world.clock
     head = SimHead(world, clock_error=CLOCK_ERROR)
     device = SimMpu6050(head.world_at_board_time)
     head.attach(device.address, device)
@@ -159,8 +118,8 @@ def head_on_a_pty(noise: NoiseModel | None = None, speed: float = 4.0) -> Iterat
         terminal.close()
 
     try:
-        port = serial.Serial(terminal.path, BAUD, timeout=0.002 / speed, exclusive=True)
-        wire = _PacedWire(port, clock, terminal)
+        port = serial.Serial(terminal.path, BAUD, timeout=0, exclusive=True)
+        wire = _PtyWire(port, clock, terminal)
         imu = RigHead(wire, clock, mpu6050(), deadman_s=2.0)
         try:
             yield Head(imu, clock, head, device, world, unplug)
@@ -175,8 +134,8 @@ TERMINAL_BYTES = 4095
 """What a terminal holds ready for its reader; the rest waits in the kernel until some is read."""
 
 
-class _PacedWire:
-    """pyserial on a simulated line in this very thread: time goes on before each look at the port.
+class _PtyWire:
+    """pyserial on a pseudo-terminal whose other end is in this very thread, with virtual time.
 
     What one end has written is waited for at the other: how long a busy kernel takes to carry it is not under test.
     """
@@ -190,13 +149,13 @@ class _PacedWire:
 
     @property
     def in_waiting(self) -> int:
-        self._clock.now_ns()
         self._settle()
         return self._port.in_waiting
 
     def read(self, size: int = 1) -> bytes:
-        self._clock.now_ns()
-        self._settle()
+        if not self.in_waiting:
+            self._clock.sleep(READ_S)
+            self._settle()
         data = self._port.read(size)
         self._taken += len(data)
         return data

@@ -30,8 +30,7 @@ class Sensor:
     """An opened IMU in its world; `unplug` pulls its cable; its z axis points up, ``latency_s`` is its filter's lag.
 
     ``buffer_s`` says how seldom it may be read for each sample to be one that was taken, ``late_s`` is
-    later than any of its buffers reaches; ``resolution_dps`` is what its rate may be off by at no noise,
-    ``delivery_s`` how late it may hand a sample over (a busy computer, in real time).
+    later than any of its buffers reaches; ``resolution_dps`` is what its rate may be off by at no noise.
     """
 
     imu: Imu
@@ -41,13 +40,10 @@ class Sensor:
     buffer_s: float
     late_s: float = 60.0
     resolution_dps: float = 0.02
-    delivery_s: float = 0.015
-    paced: Clock | None = None
 
     @property
     def clock(self) -> Clock:
-        """The clock that tests wait on: the world's, or one that keeps it in step with real time."""
-        return self.paced or self.world.clock
+        return self.world.clock
 
 
 Opened = AbstractContextManager[Sensor]
@@ -67,6 +63,8 @@ def on_i2c(
     return opened
 
 
+DELIVERY_S = 0.015
+"""How late a sensor may hand a sample over."""
 LATE_S = 4.0
 """A head's driver keeps 2 s."""
 
@@ -85,7 +83,7 @@ def on_head(
 @contextmanager
 def pseudo_terminal(noise: NoiseModel) -> Iterator[Sensor]:
     with heads.head_on_a_pty(noise) as h:
-        yield Sensor(h.imu, h.world, h.unplug, 0.05, 0.3, LATE_S, delivery_s=0.2, paced=h.clock)
+        yield Sensor(h.imu, h.world, h.unplug, 0.007, 0.3, LATE_S)
 
 
 SENSORS: dict[str, Callable[[NoiseModel], Opened]] = {
@@ -132,7 +130,7 @@ def test_samples_come_once_in_order_at_the_rate_of_the_identity(sensor: Sensor) 
     unsure_ns = 3 * max(p.time_uncertainty_ns or 0 for p in parts)
     assert all(time_ns <= sensor.clock.now_ns() + unsure_ns)
     elapsed_s = (sensor.clock.now_ns() - start_ns) * 1e-9
-    assert time_ns.size == pytest.approx(elapsed_s * sensor.imu.rate_hz, abs=sensor.delivery_s * sensor.imu.rate_hz + 1)
+    assert time_ns.size == pytest.approx(elapsed_s * sensor.imu.rate_hz, abs=DELIVERY_S * sensor.imu.rate_hz + 1)
 
 
 @pytest.mark.parametrize("dps", [-100.0, 20.0, *(pytest.param(dps, marks=NIGHTLY) for dps in (-1.0, 0.0, 100.0))])
@@ -144,7 +142,7 @@ def test_counter_clockwise_is_positive(sensor: Sensor, dps: float) -> None:
     sensor.clock.sleep(0.2)
     rates = sensor.imu.read_samples().gyro_dps
     elapsed_s = (sensor.clock.now_ns() - start_ns) * 1e-9
-    assert len(rates) == pytest.approx(elapsed_s * sensor.imu.rate_hz, abs=sensor.delivery_s * sensor.imu.rate_hz + 1)
+    assert len(rates) == pytest.approx(elapsed_s * sensor.imu.rate_hz, abs=DELIVERY_S * sensor.imu.rate_hz + 1)
     assert rates == pytest.approx(np.tile([0, 0, dps], (len(rates), 1)), abs=sensor.resolution_dps)
 
 
@@ -180,7 +178,7 @@ def test_late_read_reports_lost_samples(sensor: Sensor) -> None:
     elapsed_s = (sensor.clock.now_ns() - start_ns) * 1e-9
     assert late.lost > 0
     assert late.lost + late.time_ns.size == pytest.approx(
-        elapsed_s * sensor.imu.rate_hz, rel=0.02, abs=sensor.delivery_s * sensor.imu.rate_hz + 1
+        elapsed_s * sensor.imu.rate_hz, rel=0.02, abs=DELIVERY_S * sensor.imu.rate_hz + 1
     )
     sensor.clock.sleep(0.1)
     assert sensor.imu.read_samples().lost == 0
