@@ -66,7 +66,7 @@ def plot(result: CalibrationResult) -> Chart | None:
         Axis("length of the rotation, °", span=(0.0,)),
         Axis("seconds", span=(0.0,)),
         [
-            Series("model", distance.tolist(), _seconds(model, distance).tolist(), MODEL, dots=False, curve=True),
+            Series("model", distance.tolist(), seconds_of(model, distance).tolist(), MODEL, dots=False, curve=True),
             Series("measured", lengths, [move["seconds"] for move in moves]),
         ],
     )
@@ -95,12 +95,6 @@ class MotionModel(Procedure):
         yield evaluate(moves, MotionProfile(bench.config.table.velocity_dps, bench.config.table.acceleration_dps2))
 
 
-def predicted_s(result: CalibrationResult, distance_deg: float) -> float:
-    """Return the time that a rotation by ``distance_deg`` takes until the table stands still."""
-    model = np.array([result.estimates[name].value for name in PARAMETERS])
-    return float(_seconds(model, np.array([abs(distance_deg)]))[0])
-
-
 def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
     """Fit the model to ``moves`` robustly.
 
@@ -113,7 +107,7 @@ def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
     seconds = np.array([move.seconds for move in moves])
     fit = least_squares(
         lambda p: np.append(
-            _seconds(p, distance) - seconds, TYPICAL_S * (p[1] - wind_up_s) / (NOMINAL_TRUST * wind_up_s)
+            seconds_of(p, distance) - seconds, TYPICAL_S * (p[1] - wind_up_s) / (NOMINAL_TRUST * wind_up_s)
         ),
         x0=(1 / nominal.velocity_dps, wind_up_s, 0.5),
         bounds=((1e-3, 1e-3, 0.0), (1.0, 20.0, 10.0)),
@@ -121,7 +115,7 @@ def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
         loss="soft_l1",
         f_scale=TYPICAL_S,
     )
-    residuals = seconds - _seconds(fit.x, distance)
+    residuals = seconds - seconds_of(fit.x, distance)
     scatter = sqrt(float((residuals**2).sum()) / (len(moves) - 3))
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * scatter**2
     for (name, unit), value, variance in zip(PARAMETERS.items(), fit.x, np.diag(covariance), strict=True):
@@ -140,7 +134,8 @@ def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
     return found
 
 
-def _seconds(p: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
+def seconds_of(p: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the times of rotations by ``distance`` degrees, with the values ``p`` of `PARAMETERS`."""
     pace, wind_up, delay = p
     ramps_only = distance * pace < wind_up
     moving = np.where(ramps_only, 2 * np.sqrt(distance * pace * wind_up), distance * pace + wind_up)

@@ -1,11 +1,7 @@
 """All errors of the simulated bench."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from math import sqrt
 from typing import Self
-
-from rig.calibrations import CalibrationResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,45 +88,3 @@ class NoiseModel:
     def with_values(self, **values: float) -> Self:
         """Return a copy with some values changed."""
         return replace(self, **values)
-
-
-def from_calibration(results: Iterable[CalibrationResult], base: NoiseModel | None = None) -> NoiseModel:
-    """Return the noise model of the bench that has these calibration results.
-
-    For a value that differs from part to part, the standard deviation is the measured error, so other seeds give other
-    parts of the same quality. Values without a calibration result are those of ``base``.
-    """
-    values: dict[str, float] = {}
-    for result in results:
-        if not result.passed:
-            continue
-        found = {name: estimate.value for name, estimate in result.estimates.items()}
-        match result.name:
-            case "servo.backlash":
-                values["backlash_deg"] = max(found["backlash"], 0.0)
-            case "servo.encoder":
-                values["encoder_harmonic_deg"] = _spread(found.values())
-            case "imu.scale":
-                values["gyro_scale_error"] = abs(1 / found["scale"] - 1)
-            case "imu.noise":
-                values["gyro_noise_dps_rthz"] = found["angle_random_walk"] * sqrt(2)
-                values["gyro_bias_walk_dps_rts"] = found["rate_random_walk"]
-                values["gyro_bias_dps"] = abs(found["bias"])
-                if "bias_slope" in found:
-                    values["gyro_bias_slope_dps_c"] = abs(found["bias_slope"])
-            case "imu.mounting":
-                values["imu_tilt_deg"] = _spread(v for name, v in found.items() if name.startswith("tilt_"))
-                values["accel_bias_g"] = _spread(v for name, v in found.items() if name.startswith("accel_zero_"))
-            case "camera.noise":
-                values |= {name: found[name] for name in ("full_well_e", "read_noise_e") if name in found}
-            case "camera.flat_field":
-                values["vignetting"] = found["vignetting"]
-            case "camera.drift":
-                values["light_flicker"] = found["flicker"]
-    return (base or NoiseModel()).with_values(**values)
-
-
-def _spread(errors: Iterable[float]) -> float:
-    """Return the standard deviation about zero."""
-    squares = [error**2 for error in errors]
-    return sqrt(sum(squares) / len(squares))

@@ -52,9 +52,9 @@ class IssueCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Issue:
-    """An issue of a segmentation: its code, and JSON values with the names that `IssueCode` lists."""
+    """An issue: its code, such as an `IssueCode`, and the JSON values that are listed with the code."""
 
-    code: IssueCode
+    code: StrEnum
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:

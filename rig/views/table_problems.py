@@ -1,9 +1,10 @@
 """Problems of an empty-table image: codes with parameters, and their texts."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
+
+from hbr.segmentation.evidence import Issue
 
 
 class TableProblemCode(StrEnum):
@@ -30,16 +31,8 @@ class TableProblemCode(StrEnum):
     """``text``, stored by version 0.1."""
 
 
-@dataclass(frozen=True, slots=True)
-class TableProblem:
-    """A reason not to use an empty-table image, or to take a new one."""
-
-    code: TableProblemCode
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the code and the parameters in one flat mapping."""
-        return {"code": self.code.value, **self.parameters}
+class TableProblem(Issue):
+    """A reason not to use an empty-table image, or to take a new one; ``code`` is a `TableProblemCode`."""
 
     @property
     def text(self) -> str:

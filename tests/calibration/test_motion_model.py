@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.motion_model import DISTANCES_DEG, MotionModel, TimedMove, evaluate, predicted_s
+from calibration.motion_model import DISTANCES_DEG, PARAMETERS, MotionModel, TimedMove, evaluate, seconds_of
 from calibration.procedure import Evaluation
 from rig.calibrations import RejectionCode
 from rig.core.errors import UsageError
@@ -48,11 +48,12 @@ def test_new_rotations_are_predicted(simulated):
     assert result.passed, result.rejections
     assert result.estimates["pace"].value == pytest.approx(1 / 60, rel=0.05)
     assert s.bench.config.table.approach_deg == 3.0
+    model = np.array([result.estimates[name].value for name in PARAMETERS])
     with Turntable(s.bench) as table:
         table.goto(5.0)
         for goal_deg in (35.0, 170.0, 178.0):
-            distance_deg = goal_deg - table.rest_deg
-            assert table.goto(goal_deg).seconds == pytest.approx(predicted_s(result, distance_deg), abs=0.25)
+            predicted_s = seconds_of(model, np.array([goal_deg - table.rest_deg]))[0]
+            assert table.goto(goal_deg).seconds == pytest.approx(predicted_s, abs=0.25)
 
 
 def test_hindered_rotation_is_rejected():
