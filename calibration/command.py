@@ -177,38 +177,17 @@ def everything(
 
     Example: rig calibrate all --bench sim --object mug-star
     """
-    from calibration.procedures import (
-        Backlash,
-        CameraCard,
-        CameraModel,
-        CameraNoise,
-        Encoder,
-        GyroNoise,
-        GyroRotation,
-        GyroScale,
-        ImuMounting,
-        MotionModel,
-        Repeatability,
-        TableAxis,
-    )
+    from calibration import procedures as p
     from calibration.table_axis import ObjectSpace
 
     board = _board(columns, rows, square_mm)
-    run(
-        settings,
-        Backlash(),
-        Encoder(),
-        MotionModel(),
-        GyroScale(),
-        ImuMounting(),
-        GyroNoise(minutes),
-        GyroRotation(),
-        CameraNoise(),
-        CameraCard(),
-        CameraModel(board),
-        TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)),
-        *([] if thing is None else [Repeatability(thing)]),
+    servo_and_imu = (p.Backlash(), p.Encoder(), p.MotionModel(), p.GyroScale(), p.ImuMounting(), p.GyroNoise(minutes))
+    camera_and_table = (
+        *(p.CameraNoise(), p.CameraCard(), p.CameraModel(board)),
+        p.TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)),
     )
+    repeated = () if thing is None else (p.Repeatability(thing),)
+    run(settings, *servo_and_imu, p.GyroRotation(), *camera_and_table, *repeated)
     if thing is None:
         print("Next: run `rig calibrate noise NAME` with an object.", file=sys.stderr)
 
@@ -224,14 +203,11 @@ def report(
     Example: rig calibrate report --bench sim --out calibration.html
     """
     from calibration.report import write_page
-    from rig.calibrations import CalibrationStore
 
     with settings.open_bench(tell=False) as bench:
-        store = CalibrationStore(bench.config.calibration_path(bench.name))
-        now_utc = bench.clock.utc()
-        standings = store.standings(bench.apparatus(), now_utc)
-        unreadable = [error.what for error in store.unreadable]
-        write_page(out, standings, store.history(), bench=bench.name, now_utc=now_utc, notes=unreadable)
+        store, standings = _stored(bench)
+        notes = [error.what for error in store.unreadable]
+        write_page(out, standings, store.history(), bench=bench.name, now_utc=bench.clock.utc(), notes=notes)
     if settings.json:
         settings.print_json({"file": str(out), "calibrations": [s.result.name for s in standings]})
     else:
@@ -245,12 +221,11 @@ def show(settings: Settings) -> None:
 
     Example: rig calibrate show --bench sim
     """
-    from rig.calibrations import CalibrationStatus, CalibrationStore
+    from rig.calibrations import CalibrationStatus
     from rig.events.events import plain
 
     with settings.open_bench(tell=False) as bench:
-        store = CalibrationStore(bench.config.calibration_path(bench.name))
-        standings = store.standings(bench.apparatus(), bench.clock.utc())
+        store, standings = _stored(bench)
         if settings.json:
             rows = [{"state": s.status, "words": str(s), **_json(s.result)} for s in standings]
             settings.print_json({"folder": str(store.folder), "calibrations": plain(rows)})
@@ -337,13 +312,20 @@ def _board(columns: int, rows: int, square_mm: float) -> "Board":
     return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
 
 
-def in_force(bench: "Bench", name: str) -> "CalibrationResult":
-    """Return the result called ``name`` that is in force on the bench. Raises `UsageError` if there is none."""
-    from rig.calibrations import CalibrationStatus, CalibrationStore
-    from rig.core.errors import UsageError
+def _stored(bench: "Bench") -> "tuple[CalibrationStore, list[CalibrationStanding]]":
+    """Return the bench's calibration results and their standings."""
+    from rig.calibrations import CalibrationStore
 
     store = CalibrationStore(bench.config.calibration_path(bench.name))
-    for standing in store.standings(bench.apparatus(), bench.clock.utc()):
+    return store, store.standings(bench.apparatus(), bench.clock.utc())
+
+
+def in_force(bench: "Bench", name: str) -> "CalibrationResult":
+    """Return the result called ``name`` that is in force on the bench. Raises `UsageError` if there is none."""
+    from rig.calibrations import CalibrationStatus
+    from rig.core.errors import UsageError
+
+    for standing in _stored(bench)[1]:
         if standing.result.name == name and standing.status is CalibrationStatus.IN_FORCE:
             return standing.result
     raise UsageError(

@@ -394,12 +394,7 @@ class _Trials:
             runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
 
     def _record_margin(
-        self,
-        ranking: Ranking,
-        seen: list[int],
-        keep: NDArray[np.bool_],
-        runs: Runs,
-        at: tuple[int, int, int, int],
+        self, ranking: Ranking, seen: list[int], keep: NDArray[np.bool_], runs: Runs, at: tuple[int, int, int, int]
     ) -> None:
         runs.score[at] = ranking.scores[0] / len(seen)
         # hbr.score_margin, from similarities that are computed once for all trials

@@ -112,11 +112,7 @@ class PackedRows:
     """
 
     def __init__(
-        self,
-        measure: Measure,
-        rows: LevelArray,
-        squares: FloatArray | None = None,
-        places: IndexArray | None = None,
+        self, measure: Measure, rows: LevelArray, squares: FloatArray | None = None, places: IndexArray | None = None
     ) -> None:
         found = library()
         assert found is not None

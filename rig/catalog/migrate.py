@@ -51,9 +51,7 @@ def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 
         check_folder(root)
         file = root / DATABASE_NAME
         engine = create_engine(
-            "sqlite://",
-            creator=partial(connect, f"{file.as_uri()}?mode=rw", busy_timeout_s),
-            poolclass=NullPool,
+            "sqlite://", creator=partial(connect, f"{file.as_uri()}?mode=rw", busy_timeout_s), poolclass=NullPool
         )
         with engine.connect() as connection:
             connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # the steps replace tables that others refer to

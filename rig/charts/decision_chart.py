@@ -93,10 +93,7 @@ _Lines = list[tuple[str, str]]
 
 def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> tuple[_Lines, _Lines]:
     """Return what the rotation is for, and the numbers behind it."""
-    cost = [
-        ("cost of the motion", "small"),
-        (f"{weighed.cost[chosen]:.2f}, at most {max(weighed.cost):.2f}", "small"),
-    ]
+    cost = [("cost of the motion", "small"), (f"{weighed.cost[chosen]:.2f}, at most {max(weighed.cost):.2f}", "small")]
     if len(candidates) < 2 or weighed.similarity is None:
         return [("only one object is likely:", "small"), ("a new side improves its pose", "small")], cost
     least, most = min(weighed.similarity), max(weighed.similarity)

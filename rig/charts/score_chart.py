@@ -63,10 +63,7 @@ def score_chart(
 
     def at(view: int, score: float) -> Point:
         share = view / (len(rounds) - 1) if len(rounds) > 1 else 0.5
-        return (
-            _LEFT + 14 + (_RIGHT - _LEFT - 28) * share,
-            _BOTTOM - (_BOTTOM - _TOP) * (score - low) / (high - low),
-        )
+        return (_LEFT + 14 + (_RIGHT - _LEFT - 28) * share, _BOTTOM - (_BOTTOM - _TOP) * (score - low) / (high - low))
 
     parts = [svg.text("score per view", (2, 11), "small", anchor="start")]
     for tick in ticks:

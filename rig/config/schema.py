@@ -105,8 +105,7 @@ class TableConfig(Section):
         0.46, ge=0.001, le=10, description="time from the end of a motion until the table is at rest, for estimates"
     )
     orientation: Literal["encoder", "imu"] = Field(
-        "encoder",
-        description="source of a view's angle: the servo's encoder, or only the gyro on the platter",
+        "encoder", description="source of a view's angle: the servo's encoder, or only the gyro on the platter"
     )
     quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
     quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")

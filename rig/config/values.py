@@ -83,12 +83,7 @@ def read_values(path: Path | None = None, overrides: Iterable[str] = (), *, sear
 
 
 def validate(
-    model: type[M],
-    values: Mapping[str, Any],
-    *,
-    where: str,
-    prefix: str = "",
-    places: Mapping[Key, str] | None = None,
+    model: type[M], values: Mapping[str, Any], *, where: str, prefix: str = "", places: Mapping[Key, str] | None = None
 ) -> M:
     """Return ``values`` as ``model``; raises one `ConfigError` with all mistakes.
 

@@ -151,11 +151,5 @@ class ServoDriver(Protocol):
     """
 
     def __call__(
-        self,
-        connection: Any,
-        config: ServoConfig,
-        clock: Clock,
-        *,
-        mode: str,
-        reopen: Callable[[], Any] | None,
+        self, connection: Any, config: ServoConfig, clock: Clock, *, mode: str, reopen: Callable[[], Any] | None
     ) -> Servo: ...

@@ -84,12 +84,7 @@ def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Iterator[
     wanted = SECONDS * sensor.rate_hz
     if len(samples.time_ns) < 0.8 * wanted:
         fix = "Shorten the I2C cable and remove other devices from the bus, then: " + context.rig("doctor")
-        counts = {
-            "samples": len(samples.time_ns),
-            "seconds": SECONDS,
-            "wanted": wanted,
-            "lost": samples.lost,
-        }
+        counts = {"samples": len(samples.time_ns), "seconds": SECONDS, "wanted": wanted, "lost": samples.lost}
         yield bad("imu", FindingCode.SAMPLES_MISSING, fix, **counts)
         return
     rates = samples.gyro_dps

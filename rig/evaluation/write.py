@@ -17,10 +17,7 @@ from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
 
 _HEADINGS = {
-    "hit-rate": (
-        "Hit-rate",
-        "Shaded: Wilson's 95 % intervals of HBR, AHBR and Best 10, for independent trials.",
-    ),
+    "hit-rate": ("Hit-rate", "Shaded: Wilson's 95 % intervals of HBR, AHBR and Best 10, for independent trials."),
     "travel": ("Hit-rate by degrees of rotation", "The same points by the sum of the rotations before them."),
     "pose": (
         "Pose",

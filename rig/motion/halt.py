@@ -40,12 +40,7 @@ def reachable(earlier: ServoState, later: ServoState, cruise_dps: float) -> bool
 
 
 def halt(
-    servo: Servo,
-    clock: Clock,
-    set_goal: Callable[[float], None],
-    path: MotionPath,
-    ramp_dps2: float,
-    poll_s: float,
+    servo: Servo, clock: Clock, set_goal: Callable[[float], None], path: MotionPath, ramp_dps2: float, poll_s: float
 ) -> bool:
     """Bring the table to a stop along its ramp; return False if the servo does not answer (its watchdog stops it).
 

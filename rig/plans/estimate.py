@@ -72,11 +72,7 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
             f"The views need {angles[-1] - angles[0]:.0f}° in one direction. The cable budget does not allow that.",
             next_step="Increase table.limits_deg if the cable is long enough. Otherwise enroll the object again with "
             "--replace: the views are then planned for this bench.",
-            evidence={
-                "from_deg": angles[0],
-                "to_deg": angles[-1],
-                "limits_deg": list(limits_deg),
-            },
+            evidence={"from_deg": angles[0], "to_deg": angles[-1], "limits_deg": list(limits_deg)},
         )
     nearest = min(revolutions, key=lambda whole: (abs(angles[0] + 360.0 * whole), whole))
     return tuple(angle + 360.0 * nearest for angle in angles)

@@ -75,12 +75,7 @@ class RunWriter:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        bench: Bench,
-        model: Model | hbr.ViewIndex,
-        *,
-        empty_table: NDArray[np.uint8] | None = None,
+        self, folder: Path, bench: Bench, model: Model | hbr.ViewIndex, *, empty_table: NDArray[np.uint8] | None = None
     ) -> None:
         self._folder = folder
         model = Model(model) if isinstance(model, hbr.ViewIndex) else model

@@ -18,14 +18,7 @@ from typing import Any, Final
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import (
-    ConfigError,
-    LeaseHeld,
-    LoginRequired,
-    StateNotStored,
-    TooManyLogins,
-    os_errors_as,
-)
+from rig.core.errors import ConfigError, LeaseHeld, LoginRequired, StateNotStored, TooManyLogins, os_errors_as
 from rig.core.files import read, write
 
 TOKENS: Final = "tokens.json"

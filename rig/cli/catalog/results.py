@@ -160,8 +160,7 @@ def correct(
     result: ResultArgument,
     reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="Why; it is stored with the correction.")],
     name: Annotated[
-        str | None,
-        typer.Option("--object", metavar="NAME", help="The right object.", autocompletion=object_names),
+        str | None, typer.Option("--object", metavar="NAME", help="The right object.", autocompletion=object_names)
     ] = None,
     unknown: Annotated[bool, typer.Option("--unknown", help="The object is not in the catalog.")] = False,
     sample: Annotated[str | None, typer.Option("--sample", metavar="ID", help="The right sample.")] = None,

@@ -172,8 +172,7 @@ def log(
         ),
     ] = None,
     name: Annotated[
-        str | None,
-        typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names),
+        str | None, typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names)
     ] = None,
 ) -> None:
     """Show who did what with the catalog and the table, oldest first.

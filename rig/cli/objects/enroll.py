@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 def enroll(
     settings: Settings,
     name: Annotated[
-        str | None,
-        typer.Argument(metavar="NAME", help="Name of the object on the table.", autocompletion=object_names),
+        str | None, typer.Argument(metavar="NAME", help="Name of the object on the table.", autocompletion=object_names)
     ] = None,
     views: Annotated[
         int | None,
@@ -51,8 +50,7 @@ def enroll(
         bool, typer.Option("--resume", help="Take the missing views of an interrupted enrollment.")
     ] = False,
     replace: Annotated[
-        bool,
-        typer.Option("--replace", help="Enroll again. The old views stay in use until the new ones are complete."),
+        bool, typer.Option("--replace", help="Enroll again. The old views stay in use until the new ones are complete.")
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only show the plan: views, duration, table angles. Nothing moves.")
@@ -61,8 +59,7 @@ def enroll(
         Path | None, typer.Option(metavar="FILE", help="Write an HTML page with all views and measurements.")
     ] = None,
     yes: Annotated[
-        bool,
-        typer.Option("--yes", "-y", help="Do not ask for an empty-table image. Use the old one, or none."),
+        bool, typer.Option("--yes", "-y", help="Do not ask for an empty-table image. Use the old one, or none.")
     ] = False,
 ) -> None:
     """Enroll an object: one revolution of the table, with a checked view at every step.

@@ -45,8 +45,7 @@ def evaluate(
         ),
     ] = "cedd",
     perturb: Annotated[
-        str,
-        typer.Option(help="Other changes of the queries, as KIND:STRENGTH joined by +: shift:2+gain:1, all:3."),
+        str, typer.Option(help="Other changes of the queries, as KIND:STRENGTH joined by +: shift:2+gain:1, all:3.")
     ] = "none",
     enrolled: Annotated[
         int | None,

@@ -37,12 +37,10 @@ def identify(
     ] = None,
     top: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="Number of candidates to show.")] = 5,
     save_run: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Save images and decisions for rig replay and rig report."),
+        Path | None, typer.Option(metavar="FOLDER", help="Save images and decisions for rig replay and rig report.")
     ] = None,
     watch: Annotated[
-        bool,
-        typer.Option("--watch", help="Wait for the next object after each answer. Start with an empty table."),
+        bool, typer.Option("--watch", help="Wait for the next object after each answer. Start with an empty table.")
     ] = False,
     sample: Annotated[
         str | None, typer.Option(metavar="ID", help="Sample on the table, to be recorded with the answer.")

@@ -22,8 +22,7 @@ def replay(
     settings: Settings,
     run: RunArgument,
     check: Annotated[
-        bool,
-        typer.Option("--check", help="Compute every decision again from the images; exit code 6 if one differs."),
+        bool, typer.Option("--check", help="Compute every decision again from the images; exit code 6 if one differs.")
     ] = False,
     every: Annotated[
         bool, typer.Option("--all", help="With --check: list all differences in full, not only the first three.")

@@ -49,16 +49,13 @@ SetOption = Annotated[
     ),
 ]
 SeedOption = Annotated[
-    int | None,
-    typer.Option("--seed", min=0, metavar="N", help="Seed of the simulated bench.", rich_help_panel=COMMON),
+    int | None, typer.Option("--seed", min=0, metavar="N", help="Seed of the simulated bench.", rich_help_panel=COMMON)
 ]
 NoColorOption = Annotated[
-    bool,
-    typer.Option("--no-color", help="Print without colors, as with NO_COLOR=1.", rich_help_panel=COMMON),
+    bool, typer.Option("--no-color", help="Print without colors, as with NO_COLOR=1.", rich_help_panel=COMMON)
 ]
 JsonOption = Annotated[
-    bool,
-    typer.Option("--json", help="Print JSON on stdout and text on stderr.", rich_help_panel=COMMON),
+    bool, typer.Option("--json", help="Print JSON on stdout and text on stderr.", rich_help_panel=COMMON)
 ]
 
 
