@@ -13,7 +13,7 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from calibration.procedure import Ask, Procedure
     from rig.bench import Bench
-    from rig.calibrations import CalibrationResult
+    from rig.calibrations import CalibrationResult, CalibrationStanding, CalibrationStore
     from rig.views.charuco_board import Board
 
 EXIT_QUALITY = 6
