@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, func, insert, select
+from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
 
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
@@ -235,6 +235,16 @@ def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> lis
     conditions = [results.c.bench == wanted.bench] if wanted.bench is not None else []
     conditions += [results.c.time_utc >= wanted.since] if wanted.since is not None else []
     conditions += [results.c.time_utc < wanted.before] if wanted.before is not None else []
+    corrected = results.c.id.in_(select(corrections.c.result_id))  # their values can have changed
+    conditions += [
+        or_(column == value, corrected)
+        for column, value in (
+            (results.c.sample, wanted.sample),
+            (results.c.object_name, wanted.object_name),
+            (results.c.outcome, wanted.outcome),
+        )
+        if value is not None
+    ]
     with catalog.database.read() as connection:
         return [result for result in _load(catalog, connection, *conditions) if wanted.accepts(result)]
 

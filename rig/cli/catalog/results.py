@@ -94,11 +94,10 @@ def show(settings: Settings, result: ResultArgument) -> None:
         found = find_result(catalog, result)
         folder = catalog.path
     if settings.json:
-        shown = plain(found)
-        for name in ("answered", *(("current",) if found.corrections else ())):
-            shown[name] = getattr(found, name)._asdict()
+        shown = plain(found) | {"answered": found.answered._asdict(), "current": found.current._asdict()}
+        shown["time_utc"] = found.time_utc.isoformat()
         for correction, one in zip(shown["corrections"], found.corrections, strict=True):
-            correction["corrected"] = one.corrected._asdict()
+            correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
         settings.print_json(shown)
         return
     print(f"Result {found.id}: {_answer_words(found)}")

@@ -18,6 +18,8 @@ from rig.catalog import Action, Catalog, migrate
 from rig.catalog.edit import delete
 from rig.catalog.exchange import import_objects, plan_import, read_bundle, read_catalog, read_objects, write_bundle
 from rig.catalog.redescribe import redescribe
+from rig.catalog.results import correct
+from rig.catalog.results import record as record_result
 from rig.catalog.schema import SCHEMA_VERSION
 from rig.catalog.seal import seal_enrollments, seal_objects
 from rig.catalog.upkeep import collect_garbage, statistics
@@ -26,7 +28,16 @@ from rig.core.errors import CatalogDamaged, ImportRejected, RigError
 from rig.core.files import write
 from rig.views import image_files as images
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, image, plan, true_fill, without_waiting
+from tests.rig.catalog.catalog_samples import (
+    PROVENANCE,
+    described,
+    finished,
+    image,
+    new_result,
+    plan,
+    true_fill,
+    without_waiting,
+)
 
 SECRET = b"not a part of the catalog"
 
@@ -281,10 +292,22 @@ def test_damage_stays_noticed_after_later_changes(root: Path) -> None:
         "UPDATE audit SET user = 'intruder' WHERE id = 3",
         "UPDATE audit SET time_utc = '2031-01-01 00:00:00.000000' WHERE id = 1",
         "UPDATE audit SET digest = lower(hex(zeroblob(32))) WHERE id = 4",
+        "UPDATE results SET outcome = 'unknown' WHERE id = 1",
+        "UPDATE results SET sample = 'S-2', operator = 'intruder'",
+        "UPDATE results SET image = NULL, image_sha256 = NULL, image_bytes = NULL",
+        "UPDATE results SET answer = '{}', catalog_version = ''",
+        "DELETE FROM results",
+        "UPDATE corrections SET reason = 'another'",
+        "DELETE FROM corrections",
     ],
 )
-def test_edited_log_is_found(root: Path, statement: str) -> None:
-    triggers = [f"audit_no_{change}" for change in ("update", "delete")]
+def test_edited_log_or_result_is_found(root: Path, statement: str) -> None:
+    with opened(root) as catalog:
+        record_result(catalog, new_result(sample="S-1"), image(1))
+        correct(catalog, 1, unknown=True, reason="read the label")
+    table = statement.split()[2 if statement.startswith("DELETE") else 1]
+    problem = "log changed" if table == "audit" else "result changed"
+    triggers = [f"{table}_no_{change}" for change in ("update", "delete")]
     with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
         sources = [
             connection.execute("SELECT sql FROM sqlite_master WHERE name = ?", (one,)).fetchone() for one in triggers
@@ -295,7 +318,8 @@ def test_edited_log_is_found(root: Path, statement: str) -> None:
         for (source,) in sources:
             connection.execute(source)
     with opened(root) as catalog:
-        assert {one.problem for one in finished(verify(catalog, quick=True, jobs=1)).findings} == {"log changed"}
+        problems = {one.problem for one in finished(verify(catalog, quick=True, jobs=1)).findings}
+        assert problems - {"orphaned file"} == {problem}  # the image of a result that is gone
         catalog.note(Action.MOVED)
         assert finished(verify(catalog, quick=True, jobs=1)).findings
 

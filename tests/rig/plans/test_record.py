@@ -1,0 +1,72 @@
+"""The recorder of results: the answer comes first, and nothing keeps it back."""
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig.catalog import Catalog
+from rig.catalog.results import find_results
+from rig.events.events import Accepted, Identified, NoteCode, Recorded, Warned
+from rig.plans.record import ResultRecorder
+from rig.views.image_files import read
+from tests.rig.report.report_samples import identifying
+
+
+def stream(recorder: ResultRecorder, times: int = 1):
+    def events():
+        for _ in range(times):
+            yield from identifying()
+
+    return recorder.stream(events())
+
+
+@pytest.fixture
+def recorder(simulated, tmp_path: Path) -> ResultRecorder:
+    bench = simulated().bench
+    with Catalog.open(tmp_path, clock=bench.clock):
+        return ResultRecorder(tmp_path, bench, clock=bench.clock, catalog_version=lambda: "c" * 64)
+
+
+def test_each_answer_is_recorded_with_its_sample_and_its_first_image(recorder, tmp_path):
+    samples = iter(("S-1", None))
+    shown = []
+    for event in stream(recorder, times=2):
+        if type(event).__name__ == "Started":
+            recorder.sample = next(samples)
+        shown.append(event)
+    assert [event for event in shown if isinstance(event, Recorded)] == [Recorded(1, "S-1"), Recorded(2, None)]
+    assert all(isinstance(shown[k + 1], Recorded) for k, event in enumerate(shown) if isinstance(event, Identified))
+    first = next(event for event in shown if isinstance(event, Accepted))
+    with Catalog.open(tmp_path, clock=recorder._clock, read_only=True) as catalog:
+        for result in find_results(catalog):
+            assert np.array_equal(read(tmp_path / result.image, result.image_sha256), first.image_bgr)
+            assert len(result.azimuths_deg) == result.details["views"]
+            assert result.provenance.devices["camera"]
+
+
+def test_full_disk_does_not_keep_the_answer_back(recorder, monkeypatch):
+    def fail(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    *_, answer, warned = stream_with(recorder, monkeypatch, fail)
+    assert isinstance(answer, Identified)
+    assert isinstance(warned, Warned)
+    assert warned.note.code is NoteCode.NOT_RECORDED
+    assert "full" in warned.note.values["what"]
+    assert "free some space" in warned.note.values["next_step"]
+
+
+def stream_with(recorder, monkeypatch, fail):
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        return list(stream(recorder))
+
+
+def test_missing_catalog_is_not_created(recorder, tmp_path):
+    (tmp_path / "catalog.sqlite").unlink()
+    *_, warned = stream(recorder)
+    assert isinstance(warned, Warned)
+    assert not (tmp_path / "catalog.sqlite").exists()
