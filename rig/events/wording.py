@@ -255,10 +255,9 @@ def move_words(moved: Moved) -> str:
 def unwinding_words(unwinding: Unwinding) -> str:
     """Return that the table frees its cable by a long rotation, and why."""
     low, high = (f"{angle:g}°".replace("-", "−") for angle in unwinding.limits_deg)
-    back = counted(unwinding.revolutions, "revolution")
     return (
-        f"Unwinding the cable: the table rotates from {angle_words(unwinding.from_deg)} to "
-        f"{angle_words(unwinding.to_deg)} ({back} back; the cable allows {low} to {high})"
+        f"Unwinding the cable: the table rotates from {angle_words(unwinding.from_deg)} back to "
+        f"{angle_words(unwinding.to_deg)} (the cable allows {low} to {high})"
     )
 
 
@@ -405,4 +404,4 @@ def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:
 
 def signed(value: float, decimals: int) -> str:
     """Return a number with its sign, a real minus."""
-    return f"{value:+.{decimals}f}".replace("-", "−")
+    return f"{round(value, decimals) + 0.0:+.{decimals}f}".replace("-", "−")  # + 0.0 removes the sign of a zero

@@ -65,7 +65,8 @@ def make_plan(batch: ImportBatch, conflict: Conflict, known: Set[str]) -> Plan:
     both = tuple(item.name for item in batch.objects if item.name in known)
     if both and conflict == Conflict.REJECT:
         raise ObjectExists(
-            f"{len(both)} of the {len(batch.objects)} objects are in the catalog already; nothing was imported",
+            f"{len(both)} of {len(batch.objects)} objects {'is' if len(both) == 1 else 'are'} in the catalog already; "
+            "nothing was imported",
             next_step="skip them (--on-conflict skip), or import them as new enrollments (--on-conflict replace)",
             evidence={"objects": list(both[:20])},
         )

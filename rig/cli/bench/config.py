@@ -170,7 +170,15 @@ def set_(
         raise UsageError(
             f"{key!r} has no section.", next_step="Write SECTION.KEY, for example: rig config set servo.id 2."
         )
-    load_config(target if target.exists() else None, [*settings.overrides, f"{key}={value}"])
+    try:
+        load_config(target if target.exists() else None, [*settings.overrides, f"{key}={value}"])
+    except ConfigError as error:
+        mistakes = [mistake.removeprefix("--set: ") for mistake in error.evidence.get("mistakes", ())]
+        raise ConfigError(
+            f"{target} is unchanged: it would have mistakes.",
+            next_step="Give another value. For the keys and their values: rig config show",
+            evidence={"mistakes": mistakes} if mistakes else error.evidence,
+        ) from error
     new = with_values(old, {tuple(key.split(".")): parsed(value)})
     if new != old:
         save(target, new)

@@ -6,6 +6,8 @@ from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from rig.cli.ui.settings import Settings
+from rig.cli.ui.terminal import unguarded
+from rig.core.control_characters import neutral
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,4 +57,4 @@ def print_finding(screen: "Console", finding: "Finding") -> None:
 def show_progress(text: str) -> None:
     """Show progress at a terminal; the next line replaces it."""
     if sys.stderr.isatty():
-        print(f"\r\x1b[K{text[:78]}\r", end="", file=sys.stderr, flush=True)
+        print(f"\r\x1b[K{neutral(text[:78])}\r", end="", file=unguarded(sys.stderr), flush=True)

@@ -187,7 +187,7 @@ def _served_status(settings: Settings, server: "ServerAddress") -> None:
 
 def _table_text(angle_deg: float | None, limits_deg: tuple[float, float]) -> str:
     low, high = limits_deg
-    budget = f"cable budget {low:g}° to {high:g}° ({low / 360:+.2f} to {high / 360:+.2f} revolutions)"
+    budget = f"cable budget {low:g}° to {high:g}° ({low / 360:+.2f} to {high / 360:+.2f} revolutions)".replace("-", "−")
     return f"angle in doubt; {budget}" if angle_deg is None else f"{angle_deg:.2f}°; {budget}"
 
 

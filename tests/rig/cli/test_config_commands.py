@@ -217,6 +217,8 @@ def test_set_changes_one_line_or_nothing(rig, tmp_path):
     rejected = rig("config", "set", "servo.id", "900")
     assert rejected.exit_code == 3
     assert "from 0 to 252" in rejected.stderr
+    assert "rig.toml is unchanged: it would have mistakes." in rejected.stderr
+    assert "    servo.id: must be a whole number from 0 to 252 (found 900)" in rejected.stderr
     assert rig("config", "set", "servo.prot", "x").exit_code == 3
     assert rig("config", "set", "servo", "x").exit_code == 2
     assert file.read_bytes() == before

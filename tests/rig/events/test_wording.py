@@ -34,6 +34,7 @@ from rig.events.wording import (
     percent_words,
     reason_words,
     share_words,
+    signed,
     similar_objects_words,
     stop_words,
     wait_words,
@@ -232,3 +233,7 @@ def test_percentages_near_0_and_100() -> None:
         ">99.9 %",
         ">99.9 %",
     ]
+
+
+def test_zero_has_no_minus_sign():
+    assert [signed(value, 2) for value in (-0.001, 0.0, -0.01, 0.004)] == ["+0.00", "+0.00", "−0.01", "+0.00"]

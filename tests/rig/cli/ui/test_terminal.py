@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
+from rig.cli.bench.findings import show_progress
 from rig.cli.main import app
 from rig.cli.ui.command import show_error
 from rig.cli.ui.present import console
@@ -157,3 +158,15 @@ def test_streams_are_restored():
     with pytest.raises(KeyboardInterrupt), guarded_output():
         raise KeyboardInterrupt
     assert (sys.stdout, sys.stderr) == before
+
+
+def test_progress_of_a_scan_is_replaced_and_cannot_control_the_terminal(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    with guarded_output():
+        show_progress("/dev/ttyUSB0\x1b[2J: scanning")
+    assert terminal.getvalue() == "\r\x1b[K/dev/ttyUSB0\\u001b[2J: scanning\r"
