@@ -1,9 +1,6 @@
-"""Sample views for the tests of the catalog. As a program: enroll such views in a process of its own.
+"""Sample views for the tests of the catalog, and a program that enrolls them.
 
-    python catalog_samples.py CATALOG NAME COUNT [DIE_BEFORE]
-
-It prints the index of each stored view, and kills itself before durable step DIE_BEFORE. With COUNT 0 it records two
-results, and kills itself while it records the second one. Steps count from 1: sync of
+The program prints the index of each stored view, and kills itself before a durable step. Steps count from 1: sync of
 the image, rename, sync of the folder, commit, then those of the next view.
 """
 
@@ -28,6 +25,7 @@ from rig.catalog.results import Answer, NewResult
 from rig.catalog.results import record as record_result
 from rig.core.clock import SystemClock
 from rig.views.description import within
+from tests.programs import Program
 
 _T = TypeVar("_T")
 
@@ -144,9 +142,7 @@ def die_at(step: int) -> None:
     event.listen(Engine, "commit", counted(lambda _: None))
 
 
-def spawn_arguments(path: Path, name: str, views: int, die_before: int = 0) -> list[str]:
-    return [sys.executable, __file__, str(path), name, str(views), str(die_before)]
-
-
-if __name__ == "__main__":
-    main()
+def other_program(path: Path, name: str, views: int, die_before: int = 0) -> Program:
+    """Start a program that enrolls, or records answers if ``views`` is 0; it dies before that step of storing."""
+    code = "from tests.rig.catalog.catalog_samples import main; main()"
+    return Program(str(path), name, str(views), str(die_before), code=code)

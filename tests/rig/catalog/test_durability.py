@@ -4,7 +4,6 @@ import errno
 import os
 import signal
 import sqlite3
-import subprocess
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -18,15 +17,9 @@ from rig.catalog import Catalog, Enrollment
 from rig.catalog.database import Database
 from rig.core.errors import CatalogBusy, CatalogError
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, plan, record, spawn_arguments
+from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, other_program, plan, record
 
 VIEWS = 12
-
-
-def spawn(path: Path, name: str, views: int = VIEWS, die_before: int = 0) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        spawn_arguments(path, name, views, die_before), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
 
 
 def begin(catalog: Catalog, name: str, views: int = VIEWS) -> Enrollment:
@@ -56,8 +49,8 @@ def assert_resumes_whole(path: Path, name: str, reported: set[int]) -> None:
 
 @pytest.mark.parametrize("die_before", [5, 6, 7, 8], ids=["sync-image", "rename", "sync-folder", "commit"])
 def test_process_killed_in_add_loses_only_that_view(tmp_path: Path, die_before: int) -> None:
-    with spawn(tmp_path, "mug", die_before=die_before) as child:
-        out, err = child.communicate()
+    child = other_program(tmp_path, "mug", VIEWS, die_before)
+    out, err = child.communicate()
     assert child.returncode == -signal.SIGKILL, err
     assert out.split() == ["0"]
     assert_resumes_whole(tmp_path, "mug", {0})
@@ -65,11 +58,11 @@ def test_process_killed_in_add_loses_only_that_view(tmp_path: Path, die_before: 
 
 @pytest.mark.parametrize("reports", [1, 4, 9])
 def test_process_killed_between_views_keeps_reported_views(tmp_path: Path, reports: int) -> None:
-    with spawn(tmp_path, "mug") as child:
-        assert child.stdout is not None
-        reported = {int(child.stdout.readline()) for _ in range(reports)}
-        child.kill()
-        reported |= {int(line) for line in child.stdout}
+    child = other_program(tmp_path, "mug", VIEWS)
+    assert child.stdout is not None
+    reported = {int(child.stdout.readline()) for _ in range(reports)}
+    child.kill()
+    reported |= {int(line) for line in child.communicate()[0].splitlines()}
     assert_resumes_whole(tmp_path, "mug", reported)
 
 
@@ -172,7 +165,7 @@ def test_second_writer_gets_busy_error_after_the_timeout(tmp_path: Path) -> None
 
 def test_several_processes_share_one_catalog(tmp_path: Path) -> None:
     path = tmp_path / "new" / "catalog"
-    children = {name: spawn(path, name) for name in ("mug", "tin")}
+    children = {name: other_program(path, name, VIEWS) for name in ("mug", "tin")}
     for child in children.values():
         assert child.stdout is not None
         first = child.stdout.readline()

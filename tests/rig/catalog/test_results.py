@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import sqlite3
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -28,7 +27,7 @@ from tests.rig.catalog.catalog_samples import (
     finished,
     image,
     new_result,
-    spawn_arguments,
+    other_program,
     true_fill,
     without_waiting,
 )
@@ -184,11 +183,10 @@ def test_verify_finds_a_changed_image(catalog: Catalog) -> None:
 
 @pytest.mark.parametrize("die_before", [*(pytest.param(n, marks=pytest.mark.nightly) for n in (1, 2, 3, 4, 5, 7)), 6])
 def test_process_killed_while_recording_leaves_nothing_half_written(tmp_path: Path, die_before: int) -> None:
-    arguments = spawn_arguments(tmp_path / "catalog", "-", 0, die_before)
-    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    assert done.stdout == "answered\n"
+    program = other_program(tmp_path / "catalog", "-", 0, die_before)
+    assert program.communicate()[0] == "answered\n"
     with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as catalog:
-        killed = done.returncode == -signal.SIGKILL
+        killed = program.returncode == -signal.SIGKILL
         assert numbers(catalog) == ([1] if killed else [1, 2])
         record(catalog, new_result(), image(3))
         assert finished(verify(catalog, jobs=1)).findings == ()  # the image without a row was replaced
