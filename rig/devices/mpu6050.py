@@ -240,7 +240,8 @@ class Mpu9250(Mpu6500):
 class Mpu6050Clone(Mpu6050):
     """A clone of the MPU-6050 that has no datasheet. Opening it also tests how it behaves at rest.
 
-    The FIFO is used as if it had the smallest size of the family. The temperature has the MPU-6050's scale.
+    It counts as the worst of the family: the smallest FIFO and the largest noise. The temperature has the MPU-6050's
+    scale.
 
     Raises
     ------
@@ -250,6 +251,7 @@ class Mpu6050Clone(Mpu6050):
 
     KIND = imu_kind("mpu6050_clone")
     FIFO_BYTES = 512
+    NOISE_DPS_RTHZ = 0.01
 
     def _set_up(self) -> None:
         super()._set_up()

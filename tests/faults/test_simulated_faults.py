@@ -279,7 +279,7 @@ def test_fault_at_the_start_stops_the_bench_from_opening():
 
 
 @pytest.mark.parametrize("servo", ["xl430_w250", "xm430_w350", "xl330_m288", "mx_28", "ax_12a"])
-@pytest.mark.parametrize("imu", [("mpu6050", 0x68), ("bno055", 0x28)])
+@pytest.mark.parametrize("imu", [("mpu6050", 0x68), ("mpu6500", 0x68), ("bno055", 0x28)])
 def test_every_fault_works_on_every_simulated_device(servo, imu):
     settings = (f"servo.model={servo}", "servo.baud=1000000", f"imu.model={imu[0]}", f"imu.address={imu[1]}")
     for name in fault_kinds():

@@ -10,13 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.config import load_config
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.mpu6050 import Mpu6050, Mpu6050Clone, Mpu6500, Mpu9250
+from sim.bench import ShelfOperator, open_sim_bench
 from sim.clock import VirtualClock
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone, SimMpu6500, SimMpu9250
 from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
 from sim.world import World
 from tests.fuzzing import examples
 
@@ -183,6 +186,13 @@ def test_clone_that_misbehaves_is_rejected(spoil: Any, problem: str) -> None:
         spoil(bench.sensor)
         with pytest.raises(DeviceMismatch, match=problem):
             bench.open(Mpu6050Clone)
+
+
+def test_opening_a_bench_notes_a_clone() -> None:
+    world = World(seed=1)
+    with open_sim_bench(load_config(None, ["imu.model=mpu6050_clone"]), ShelfOperator(world, shelf())) as bench:
+        assert bench.imu.identity.gyro_noise_dps_rthz == 0.01
+        assert any("clone" in finding for finding in bench.findings)
 
 
 def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:
