@@ -1,4 +1,7 @@
-"""Objects that other packages name in their entry points."""
+"""Objects that other packages name in their entry points.
+
+Decision: docs/decisions/0041.
+"""
 
 from collections.abc import Iterator
 from importlib.metadata import entry_points
