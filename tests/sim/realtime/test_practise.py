@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import DeviceNotFound
+from rig.devices.dynamixel.port import open_serial
 from sim.realtime.wire import tell
 from tests.docs.pages import DOCS
 
@@ -64,6 +66,15 @@ def until(reached: Callable[[], bool]) -> None:
         CLOCK.sleep(0.02)
 
 
+def is_free(port: Path) -> bool:
+    """Return whether no program, such as a guardian, has a port open."""
+    try:
+        open_serial(str(port), 57_600).close()
+    except DeviceNotFound:
+        return False
+    return True
+
+
 def process(*words: str, cwd: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-c", START, *words],
@@ -99,7 +110,7 @@ def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
                 killed = others.pop()[1]
                 killed.kill()
                 killed.communicate()
-                until(lambda: not tell(folder, "status")["world"]["torque"])
+                until(lambda: not tell(folder, "status")["world"]["torque"] and is_free(folder / "servo"))
             elif following and (typed.terminal, following.terminal) == ("second terminal", "third terminal"):
                 start_deg = tell(folder, "status")["world"]["table_deg"]
                 others.append((typed, process(*words, cwd=folder)))
