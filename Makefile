@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 
 LIBRARY := hbr/kernels/_kernels.so
 
-.PHONY: demo web test test-nightly test-kills fuzz lint docs wheel bench lock clean help
+.PHONY: demo web test test-nightly test-kills test-web fuzz lint docs wheel bench lock clean help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
@@ -16,6 +16,7 @@ help:
 	@echo "make test   run the tests (about three minutes on two cores)"
 	@echo "make test-nightly  run all tests, with many more cases in each"
 	@echo "make test-kills  kill the program at a hundred points of its work, and check what is left"
+	@echo "make test-web   use the pages in a real browser, and attack the server"
 	@echo "make fuzz   attack every kind of input for about an hour (a part of test-nightly)"
 	@echo "make lint   formatting, lint, types, import contracts"
 	@echo "make docs   the documentation as a site in site/"
@@ -41,6 +42,11 @@ KILLS ?= 8
 test-kills: $(READY) $(LIBRARY)
 	@RIG_TEST_KILLS=$(KILLS) $(BIN)/python -m pytest -n auto --dist worksteal --timeout 3600 tests/faults/test_kill*.py
 
+# Needs Debian's chromium. The packages of these tests are large, so only this target installs them.
+test-web: $(READY) $(LIBRARY)
+	@sh .ci/install .ci/browser.lock
+	@$(BIN)/python -m pytest -rs -m "" --timeout 300 tests/browser
+
 fuzz: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly tests/fuzz
 
@@ -65,7 +71,8 @@ bench: $(READY) $(LIBRARY)
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
-	for tool in uv:uv cyclonedx-bom:sbom; do echo $${tool%:*} | uv pip compile - --universal --python-version 3.11 \
+	for tool in uv:uv cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser'; do \
+	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
 
 $(READY): requirements.lock pyproject.toml

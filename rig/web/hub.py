@@ -45,6 +45,7 @@ class Hub:
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._changed: asyncio.Event | None = None
+        self._closed = False
         self.listeners = 0
 
     def publish(self, kind: str, data: Any) -> None:
@@ -58,6 +59,11 @@ class Hub:
                 self._loop.call_soon_threadsafe(self._wake)
             except RuntimeError:  # the loop is closed: the server ends
                 self._loop = None
+
+    def close(self) -> None:
+        """End all streams."""
+        self._closed = True
+        self.publish("stop", {"ended": True})
 
     @property
     def last_id(self) -> str:
@@ -83,7 +89,7 @@ class Hub:
         return int(number), False
 
     async def stream(self, last_event_id: str | None = None) -> AsyncIterator[str]:
-        """Yield server-sent events after ``last_event_id``, without an end.
+        """Yield server-sent events after ``last_event_id``, until the hub is closed.
 
         The first event is ``hello``. Its data say whether messages were lost since ``last_event_id``: the listener must
         then load the present state again.
@@ -94,7 +100,7 @@ class Hub:
         self.listeners += 1
         try:
             yield self._hello(number, lost)
-            while True:
+            while not self._closed:
                 changed = self._changed
                 messages, lost = self.since(number)
                 if lost:

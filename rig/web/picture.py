@@ -30,6 +30,7 @@ class LivePicture:
         self._encoded: tuple[int, bytes] | None = None
         self._encoding = threading.Lock()
         self._shown_ns = clock.now_ns()
+        self.closed = False
         self.viewers = 0
         self.wanted_until_ns = 0
 
@@ -74,7 +75,7 @@ class LivePicture:
         sent = -1
         waited_s = 0.0
         try:
-            while True:
+            while not self.closed:
                 if self._number != sent or waited_s > VIEWER_GONE_S:
                     found = await asyncio.to_thread(self.jpeg)
                     if found is not None:

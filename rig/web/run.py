@@ -105,7 +105,9 @@ def run_server(
                 server.worker.run()
             finally:
                 (folder / SERVER_FILE).unlink(missing_ok=True)
-                web.should_exit = web.force_exit = True
+                server.hub.close()
+                server.picture.closed = True
+                web.should_exit = True
                 thread.join(START_S)
     finally:
         lock.close()

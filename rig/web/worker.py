@@ -304,9 +304,9 @@ class BenchWorker:
     def _observe(self, state: ServoState) -> None:
         """Take a reading of the servo from the control loop."""
         now_ns = self._clock.now_ns()
-        if self._polled_ns is not None and seconds_between(self._polled_ns, now_ns) < 1.0:
+        if self._polled_ns is not None and state.moving:
             self.intervals_s.append(seconds_between(self._polled_ns, now_ns))
-        self._polled_ns = now_ns
+        self._polled_ns = now_ns if state.moving else None
         if seconds_between(self._status_ns, now_ns) >= STATUS_S:
             self._publish_status(state)
 

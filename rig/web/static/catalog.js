@@ -49,7 +49,7 @@ function ring(views) {
   const step = Math.max(1, Math.ceil(views.length / 24));
   return h("ol", { class: "thumbs", "aria-label": "Views by azimuth" },
     ...views.filter((_, k) => k % step === 0).map((view) =>
-      h("li", {}, h("a", { href: `${API}/views/${view.id}/image?full=true`, target: "_blank" }, h("img", { src: `${API}/views/${view.id}/image`, alt: `azimuth ${view.azimuth_deg.toFixed(0)}°`, loading: "lazy" })), `${view.azimuth_deg.toFixed(0)}°`)));
+      h("li", {}, h("a", { href: `${API}/views/${view.id}/image?full=true`, target: "_blank", "aria-label": `View at ${view.azimuth_deg.toFixed(0)}°, full size` }, h("img", { src: `${API}/views/${view.id}/image`, alt: "", loading: "lazy" })), `${view.azimuth_deg.toFixed(0)}°`)));
 }
 
 async function upload(file) {

@@ -243,7 +243,7 @@ export function followJobs(box, kinds, changed = () => {}) {
 }
 
 export const thumb = (job, number, words) =>
-  h("li", {}, h("img", { src: `${API}/jobs/${job}/views/${number}`, alt: words, loading: "lazy" }), words);
+  h("li", {}, h("img", { src: `${API}/jobs/${job}/views/${number}`, alt: "", loading: "lazy" }), words);
 
 export function table(element, head, rows) {
   element.replaceChildren(
@@ -253,6 +253,7 @@ export function table(element, head, rows) {
 }
 
 export async function start() {
+  await act(loadMe); // leads to the login if there is none
   on("hello", () => act(async () => { await loadMe(); tell("status", await request("GET", "/status")); }));
   listen();
 }

@@ -1,0 +1,93 @@
+"""A server process, and a browser that uses its pages: `make test-web` installs what these tests need."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra hbr-rig[web] is not installed")
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@dataclass
+class ServerProcess:
+    """A running `rig serve`."""
+
+    process: "subprocess.Popen[str]"
+    url: str
+    settings: list[str] = field(default_factory=list)
+
+    def kill(self, number: int = signal.SIGKILL) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(30)
+
+
+@pytest.fixture
+def serve_process(tmp_path: Path) -> Iterator[Callable[..., ServerProcess]]:
+    """Return a function that starts `rig serve` on the simulated bench, always with the same data."""
+    running: list[ServerProcess] = []
+
+    def start(*settings: str, options: tuple[str, ...] = ()) -> ServerProcess:
+        paths = [f"catalog.path={tmp_path}/catalog", f"state_dir={tmp_path}/state", f"calibration_dir={tmp_path}/cal"]
+        given = [word for one in (*paths, *settings) for word in ("--set", one)]
+        command = [*RIG, "serve", "--bench", "sim", "--seed", "1", "--port", "0"]
+        process = subprocess.Popen(
+            [*command, *given, *options], stderr=subprocess.PIPE, text=True, env={**os.environ, "NO_COLOR": "1"}
+        )
+        assert process.stderr is not None
+        lines = []
+        for line in process.stderr:
+            lines.append(line)
+            if found := re.search(r"https?://\S+/", line):
+                running.append(ServerProcess(process, found.group(), given))
+                return running[-1]
+        pytest.fail(f"rig serve ended: {''.join(lines)}")
+
+    yield start
+    for one in running:
+        with one.process:  # closes its pipe
+            if one.process.poll() is None:
+                one.kill(signal.SIGTERM)
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A headless Chromium of the system."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is missing: make test-web installs it")
+    if CHROMIUM is None:
+        pytest.skip("Chromium is missing: apt-get install chromium")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(
+            executable_path=CHROMIUM,
+            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"],
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(chromium: Any) -> Iterator[Any]:
+    """A page that fails the test on a script error, or if it asks another server."""
+    context = chromium.new_context(viewport={"width": 1280, "height": 900})
+    shown = context.new_page()
+    problems: list[str] = []
+    context.on("weberror", lambda error: problems.append(str(error.error)))
+    context.on(
+        "request",
+        lambda one: (
+            None if "://127.0.0.1:" in one.url or one.url.startswith(("data:", "blob:")) else problems.append(one.url)
+        ),
+    )
+    yield shown
+    context.close()
+    assert problems == []
