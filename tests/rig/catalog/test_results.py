@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -38,10 +39,12 @@ def _without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     without_waiting(monkeypatch)
 
 
-@pytest.fixture
-def catalog(tmp_path: Path) -> Iterator[Catalog]:
+@pytest.fixture(scope="module")
+def three_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("results") / "catalog"
     clock = VirtualClock()
-    with Catalog.open(tmp_path / "catalog", clock=clock) as opened:
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(path, clock=clock) as opened:
+        without_waiting(patch)
         true_fill(opened, "mug", 1, 0)
         true_fill(opened, "tin", 1, 10)
         record(opened, new_result(sample="S-1"), image(1))
@@ -49,6 +52,12 @@ def catalog(tmp_path: Path) -> Iterator[Catalog]:
         record(opened, new_result("ambiguous", "tin", " S-2 ", operator="A. Silva"), image(2))
         clock.sleep(3600)
         record(opened, new_result("unknown", None), None)
+    return path
+
+
+@pytest.fixture
+def catalog(three_results: Path, tmp_path: Path) -> Iterator[Catalog]:
+    with Catalog.open(shutil.copytree(three_results, tmp_path / "catalog"), clock=VirtualClock()) as opened:
         yield opened
 
 

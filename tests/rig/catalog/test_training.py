@@ -22,7 +22,7 @@ from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record, without_waiting
 
 REGION = (16, 0, 160, 144)
-VIEWS = 8
+VIEWS = 4
 AREA = np.pi * 28 * 44
 
 
@@ -61,7 +61,7 @@ def enroll(catalog: Catalog, name: str, frames: list[NDArray[np.uint8]], region:
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two objects with 8 views each: one with an empty-table image and a region, one with neither."""
+    """Two objects with 4 views each: one with an empty-table image and a region, one with neither."""
     path = tmp_path_factory.mktemp("training") / "catalog"
     with pytest.MonkeyPatch.context() as patch, Catalog.open(path, clock=VirtualClock()) as catalog:
         without_waiting(patch)
@@ -142,7 +142,7 @@ def test_split_by_view_divides_the_views_of_each_object(catalog: Catalog, tmp_pa
         }
 
     first = split("a", 1)
-    for part, count in (("train", 4), ("val", 2), ("test", 2)):
+    for part, count in (("train", 2), ("val", 1), ("test", 1)):
         assert [sum(key in name for name in first[part]) for key in ("-mug", "-tin")] == [count, count]
     assert split("b", 1) == first
     assert split("c", 2) != first
