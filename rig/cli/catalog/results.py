@@ -1,7 +1,7 @@
 """`rig results ...`: the recorded answers of identifications."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,7 @@ from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from rig.catalog.results import Answer, Result
+    from rig.events.events import Identified
 
 app = typer.Typer(help="Show, export and correct the recorded answers of identifications.", no_args_is_help=True)
 
@@ -100,22 +101,24 @@ def show(settings: Settings, result: ResultArgument) -> None:
             correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
         settings.print_json(shown)
         return
-    print(f"Result {found.id}: {_answer_words(found)}")
+    corrected = f"corrected to {_words(found.current)}; the answer was: " if found.corrections else ""
+    print(f"Result {found.id}: {corrected}{_answer_words(found)}")
     lines = {
         "sample": found.answered.sample or "–",
         "time": f"{found.time_utc:%Y-%m-%d %H:%M:%S} UTC",
         "operator": f"{found.operator} (account {found.user} on {found.host})",
+        "candidates": _candidates(found),
         "views": f"{len(found.azimuths_deg)}",
         "bench": f"{found.provenance.bench}, {found.provenance.software}",
         "catalog": f"version {found.catalog_version[:12]}",
         "image": str(folder / found.image) if found.image else "–",
     }
     for name, text in lines.items():
-        print(f"  {name:9} {text}")
+        print(f"  {name:10} {text}")
     for one in found.corrections:
         sample = f", sample {one.corrected.sample}" if one.corrected.sample else ""
         print(f"Corrected {one.time_utc:%Y-%m-%d %H:%M:%S} UTC by {one.operator}: {_words(one.corrected)}{sample}")
-        print(f"  reason    {one.reason}")
+        print(f"  reason     {one.reason}")
 
 
 @app.command("export")
@@ -219,13 +222,24 @@ def _words(answer: "Answer") -> str:
 
 def _answer_words(result: "Result") -> str:
     """Return the answer in the words that were printed after the search."""
-    from rig.events.events import Identified
     from rig.events.wording import result_words
+
+    answer = _event(result)
+    return _words(result.answered) if answer is None else result_words(answer)
+
+
+def _candidates(result: "Result") -> str:
+    answer = _event(result)
+    return "–" if answer is None else ", ".join(f"{one.name} {one.score:.3f}" for one in answer.candidates)
+
+
+def _event(result: "Result") -> "Identified | None":
+    """Return the recorded event; None if another version of the program recorded it."""
+    from rig.events.events import Identified
     from rig.search.saved_run import built
 
-    details: Any = {name: value for name, value in result.details.items() if name != "event"}
     try:
-        answer: Identified = built(Identified, details)
-        return result_words(answer)
-    except (LookupError, TypeError, ValueError, AttributeError):  # an event of another version
-        return _words(result.answered)
+        answer: Identified = built(Identified, result.details)
+    except (LookupError, TypeError, ValueError, AttributeError):
+        return None
+    return answer

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,13 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
-from rig.catalog import Catalog
+from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
+from rig.catalog import Catalog, Provenance
 from rig.catalog.exchange import import_objects, plan_import, read_objects, read_unpacked, write_bundle
 from rig.catalog.exchange.training import Annotations, Split, write_training
+from rig.cli.main import app
 from rig.config import ViewConfig
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
 from rig.views.description import ViewDescriber
@@ -39,8 +43,15 @@ def scene(index: int | None, colour: tuple[int, int, int] = (40, 60, 200)) -> ND
     return frame
 
 
-def enroll(catalog: Catalog, name: str, frames: list[NDArray[np.uint8]], region: Any, table: Any) -> None:
-    enrollment = catalog.begin(name, planned_azimuth_deg=plan(len(frames)), provenance=PROVENANCE, label="toys")
+def enroll(
+    catalog: Catalog,
+    name: str,
+    frames: list[NDArray[np.uint8]],
+    region: Any = None,
+    table: Any = None,
+    provenance: Provenance = PROVENANCE,
+) -> None:
+    enrollment = catalog.begin(name, planned_azimuth_deg=plan(len(frames)), provenance=provenance, label="toys")
     if table is not None:
         enrollment.store_empty_table(table)
     describe = ViewDescriber(ViewConfig(roi=region), empty_table=table)
@@ -66,7 +77,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch, Catalog.open(path, clock=VirtualClock()) as catalog:
         without_waiting(patch)
         enroll(catalog, "mug", [scene(i) for i in range(VIEWS)], REGION, scene(None))
-        enroll(catalog, 'tin: "7"', [*(scene(i, (200, 90, 30)) for i in range(VIEWS - 1)), scene(None)], None, None)
+        enroll(catalog, 'tin: "7"', [*(scene(i, (200, 90, 30)) for i in range(VIEWS - 1)), scene(None)])
     return path
 
 
@@ -122,6 +133,32 @@ def test_pycocotools_reads_the_masks(catalog: Catalog, tmp_path: Path) -> None:
         assert not mask[:y, :].any()
         assert mask[y : y + height, x : x + width].sum() == mask.sum() == annotation["area"]
     assert len(read.getAnnIds(iscrowd=True)) == 1
+
+
+def test_intrinsics_are_those_of_the_calibration_in_force(tmp_path: Path) -> None:
+    result = CalibrationResult(
+        name="camera.intrinsics",
+        estimates={"fx": Estimate(701.5, 0.4, "px"), "k1": Estimate(-0.1, 0.01, "")},
+        residual=None,
+        limit=None,
+        residual_unit="px",
+        rejections=(),
+        when_utc=datetime(2026, 3, 1, tzinfo=UTC),
+        device={},
+        evidence={},
+    )
+    CalibrationStore(tmp_path / "calibration" / "sim").add(result)
+    with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as catalog:
+        for name, conditions in (("before", {}), ("after", {"calibrations": ["imu.scale@1", result.id]})):
+            enroll(catalog, name, [scene(1)], provenance=Provenance("sim", {}, conditions))
+        enroll(catalog, "elsewhere", [scene(1)], provenance=Provenance("../sim", {}, {"calibrations": [result.id]}))
+    folders = {"catalog.path": "catalog", "calibration_dir": "calibration"}
+    places = [word for key, name in folders.items() for word in ("--set", f"{key}={tmp_path / name}")]
+    target = str(tmp_path / "out")
+    done = CliRunner().invoke(app, ["export", target, "--format", "coco", "--jobs", "1", "--bench", "sim", *places])
+    assert done.exit_code == 0, done.output
+    (content,) = parts_of(tmp_path / "out").values()
+    assert [one["intrinsics"] for one in content["images"]] == [None, {"fx": 701.5, "k1": -0.1}, None]
 
 
 @pytest.mark.parametrize("form", Annotations)
