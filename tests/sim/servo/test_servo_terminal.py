@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,18 +15,16 @@ from rig.core.clock import SystemClock
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
 from rig.devices.servo import MotionProfile
-
-START = "from rig.cli.main import main; main()"
+from tests.programs import Program
 
 
 @pytest.fixture
 def sim_servo(tmp_path: Path) -> Iterator[Callable[..., dict[str, Any]]]:
     """Return a function that starts `rig sim-servo` and returns what it says about itself."""
-    running: list[subprocess.Popen[str]] = []
+    running: list[Program] = []
 
     def start(*options: str) -> dict[str, Any]:
-        arguments = [sys.executable, "-c", START, "sim-servo", "--json", "--seconds", "60", *options]
-        process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+        process = Program("sim-servo", "--json", "--seconds", "600", *options, folder=tmp_path)
         running.append(process)
         assert process.stdout is not None
         started: dict[str, Any] = json.loads(process.stdout.readline())
@@ -36,16 +32,13 @@ def sim_servo(tmp_path: Path) -> Iterator[Callable[..., dict[str, Any]]]:
 
     yield start
     for process in running:
-        process.kill()
-        process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
+        process.close()
 
 
 def test_rustypot_drives_an_xl430(sim_servo: Callable[..., dict[str, Any]]) -> None:
     rustypot = pytest.importorskip("rustypot")
     started = sim_servo("--id", "1", "--id", "4")
-    servo = rustypot.Xl430PyController(started["port"], 1_000_000, 0.5)
+    servo = rustypot.Xl430PyController(started["port"], 1_000_000, 30.0)
     assert [servo.ping(i) for i in (1, 4)] == [True, True]
     assert servo.read_model_number(1) in (1060, [1060])
     servo.write_operating_mode(1, 4)
@@ -64,15 +57,18 @@ def test_rustypot_drives_an_xl430(sim_servo: Callable[..., dict[str, Any]]) -> N
 def test_rustypot_drives_an_ax12(sim_servo: Callable[..., dict[str, Any]]) -> None:
     rustypot = pytest.importorskip("rustypot")
     started = sim_servo("--set", "servo.model=ax_12a")
-    servo = rustypot.AxPyController(started["port"], 1_000_000, 0.5)
+    servo = rustypot.AxPyController(started["port"], 1_000_000, 30.0)
     assert servo.ping(1)
     assert servo.read_model_number(1) in (12, [12])
     assert servo.read_raw_present_position(1) in (512, [512])
     servo.close()
 
 
-def test_sdk_and_rig_driver_find_the_servo(sim_servo: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+def test_sdk_and_rig_driver_find_the_servo(
+    sim_servo: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One after the other, through a link of a fixed name; in real time the driver moves it, and sees it move."""
+    monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 30_000)  # ms: the other process may have to wait
     sim_servo("--link", str(tmp_path / "servo"))
     port = PortHandler(str(tmp_path / "servo"))
     assert port.openPort()
@@ -85,7 +81,7 @@ def test_sdk_and_rig_driver_find_the_servo(sim_servo: Callable[..., dict[str, An
     servo.set_profile(MotionProfile(180.0, 2000.0))
     servo.torque_on()
     start_deg = servo.read_state().position_deg
-    servo.arm_watchdog(0.5)
+    servo.arm_watchdog(2.5)
     servo.move_to(start_deg + 60.0)
     seen = []
     while not seen or (not servo.read_state().in_position and len(seen) < 200):
