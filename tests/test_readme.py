@@ -1,8 +1,6 @@
 """The README shows only what the program does."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,6 +8,7 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 from rig.cli.ui.exit_codes import EXIT_CODES
+from tests.programs import Program
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -56,9 +55,10 @@ def test_walk_through_shows_the_real_output(tmp_path, monkeypatch):
 
 def test_library_example_finds_the_object(tmp_path):
     (code,) = blocks("python")
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1].startswith("teapot ")
+    program = Program(code=code, folder=tmp_path)
+    output, errors = program.communicate()
+    assert program.returncode == 0, errors
+    assert output.splitlines()[-1].startswith("teapot ")
 
 
 def test_every_command_and_option_exists():

@@ -4,16 +4,20 @@ import json
 import re
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.programs import Program
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *arguments], cwd=cwd, capture_output=True, text=True)
+def run(script: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    code = f"import runpy; runpy.run_path({script!r}, run_name='__main__')"
+    program = Program(*arguments, code=code, folder=cwd)
+    output, errors = program.communicate()
+    return subprocess.CompletedProcess(script, program.wait(), output, errors)
 
 
 def commands() -> list[list[str]]:
