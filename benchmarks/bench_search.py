@@ -24,15 +24,15 @@ def model(objects: int) -> Views:
     used = rng.random(shape) < 0.12
     mean = rng.gamma(1.5, 2.0, shape) * used
     phase, swing = rng.uniform(0, 2 * np.pi, shape), rng.uniform(0, 2, shape) * used
-    turn = np.linspace(0, 2 * np.pi, VIEWS_OF_AN_OBJECT, endpoint=False)[:, None]
+    rotation = np.linspace(0, 2 * np.pi, VIEWS_OF_AN_OBJECT, endpoint=False)[:, None]
     levels = np.empty((objects, VIEWS_OF_AN_OBJECT, 144), np.uint8)
     for start in range(0, objects, 500):
         part = slice(start, start + 500)
         noise = rng.normal(0, 0.3, levels[part].shape) * used[part]
-        levels[part] = np.clip(np.rint(mean[part] + swing[part] * np.sin(turn + phase[part]) + noise), 0, 7)
+        levels[part] = np.clip(np.rint(mean[part] + swing[part] * np.sin(rotation + phase[part]) + noise), 0, 7)
     return Views(
         levels.reshape(-1, 144),
-        np.tile(np.degrees(turn[:, 0]), objects),
+        np.tile(np.degrees(rotation[:, 0]), objects),
         np.repeat(np.arange(objects), VIEWS_OF_AN_OBJECT),
         tuple(f"object {j}" for j in range(objects)),
     )

@@ -82,11 +82,11 @@ def calibrated_on(bench: Bench, store: CalibrationStore, figures: Figures, name:
 def angle_errors(events: Iterator[Any], operator: ShelfOperator, orientation: str) -> list[float]:
     """Run an enrollment and return the errors of the angles of its views, without their mean."""
     errors = []
-    turned_deg = 0.0
+    rotated_deg = 0.0
     for event in events:
         if isinstance(event, Moved):
-            turned_deg += event.rotation_imu_deg or 0.0
-            read_deg = event.encoder_deg if orientation == "encoder" else turned_deg
+            rotated_deg += event.rotation_imu_deg or 0.0
+            read_deg = event.encoder_deg if orientation == "encoder" else rotated_deg
             errors.append(read_deg - operator.world.table_deg())
     return [float(value) for value in np.array(errors) - np.mean(errors)]
 

@@ -76,7 +76,7 @@ def _objects(views: Views) -> Iterator[Object]:
     own = descriptor(BENCH_DESCRIPTOR)
     for j, name in enumerate(views.object_names):
         rows = views.of(j)
-        turning = _turning(own.size_bytes, len(rows), j)
+        rotating = _rotating(own.size_bytes, len(rows), j)
         azimuths_deg = views.azimuth_deg[rows].tolist()
         yield Object(
             name=name,
@@ -107,7 +107,7 @@ def _objects(views: Views) -> Iterator[Object]:
                                     name="cedd", version=1, settings=settings, packed=pack(views.descriptors[row]).hex()
                                 ),
                                 BundledDescriptor(
-                                    name=own.name, version=own.version, settings=settings, packed=turning[i]
+                                    name=own.name, version=own.version, settings=settings, packed=rotating[i]
                                 ),
                             ),
                         )
@@ -118,7 +118,7 @@ def _objects(views: Views) -> Iterator[Object]:
         )
 
 
-def _turning(size: int, views: int, seed: int) -> list[str]:
+def _rotating(size: int, views: int, seed: int) -> list[str]:
     """Return packed levels of an object's views, as hexadecimal: a third of them changes slowly with the azimuth."""
     rng = np.random.default_rng(seed)
     base, other = rng.integers(0, 256, (2, size), np.uint8)

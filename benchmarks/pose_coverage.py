@@ -50,8 +50,8 @@ def coil(folder: Path, step: int) -> Iterator[Found]:
         def levels(i: int, enrolled: bool, item=item) -> LevelArray:  # type: ignore[no-untyped-def]
             image = read_photograph(item.photographs[i].path, (128, 128))
             rng = generator(1, item.name, "photograph", i)
-            shot = condition.enrolled(image) if enrolled else condition.query(image, rng)
-            return describe(shot.image, descriptor=condition.descriptor, empty_table=shot.empty)
+            captured = condition.enrolled(image) if enrolled else condition.query(image, rng)
+            return describe(captured.image, descriptor=condition.descriptor, empty_table=captured.empty)
 
         views = np.stack([levels(int(i), True) for i in np.flatnonzero(kept)])
         index = DenseIndex(Views.of_object(item.name, views, azimuth_deg[kept], condition.descriptor))

@@ -82,8 +82,8 @@ def take_views(
             for angle_deg in angles_deg:
                 move = table.goto(angle_deg)
                 yield moved(index, move)
-                shot = yield from capture(index, viewer, table, move.settled_ns)
-                seen = detect_board(board, shot.image_bgr)
+                captured = yield from capture(index, viewer, table, move.settled_ns)
+                seen = detect_board(board, captured.image_bgr)
                 foreign |= set(seen.marker_ids.tolist()) - known
                 elsewhere += seen.marker_ids.size >= MIN_MARKERS and not seen.ids.size
                 if seen.ids.size >= MIN_CORNERS:

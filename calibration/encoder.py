@@ -28,8 +28,8 @@ from rig.plans.capture import moved
 NAME = "servo.encoder"
 
 NAMES = ("cos1", "sin1", "cos2", "sin2")
-STEPS_PER_TURN = 12
-MIN_TURNS = 1
+STEPS_PER_REVOLUTION = 12
+MIN_REVOLUTIONS = 1
 MAX_ERROR_DEG = 2.0
 """Encoders of sound servos stay far below: more is a magnet that came off, or a platter off its shaft."""
 MAX_UNCERTAINTY_DEG = 0.05
@@ -48,12 +48,12 @@ def plot(result: CalibrationResult) -> Chart | None:
     """Return the encoder's error over its revolution, as fitted and as the steps show it."""
     if not result.estimates:
         return None
-    turn_deg = result.evidence["turn_deg"]
+    revolution_deg = result.evidence["turn_deg"]
     steps = [step for step in result.evidence["steps"] if stored_valid(step["leg"])]
     values = np.array([result.estimates[name].value for name in NAMES])
     sigma = np.array([result.estimates[name].uncertainty for name in NAMES])
-    phi = np.linspace(0.0, turn_deg, 121)
-    basis = _basis(phi, turn_deg)
+    phi = np.linspace(0.0, revolution_deg, 121)
+    basis = _basis(phi, revolution_deg)
     encoder = np.array([step["leg"]["encoder_deg"] for step in steps])
     gyro = np.array([step["leg"]["gyro_deg"] for step in steps])
     # Over whole revolutions the encoder's error is zero: what differs is the gyro's scale.
@@ -61,45 +61,45 @@ def plot(result: CalibrationResult) -> Chart | None:
     sense = np.sign(steps[0]["to_deg"] - steps[0]["from_deg"]) * np.sign(encoder[0])
     to = np.array([step["to_deg"] for step in steps])
     seen = sense * error
-    seen += float(np.mean(_basis(to, turn_deg) @ values - seen))
+    seen += float(np.mean(_basis(to, revolution_deg) @ values - seen))
     curve, band = basis @ values, 2 * np.sqrt(basis**2 @ sigma**2)
     low, high = (curve - band).tolist(), (curve + band).tolist()
     return Chart(
         "Error of the encoder over its revolution",
-        Axis("position of the encoder, °", span=(0.0, turn_deg)),
+        Axis("position of the encoder, °", span=(0.0, revolution_deg)),
         Axis("error of the reading, °"),
         [
             Series("two harmonics", phi.tolist(), curve.tolist(), MODEL, False, True, low=low, high=high),
-            Series("steps, summed up", np.mod(to, turn_deg).tolist(), seen.tolist()),
+            Series("steps, summed up", np.mod(to, revolution_deg).tolist(), seen.tolist()),
         ],
     )
 
 
 @dataclass(frozen=True)
 class Encoder(Procedure):
-    """Measure the encoder's error over ``turns`` revolutions of the table, in even steps upwards."""
+    """Measure the encoder's error over ``revolutions`` of the table, in even steps upwards."""
 
     names, title, devices, valid_days, plots = (NAME,), "error of the encoder", ("servo", "imu"), 365, (plot,)
-    turns: int = 2
+    revolutions: int = 2
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(MIN_TURNS, self.turns, "revolutions")
-        config, turn_deg = bench.config.table, bench.servo.turn_deg
+        require_at_least(MIN_REVOLUTIONS, self.revolutions, "revolutions")
+        config, revolution_deg = bench.config.table, bench.servo.revolution_deg
         low, high = config.limits_deg
         first_deg = low + config.approach_deg
         possible = floor((high - first_deg) / 360.0)
-        if possible < MIN_TURNS:
+        if possible < MIN_REVOLUTIONS:
             raise too_little_room(bench, "a whole revolution and table.approach_deg")
-        sweep = min(possible, self.turns)
+        sweep = min(possible, self.revolutions)
         middle = max(first_deg, min(-180.0 * sweep, high - 360.0 * sweep))
         # Behind a gear the encoder repeats more often than the table: the steps divide its own revolution.
-        step_deg = turn_deg / STEPS_PER_TURN if turn_deg < 360.0 else 360.0 / STEPS_PER_TURN
+        step_deg = revolution_deg / STEPS_PER_REVOLUTION if revolution_deg < 360.0 else 360.0 / STEPS_PER_REVOLUTION
         steps: list[Step] = []
         with Turntable(bench) as table, returning(table) as goto:
             reference = bench.safety.angle_reference
-            for _sweep in range(ceil(self.turns / sweep)):
+            for _sweep in range(ceil(self.revolutions / sweep)):
                 yield moved(len(steps), goto(middle))
-                for index in range(1, STEPS_PER_TURN * sweep + 1):
+                for index in range(1, STEPS_PER_REVOLUTION * sweep + 1):
                     before = reference.to_servo(table.rest_deg)
                     move = goto(middle + index * step_deg)
                     after = reference.to_servo(table.rest_deg)
@@ -109,10 +109,10 @@ class Encoder(Procedure):
                     steps.append(Step(before, after, raw))
                     yield moved(len(steps), move)
         resolution_deg = bench.servo.resolution_deg
-        yield evaluate(steps, direction=config.direction, turn_deg=turn_deg, resolution_deg=resolution_deg)
+        yield evaluate(steps, direction=config.direction, revolution_deg=revolution_deg, resolution_deg=resolution_deg)
 
 
-def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resolution_deg: float) -> Evaluation:
+def evaluate(steps: Sequence[Step], *, direction: int, revolution_deg: float, resolution_deg: float) -> Evaluation:
     """Fit the harmonics to ``steps``.
 
     Parameters
@@ -121,20 +121,20 @@ def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resoluti
         Consecutive ones, over whole revolutions.
     direction
         Of the table relative to the servo.
-    turn_deg
+    revolution_deg
         The table's angle of one revolution of the encoder.
     resolution_deg
         Angle of one encoder count.
     """
-    evidence = {"steps": plain(list(steps)), "turn_deg": turn_deg}
+    evidence = {"steps": plain(list(steps)), "turn_deg": revolution_deg}
     found = Evaluation(name=NAME, residual_unit="°", evidence=evidence)
     used = [step for step in steps if not step.leg.invalid]
-    if len(used) < STEPS_PER_TURN:
+    if len(used) < STEPS_PER_REVOLUTION:
         why = reasons([step.leg for step in steps])
-        return found.reject(RejectionCode.TOO_FEW_STEPS, used=len(used), needed=STEPS_PER_TURN, reasons=why)
+        return found.reject(RejectionCode.TOO_FEW_STEPS, used=len(used), needed=STEPS_PER_REVOLUTION, reasons=why)
     gyro = np.array([step.leg.gyro_deg for step in used])
-    basis = _basis(np.array([s.to_deg for s in used]), turn_deg) - _basis(
-        np.array([s.from_deg for s in used]), turn_deg
+    basis = _basis(np.array([s.to_deg for s in used]), revolution_deg) - _basis(
+        np.array([s.from_deg for s in used]), revolution_deg
     )
     fitted = fit([s.leg for s in used], np.column_stack([gyro, direction * basis]), resolution_deg)
     found.residual = abs(float(fitted.residuals_deg[fitted.worst]))
@@ -143,7 +143,7 @@ def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resoluti
         found.estimate(name, value, sigma, "°")
     found.proposed = {"table.encoder_harmonics_deg": [round(float(value), 4) for value in fitted.values[1:]]}
 
-    largest = float(np.abs(_basis(np.linspace(0.0, turn_deg, 361), turn_deg) @ fitted.values[1:]).max())
+    largest = float(np.abs(_basis(np.linspace(0.0, revolution_deg, 361), revolution_deg) @ fitted.values[1:]).max())
     reject_slipped_leg(found, steps.index(used[fitted.worst]) + 1)
     found.reject_if(
         largest > MAX_ERROR_DEG, RejectionCode.ENCODER_ERROR_TOO_LARGE, error_deg=largest, limit_deg=MAX_ERROR_DEG
@@ -157,7 +157,7 @@ def evaluate(steps: Sequence[Step], *, direction: int, turn_deg: float, resoluti
     return found
 
 
-def _basis(position_deg: NDArray[np.float64], turn_deg: float) -> NDArray[np.float64]:
+def _basis(position_deg: NDArray[np.float64], revolution_deg: float) -> NDArray[np.float64]:
     """Return cosine and sine of the first two harmonics, float64 (n, 4)."""
-    turn = np.radians(position_deg * 360.0 / turn_deg)
-    return np.column_stack([np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)])
+    angle = np.radians(position_deg * 360.0 / revolution_deg)
+    return np.column_stack([np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)])

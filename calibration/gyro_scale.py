@@ -32,7 +32,7 @@ NAME = "imu.scale"
 
 MIN_LEGS = 2
 """Legs in each direction: fewer cannot contradict each other."""
-MAX_LEG_TURNS = 2
+MAX_LEG_REVOLUTIONS = 2
 """Longer legs gain nothing: the bias learned at the rest before gets old."""
 PLAUSIBLE = (0.9, 1.1)
 """±3 % from part to part, ±2 % over temperature (PS-MPU-6000A, 6.1), a mounting tilted by up to 15°."""
@@ -67,25 +67,25 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class GyroScale(Procedure):
-    """Measure the gyro's scale by at least ``turns`` whole revolutions."""
+    """Measure the gyro's scale by at least ``revolutions`` whole revolutions."""
 
     names, title, devices, plots = (NAME,), "scale of the gyro", ("servo", "imu"), (plot,)
     valid_days = 180
     """The scale ages by mounting and temperature, not by use; half a year finds a sensor that came loose."""
-    turns: int = 8
+    revolutions: int = 8
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(2 * MIN_LEGS, self.turns, "revolutions")
+        require_at_least(2 * MIN_LEGS, self.revolutions, "revolutions")
         low_deg, high_deg = bench.config.table.limits_deg
         # Downwards the table overshoots its goal and comes back, so that every rest has the backlash on the same side.
         low_deg += bench.config.table.approach_deg
         possible = floor((high_deg - low_deg) / 360)
         if possible < 1:
             raise too_little_room(bench, "a whole revolution and table.approach_deg")
-        leg_turns = min(possible, MAX_LEG_TURNS, self.turns // (2 * MIN_LEGS))
-        first_deg = (low_deg + high_deg - 360.0 * leg_turns) / 2
-        ends_deg = first_deg, first_deg + 360.0 * leg_turns
-        each_way = max(ceil(self.turns / leg_turns / 2), MIN_LEGS)
+        leg_revolutions = min(possible, MAX_LEG_REVOLUTIONS, self.revolutions // (2 * MIN_LEGS))
+        first_deg = (low_deg + high_deg - 360.0 * leg_revolutions) / 2
+        ends_deg = first_deg, first_deg + 360.0 * leg_revolutions
+        each_way = max(ceil(self.revolutions / leg_revolutions / 2), MIN_LEGS)
         legs: list[Leg] = []
         with Turntable(bench, trust_gyro=False) as table, returning(table) as goto:
             for index in range(1 + 2 * each_way):

@@ -160,9 +160,9 @@ def _levels(
     levels: Sequence[GravityReading], axis: NDArray[np.float64], column: int, tilt_sigma: Mapping[int, float]
 ) -> dict[str, Estimate]:
     """Return the accelerometer's zero errors (g), and the deviation of the table's axis from the vertical (°)."""
-    turn = np.radians([level.table_deg for level in levels])
+    angle = np.radians([level.table_deg for level in levels])
     readings = np.array([level.mean_g for level in levels])
-    design = np.column_stack([np.ones(turn.size), np.cos(turn), np.sin(turn)])
+    design = np.column_stack([np.ones(angle.size), np.cos(angle), np.sin(angle)])
     (mean, cosine, sine), *_ = np.linalg.lstsq(design, readings, rcond=None)
     noise = sqrt(sum(level.sigma_g**2 for level in levels)) / len(levels)
     estimates = {}

@@ -104,9 +104,9 @@ class Repeatability(Procedure):
                     for step in range(AZIMUTHS):
                         move = table.goto(step * 360.0 / AZIMUTHS)
                         yield moved(index, move)
-                        shot = yield from capture(index, viewer, table, move.settled_ns)
-                        yield Accepted(index, (-move.encoder_deg) % 360.0, shot.evidence, shot.image_bgr)
-                        views.append(describe(shot.image_bgr).levels[PAPER_DESCRIPTOR])
+                        captured = yield from capture(index, viewer, table, move.settled_ns)
+                        yield Accepted(index, (-move.encoder_deg) % 360.0, captured.evidence, captured.image_bgr)
+                        views.append(describe(captured.image_bgr).levels[PAPER_DESCRIPTOR])
                         index += 1
                     rounds.append(views)
                 table.goto(0.0)

@@ -347,8 +347,8 @@ def _first_axis(
     ):
         before, after = cv2.Rodrigues(rotation_a)[0], cv2.Rodrigues(rotation_b)[0]
         between = after @ before.T
-        turned = cv2.Rodrigues(between)[0].ravel()
-        direction += turned * np.sign(b.table_deg - a.table_deg)
+        rotated = cv2.Rodrigues(between)[0].ravel()
+        direction += rotated * np.sign(b.table_deg - a.table_deg)
         centre_a, centre_b = before @ middle + shift_a.ravel(), after @ middle + shift_b.ravel()
         equations.append(np.eye(3) - between)
         values.append(centre_b - between @ centre_a)

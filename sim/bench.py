@@ -212,7 +212,7 @@ def open_sim_bench(
             head_port=devices.head_port,
         )
         if operator.state.load().table is None and bench.safety.fault is None:
-            if bench.servo.turn_deg < 360.0:  # with a gear, the servo alone does not know the table's angle
+            if bench.servo.revolution_deg < 360.0:  # with a gear, the servo alone does not know the table's angle
                 bench.safety.set_angle(world.table_deg())
             else:
                 bench.safety.set_revolutions(0)
@@ -278,9 +278,9 @@ def rest_angle_deg(config: RigConfig, state: StateStore) -> float:
     table = state.load().table
     if table is None:
         return 0.0
-    turn_deg = 360.0 / config.servo.gear_ratio
-    turns = round(table.shift_deg / turn_deg)  # the rest of the shift is a home that the operator set
-    return table.position_deg + (turns - 0.5) * turn_deg
+    revolution_deg = 360.0 / config.servo.gear_ratio
+    revolutions = round(table.shift_deg / revolution_deg)  # the rest of the shift is a home that the operator set
+    return table.position_deg + (revolutions - 0.5) * revolution_deg
 
 
 SIM: BenchKind = SimBenchKind()

@@ -55,8 +55,8 @@ class BoardOnPlatter:
         The board's frame is OpenCV's: x to its right, y down, from its first corner.
         """
         loose = self.loose_deg * sin(table_deg * 7.3) if self.loose_deg else 0.0
-        turn = radians(self.swing_deg + loose)
-        about = np.array([[cos(turn), -sin(turn), 0.0], [sin(turn), cos(turn), 0.0], [0.0, 0.0, 1.0]])
+        rotate = radians(self.swing_deg + loose)
+        about = np.array([[cos(rotate), -sin(rotate), 0.0], [sin(rotate), cos(rotate), 0.0], [0.0, 0.0, 1.0]])
         lean = radians(self.tilt_deg)
         upright = np.array([[1.0, 0.0, 0.0], [0.0, -sin(lean), cos(lean)], [0.0, -cos(lean), -sin(lean)]])
         c, s = cos(radians(self.roll_deg)), sin(radians(self.roll_deg))
@@ -99,8 +99,8 @@ class BoardOnPlatter:
         outline = outline * (width + 2 * margin, height + 2 * margin, 0) - (margin, margin, 0)
         if (rotation[2] @ outline.T + translation[2]).min() <= 0:  # partly behind the camera
             return slice(0, WIDTH), slice(0, HEIGHT)
-        turn = cv2.Rodrigues(rotation)[0]
-        at = cv2.projectPoints(outline, turn, translation, self.optics.matrix, np.array(self.optics.distortion))[0]
+        rotate = cv2.Rodrigues(rotation)[0]
+        at = cv2.projectPoints(outline, rotate, translation, self.optics.matrix, np.array(self.optics.distortion))[0]
         low, high = at.min(axis=(0, 1)) - 2, at.max(axis=(0, 1)) + 3
         (left, right), (top, bottom) = (
             np.clip([low[axis], high[axis]], 0, size).astype(int).tolist() for axis, size in enumerate((WIDTH, HEIGHT))

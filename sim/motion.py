@@ -56,8 +56,8 @@ def _from_pieces(start_s: float, position: float, velocity: float, pieces: list[
     for duration, a in pieces:
         if duration <= 0:
             continue
-        turn = -v / a if a and v else 0.0
-        for d in (turn, duration - turn) if 0 < turn < duration else (duration,):
+        rotation = -v / a if a and v else 0.0
+        for d in (rotation, duration - rotation) if 0 < rotation < duration else (duration,):
             rows.append((t, x, v, a))
             t, x, v = t + d, x + v * d + 0.5 * a * d * d, v + a * d
     rows.append((t, x, v, 0.0))

@@ -159,14 +159,14 @@ class DenseIndex:
         keys = (ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
         return ring, keys, (ends_deg * (self.omega / 360)).astype(np.float32)
 
-    def support(self, similar: FloatArray, turned_deg: float) -> Floats:
+    def support(self, similar: FloatArray, rotated_deg: float) -> Floats:
         """Return what one query adds to every hypothesis.
 
         Parameters
         ----------
         similar : float array (n,)
             Similarity of the query to every view.
-        turned_deg : float
+        rotated_deg : float
             Orientation since the first query, counter-clockwise.
 
         Returns
@@ -174,7 +174,7 @@ class DenseIndex:
         float32 array (k, 72)
             For azimuths 0, 5, 10, ... at the first query.
         """
-        whole, part_deg = divmod(turned_deg % 360.0, _BIN_DEG)
+        whole, part_deg = divmod(rotated_deg % 360.0, _BIN_DEG)
         levels = self._raised(similar)
         slope = self.omega / 360
         azimuth_deg = self.views.azimuth_deg
@@ -228,7 +228,7 @@ class Belief:
         return len(self.orientation_deg)
 
     @property
-    def turned_deg(self) -> float:
+    def rotated_deg(self) -> float:
         """Orientation of the last query, from the first."""
         return float(self.orientation_deg[-1] - self.orientation_deg[0])
 
@@ -242,7 +242,7 @@ class Belief:
         """The objects considered, best first."""
         scores = self.scores()
         order = np.argsort(-scores, kind="stable")
-        azimuth_deg = self._azimuth_deg(order) + self.turned_deg
+        azimuth_deg = self._azimuth_deg(order) + self.rotated_deg
         return DenseRanking(self.index.object_index[order], scores[order], wrap360(azimuth_deg))
 
     def _azimuth_deg(self, which: IndexArray) -> FloatArray:
@@ -331,8 +331,8 @@ def update_belief(
         raise ValueError(f"kept is {kept}; at least 1 object is needed")
     similar = index.compared.similarity(query[None])[0]
     if isinstance(so_far, Belief):
-        turned_deg = float(wrap180(orientation_deg - so_far.orientation_deg[0]))
-        support = so_far.support + index.support(similar, turned_deg)
+        rotated_deg = float(wrap180(orientation_deg - so_far.orientation_deg[0]))
+        support = so_far.support + index.support(similar, rotated_deg)
         return Belief(index, support, np.append(so_far.orientation_deg, orientation_deg))
     if len(index) > kept:
         index = index.only(np.sort(np.argsort(-index.best(similar), kind="stable")[:kept]))

@@ -121,8 +121,8 @@ def next_best_view(
         ordered = sorted((first, second), key=lambda i: -probability[i])
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
         similarity = similar[:, first, second]
-    turn = float(angles_deg[chosen])
-    return NextBestView(turn, wrap360(here_deg + turn), pair, angles_deg, confusion, cost, similarity)
+    rotation_deg = float(angles_deg[chosen])
+    return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
 
 
 def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
@@ -176,7 +176,7 @@ def _expected(
 ) -> tuple[FloatArray, FloatArray]:
     """Similarity of what the hypotheses would show after each turn, (a, m, m), and how well that is known, (a, m)."""
     index = belief.index
-    seen_deg = bin_of * (360.0 / BINS) + belief.turned_deg + angles_deg[:, None]
+    seen_deg = bin_of * (360.0 / BINS) + belief.rotated_deg + angles_deg[:, None]
     own_deg = index.azimuth_deg[place]
     away_deg = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None]))
     away_deg[:, index.left_out[place]] = np.inf

@@ -58,7 +58,7 @@ def pose(belief: Belief, object_index: int) -> Pose:
     azimuth_deg = float(ranking.pose_deg[ranking.object_index == object_index][0])
     (support,) = belief.support[belief.index.object_index == object_index].astype(np.float64)
     p = np.exp(SHARPNESS * (support - support.max()) / np.sqrt(belief.queries))
-    return pose_of(p / p.sum(), azimuth_deg, azimuth_deg - belief.turned_deg)
+    return pose_of(p / p.sum(), azimuth_deg, azimuth_deg - belief.rotated_deg)
 
 
 def pose_of(posterior: FloatArray, azimuth_deg: float, estimate_deg: float) -> Pose:

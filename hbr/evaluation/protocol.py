@@ -226,7 +226,7 @@ class _Trials:
         self._ring = np.argsort(self._azimuth_deg, kind="stable")
         own = views.descriptors[self._rows]
         compared = descriptor(views.descriptor)
-        self._alike = _same_looking(compared.similarity(own, own), self._ring)
+        self._alike = _similar_views(compared.similarity(own, own), self._ring)
         symmetric = symmetry(views, object_index, similarity=compared.similarity)
         self._period_deg = np.nan if symmetric is None else symmetric.period_deg
         similar = compared.similarity(queries, views.descriptors)
@@ -428,7 +428,7 @@ def views_of_trial(views: Views, protocol: Protocol) -> NDArray[np.bool_]:
     return mask
 
 
-def _same_looking(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
+def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
     """Return for each view which views are at least as similar to it as one of its two neighbours, bool (n, n)."""
     before, after = np.empty_like(ring), np.empty_like(ring)
     before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)

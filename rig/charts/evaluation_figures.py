@@ -8,7 +8,7 @@ from typing import Any, Final
 from rig.charts.xy import INK, Axis, Chart, Series
 
 #: Colour and dashes of each method, the same in every figure (Okabe and Ito's palette, for all kinds of colour vision).
-_LOOKS: Final = {
+_STYLES: Final = {
     "single": ("#8a8f96", True),
     "hbr-visual": ("#56b4e9", False),
     "hbr-0": ("#009e73", False),
@@ -55,7 +55,7 @@ def hit_rate_figure(results: dict[str, Any]) -> Chart:
     """Hit-rate against the number of views, with 95 % Wilson intervals, and Best 10 of HBR (Fig. 6 of the paper)."""
     series = []
     for m, method in enumerate(results["methods"]):
-        colour, dashed = _look(method["name"], m)
+        colour, dashed = _style(method["name"], m)
         curve = method["curve"]
         drawn = _rates(method["label"], colour, dashed, [p["views"] for p in curve], curve)
         series.append(drawn if method["name"] in _BANDS or len(curve) == 1 else replace(drawn, low=(), high=()))
@@ -75,7 +75,7 @@ def travel_figure(results: dict[str, Any]) -> Chart:
     for m, method in enumerate(results["methods"]):
         if method["name"] in ("single", "hbr-visual", "hbr-0", "hbr-0-orient"):
             continue  # the same rotations as HBR
-        colour, dashed = _look(method["name"], m)
+        colour, dashed = _style(method["name"], m)
         travelled = [p["travelled_mean_deg"] for p in method["curve"]]
         drawn = _rates(method["label"], colour, dashed, travelled, method["curve"])
         series.append(drawn if method["name"] in _BANDS else replace(drawn, low=(), high=()))
@@ -91,7 +91,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> C
     """
     series = []
     for m, method in enumerate(methods):
-        colour, _ = _look(method["name"], m)
+        colour, _ = _style(method["name"], m)
         for key, dashed, words in (
             ("pose_rmse_deg_by_object", True, "plain"),
             ("alike_rmse_deg_by_object", False, "alike"),
@@ -120,8 +120,8 @@ def _rates(label: str, colour: str, dashed: bool, x: Sequence[float], points: Se
     return Series(label, x, rate, colour, curve=True, dashed=dashed, low=low, high=high)
 
 
-def _look(name: str, position: int) -> tuple[str, bool]:
-    return _LOOKS.get(name, (_OTHERS[position % len(_OTHERS)], False))
+def _style(name: str, position: int) -> tuple[str, bool]:
+    return _STYLES.get(name, (_OTHERS[position % len(_OTHERS)], False))
 
 
 def _title(results: dict[str, Any]) -> str:

@@ -116,7 +116,7 @@ class TableConfig(Section):
 
     @field_validator("limits_deg")
     @classmethod
-    def _limits_hold_a_turn(cls, limits_deg: tuple[float, float], others: ValidationInfo) -> tuple[float, float]:
+    def _limits_hold_a_revolution(cls, limits_deg: tuple[float, float], others: ValidationInfo) -> tuple[float, float]:
         low, high = limits_deg
         pan = others.data.get("mode") == "pan"
         if pan and not (low <= 0 <= high and low < high):

@@ -97,7 +97,7 @@ class Servo(Protocol):
         """Angle of one encoder count."""
 
     @property
-    def turn_deg(self) -> float:
+    def revolution_deg(self) -> float:
         """Angle after which the encoder repeats; without supply, the servo loses the count of these."""
 
     @property

@@ -190,10 +190,10 @@ class Turntable(AbstractContextManager["Turntable"]):
         peak = self._gyro.peak_dps(window_s)
         if not isfinite(peak):
             self._clock.sleep(self._config.quiet_s)  # the plan paused for longer than the gyro's memory
-        turned = self._gyro.since_rest()
-        slipped = abs(turned.angle_deg) > 4 * turned.sigma_deg + self._config.backlash_deg
+        moved_by = self._gyro.since_rest()
+        slipped = abs(moved_by.angle_deg) > 4 * moved_by.sigma_deg + self._config.backlash_deg
         still = peak <= self._config.quiet_dps and change <= QUIET_COUNTS * self._servo.resolution_deg and not slipped
-        return Stillness(peak, change, turned.angle_deg, still)
+        return Stillness(peak, change, moved_by.angle_deg, still)
 
     def _waypoints(self, target_deg: float) -> tuple[float, ...]:
         """Return the stops of a motion: if it would end downwards, it first goes below the target."""

@@ -41,8 +41,8 @@ def announced(
     LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `Turntable.goto`.
     """
-    if target_deg != asked_deg and (turns := table.unwound_revolutions(target_deg)):
-        yield Unwinding(index, table.rest_deg, target_deg, turns, table.limits_deg)
+    if target_deg != asked_deg and (rotations := table.unwound_revolutions(target_deg)):
+        yield Unwinding(index, table.rest_deg, target_deg, rotations, table.limits_deg)
     return table.goto(target_deg)
 
 

@@ -96,10 +96,10 @@ def identify(
         while True:
             # View: at rest, an acceptable frame, described.
             yield moved(number, move)
-            shot = yield from capture(number, viewer, table, move.settled_ns)
+            captured = yield from capture(number, viewer, table, move.settled_ns)
             azimuth_deg = float(wrap360(orientation_deg))
-            described = describe(shot.image_bgr)
-            yield Accepted(number, azimuth_deg, shot.evidence, shot.image_bgr, described.segmentation)
+            described = describe(captured.image_bgr)
+            yield Accepted(number, azimuth_deg, captured.evidence, captured.image_bgr, described.segmentation)
             yield from warn_of_table(bench, number, described)
             # Decide: rank the candidates, then rotate or finish.
             ranked, step = search.add(described.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)

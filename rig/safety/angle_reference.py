@@ -122,12 +122,12 @@ class AngleReference:
 
     The table's angle is ``direction · (position − error + shift − zero)``, degrees, unwrapped. The error is the
     encoder's error at that position, from calibration. The shift is what the servo lost (whole revolutions) or the
-    operator set (`set_angle`). ``turn_deg`` is the table's rotation for one revolution of the encoder.
+    operator set (`set_angle`). ``revolution_deg`` is the table's rotation for one revolution of the encoder.
     """
 
-    def __init__(self, config: TableConfig, shift_deg: float = 0.0, turn_deg: float = 360.0) -> None:
+    def __init__(self, config: TableConfig, shift_deg: float = 0.0, revolution_deg: float = 360.0) -> None:
         self._config = config
-        self._turn_deg = turn_deg
+        self._revolution_deg = revolution_deg
         self.shift_deg = shift_deg
 
     def calibrate(self, config: TableConfig) -> None:
@@ -147,8 +147,8 @@ class AngleReference:
 
     def _error_deg(self, position_deg: float) -> float:
         a1, b1, a2, b2 = self._config.encoder_harmonics_deg
-        turn = radians(position_deg * 360.0 / self._turn_deg)
-        return a1 * cos(turn) + b1 * sin(turn) + a2 * cos(2 * turn) + b2 * sin(2 * turn)
+        rotate = radians(position_deg * 360.0 / self._revolution_deg)
+        return a1 * cos(rotate) + b1 * sin(rotate) + a2 * cos(2 * rotate) + b2 * sin(2 * rotate)
 
     def set_angle(self, position_deg: float, table_deg: float) -> None:
         """Set the shift so that the servo's ``position_deg`` is the table angle ``table_deg``."""
@@ -164,19 +164,19 @@ def check_saved_angle(
     identity: ServoIdentity,
     position_deg: float,
     condition: ServoCondition,
-    turn_deg: float = 360.0,
+    revolution_deg: float = 360.0,
 ) -> SavedAngleCheck:
     """Compare the servo's position after a pause with the stored one.
 
     As long as the servo has its supply, it counts its revolutions itself, also if the table is rotated by hand. Without
     supply only the angle within the revolution remains: if it is the stored one, the stored revolutions hold as well.
-    In all other cases the operator must look at the cable. ``turn_deg`` is the angle after which the encoder repeats.
+    In all other cases the operator must look at the cable. ``revolution_deg`` is the period of the encoder.
     """
     if saved is None:
         return SavedAngleCheck(AngleFinding.NEVER_REFERENCED, 0.0, position_deg)
     moved_deg = position_deg - saved.position_deg
-    revolutions = round(moved_deg / turn_deg)
-    same_within_turn = abs(moved_deg - turn_deg * revolutions) <= TOLERANCE_DEG
+    revolutions = round(moved_deg / revolution_deg)
+    same_within_revolution = abs(moved_deg - revolution_deg * revolutions) <= TOLERANCE_DEG
     lost = 0
     finding = AngleFinding.UNCHANGED
     if (identity.model_number, identity.bus_id) != (saved.model_number, saved.bus_id):
@@ -192,17 +192,17 @@ def check_saved_angle(
         else:
             finding = AngleFinding.MOTION_INTERRUPTED if on_path else AngleFinding.NOT_ON_PATH
     elif condition.power_lost:
-        if not same_within_turn:
+        if not same_within_revolution:
             finding = AngleFinding.ROTATED_WITHOUT_POWER
         elif revolutions:
             finding, lost = AngleFinding.REVOLUTIONS_RESTORED, revolutions
-    elif abs(moved_deg) > min(HAND_DEG, turn_deg / 2):
+    elif abs(moved_deg) > min(HAND_DEG, revolution_deg / 2):
         finding = AngleFinding.POSITION_CHANGED
     elif abs(moved_deg) > TOLERANCE_DEG:
         finding = AngleFinding.ROTATED_BY_HAND
     return SavedAngleCheck(
         finding,
-        saved.shift_deg - turn_deg * lost,
+        saved.shift_deg - revolution_deg * lost,
         position_deg,
         saved.position_deg,
         identity.firmware,

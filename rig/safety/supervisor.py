@@ -40,7 +40,7 @@ from rig.safety.state_machine import StateEvent, StateMachine
 from rig.safety.state_machine import TableState as TableState
 from rig.safety.table_record import TableRecord
 
-_LOOK_AT_CABLE: Final = (
+_CHECK_CABLE: Final = (
     "Look at the cable. If it hangs free, run `rig home --turns 0`, else give the revolutions that it is wound up. Or "
     "rotate the table by hand to its home and run `rig home --here`."
 )
@@ -348,7 +348,7 @@ class Safety:
         """
         if self.doubt and self.doubt.finding is AngleFinding.SETTINGS_CHANGED:
             raise self._not_ready()
-        if self.doubt and self._servo.turn_deg < 360.0:
+        if self.doubt and self._servo.revolution_deg < 360.0:
             raise NotReady(
                 "Because of its gear, the servo cannot measure the table's angle within a revolution.",
                 next_step=_SET_HOME,
@@ -400,7 +400,7 @@ class Safety:
             case TableState.UNREFERENCED:
                 return Unreferenced(
                     f"How far the table's cable is wound up is not known: {self.doubt}.",
-                    next_step=_WAYS_OUT.get(self.doubt.finding, _LOOK_AT_CABLE) if self.doubt else _LOOK_AT_CABLE,
+                    next_step=_WAYS_OUT.get(self.doubt.finding, _CHECK_CABLE) if self.doubt else _CHECK_CABLE,
                     evidence={"finding": self.doubt.finding} if self.doubt else None,
                 )
             case TableState.STOPPED:

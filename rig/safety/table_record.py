@@ -29,7 +29,7 @@ class TableRecord:
         self._store = store
         self._state = store.load()
         shift_deg = self._state.table.shift_deg if self._state.table else 0.0
-        self.angle_reference = AngleReference(config, shift_deg, servo.turn_deg)
+        self.angle_reference = AngleReference(config, shift_deg, servo.revolution_deg)
         self.doubt: SavedAngleCheck | None = None
         """Why the table's angle is uncertain; None if it is certain."""
         self.findings: list[str] = []
@@ -48,7 +48,7 @@ class TableRecord:
         """Compare the servo's position with the stored one; return whether the table's angle is certain."""
         state, condition = self._servo.read_state(), self._servo.read_condition()
         check = check_saved_angle(
-            self._state.table, self._servo.identity, state.position_deg, condition, self._servo.turn_deg
+            self._state.table, self._servo.identity, state.position_deg, condition, self._servo.revolution_deg
         )
         self.angle_reference.shift_deg = check.shift_deg
         if check.finding is not AngleFinding.NEVER_REFERENCED and self._settings_changed():
@@ -71,7 +71,7 @@ class TableRecord:
         if saved is None or saved.gear_ratio is None:
             return False
         return (saved.zero_deg, saved.direction) != (self._config.zero_deg, self._config.direction) or not isclose(
-            saved.gear_ratio * self._servo.turn_deg, 360.0
+            saved.gear_ratio * self._servo.revolution_deg, 360.0
         )
 
     def set_angle(self, table_deg: float) -> None:
@@ -95,7 +95,7 @@ class TableRecord:
             path_deg=path_deg,
             zero_deg=self._config.zero_deg,
             direction=self._config.direction,
-            gear_ratio=360.0 / self._servo.turn_deg,
+            gear_ratio=360.0 / self._servo.revolution_deg,
         )
         self._save(self._state.model_copy(update={"table": table, "damage": ""}))
 

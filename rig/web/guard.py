@@ -60,14 +60,14 @@ class Guard:
                 await self._app(scope, receive, send)
             return  # there are no web sockets
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        refusal = self._refusal(scope["method"], scope["path"], headers)
-        if refusal is not None:
-            await _refuse(send, *refusal)
+        rejection = self._rejection(scope["method"], scope["path"], headers)
+        if rejection is not None:
+            await _reject(send, *rejection)
             return
         limit = self._max_upload_bytes if scope["path"] == self._upload_path else MAX_BODY_BYTES
         declared = headers.get("content-length", "0")
         if not declared.isdecimal() or int(declared) > limit:
-            await _refuse(send, 413, "The request is too large.", f"Send at most {limit} bytes.")
+            await _reject(send, 413, "The request is too large.", f"Send at most {limit} bytes.")
             return
         received = 0
         complete = False
@@ -95,7 +95,7 @@ class Guard:
 
         await self._app(scope, limited, guarded)
 
-    def _refusal(self, method: str, path: str, headers: dict[str, str]) -> tuple[int, str, str] | None:
+    def _rejection(self, method: str, path: str, headers: dict[str, str]) -> tuple[int, str, str] | None:
         host = headers.get("host", "")
         if _host_name(host) not in self._hosts:
             step = "Use an address that rig serve prints, or allow this name with --allow-host."
@@ -120,7 +120,7 @@ def _host_name(host: str) -> str:
         return ""
 
 
-async def _refuse(send: Send, status: int, what: str, next_step: str) -> None:
+async def _reject(send: Send, status: int, what: str, next_step: str) -> None:
     from rig.web.problems import problem_body
 
     body = problem_body(status, what, next_step)

@@ -52,12 +52,12 @@ class MoveLines:
         assert self._move is not None  # every view follows a Moved event
         move = self._move
         if self._asked_deg is None:
-            turned = f"{'–':>8}{'–':>11}{'–':>18}"
+            rotated = f"{'–':>8}{'–':>11}{'–':>18}"
         else:
             imu = "no value"
             if move.rotation_imu_deg is not None and move.imu_sigma_deg is not None:
                 imu = f"{signed(move.rotation_imu_deg, 2)} ± {move.imu_sigma_deg:.2f}°"
-            turned = f"{signed(self._asked_deg, 1):>7}°{signed(move.rotation_encoder_deg, 2):>10}°{imu:>18}"
+            rotated = f"{signed(self._asked_deg, 1):>7}°{signed(move.rotation_encoder_deg, 2):>10}°{imu:>18}"
         similarity = f"{'–':>12}{'–':>9}  "
         if decided and decided.s_left is not None and decided.s_right is not None:
             left, right = distinct(decided.s_left, decided.s_right, decimals=3)
@@ -70,5 +70,5 @@ class MoveLines:
         leading = ", ".join(f"{c.name} {share_words(c, self._decision) or f'{c.score:.3f}'}" for c in self._leading)
         note = "" if move.agrees else "  encoder and IMU differ"
         return (
-            f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{turned}{similarity}{goes:<11} {leading}{note}"
+            f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{rotated}{similarity}{goes:<11} {leading}{note}"
         )

@@ -42,7 +42,7 @@ TICK_NS = 10_000_000  # period of the fusion
 GYRO_BANDWIDTH_HZ = 32.0
 GYRO_NOISIER, GYRO_TRUER = 2.8, 0.2
 """Ratio of its gyro's noise (0.014 °/s/√Hz) and zero rate (±1 °/s) to those of the bench's noise model."""
-REST_TICKS, JUDGE_TICKS = 100, 20  # time at rest before the sensor measures its bias, and period of the check
+REST_TICKS, CHECK_TICKS = 100, 20  # time at rest before the sensor measures its bias, and period of the check
 REST_DPS, REST_SPREAD_DPS = 3.0, 0.5
 
 _IDENTITY = {CHIP_ID: 0xA0, 0x01: 0xFB, 0x02: 0x32, 0x03: 0x0F, 0x04: 0x11, 0x05: 0x03, 0x06: 0x15}
@@ -176,7 +176,7 @@ class SimBno055:
         gyro, accel = self._distorted(*self.inertial.sample(times, 1e9 / TICK_NS, GYRO_BANDWIDTH_HZ))
         up = self.inertial.up
         begun = due - len(gyro)
-        cuts = range(begun - begun % JUDGE_TICKS + JUDGE_TICKS, due + 1, JUDGE_TICKS)
+        cuts = range(begun - begun % CHECK_TICKS + CHECK_TICKS, due + 1, CHECK_TICKS)
         parts = np.split(gyro, [cut - begun for cut in cuts])
         for i, part in enumerate(parts):
             self._yaw_deg += float(((part - self._bias_dps) @ up).sum()) * TICK_NS * 1e-9

@@ -149,8 +149,8 @@ def _book(name: str, size: tuple[float, float, float], cloth: Colour, cover: Bru
         words = Sheet((s.columns, s.rows), cloth)
         words.text(title, 0.5, 0.5, 0.4, ink, width=0.66)
         inner = s.pixels[round(s.rows * 0.15) : round(s.rows * 0.85)]
-        turned = words.pixels[:, round(s.rows * 0.15) : round(s.rows * 0.85)]
-        inner[:] = turned.transpose(1, 0, 2)[:, ::-1]
+        rotated = words.pixels[:, round(s.rows * 0.15) : round(s.rows * 0.85)]
+        inner[:] = rotated.transpose(1, 0, 2)[:, ::-1]
 
     def paper(s: Sheet) -> None:
         s.stripes(14, (170, 200, 210), share=0.3)

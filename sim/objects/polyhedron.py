@@ -137,13 +137,13 @@ def _paint_printed(solid: Image, texture: Image, frame: Floats, polygon: Floats 
     on_texture = np.array([[-0.5, -0.5], [columns - 0.5, -0.5], [-0.5, rows - 0.5]], dtype=np.float32)
     move = cv2.getAffineTransform(on_texture, (frame - (x0, y0)).astype(np.float32))
     seen = cv2.warpAffine(texture, move, (x1 - x0, y1 - y0), borderMode=cv2.BORDER_REPLICATE)
-    lit = np.asarray(cv2.convertScaleAbs(seen, alpha=light), dtype=np.uint8)
+    shaded = np.asarray(cv2.convertScaleAbs(seen, alpha=light), dtype=np.uint8)
     if polygon is None:
-        solid[:] = lit
+        solid[:] = shaded
     else:
-        cover = np.zeros(lit.shape[:2], dtype=np.uint8)
+        cover = np.zeros(shaded.shape[:2], dtype=np.uint8)
         _fill(cover, polygon - (x0, y0), (255,))
-        blend(solid[y0:y1, x0:x1], lit, cover)
+        blend(solid[y0:y1, x0:x1], shaded, cover)
 
 
 def _fill(image: Image, polygon: Floats, colour: Sequence[float]) -> None:

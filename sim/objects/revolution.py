@@ -72,9 +72,9 @@ class Revolution:
         whole = int(np.floor(shift))
         texture = self._texture[:, whole % columns :]
         seen = cv2.remap(texture, base.column + np.float32(shift - whole), base.row, cv2.INTER_LINEAR)
-        lit = np.asarray(cv2.multiply(seen, base.light, scale=1 / 255), dtype=np.uint8)
-        cv2.add(lit, base.highlight, dst=lit)
-        place(image, lit, base.clear, foot_px - base.foot_px)
+        shaded = np.asarray(cv2.multiply(seen, base.light, scale=1 / 255), dtype=np.uint8)
+        cv2.add(shaded, base.highlight, dst=shaded)
+        place(image, shaded, base.clear, foot_px - base.foot_px)
 
     @cached_property
     def _outside(self) -> Floats:

@@ -66,10 +66,10 @@ def _blocks() -> Solid:
         return painted(p.WOOD, wood(71), brush)
 
     def block(
-        size: float, letters: str, ink: Colour, at: tuple[float, float, float], turned: float, layer: int
+        size: float, letters: str, ink: Colour, at: tuple[float, float, float], rotated: float, layer: int
     ) -> Polyhedron:
         front, right, back, left, top = (face(letter, ink) for letter in letters)
-        return box((size, size, size), (front, right, back, left), top=top, at=at, rotation_deg=turned, layer=layer)
+        return box((size, size, size), (front, right, back, left), top=top, at=at, rotation_deg=rotated, layer=layer)
 
     return Solid(
         "toy-blocks",
@@ -109,9 +109,9 @@ def _car() -> Solid:
     body = box((150, 62, 30), (side, painted(p.BLUE, nose), side, painted(p.BLUE, tail)), top=p.BLUE, at=(0, 0, 14))
     top = box((78, 54, 28), (cabin, shield, cabin, shield), top=p.WHITE, at=(-8, 0, 44), layer=2)
     wheels = [
-        lying_cylinder(18, 10, wall=p.BLACK, end=hub, at=(x, y, 18), rotation_deg=turned, depth_at=(0.1 * x, y))
+        lying_cylinder(18, 10, wall=p.BLACK, end=hub, at=(x, y, 18), rotation_deg=rotated, depth_at=(0.1 * x, y))
         for x in (-46, 46)
-        for y, turned in ((-29, 0.0), (29, 180.0))
+        for y, rotated in ((-29, 0.0), (29, 180.0))
     ]
     return Solid("toy-car", (body, *wheels, top))
 

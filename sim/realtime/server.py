@@ -28,7 +28,7 @@ from sim.realtime.wire import SOCKET, short_path
 MAX_LINE: Final = 100_000
 MAX_MESSAGES, MAX_MESSAGE_BYTES = 42, 8192
 MAX_CONNECTIONS: Final = 64
-_LOOK_S: Final = 0.05
+_POLL_S: Final = 0.05
 """How often a program that waits for a frame looks whether the camera was unplugged."""
 
 Answer = tuple[dict[str, Any], bytes]
@@ -117,7 +117,7 @@ class Session:
                     return camera.grab()
             if self._time.now_ns() > give_up_ns:
                 return False
-            SystemClock().sleep(min(wait_ns * 1e-9, _LOOK_S))
+            SystemClock().sleep(min(wait_ns * 1e-9, _POLL_S))
 
     # -- I2C --------------------------------------------------------------------------------------------------------
 

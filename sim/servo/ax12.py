@@ -307,7 +307,7 @@ class Ax12Servo(SimulatedServoBase):
         """Return the error bits of the hardware's state."""
         return self._supply_and_heat() | self._failed | (Error.OVERLOAD if self._overload else 0)
 
-    def _judge(self) -> None:
+    def _check_shutdown(self) -> None:
         if not self._powered:
             return
         self._overload |= self.motor.overloaded

@@ -76,12 +76,12 @@ class SimulatedServoBase(ABC):
     def set_voltage(self, supply_v: float) -> None:
         """Set the supply voltage; the servo checks it at once."""
         self.motor.supply_v = supply_v
-        self._judge()
+        self._check_shutdown()
 
     def set_temperature(self, temperature_c: float) -> None:
         """Set the temperature of the case; then it follows the thermal model again."""
         self.motor.set_temperature(temperature_c)
-        self._judge()
+        self._check_shutdown()
 
     @abstractmethod
     def slip_encoder(self, angle_deg: float) -> None:
@@ -110,7 +110,7 @@ class SimulatedServoBase(ABC):
         """Boot: set the RAM to its initial values."""
 
     @abstractmethod
-    def _judge(self) -> None:
+    def _check_shutdown(self) -> None:
         """Shut down if load, temperature or supply require it."""
 
     def _schedule(self, action: Callable[[], None], time_ns: int | None) -> None:
@@ -123,7 +123,7 @@ class SimulatedServoBase(ABC):
     def _supervise(self) -> None:
         """Check load, temperature and supply now, and repeatedly while the load varies."""
         self.motor.settle()
-        self._judge()
+        self._check_shutdown()
         varies = self._powered and self.motor.busy
         self._schedule(self._supervise, self._clock.now_ns() + round(SUPERVISION_S * 1e9) if varies else None)
 

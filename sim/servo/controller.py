@@ -5,7 +5,7 @@ from math import cos, radians, sin
 
 from sim.servo.control_table import Memory
 from sim.servo.models import (
-    COUNTS_PER_TURN,
+    COUNTS_PER_REVOLUTION,
     DEG_PER_COUNT,
     DPS2_PER_UNIT,
     DPS_PER_UNIT,
@@ -138,7 +138,7 @@ class Controller:
         """Reset the count of revolutions: the position continues from within one revolution."""
         self._revolution_counts = 0
         present = self._present_position() - self._homing
-        self._revolution_counts = present - present % COUNTS_PER_TURN
+        self._revolution_counts = present - present % COUNTS_PER_REVOLUTION
         self._memory["Goal Position"] = self._present_position()
 
     def slip_encoder(self, angle_deg: float) -> None:

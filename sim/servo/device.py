@@ -6,7 +6,7 @@ from rig.devices.dynamixel.registers import Register
 from sim.servo.base import OVERLOAD_ERROR, SimulatedServoBase
 from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, Memory, Rejection
 from sim.servo.controller import Controller
-from sim.servo.models import BAUD_RATES, COUNTS_PER_TURN, POSITION_MODE, servo_model
+from sim.servo.models import BAUD_RATES, COUNTS_PER_REVOLUTION, POSITION_MODE, servo_model
 from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, Status, StatusError
 from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
 from sim.servo.shaft import Shaft
@@ -56,7 +56,7 @@ class XSeriesServo(SimulatedServoBase):
         bus_id: int = 1,
         baudrate: int = 57_600,
         firmware: int | None = None,
-        center_counts: int = COUNTS_PER_TURN // 2,
+        center_counts: int = COUNTS_PER_REVOLUTION // 2,
     ) -> None:
         row = servo_model(model)
         if baudrate not in BAUD_RATES:
@@ -72,9 +72,9 @@ class XSeriesServo(SimulatedServoBase):
         self._on_write: dict[str, Callable[[], None]] = {
             "Drive Mode": self._controller.wrap_position,
             "Operating Mode": self._controller.change_mode,
-            "Temperature Limit": self._judge,
-            "Max Voltage Limit": self._judge,
-            "Min Voltage Limit": self._judge,
+            "Temperature Limit": self._check_shutdown,
+            "Max Voltage Limit": self._check_shutdown,
+            "Min Voltage Limit": self._check_shutdown,
             "Torque Enable": self._on_torque_enable,
             "Bus Watchdog": self._arm_watchdog,
             "Goal Velocity": lambda: self._on_goal(self._controller.pursue_velocity),
@@ -216,7 +216,7 @@ class XSeriesServo(SimulatedServoBase):
         if self.memory.starts_with_torque:
             self.memory["Torque Enable"] = 1
             self._on_torque_enable()
-        self._judge()
+        self._check_shutdown()
 
     def _factory_reset(self, option: int, everyones: bool) -> None:
         if everyones and option == 0xFF:
@@ -253,7 +253,7 @@ class XSeriesServo(SimulatedServoBase):
         pursue()
         self._supervise()
 
-    def _judge(self) -> None:
+    def _check_shutdown(self) -> None:
         if not self._powered:
             return
         if errors := self._supply_and_heat() | (OVERLOAD_ERROR if self.motor.overloaded else 0):

@@ -15,8 +15,8 @@ GROUP = "rig.simulated_servos"
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate."""
 
-COUNTS_PER_TURN = 4096
-DEG_PER_COUNT = 360.0 / COUNTS_PER_TURN
+COUNTS_PER_REVOLUTION = 4096
+DEG_PER_COUNT = 360.0 / COUNTS_PER_REVOLUTION
 DPS_PER_UNIT = 0.229 * 6.0  # velocity registers count in 0.229 rev/min
 DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # profile Acceleration counts in 214.577 rev/min²
 PWM_FULL = 885  # goal and Present PWM at 100 %
@@ -39,7 +39,7 @@ _INITIAL = {
     "Homing Offset": 0,
     "Moving Threshold": 10,
     "PWM Limit": PWM_FULL,
-    "Max Position Limit": COUNTS_PER_TURN - 1,
+    "Max Position Limit": COUNTS_PER_REVOLUTION - 1,
     "Min Position Limit": 0,
     "Shutdown": 52,
     "Status Return Level": 2,
@@ -58,8 +58,8 @@ _RANGES: dict[str, Container[int]] = {
     "Temperature Limit": range(101),
     "PWM Limit": range(PWM_FULL + 1),
     "Velocity Limit": range(1024),
-    "Max Position Limit": range(COUNTS_PER_TURN),
-    "Min Position Limit": range(COUNTS_PER_TURN),
+    "Max Position Limit": range(COUNTS_PER_REVOLUTION),
+    "Min Position Limit": range(COUNTS_PER_REVOLUTION),
     "Torque Enable": range(2),
     "LED": range(2),
     "Status Return Level": range(3),

@@ -16,10 +16,10 @@ def hand(s, angle_deg: float) -> None:
 def test_ends_shown_by_hand_become_the_limits(simulated):
     s = simulated(seed=2)
     result = None
-    turns = iter([500.0, -1100.0, 600.0])
+    revolutions = iter([500.0, -1100.0, 600.0])
     for event in Cable().live(s.bench):
         if isinstance(event, Ask):
-            hand(s, next(turns))
+            hand(s, next(revolutions))
         else:
             result = event
     assert result.passed, result.rejections

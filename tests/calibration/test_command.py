@@ -63,9 +63,9 @@ def test_passed_results_are_stored_and_in_force(rig, tmp_path, imu_calibration):
         assert path.name in "".join(output.split())
     assert results[0].device["imu"]["range_dps"] == 250
     copytree(folder, tmp_path / "calibrations")
-    told = json.loads(rig("goto", "90", "--json").stdout)
-    assert told["agrees"] is True
-    assert told["bound_deg"] < 1.5
+    reported = json.loads(rig("goto", "90", "--json").stdout)
+    assert reported["agrees"] is True
+    assert reported["bound_deg"] < 1.5
     other = json.loads(rig("goto", "90", "--seed", "7", "--json").stdout)
     assert other["bound_deg"] > 1.5, "another world has another gyro"
 
@@ -121,8 +121,8 @@ def test_show_and_history_list_results(rig, tmp_path, imu_calibration):
     failed, passed = rig("calibrate", "history", "imu.scale").output.splitlines()
     assert "FAIL" in failed
     assert "scale " in passed
-    told = json.loads(rig("calibrate", "history", "--json").stdout)
-    assert [result["name"] for result in told["calibrations"]] == [
+    reported = json.loads(rig("calibrate", "history", "--json").stdout)
+    assert [result["name"] for result in reported["calibrations"]] == [
         "imu.scale",
         "imu.scale",
         "imu.mounting",
@@ -208,7 +208,7 @@ def store(tmp_path, days: float, **device: str) -> None:
             when_utc=SystemClock().utc() - timedelta(days=days),
             valid_days=30.0,
             device=device,
-            evidence={"steps": [], "turn_deg": 360.0},
+            evidence={"steps": [], "revolution_deg": 360.0},
         )
     )
 
@@ -224,8 +224,8 @@ def test_enrollment_reports_expired_results_and_results_of_other_devices(rig, tm
     store(tmp_path, days, **device)
     done = rig("enroll", "mug-star", "--views", "4")
     assert done.exit_code == 0, done.output
-    told = " ".join(done.stderr.split())
-    assert f"Note: {words}" in told
-    assert "`rig calibrate servo`" in told
+    reported = " ".join(done.stderr.split())
+    assert f"Note: {words}" in reported
+    assert "`rig calibrate servo`" in reported
     stored = json.loads(rig("catalog", "show", "mug-star", "--json").stdout)
     assert words in json.dumps(stored, ensure_ascii=False)

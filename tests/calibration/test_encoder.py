@@ -18,16 +18,16 @@ NAMES = ("cos1", "sin1", "cos2", "sin2")
 
 
 def error_deg(harmonics, position_deg):
-    turn = np.radians(position_deg)
+    rotation = np.radians(position_deg)
     a1, b1, a2, b2 = harmonics
-    return a1 * np.cos(turn) + b1 * np.sin(turn) + a2 * np.cos(2 * turn) + b2 * np.sin(2 * turn)
+    return a1 * np.cos(rotation) + b1 * np.sin(rotation) + a2 * np.cos(2 * rotation) + b2 * np.sin(2 * rotation)
 
 
-def drawn(rng: np.random.Generator, harmonics, *, direction: int = 1, turns: int = 2) -> list[Step]:
-    true = np.arange(12 * turns + 1) * 30.0 + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, 12 * turns + 1)
+def drawn(rng: np.random.Generator, harmonics, *, direction: int = 1, revolutions: int = 2) -> list[Step]:
+    true = np.arange(12 * revolutions + 1) * 30.0 + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, 12 * revolutions + 1)
     shaft = direction * true
     read = np.round((shaft + error_deg(harmonics, shaft)) / COUNT_DEG) * COUNT_DEG
-    gyro = np.diff(true) / 1.01 + rng.normal(0.0, 0.01, 12 * turns)
+    gyro = np.diff(true) / 1.01 + rng.normal(0.0, 0.01, 12 * revolutions)
     return [
         Step(float(a), float(b), Leg(direction * float(b - a), float(g), 0.01))
         for a, b, g in zip(read[:-1], read[1:], gyro, strict=True)
@@ -38,7 +38,7 @@ def fit(steps: list[Step], direction: int = 1) -> Evaluation:
     return evaluate(
         steps,
         direction=direction,
-        turn_deg=360.0,
+        revolution_deg=360.0,
         resolution_deg=COUNT_DEG,
     )
 
@@ -113,4 +113,4 @@ def test_short_cable_and_zero_revolutions_are_rejected_before_moving(simulated):
     with pytest.raises(LimitExceeded):
         next(Encoder().live(s.bench))
     with pytest.raises(UsageError):
-        next(Encoder(turns=0).live(s.bench))
+        next(Encoder(revolutions=0).live(s.bench))

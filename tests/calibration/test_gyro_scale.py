@@ -31,18 +31,18 @@ def fit(legs: list[Leg]) -> Evaluation:
     return evaluate(legs, resolution_deg=COUNT_DEG)
 
 
-def drawn(rng: np.random.Generator, scale: float, legs: int = 4, turn_deg: float = 720.0) -> list[Leg]:
+def drawn(rng: np.random.Generator, scale: float, legs: int = 4, revolution_deg: float = 720.0) -> list[Leg]:
     """Return legs as a bench measures them that errs as stated: rests anywhere in a count, a gyro with noise."""
-    rests = np.arange(legs + 1) % 2 * turn_deg + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, legs + 1)
+    rests = np.arange(legs + 1) % 2 * revolution_deg + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, legs + 1)
     read = np.round(rests / COUNT_DEG) * COUNT_DEG
     sigma = 0.03
-    turned = np.diff(rests) / scale + rng.normal(0.0, sigma, legs)
-    return [Leg(float(e), float(g), sigma) for e, g in zip(np.diff(read), turned, strict=True)]
+    rotated = np.diff(rests) / scale + rng.normal(0.0, sigma, legs)
+    return [Leg(float(e), float(g), sigma) for e, g in zip(np.diff(read), rotated, strict=True)]
 
 
-def run(s, *, turns: int = 4, during=None) -> CalibrationResult:
+def run(s, *, revolutions: int = 4, during=None) -> CalibrationResult:
     """Calibrate; ``during`` maps the index of a leg, from 1, to what happens to the world in the middle of it."""
-    events = GyroScale(turns=turns).live(s.bench)
+    events = GyroScale(revolutions=revolutions).live(s.bench)
     for event in events:
         if isinstance(event, Moved) and during and (happens := during.get(event.index + 1)):
             s.world.clock.call_at(s.world.clock.now_ns() + SLIP_DELAY_NS, happens)
@@ -159,12 +159,14 @@ def test_short_cable_is_rejected_before_moving(simulated):
         next(GyroScale().live(s.bench))
     assert s.world.shaft()[0] == pytest.approx(0, abs=0.2)
     with pytest.raises(UsageError, match="too few"):
-        next(GyroScale(turns=3).live(s.bench))
+        next(GyroScale(revolutions=3).live(s.bench))
 
 
 def test_limits_are_never_exceeded(simulated):
     s = simulated("table.limits_deg=[-10, 354]", seed=5)
-    events, shaft_deg = zip(*((event, s.world.shaft()[0]) for event in GyroScale(turns=4).live(s.bench)), strict=True)
+    events, shaft_deg = zip(
+        *((event, s.world.shaft()[0]) for event in GyroScale(revolutions=4).live(s.bench)), strict=True
+    )
     assert events[-1].passed
     assert len(events[-1].evidence["legs"]) == 4
     assert -10 <= min(shaft_deg) < max(shaft_deg) <= 354
@@ -175,7 +177,7 @@ def test_table_returns_at_the_end_and_when_closed_between_moves(simulated):
         s = simulated(seed=seed)
         with Turntable(s.bench) as table:
             table.goto(40.0)
-        events = GyroScale(turns=4).live(s.bench)
+        events = GyroScale(revolutions=4).live(s.bench)
         if seed == 1:
             assert list(events)[-1].passed
         else:
@@ -193,7 +195,7 @@ def test_nothing_moves_after_an_interruption(simulated, after_s):
     def interrupt():
         raise KeyboardInterrupt
 
-    events = GyroScale(turns=4).live(s.bench)
+    events = GyroScale(revolutions=4).live(s.bench)
     next(events)
     before = s.world.shaft()[0]
     s.world.clock.call_at(s.world.clock.now_ns() + round(after_s * 1e9), interrupt)
@@ -208,7 +210,7 @@ def test_nothing_moves_after_an_interruption(simulated, after_s):
 
 def test_silent_servo_ends_the_calibration(simulated):
     s = simulated()
-    events = GyroScale(turns=4).live(s.bench)
+    events = GyroScale(revolutions=4).live(s.bench)
     next(events)
     s.bench.servo.bus.port.ser.unplug()
     with pytest.raises(DeviceSilent):

@@ -24,8 +24,8 @@ def rig(rig, monkeypatch):
 
 def region(rig, name: str) -> list[int]:
     """Return what the object's first view is described within."""
-    told = json.loads(rig("catalog", "show", name, "--json").stdout)
-    return told["views"][0]["record"]["region"]
+    reported = json.loads(rig("catalog", "show", name, "--json").stdout)
+    return reported["views"][0]["record"]["region"]
 
 
 def test_region_follows_the_object_after_the_camera_moved(rig):

@@ -32,5 +32,5 @@ def test_wrong_board_and_moving_table_are_rejected(rig, tmp_path, monkeypatch, s
     (result,) = CalibrationStore(tmp_path / "calibrations" / "sim").history()
     assert code in [rejection.code for rejection in result.rejections]
     assert not result.settings
-    (told,) = json.loads(rig("calibrate", "show", "--json").stdout)["calibrations"]
-    assert told["state"] != "in force"
+    (reported,) = json.loads(rig("calibrate", "show", "--json").stdout)["calibrations"]
+    assert reported["state"] != "in force"

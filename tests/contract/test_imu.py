@@ -150,13 +150,13 @@ def test_counter_clockwise_is_positive(sensor: Sensor, dps: float) -> None:
 def test_integral_between_two_rests_is_the_rotation(sensor: Sensor, angle_deg: float) -> None:
     sensor.imu.read_samples()
     sensor.world.drive(to_position(sensor.clock.now_ns() * 1e-9, 0.0, 0.0, angle_deg, 90.0, 300.0))
-    turned = 0.0
+    rotated = 0.0
     for _ in range(30):
         sensor.clock.sleep(0.1)
         samples = sensor.imu.read_samples()
         assert samples.lost == 0
-        turned += samples.gyro_dps[:, 2].sum() / sensor.imu.rate_hz
-    assert turned == pytest.approx(angle_deg, abs=0.02)
+        rotated += samples.gyro_dps[:, 2].sum() / sensor.imu.rate_hz
+    assert rotated == pytest.approx(angle_deg, abs=0.02)
 
 
 def test_sample_times_are_those_of_the_rotation(sensor: Sensor) -> None:

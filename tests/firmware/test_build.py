@@ -54,8 +54,8 @@ def test_core_builds_without_a_warning_on_this_machine(compiler, tmp_path):
 def test_avr_build_fits_its_limits(tmp_path):
     if lacking := build.missing("avr"):
         pytest.skip(lacking)
-    told = make(tmp_path, "avr", "size")
-    sizes = re.search(r"flash (\d+) of (\d+) bytes, RAM (\d+) of (\d+) bytes", told)
+    reported = make(tmp_path, "avr", "size")
+    sizes = re.search(r"flash (\d+) of (\d+) bytes, RAM (\d+) of (\d+) bytes", reported)
     assert sizes
     flash, flash_limit, ram, ram_limit = map(int, sizes.groups())
     assert (flash_limit, ram_limit) == (8192, 1024)

@@ -72,8 +72,10 @@ def compiler():
 
 def runtime(name: str) -> str:
     """Return the path of a sanitizer's runtime; empty if the compiler has none."""
-    told = subprocess.run([build.compiler(), f"-print-file-name={name}"], capture_output=True, text=True, check=True)
-    path = Path(told.stdout.strip())
+    reported = subprocess.run(
+        [build.compiler(), f"-print-file-name={name}"], capture_output=True, text=True, check=True
+    )
+    path = Path(reported.stdout.strip())
     return str(path) if path.is_absolute() else ""
 
 

@@ -82,8 +82,8 @@ def host(port: str, deadman_s: float, how: str) -> subprocess.Popen:
 def test_stream_runs_in_real_time(terminal):
     terminal.say("spin 20")
     program = host(terminal.port, 2.0, "leave")
-    told, _ = program.communicate(timeout=60)
-    count, lost, rate_dps = told.split()[1:]
+    reported, _ = program.communicate(timeout=60)
+    count, lost, rate_dps = reported.split()[1:]
     assert int(lost) == 0
     assert int(count) > 150  # a busy machine may be late with some; none is lost
     assert float(rate_dps) == pytest.approx(20.0, abs=0.02)

@@ -296,20 +296,20 @@ def test_noise_is_new_in_every_frame() -> None:
 
 
 def test_same_seed_gives_the_same_bytes_for_any_number_of_frames() -> None:
-    def last(seed: int, *, look_at_all: bool) -> Image:
+    def last(seed: int, *, view_all: bool) -> Image:
         world = World(seed=seed)
         world.put(shelf()["mug-star"], 30.0)
         capture = camera(world)
         for _ in range(8):
             capture.grab()
-            if look_at_all:
+            if view_all:
                 capture.retrieve()
         image = capture.retrieve()[1]
         assert image is not None
         return image
 
-    np.testing.assert_array_equal(last(3, look_at_all=True), last(3, look_at_all=False))
-    assert (last(3, look_at_all=False) != last(4, look_at_all=False)).mean() > 0.3
+    np.testing.assert_array_equal(last(3, view_all=True), last(3, view_all=False))
+    assert (last(3, view_all=False) != last(4, view_all=False)).mean() > 0.3
 
 
 # -- settings ---------------------------------------------------------------------------------------------------------
@@ -334,12 +334,12 @@ def test_automatic_settings_drift_with_the_scene_until_they_are_off() -> None:
 
 
 def test_automatic_exposure_does_not_depend_on_reading_frames() -> None:
-    def exposure(looks: int) -> float:
+    def exposure(views: int) -> float:
         world = World(noise=QUIET)
         world.put(shelf()["teapot"])
         capture = SimCapture(world)
-        for _ in range(looks):
-            world.clock.advance_to(world.clock.now_ns() + 3_000_000_000 // looks)
+        for _ in range(views):
+            world.clock.advance_to(world.clock.now_ns() + 3_000_000_000 // views)
             capture.read()
         world.clock.advance_to(4_000_000_000)
         return capture.get(cv2.CAP_PROP_EXPOSURE)

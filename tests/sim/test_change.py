@@ -35,8 +35,8 @@ def _seen(change: Change, seed: int, name: str | None = "toy-house") -> tuple[ND
 
 def test_light_change_affects_only_exposure_and_colour() -> None:
     before, after = _seen(CHANGES["light"], seed=1)
-    lit = (before.min(axis=2) > 40) & (before.max(axis=2) < 150)
-    gains = after[lit].astype(float) / before[lit]
+    shaded = (before.min(axis=2) > 40) & (before.max(axis=2) < 150)
+    gains = after[shaded].astype(float) / before[shaded]
     middle = np.median(gains, axis=0)
     assert np.abs(gains - middle).max() < 0.1  # one factor a channel, everywhere
     assert np.abs(middle - 1).max() > 0.05

@@ -262,14 +262,14 @@ def test_old_samples_show_the_rate_of_their_own_time(chip: Chip) -> None:
         assert np.median(third) == pytest.approx(dps, abs=0.01)
 
 
-@given(slip_deg=st.floats(-0.8, 0.8), after_ms=st.integers(0, 20), look_first=st.booleans())
+@given(slip_deg=st.floats(-0.8, 0.8), after_ms=st.integers(0, 20), view_first=st.booleans())
 @examples(14)
-def test_short_knock_is_measured(slip_deg: float, after_ms: int, look_first: bool) -> None:
+def test_short_knock_is_measured(slip_deg: float, after_ms: int, view_first: bool) -> None:
     with Chip() as chip:
         chip.wake(divider=1, fifo=0x10)
         chip.wait((20 + after_ms) * 1e-3)
         chip.drain()
-        if look_first:
+        if view_first:
             chip.get(INT_STATUS)
         chip.world.slip(slip_deg)
         chip.wait(0.2)
@@ -335,12 +335,12 @@ def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
         assert words[4:] / 131 == pytest.approx(-90 * up, abs=0.01)
 
 
-@given(looks_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))
+@given(views_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))
 @examples(14)
-def test_samples_do_not_depend_on_the_reading_rate(looks_ms: list[int], seed: int) -> None:
+def test_samples_do_not_depend_on_the_reading_rate(views_ms: list[int], seed: int) -> None:
     """The same seed gives the same bytes, in whatever portions they are fetched."""
 
-    def fetch(looks: list[int]) -> bytes:
+    def fetch(views: list[int]) -> bytes:
         # Straight at the device, where time does not pass while it talks.
         world = World(seed=seed)
         sensor = SimMpu6050(world)
@@ -353,15 +353,15 @@ def test_samples_do_not_depend_on_the_reading_rate(looks_ms: list[int], seed: in
             send(*message)
         world.drive(to_velocity(0.0, 0.0, 0.0, 60.0, 100.0))
         got = b""
-        for look in looks:
-            world.clock.sleep(look * 1e-3)
+        for view in views:
+            world.clock.sleep(view * 1e-3)
             send(COUNT)
             count = int.from_bytes(sensor.read(2), "big")
             got += sensor.read(count)
         return got
 
-    whole = fetch(looks_ms)
-    total_ms = sum(looks_ms)
+    whole = fetch(views_ms)
+    total_ms = sum(views_ms)
     at_once = fetch([total_ms])
     assert len(whole) == total_ms // 10 * 12
     assert whole[-len(at_once) :] == at_once if at_once else not whole

@@ -146,9 +146,9 @@ def test_every_object_fits_the_frame_and_rotates_smoothly(name: str) -> None:
 @pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg < 360])
 def test_symmetric_objects_look_the_same_after_their_rotation(name: str) -> None:
     solid = shelf()[name]
-    turn = solid.symmetry_deg or 41.3
+    rotation = solid.symmetry_deg or 41.3
     for azimuth in (0.0, 17.0):
-        a, b = render(solid, azimuth), render(solid, azimuth + turn)
+        a, b = render(solid, azimuth), render(solid, azimuth + rotation)
         assert difference(a, b) < 0.1
         assert tanimoto(describe(a), describe(b)).item() > 0.99
 
@@ -157,8 +157,8 @@ def test_symmetric_objects_look_the_same_after_their_rotation(name: str) -> None
 def test_objects_without_symmetry_look_different_after_a_rotation(name: str) -> None:
     solid = shelf()[name]
     views = [render(solid, azimuth) for azimuth in range(0, 360, 30)]
-    for turn in (2, 3, 4, 6):  # of 30°: 6-, 4-, 3- and 2-fold
-        assert max(difference(views[i], views[(i + turn) % 12]) for i in range(12)) > 0.3
+    for rotation in (2, 3, 4, 6):  # of 30°: 6-, 4-, 3- and 2-fold
+        assert max(difference(views[i], views[(i + rotation) % 12]) for i in range(12)) > 0.3
 
 
 @pytest.mark.parametrize(("one", "other"), CONFUSABLE)

@@ -24,12 +24,12 @@ def drive(world: World, goal: float, v_max: float = 60.0, a_max: float = 300.0) 
 moves = st.lists(st.tuples(st.floats(-400, 400), st.floats(0.01, 3.0)), min_size=1, max_size=5)
 
 
-def run(moves_made: list[tuple[float, float]], noise: NoiseModel, look: Callable[[World], None]) -> World:
+def run(moves_made: list[tuple[float, float]], noise: NoiseModel, view: Callable[[World], None]) -> World:
     world = World(noise=noise)
     for goal, seconds in moves_made:
         drive(world, goal)
         world.clock.sleep(seconds)
-        look(world)
+        view(world)
     return world
 
 
@@ -46,9 +46,9 @@ def test_past_does_not_change(moves_made: list[tuple[float, float]]) -> None:
 
 @quick
 @given(moves, st.integers(2, 200))
-def test_reading_the_world_changes_nothing(moves_made: list[tuple[float, float]], looks: int) -> None:
+def test_reading_the_world_changes_nothing(moves_made: list[tuple[float, float]], views: int) -> None:
     def stare(world: World) -> None:
-        for t in np.linspace(0, world.clock.now_ns(), looks).astype(np.int64):
+        for t in np.linspace(0, world.clock.now_ns(), views).astype(np.int64):
             world.table_deg(int(t))
 
     watched = run(moves_made, NoiseModel(), stare)

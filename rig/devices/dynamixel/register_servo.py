@@ -99,7 +99,7 @@ class RegisterServo(ABC):
         )
 
     @property
-    def turn_deg(self) -> float:
+    def revolution_deg(self) -> float:
         return 360.0 / self._gear_ratio
 
     @property

@@ -11,8 +11,8 @@ from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
 from rig.devices.dynamixel.settings import ServoMode
 from rig.devices.servo import MotionProfile, ServoCondition, ServoState
 
-COUNTS_PER_TURN = 4096
-DEG_PER_COUNT = 360.0 / COUNTS_PER_TURN
+COUNTS_PER_REVOLUTION = 4096
+DEG_PER_COUNT = 360.0 / COUNTS_PER_REVOLUTION
 DPS_PER_UNIT = 0.229 * 6.0  # Velocity registers: 0.229 rev/min
 DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # Profile Acceleration: 214.577 rev/min^2
 EXTENDED_RANGE_COUNTS = 1_048_575
@@ -45,7 +45,7 @@ class DynamixelServo(RegisterServo):
     @property
     def reach_deg(self) -> tuple[float, float]:
         if self._mode is ServoMode.PAN:
-            return 0.0, (COUNTS_PER_TURN - 1) * self.resolution_deg
+            return 0.0, (COUNTS_PER_REVOLUTION - 1) * self.resolution_deg
         return -EXTENDED_RANGE_COUNTS * self.resolution_deg, EXTENDED_RANGE_COUNTS * self.resolution_deg
 
     def read_state(self) -> ServoState:

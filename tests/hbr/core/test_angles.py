@@ -23,8 +23,8 @@ def test_wrap_of_known_angles(angle_deg: float, in_360: float, in_180: float) ->
 def test_wrapped_angles_stay_in_range_and_in_direction(angle_deg: float) -> None:
     for wrapped, low, high in ((wrap360(angle_deg), 0, 360), (wrap180(angle_deg), -180, 180)):
         assert low <= wrapped < high
-        turns = (wrapped - angle_deg) / 360
-        assert turns == pytest.approx(round(turns), abs=1e-9)
+        revolutions = (wrapped - angle_deg) / 360
+        assert revolutions == pytest.approx(round(revolutions), abs=1e-9)
 
 
 @pytest.mark.parametrize("tiny", [-5e-324, -1e-300, -1e-17, -0.0])
@@ -35,10 +35,10 @@ def test_tiny_negative_angle_does_not_wrap_to_360(tiny: float) -> None:
 
 @given(angle, angle)
 def test_revolutions_between_is_a_symmetric_distance(a_deg: float, b_deg: float) -> None:
-    turns = revolutions_between(a_deg, b_deg)
-    assert 0 <= turns <= 0.5
-    assert turns == pytest.approx(revolutions_between(b_deg, a_deg), abs=1e-9)
-    assert math.cos(2 * math.pi * turns) == pytest.approx(math.cos(math.radians(a_deg - b_deg)), abs=1e-6)
+    revolutions = revolutions_between(a_deg, b_deg)
+    assert 0 <= revolutions <= 0.5
+    assert revolutions == pytest.approx(revolutions_between(b_deg, a_deg), abs=1e-9)
+    assert math.cos(2 * math.pi * revolutions) == pytest.approx(math.cos(math.radians(a_deg - b_deg)), abs=1e-6)
 
 
 def test_arrays_return_arrays_and_floats_return_floats() -> None:

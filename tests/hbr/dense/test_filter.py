@@ -33,8 +33,8 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
                 for k in rows:
                     others = [(views.azimuth_deg[i] - views.azimuth_deg[k]) % 360 for i in rows if i != k] or [360.0]
                     left, right = min(others) / 2, (360 - max(others)) / 2 if len(rows) > 1 else 180.0
-                    turned = (b * 5 + angle - angles[0] - views.azimuth_deg[k]) % 360
-                    away = max(0.0, min(turned - left, 360 - turned - right))
+                    rotated = (b * 5 + angle - angles[0] - views.azimuth_deg[k]) % 360
+                    away = max(0.0, min(rotated - left, 360 - rotated - right))
                     similar = float(tanimoto(query, views.descriptors[k])[0, 0])
                     best = max(best, similar**power - omega * away / 360)
                 total[j, b] += best

@@ -17,11 +17,11 @@ def twins() -> Views:
     """Two objects that differ from 180 to 210 degrees only, and a third that is nothing like them."""
     rng = np.random.default_rng(0)
     azimuth = np.arange(0, 360, STEP, dtype=float)
-    turn = np.radians(azimuth)[:, None]
+    rotation = np.radians(azimuth)[:, None]
     parts = []
     base = rng.uniform(1, 6, 144) * (rng.random(144) < 0.3)
     swing, phase = rng.uniform(0, 2, 144) * (base > 0), rng.uniform(0, 7, 144)
-    plain = np.rint(np.clip(base + swing * np.sin(turn + phase), 0, 7)).astype(np.uint8)
+    plain = np.rint(np.clip(base + swing * np.sin(rotation + phase), 0, 7)).astype(np.uint8)
     marked = plain.copy()
     marked[(azimuth >= 180) & (azimuth <= 210), 60:110] = 5
     parts = [Views.of_object("plain", plain, azimuth), Views.of_object("marked", marked, azimuth)]
@@ -33,43 +33,45 @@ VIEWS = twins()
 INDEX = DenseIndex(VIEWS)
 
 
-def looked(azimuth: float) -> np.ndarray:
+def viewed(azimuth: float) -> np.ndarray:
     return VIEWS.descriptors[VIEWS.of(0)[int(azimuth // STEP)]]
 
 
 @pytest.mark.parametrize(("azimuth", "low", "high"), [(30.0, 145, 185), (300.0, -125, -85)])
 def test_twins_are_distinguished_at_the_azimuth_of_their_difference(azimuth: float, low: float, high: float) -> None:
-    look = next_best_view(update_belief(looked(azimuth), 0.0, INDEX), beta=60.0)
-    assert low <= look.rotation_deg <= high
-    assert look.pair in ((0, 1), (1, 0))
-    assert look.orientation_deg == look.rotation_deg % 360
+    see = next_best_view(update_belief(viewed(azimuth), 0.0, INDEX), beta=60.0)
+    assert low <= see.rotation_deg <= high
+    assert see.pair in ((0, 1), (1, 0))
+    assert see.orientation_deg == see.rotation_deg % 360
     # the baseline sees it, too
-    assert low <= most_informative_rotation(update_belief(looked(azimuth), 0.0, INDEX), beta=60.0) <= high
+    assert low <= most_informative_rotation(update_belief(viewed(azimuth), 0.0, INDEX), beta=60.0) <= high
 
 
 def test_only_rotations_that_the_cable_allows_are_chosen() -> None:
-    belief = update_belief(looked(30.0), 0.0, INDEX)
+    belief = update_belief(viewed(30.0), 0.0, INDEX)
     allowed = np.array([-90.0, -40.0, 20.0, 70.0])
-    look = next_best_view(belief, beta=60.0, rotations_deg=allowed)
-    assert look.rotation_deg in allowed
-    assert len(look.confusion) == len(look.cost) == 4
+    see = next_best_view(belief, beta=60.0, rotations_deg=allowed)
+    assert see.rotation_deg in allowed
+    assert len(see.confusion) == len(see.cost) == 4
 
 
 def test_next_view_weighs_information_against_motion_time() -> None:
-    belief = update_belief(looked(30.0), 0.0, INDEX)
-    turns = np.arange(-175.0, 181.0, 5)
-    quick = next_best_view(belief, beta=60.0, rotations_deg=turns, seconds=np.zeros(len(turns)))
-    slow = next_best_view(belief, beta=60.0, rotations_deg=turns, seconds=np.abs(turns) / 10, second_costs=5.0)
+    belief = update_belief(viewed(30.0), 0.0, INDEX)
+    revolutions = np.arange(-175.0, 181.0, 5)
+    quick = next_best_view(belief, beta=60.0, rotations_deg=revolutions, seconds=np.zeros(len(revolutions)))
+    slow = next_best_view(
+        belief, beta=60.0, rotations_deg=revolutions, seconds=np.abs(revolutions) / 10, second_costs=5.0
+    )
     assert abs(slow.rotation_deg) < abs(quick.rotation_deg)
 
 
 def test_visited_view_has_no_expected_gain() -> None:
-    first = update_belief(looked(30.0), 0.0, INDEX)
-    second = update_belief(looked(180.0), 150.0, first)
-    look = next_best_view(second, beta=60.0, seconds=np.zeros(BINS - 1))
-    landing = (150 + look.rotations_deg) % 360
+    first = update_belief(viewed(30.0), 0.0, INDEX)
+    second = update_belief(viewed(180.0), 150.0, first)
+    see = next_best_view(second, beta=60.0, seconds=np.zeros(BINS - 1))
+    landing = (150 + see.rotations_deg) % 360
     visited = np.isin(landing, [0.0, 150.0])
-    assert look.confusion[visited].min() >= look.confusion.max() - 1e-9
+    assert see.confusion[visited].min() >= see.confusion.max() - 1e-9
 
 
 @examples(10)
@@ -78,14 +80,14 @@ def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> 
     """Once more from the posterior of single hypotheses that the decision keeps, written out."""
     from hbr.dense.next_view import _strongest
 
-    belief = update_belief(looked(start * STEP), 20.0, INDEX)
-    turns = np.array([-120.0, 33.0, 90.0])
-    look = next_best_view(belief, beta=40.0, sharpness=sharpness, rotations_deg=turns)
+    belief = update_belief(viewed(start * STEP), 20.0, INDEX)
+    revolutions = np.array([-120.0, 33.0, 90.0])
+    see = next_best_view(belief, beta=40.0, sharpness=sharpness, rotations_deg=revolutions)
     probability, place, bins = _strongest(belief.posterior(40.0))
-    for turn, confusion in zip(turns, look.confusion, strict=True):
-        novelty = 1 - np.exp(-0.5 * (min(abs(turn), 360 - abs(turn)) / 15) ** 2)
+    for rotation, confusion in zip(revolutions, see.confusion, strict=True):
+        novelty = 1 - np.exp(-0.5 * (min(abs(rotation), 360 - abs(rotation)) / 15) ** 2)
         away = [
-            np.abs((VIEWS.azimuth_deg[VIEWS.of(j)] - b * 5 - turn + 180) % 360 - 180)
+            np.abs((VIEWS.azimuth_deg[VIEWS.of(j)] - b * 5 - rotation + 180) % 360 - 180)
             for j, b in zip(place.tolist(), bins.tolist(), strict=True)
         ]
         shown = [VIEWS.descriptors[VIEWS.of(j)[own.argmin()]] for j, own in zip(place.tolist(), away, strict=True)]
@@ -100,13 +102,13 @@ def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> 
 
 def test_single_object_is_viewed_from_a_new_side() -> None:
     alone = DenseIndex(VIEWS.select(VIEWS.of(0)))
-    look = next_best_view(update_belief(looked(30.0), 0.0, alone), beta=60.0)
-    assert look.pair is None
-    assert abs(look.rotation_deg) >= 50
+    see = next_best_view(update_belief(viewed(30.0), 0.0, alone), beta=60.0)
+    assert see.pair is None
+    assert abs(see.rotation_deg) >= 50
 
 
 def test_invalid_choice_is_rejected() -> None:
-    belief = update_belief(looked(0.0), 0.0, INDEX)
+    belief = update_belief(viewed(0.0), 0.0, INDEX)
     with pytest.raises(ValueError, match="the cable's limits"):
         next_best_view(belief, beta=1.0, rotations_deg=[])
     with pytest.raises(ValueError, match="one finite time each"):

@@ -30,8 +30,8 @@ def catalog(objects: int = 8, noise: float = 0.15, seed: int = 0) -> Views:
     for j in range(objects):
         used = rng.random(144) < 0.2
         swing = rng.uniform(0, 2, 144)
-        turn = np.radians(azimuth)[:, None] + rng.uniform(0, 7, 144)
-        levels = (rng.uniform(1, 6, 144) + swing * np.sin(turn)) * used
+        rotation = np.radians(azimuth)[:, None] + rng.uniform(0, 7, 144)
+        levels = (rng.uniform(1, 6, 144) + swing * np.sin(rotation)) * used
         levels = levels + (rng.random(levels.shape) < noise) * rng.integers(-1, 2, levels.shape)
         parts.append(Views.of_object(f"object {j}", np.rint(np.clip(levels, 0, 7)).astype(np.uint8), azimuth))
     return Views.concatenate(parts)

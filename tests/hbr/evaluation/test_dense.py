@@ -64,7 +64,7 @@ def test_queries_are_views_that_are_not_enrolled() -> None:
     trials = _Trials(1, QUERIES[VIEWS.of(1)], VIEWS, PROTOCOL, None, lambda: 0)
     for t in range(20):
         assert (trials.draw(t).order % 3 != 0).all()
-    assert (np.array([trials._nearest([1], turn) for turn in np.arange(0, 360, 7.0)]) % 3 != 0).all()
+    assert (np.array([trials._nearest([1], rotation) for rotation in np.arange(0, 360, 7.0)]) % 3 != 0).all()
     with pytest.raises(ValueError, match="16 views; for 16 queries"):
         run("dense-90", protocol=replace(PROTOCOL, max_views=16))
 

@@ -20,14 +20,14 @@ def ball() -> np.ndarray:
     return image
 
 
-def shot(text: str, seed: int = 0, bench: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+def captured(text: str, seed: int = 0, bench: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     image = ball()
     return Perturbations.parse(text).photograph(image, object_mask(image), np.random.default_rng(seed), bench)
 
 
 def differs(text: str) -> float:
     """Mean change of the grey levels over some draws."""
-    return float(np.mean([np.abs(shot(text, seed)[0].astype(int) - ball()).mean() for seed in range(12)]))
+    return float(np.mean([np.abs(captured(text, seed)[0].astype(int) - ball()).mean() for seed in range(12)]))
 
 
 @pytest.mark.parametrize("kind", [kind for kind in STRENGTHS if kind != "shadow"])
@@ -37,15 +37,15 @@ def test_stronger_perturbation_changes_the_image_more(kind: str) -> None:
 
 
 def test_none_keeps_the_photograph_and_equal_seeds_give_equal_images() -> None:
-    np.testing.assert_array_equal(shot("none")[0], ball())
-    np.testing.assert_array_equal(shot("all:2", 5)[0], shot("all:2", 5)[0])
-    assert (shot("all:2", 5)[0] != shot("all:2", 6)[0]).any()
+    np.testing.assert_array_equal(captured("none")[0], ball())
+    np.testing.assert_array_equal(captured("all:2", 5)[0], captured("all:2", 5)[0])
+    assert (captured("all:2", 5)[0] != captured("all:2", 6)[0]).any()
 
 
 def test_shift_and_scale_have_the_stated_size() -> None:
     places, sizes = [], []
     for seed in range(60):
-        mask = object_mask(shot("shift:2+scale:2", seed)[0])
+        mask = object_mask(captured("shift:2+scale:2", seed)[0])
         y, x = np.nonzero(mask)
         places.append([(x.mean() - 63.5) / 128, (y.mean() - 63.5) / 128])
         sizes.append(np.sqrt(mask.sum() / object_mask(ball()).sum()))
@@ -56,7 +56,7 @@ def test_shift_and_scale_have_the_stated_size() -> None:
 
 def test_empty_table_image_has_the_light_of_the_image() -> None:
     bench = plain_bench(np.random.default_rng(0))
-    picture, empty = shot("gain:3+white-balance:3+gradient:3", 1, bench)
+    picture, empty = captured("gain:3+white-balance:3+gradient:3", 1, bench)
     assert empty is not None
     assert picture.shape == empty.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_array_equal(picture[:40], empty[:40])
@@ -66,8 +66,8 @@ def test_empty_table_image_has_the_light_of_the_image() -> None:
 
 def test_cast_shadow_darkens_the_bench_and_not_the_object() -> None:
     bench = plain_bench(np.random.default_rng(0))
-    with_shadow, _ = shot("shadow:3", 3, bench)
-    without, _ = shot("none", 3, bench)
+    with_shadow, _ = captured("shadow:3", 3, bench)
+    without, _ = captured("none", 3, bench)
     change = with_shadow.astype(int) - without
     assert change.min() < -15
     assert change.max() <= 1
@@ -115,21 +115,21 @@ def test_conflicting_conditions_are_rejected(setting: dict) -> None:
 
 
 def test_queries_on_another_bench_have_the_requested_empty_table_image() -> None:
-    shots = {}
+    images = {}
     for reference in ("own", "enrollment", "none"):
         condition = Condition(background="other-bench", reference=reference)  # type: ignore[arg-type]
         enrolled, query = condition.enrolled(ball()), condition.query(ball(), np.random.default_rng(4))
-        shots[reference] = query
+        images[reference] = query
         assert (enrolled.empty is None) == (reference == "none")
         if reference == "enrollment":
             assert query.empty is not None
             assert enrolled.empty is not None
             np.testing.assert_array_equal(query.empty, enrolled.empty)
-    np.testing.assert_array_equal(shots["own"].image, shots["none"].image)
-    assert shots["own"].empty is not None
-    assert shots["none"].empty is None
+    np.testing.assert_array_equal(images["own"].image, images["none"].image)
+    assert images["own"].empty is not None
+    assert images["none"].empty is None
     border = np.s_[:40, :, :]
-    np.testing.assert_array_equal(shots["own"].empty[border], shots["own"].image[border])
+    np.testing.assert_array_equal(images["own"].empty[border], images["own"].image[border])
     with pytest.raises(ValueError, match="reference 'some'"):
         Condition(reference="some")  # type: ignore[arg-type]
 

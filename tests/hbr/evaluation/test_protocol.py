@@ -19,12 +19,12 @@ def world(seed: int = 0, objects: int = 6) -> tuple[Views, np.ndarray]:
     """Objects whose levels change slowly around them, and all their views again with errors: the queries."""
     rng = np.random.default_rng(seed)
     azimuth = np.arange(0, 360, STEP, dtype=float)
-    turn = np.radians(azimuth)[:, None]
+    rotation = np.radians(azimuth)[:, None]
     parts = []
     for j in range(objects):
         used = rng.random(144) < 0.15
         mean, swing, phase = rng.uniform(1, 5, 144), rng.uniform(0, 3, 144), rng.uniform(0, 7, 144)
-        levels = np.rint(np.clip(mean + swing * np.sin(turn + phase), 0, 7)) * used
+        levels = np.rint(np.clip(mean + swing * np.sin(rotation + phase), 0, 7)) * used
         parts.append(Views.of_object(f"object {j}", levels.astype(np.uint8), azimuth))
     views = Views.concatenate(parts)
     errors = rng.integers(-2, 3, views.descriptors.shape) * (rng.random(views.descriptors.shape) < 0.3)

@@ -43,12 +43,12 @@ def test_round_object_has_period_0_and_few_views_have_none():
     assert symmetry(views_of(same[:17]), 0) is None
 
 
-@given(turn=st.integers(0, COUNT - 1), period=st.sampled_from([36, 18, 12]), order=st.randoms())
-def test_symmetry_is_independent_of_start_and_order_of_views(turn, period, order):
+@given(rotation=st.integers(0, COUNT - 1), period=st.sampled_from([36, 18, 12]), order=st.randoms())
+def test_symmetry_is_independent_of_start_and_order_of_views(rotation, period, order):
     descriptors = ring(period)
     rows = list(range(COUNT))
     order.shuffle(rows)
-    azimuth_deg = (np.array(rows) + turn) % COUNT * STEP_DEG
+    azimuth_deg = (np.array(rows) + rotation) % COUNT * STEP_DEG
     shuffled = symmetry(hbr.Views.of_object("a", descriptors[rows], azimuth_deg), 0)
     straight = symmetry(views_of(descriptors), 0)
     assert shuffled is not None

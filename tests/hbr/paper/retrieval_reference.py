@@ -13,7 +13,7 @@ def wrap(angle: float) -> float:
     return (angle + 180) % 360 - 180
 
 
-def turns(a: float, b: float) -> float:
+def revolutions(a: float, b: float) -> float:
     return abs(wrap(a - b)) / 360
 
 
@@ -57,8 +57,8 @@ class Enumeration:
         """Return the view of k's object that the camera sees at i if it saw k at i_from; the first of equals."""
 
         def miss(v: int) -> float:
-            turned = self.azimuth[v] - self.azimuth[k]
-            return abs(wrap(turned - (self.orientations[i] - self.orientations[i_from])))
+            rotated = self.azimuth[v] - self.azimuth[k]
+            return abs(wrap(rotated - (self.orientations[i] - self.orientations[i_from])))
 
         return min(self.of(self.object_of[k]), key=miss)
 
@@ -84,7 +84,9 @@ class Enumeration:
     def value(self, path: Sequence[int]) -> float:
         similarity = sum(self.similar[i][v] for i, v in enumerate(path))
         penalty = sum(
-            turns(self.orientations[i] - self.orientations[i + 1], self.azimuth[path[i]] - self.azimuth[path[i + 1]])
+            revolutions(
+                self.orientations[i] - self.orientations[i + 1], self.azimuth[path[i]] - self.azimuth[path[i + 1]]
+            )
             for i in range(len(path) - 1)
         )
         return similarity - self.omega * penalty
@@ -124,9 +126,9 @@ def next_view_reference(
         for sign in (1, -1)
     }
     sign = 1 if sums[1] <= sums[-1] else -1
-    turn = step(ranked[0][1], sign)[1]
+    rotate = step(ranked[0][1], sign)[1]
     for detour in (0, 90, 180, 270):
-        if all(abs(wrap(here + sign * (turn + detour) - seen)) > 10 for seen in visited):
-            turn += detour
+        if all(abs(wrap(here + sign * (rotate + detour) - seen)) > 10 for seen in visited):
+            rotate += detour
             break
-    return ("left" if sign == 1 else "right"), sign * turn, sums[1], sums[-1]
+    return ("left" if sign == 1 else "right"), sign * rotate, sums[1], sums[-1]

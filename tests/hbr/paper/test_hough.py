@@ -159,9 +159,9 @@ def test_object_indices_are_independent_of_the_order_of_views() -> None:
     azimuth = np.repeat(np.arange(6) * 60.0, 4)
     views = Views(descriptors, azimuth, np.tile(np.arange(4), 6), tuple("abcd"))
     order = rng.permutation(24)
-    queries, turn = rng.integers(0, 3, (3, 144), dtype=np.uint8), [0, 60, 180]
-    plain = retrieve(queries, turn, ViewIndex(views))
-    shuffled = retrieve(queries, turn, ViewIndex(views.select(order)))
+    queries, rotation = rng.integers(0, 3, (3, 144), dtype=np.uint8), [0, 60, 180]
+    plain = retrieve(queries, rotation, ViewIndex(views))
+    shuffled = retrieve(queries, rotation, ViewIndex(views.select(order)))
     assert plain.names == shuffled.names
     assert plain.scores.tolist() == shuffled.scores.tolist()
     assert plain.paths.tolist() == order[shuffled.paths].tolist()

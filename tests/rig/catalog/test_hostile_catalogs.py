@@ -324,7 +324,7 @@ def test_edited_log_or_result_is_found(root: Path, statement: str) -> None:
         assert finished(verify(catalog, quick=True, jobs=1)).findings
 
 
-def told(root: Path) -> Any:
+def reported(root: Path) -> Any:
     """Everything that a catalog answers and lists."""
     with opened(root) as catalog:
         names = [item.name for item in catalog.objects()]
@@ -361,13 +361,13 @@ def flip(root: Path, intact: Path, expected: Any, seed: int) -> bool:
                 return True
     except RigError:
         return True
-    assert told(root) == expected, f"seed {seed}"
+    assert reported(root) == expected, f"seed {seed}"
     return False
 
 
 @pytest.mark.parametrize("count", [30, pytest.param(1000, marks=[pytest.mark.nightly, pytest.mark.timeout(1200)])])
 def test_flipped_bytes_are_found_or_change_nothing(root: Path, sample: Path, count: int) -> None:
-    expected = told(sample)
+    expected = reported(sample)
     noticed = sum(flip(root, sample, expected, seed) for seed in range(count))
     print(f"{noticed} of {count} flipped bytes were noticed; all others change nothing that is read")
     assert noticed > count / 5
@@ -428,7 +428,7 @@ def test_wrong_descriptors_of_another_catalog_are_rejected(root: Path, tmp_path:
 def test_invalid_values_end_in_an_error(root: Path, tmp_path: Path, statement: str) -> None:
     sql(root, "PRAGMA ignore_check_constraints = ON", statement)
     with pytest.raises(RigError):
-        told(root)
+        reported(root)
     for reader in READERS.values():
         try:
             with opened(root) as catalog:

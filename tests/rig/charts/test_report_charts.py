@@ -298,14 +298,14 @@ def test_numbers_are_short_and_accurate(value: float) -> None:
     assert "e" not in number(value)
 
 
-TURNS = tuple(float(turn) for turn in range(-175, 185, 5) if turn)
+TURNS = tuple(float(rotate) for rotate in range(-175, 185, 5) if rotate)
 
 
 class TestDecisionChart:
     @examples(12)
     @given(here=ANGLE, chosen=st.sampled_from(TURNS), seen=st.lists(ANGLE, min_size=1, max_size=4))
     def test_chosen_rotation_is_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
-        away = tuple(abs(turn - chosen) for turn in TURNS)
+        away = tuple(abs(rotate - chosen) for rotate in TURNS)
         weighed = Weighed(TURNS, tuple(-9 + a for a in away), tuple(abs(t) / 100 for t in TURNS), away)
         svg = decision_chart(here, weighed, chosen, candidates=("a", HOSTILE), seen_deg=seen, number=len(seen))
         goal, *others = having(svg, "stop", "last")
@@ -322,9 +322,9 @@ class TestDecisionChart:
         assert f"{abs(chosen):.0f}°" in text
 
     def test_single_object_and_equal_values_are_drawn(self) -> None:
-        for turns in ((5.0,), (-5.0, 5.0), TURNS):
-            even = (0.0,) * len(turns)
-            svg = decision_chart(0.0, Weighed(turns, even, even), turns[0])
+        for revolutions in ((5.0,), (-5.0, 5.0), TURNS):
+            even = (0.0,) * len(revolutions)
+            svg = decision_chart(0.0, Weighed(revolutions, even, even), revolutions[0])
             assert "only one object is likely" in svg
             assert not having(svg, "similarity")
             assert "nan" not in svg

@@ -79,14 +79,14 @@ def test_show_prints_toml_with_the_source_of_each_value(rig, tmp_path):
     assert done.exit_code == 0
     shown = tomllib.loads(done.stdout)
     assert (shown["servo"]["id"], shown["servo"]["baud"], shown["bench"]["sim"]["object"]) == (4, 115200, "dice")
-    told = json.loads(rig("config", "show", "servo", "--set", "servo.baud=115200", "--json").stdout)["keys"]
-    assert {key: told[key]["origin"] for key in ("servo.id", "servo.baud", "servo.port")} == {
+    reported = json.loads(rig("config", "show", "servo", "--set", "servo.baud=115200", "--json").stdout)["keys"]
+    assert {key: reported[key]["origin"] for key in ("servo.id", "servo.baud", "servo.port")} == {
         "servo.id": "rig.toml line 2",
         "servo.baud": "--set",
         "servo.port": "default",
     }
-    assert told["servo.baud"]["unit"] == "bit/s"
-    assert "table.zero_deg" not in told
+    assert reported["servo.baud"]["unit"] == "bit/s"
+    assert "table.zero_deg" not in reported
     changed = rig("config", "show", "--changed").stdout
     assert "id = 4" in changed
     assert "baud" not in changed

@@ -283,12 +283,12 @@ def test_dense_is_the_default_strategy(rig, enrolled):
 
 
 def test_stopping_rule_is_calibrated_stored_and_used(rig, enrolled):
-    told = rig("catalog", "calibrate", "--false-reject", "0.1")
-    assert told.exit_code == 0, told.output
-    assert re.search(r"^\d+ leave-one-out searches of 4 views for 2 objects", told.stdout)
-    assert "Not guaranteed: An error rate of 1.0 % needs 100 leave-one-out searches" in told.stdout
+    reported = rig("catalog", "calibrate", "--false-reject", "0.1")
+    assert reported.exit_code == 0, reported.output
+    assert re.search(r"^\d+ leave-one-out searches of 4 views for 2 objects", reported.stdout)
+    assert "Not guaranteed: An error rate of 1.0 % needs 100 leave-one-out searches" in reported.stdout
     kept = enrolled[0] / "catalog" / "search_rules.json"
-    assert told.stdout.rstrip().endswith(str(kept))
+    assert reported.stdout.rstrip().endswith(str(kept))
     values = json.loads(rig("catalog", "calibrate", "--json").stdout)
     assert values["false_reject"] == 0.02
     assert values["calibration"]["views"] == 4

@@ -44,10 +44,10 @@ def state() -> dict:
 
 def test_table_angle_survives_the_program(rig):
     assert rig("goto", "370").exit_code == 0
-    told = json.loads(rig("status", "--json").stdout)
-    assert told["state"] == "ready"
-    assert told["table_deg"] == pytest.approx(370, abs=0.3)
-    assert "lost its supply and 1 of its revolutions" in " ".join(told["findings"])
+    reported = json.loads(rig("status", "--json").stdout)
+    assert reported["state"] == "ready"
+    assert reported["table_deg"] == pytest.approx(370, abs=0.3)
+    assert "lost its supply and 1 of its revolutions" in " ".join(reported["findings"])
     done = rig("home", "--json")
     unwinding, moved = (json.loads(line) for line in done.stdout.splitlines())
     assert unwinding["event"] == "unwinding"
@@ -68,9 +68,9 @@ def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
     kept = state()
     kept["table"]["path_deg"] = [200.0, 600.0]  # killed in a motion, and the supply was off since
     Path("state/sim/state.json").write_text(json.dumps(kept))
-    told = json.loads(rig("status", "--json").stdout)
-    assert told["state"] == "unreferenced"
-    assert told["table_deg"] is None
+    reported = json.loads(rig("status", "--json").stdout)
+    assert reported["state"] == "unreferenced"
+    assert reported["table_deg"] is None
     rejected = rig("goto", "0")
     assert rejected.exit_code == 5
     assert "rig home --turns 0" in rejected.stderr
@@ -88,8 +88,8 @@ def test_home_shows_a_long_rotation_and_asks(rig):
     assert "rotates by -370° to home" in asked.stderr
     assert "--yes" in asked.stderr
     assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(10, abs=0.3)
-    for turns in ("3", "249", "99999999", "9" * 400):
-        assert rig("home", "--turns", turns, "--yes").exit_code == 2, turns
+    for rotations in ("3", "249", "99999999", "9" * 400):
+        assert rig("home", "--turns", rotations, "--yes").exit_code == 2, rotations
     assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(10, abs=0.3)
     moved = [json.loads(line) for line in rig("home", "--turns", "1", "--yes", "--json").stdout.splitlines()]
     assert moved[-1]["rotation_encoder_deg"] == pytest.approx(-370, abs=0.3)
@@ -127,9 +127,9 @@ def test_every_command_reports_a_fault_until_it_is_acknowledged(rig):
         assert rejected.exit_code == 5
         assert "2026-01-02T03:04:05+00:00: The table is blocked at 7.0°." in rejected.stderr
         assert "Free it. Then `rig acknowledge`." in rejected.stderr
-    told = rig("status")
-    assert told.exit_code == 0
-    assert "fault 505" in told.stdout
+    reported = rig("status")
+    assert reported.exit_code == 0
+    assert "fault 505" in reported.stdout
     assert json.loads(rig("status", "--json").stdout)["fault"]["evidence"] == {"load_percent": 99}
     done = rig("acknowledge")
     assert done.exit_code == 0
@@ -173,8 +173,8 @@ def test_killed_program_leaves_the_bench_free(rig, running):
     assert holder(Path("state/sim")) is None
     # The simulated servo died with its world, as in a power cut: where it was in a motion, its turns are in doubt.
     cut_off = state()["table"]["path_deg"] is not None
-    told = json.loads(rig("status", "--json").stdout)
-    assert told["state"] == ("unreferenced" if cut_off else "ready")
+    reported = json.loads(rig("status", "--json").stdout)
+    assert reported["state"] == ("unreferenced" if cut_off else "ready")
     assert rig("home", "--turns", "0").exit_code == 0
     assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
 

@@ -229,12 +229,12 @@ def test_doctor_prints_findings_with_fixes_and_exits_with_the_first_problem(part
 
 
 def test_doctor_json_has_a_fix_for_each_problem(parts, home):
-    told = json.loads(rig("doctor", "--json").stdout)
-    assert told["exit_code"] == 4
-    bad = [finding for finding in told["findings"] if finding["level"] == "bad"]
-    assert len(bad) == told["bad"] > 0
+    reported = json.loads(rig("doctor", "--json").stdout)
+    assert reported["exit_code"] == 4
+    bad = [finding for finding in reported["findings"] if finding["level"] == "bad"]
+    assert len(bad) == reported["bad"] > 0
     assert all(finding["fix"] for finding in bad)
-    voltage = next(f for f in told["findings"] if "voltage_v" in f["evidence"])
+    voltage = next(f for f in reported["findings"] if "voltage_v" in f["evidence"])
     assert voltage["evidence"]["voltage_v"] == pytest.approx(12, abs=0.5)
 
 
@@ -262,8 +262,8 @@ def test_find_prints_valid_settings(parts, home):
     (home / "rig.toml").write_text(done.stdout.partition("`rig setup` writes it):")[2], encoding="utf-8")
     config = load_config(home / "rig.toml")
     assert (config.servo.baud, config.servo.id, config.imu.address) == (57_600, 1, 0x68)
-    told = json.loads(rig("find", "--json").stdout)
-    assert told["settings"]["camera.source"] == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
+    reported = json.loads(rig("find", "--json").stdout)
+    assert reported["settings"]["camera.source"] == "/dev/v4l/by-id/usb-HD_Webcam-video-index0"
 
 
 def test_find_detects_a_rig_head(home):
@@ -316,11 +316,11 @@ def test_two_servos_on_the_bus_are_rejected(parts, home):
 
 
 def test_info_shows_every_register(parts, home):
-    told = json.loads(rig("servo", "info", "--json").stdout)
-    assert told["registers"]["Present Input Voltage"]["meaning"] == "12.0 V"
-    assert told["registers"]["Operating Mode"]["kept_without_supply"] is True
+    reported = json.loads(rig("servo", "info", "--json").stdout)
+    assert reported["registers"]["Present Input Voltage"]["meaning"] == "12.0 V"
+    assert reported["registers"]["Operating Mode"]["kept_without_supply"] is True
     text = rig("servo", "info").stdout
-    assert all(name in text for name in told["registers"])
+    assert all(name in text for name in reported["registers"])
 
 
 def test_settings_are_shown_and_written_on_request(parts, home):

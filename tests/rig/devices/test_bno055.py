@@ -67,11 +67,11 @@ def test_opening_waits_for_the_gyro_calibration() -> None:
     with closing(bench.bus), closing(bench.open()) as imu:
         assert imu.calibration().gyro == 3
         imu.read_samples()
-        turned = 0.0
+        rotated = 0.0
         for _ in range(100):
             bench.clock.sleep(0.04)
-            turned += imu.read_samples().gyro_dps[:, 2].sum() / imu.rate_hz
-        assert abs(turned) < 0.3
+            rotated += imu.read_samples().gyro_dps[:, 2].sum() / imu.rate_hz
+        assert abs(rotated) < 0.3
 
 
 def test_opening_on_a_moving_table_ends_in_bounded_time(bench: Bench) -> None:
@@ -114,13 +114,13 @@ def test_samples_sum_to_the_rotation_for_any_reading_pattern(angles: list[float]
         for angle in angles:
             start_s, start_deg = bench.clock.now_ns() * 1e-9, bench.world.table_deg()
             bench.world.drive(to_position(start_s, start_deg, 0.0, start_deg + angle, speed, 300.0))
-            turned, done_s = 0.0, abs(angle) / speed + speed / 300.0 + 1.0
+            rotated, done_s = 0.0, abs(angle) / speed + speed / 300.0 + 1.0
             while bench.clock.now_ns() * 1e-9 < start_s + done_s:
                 bench.clock.sleep(pause_s)
                 samples = imu.read_samples()
                 assert samples.lost == 0
-                turned += samples.gyro_dps[:, 2].sum() / imu.rate_hz
-            assert turned == pytest.approx(angle, abs=0.03)
+                rotated += samples.gyro_dps[:, 2].sum() / imu.rate_hz
+            assert rotated == pytest.approx(angle, abs=0.03)
 
 
 def test_saturation_matches_the_stated_range(bench: Bench, imu: Bno055) -> None:

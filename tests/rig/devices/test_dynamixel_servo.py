@@ -28,8 +28,8 @@ def test_factory_settings_are_rejected_with_a_list_of_differences_and_not_change
     with pytest.raises(DeviceMismatch) as caught:
         servo.prepare(write=False)
     assert {frame[7] for frame in wires.instructions} <= {1, 2}  # Ping and Read
-    told = {register: text.partition(":")[0] for register, text in caught.value.evidence.items()}
-    assert told == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
+    reported = {register: text.partition(":")[0] for register, text in caught.value.evidence.items()}
+    assert reported == {"Operating Mode": "found 3, wanted 4", "Return Delay Time": "found 250, wanted 0"}
     assert all(text.partition(": ")[2] for text in caught.value.evidence.values())  # each with its reason
     assert "write_settings" in caught.value.next_step
 

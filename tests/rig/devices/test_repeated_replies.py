@@ -77,7 +77,7 @@ def test_ax12_reads_no_old_answer_although_it_has_no_clock(share, poll_s):
             return frame
 
         bus.filters.append(repeat)
-        readings = refused = 0
+        readings = rejection = 0
         for goal_deg in (300.0, 0.0):
             servo.move_to(goal_deg)
             for _ in range(150):
@@ -86,13 +86,13 @@ def test_ax12_reads_no_old_answer_although_it_has_no_clock(share, poll_s):
                 try:
                     position_deg = servo.read_state().position_deg - 150.0
                 except RigError:
-                    refused += 1
+                    rejection += 1
                     continue
                 readings += 1
                 low_deg, high_deg = sorted((begun_deg, world.shaft()[0]))
                 assert low_deg - 0.6 <= position_deg <= high_deg + 0.6
     assert readings > 280
-    assert refused < 20
+    assert rejection < 20
 
 
 @pytest.mark.parametrize("model", [[], AX12], ids=["xl430", "ax12"])

@@ -60,9 +60,9 @@ def test_each_model_rotates_beyond_a_revolution_and_reads_its_state(model: str) 
     devices = parts_of(chosen)
     servo = servo_of(devices, chosen)
     start = servo.read_state()
-    turned = go(devices, servo, start.position_deg + 500.0)
+    rotated = go(devices, servo, start.position_deg + 500.0)
     state = servo.read_state()
-    assert turned == pytest.approx(500.0, abs=servo.resolution_deg)
+    assert rotated == pytest.approx(500.0, abs=servo.resolution_deg)
     assert state.position_deg - start.position_deg == pytest.approx(500.0, abs=servo.resolution_deg)
     assert (state.moving, state.in_position, state.hardware_errors) == (False, True, ())
     assert state.voltage_v == pytest.approx(MODELS[model].supply_v, abs=0.1)
@@ -103,9 +103,9 @@ def test_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
     servo = servo_of(devices, *AX)
     start_deg = servo.read_state().position_deg
     assert servo.reach_deg == pytest.approx((0.0, 300.0))
-    turned = go(devices, servo, goal_deg)
+    rotated = go(devices, servo, goal_deg)
     state = servo.read_state()
-    assert turned == pytest.approx(goal_deg - start_deg, abs=DEG_PER_COUNT)
+    assert rotated == pytest.approx(goal_deg - start_deg, abs=DEG_PER_COUNT)
     assert state.position_deg == pytest.approx(goal_deg, abs=DEG_PER_COUNT)
     assert state.in_position
     assert not state.moving

@@ -93,9 +93,9 @@ def check_event(event: Event) -> str:
     return check_values(event_dict(event))
 
 
-def check_values(told: dict[str, Any]) -> str:
-    kind = str(told["event"])
-    check_fields({name: value for name, value in told.items() if name != "event"}, kind, kind)
+def check_values(reported: dict[str, Any]) -> str:
+    kind = str(reported["event"])
+    check_fields({name: value for name, value in reported.items() if name != "event"}, kind, kind)
     return kind
 
 
@@ -125,9 +125,9 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
         for event in recorder.stream(identify(s.bench, hbr.ViewIndex(views), strategy="sweep")):
             seen.add(check_event(event))
         s.operator.next_object = "radio"  # not enrolled: the dense search weighs its rotations, and ends
-        told = [event_dict(event) for event in identify(s.bench, load_model(catalog))]
-        assert {"decided", "identified"} <= {check_values(values) for values in told}
-        assert any(values["weighed"] for values in told if values["event"] == "decided")
+        reported = [event_dict(event) for event in identify(s.bench, load_model(catalog))]
+        assert {"decided", "identified"} <= {check_values(values) for values in reported}
+        assert any(values["weighed"] for values in reported if values["event"] == "decided")
         s.world.change(light=(0.0, 0.0, 0.0))
         with pytest.raises(ViewRejected) as caught:
             for event in enroll(s.bench, catalog, "candle", views=4):

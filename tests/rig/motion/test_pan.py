@@ -38,10 +38,10 @@ def test_azimuths_agree_whether_object_or_camera_rotates(simulated, tmp_path: Pa
     for overrides in ((), ARM):
         with Catalog.open(tmp_path / str(len(views)), clock=simulated().bench.clock, create=True) as catalog:
             views.append(enrolled(simulated, catalog, "mug-star", *overrides, views=4))
-    turned, around = views
-    assert [view.azimuth_deg for view in turned[1:]] == pytest.approx([270, 180, 90], abs=0.5)
+    rotated, around = views
+    assert [view.azimuth_deg for view in rotated[1:]] == pytest.approx([270, 180, 90], abs=0.5)
     assert [view.azimuth_deg for view in around[1:]] == pytest.approx([90, 180, 270], abs=0.5)
-    sides = {round(view.azimuth_deg) % 360: view.image_bgr.astype(float) for view in turned}
+    sides = {round(view.azimuth_deg) % 360: view.image_bgr.astype(float) for view in rotated}
     for view in around:
         azimuth = round(view.azimuth_deg) % 360
         unlike = {side: np.abs(image - view.image_bgr).mean() for side, image in sides.items()}

@@ -81,14 +81,14 @@ def test_stop_follows_the_ramp_without_overshoot():
     with motion_bench() as (bench, wires):
         speeds = []
 
-        def look() -> None:
+        def view() -> None:
             speeds.append(wires.world.shaft()[1])
-            wires.world.clock.call_at(wires.world.clock.now_ns() + 10_000_000, look)
+            wires.world.clock.call_at(wires.world.clock.now_ns() + 10_000_000, view)
 
         def interrupt() -> None:
             raise KeyboardInterrupt
 
-        wires.world.clock.call_at(0, look)
+        wires.world.clock.call_at(0, view)
         wires.world.clock.call_at(wires.world.clock.now_ns() + 1_900_000_000, interrupt)
         with pytest.raises(KeyboardInterrupt), Turntable(bench) as table:
             table.goto(300.0)
@@ -119,8 +119,8 @@ def test_within_reach_returns_an_equivalent_angle(target, low, span):
         table = Turntable(bench)
         found = table.within_reach(target)
         assert low <= found <= high
-        turns = (found - target) / 360
-        assert turns == pytest.approx(round(turns), abs=1e-9)
+        revolutions = (found - target) / 360
+        assert revolutions == pytest.approx(round(revolutions), abs=1e-9)
         if low <= target <= high:
             assert found == target
 
@@ -274,8 +274,8 @@ def test_timeout_without_gyro_data_is_valid_json():
         with Turntable(bench) as table:
             table._gyro.bias = None
             table._wait_for_rest(60.0, 0.1, 0.5)
-    told = json.loads(json.dumps(caught.value.as_dict(), allow_nan=False))
-    assert told["evidence"]["peak_rate_dps"] is None
+    reported = json.loads(json.dumps(caught.value.as_dict(), allow_nan=False))
+    assert reported["evidence"]["peak_rate_dps"] is None
 
 
 def test_interrupted_motion_must_be_acknowledged():

@@ -42,10 +42,10 @@ def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, cat
 
 
 @pytest.mark.parametrize(
-    ("start_deg", "step_deg", "turns_to"),
+    ("start_deg", "step_deg", "rotates_to"),
     [(390.0, -90, [120.0]), (-395.0, 90, [-125.0]), (250.0, 5, [-115.0]), (30.0, 90, [])],
 )
-def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_deg, step_deg, turns_to):
+def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_deg, step_deg, rotates_to):
     s = simulated(*SMALL, "identify.max_views=2", f"identify.first_step_deg={step_deg}", seed=3)
     list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
     with Turntable(s.bench) as table:
@@ -53,7 +53,7 @@ def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_
     s.operator.next_object = "toy-car"
     events = list(identify(s.bench, hbr.ViewIndex(catalog.views().views)))
     assert isinstance(events[-1], Identified)
-    assert [e.to_deg for e in events if isinstance(e, Unwinding)] == pytest.approx(turns_to, abs=0.3)
+    assert [e.to_deg for e in events if isinstance(e, Unwinding)] == pytest.approx(rotates_to, abs=0.3)
     assert abs(s.world.table_deg()) <= 180
     low, high = s.bench.config.table.limits_deg
     assert all(low <= e.commanded_deg <= high for e in events if isinstance(e, Moved))

@@ -103,8 +103,8 @@ def test_missing_list_is_rejected(tmp_path):
 class Scripted:
     """An operator with prepared decisions."""
 
-    def __init__(self, bring=(), trouble=()):
-        self._bring, self._trouble = list(bring), list(trouble)
+    def __init__(self, bring=(), problem=()):
+        self._bring, self._problem = list(bring), list(problem)
         self.brought = []
         self.troubles = []
 
@@ -114,7 +114,7 @@ class Scripted:
 
     def decide_after_error(self, item, error):
         self.troubles.append((item.name, type(error)))
-        return self._trouble.pop(0)
+        return self._problem.pop(0)
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, cata
             s.world.change(light=(1.0, 1.0, 1.0))
             return super().decide_after_error(item, error)
 
-    operator = Lights(trouble=[TrayDecision.PROCEED])
+    operator = Lights(problem=[TrayDecision.PROCEED])
     events = list(enroll_tray(s.bench, catalog, items("dice"), views=4, operator=operator))
     assert operator.troubles == [("dice", ViewRejected)]
     assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
@@ -190,7 +190,7 @@ def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, cata
 
 def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
     s = simulated(*SMALL)
-    operator = Scripted(trouble=[TrayDecision.SKIP])
+    operator = Scripted(problem=[TrayDecision.SKIP])
     events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, operator=operator))
     assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
     with pytest.raises(ObjectNotFound):

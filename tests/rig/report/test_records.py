@@ -65,9 +65,9 @@ class TestEnrollment:
 class TestIdentification:
     def test_steps_are_the_measured_rotations(self) -> None:
         rotations = (90.0, 47.3, -120.5)
-        turns = identified(rotations_deg=rotations).steps
-        assert [turn.rotation_deg for turn in turns] == pytest.approx(list(rotations))
-        assert [(turn.s_left, turn.s_right) for turn in turns] == [(None, None), (0.41, 0.66), (0.66, 0.41)]
+        revolutions = identified(rotations_deg=rotations).steps
+        assert [rotate.rotation_deg for rotate in revolutions] == pytest.approx(list(rotations))
+        assert [(rotate.s_left, rotate.s_right) for rotate in revolutions] == [(None, None), (0.41, 0.66), (0.66, 0.41)]
 
     @pytest.mark.parametrize("rotation_deg", [-270.0, 250.0, 359.0])
     def test_steps_count_whole_revolutions(self, rotation_deg: float) -> None:
@@ -112,10 +112,10 @@ class TestIdentification:
         record = identified(yaw_deg=yaw, truth=Truth("mug-white", yaw + error))
         assert record.pose_error_deg == pytest.approx(abs(error), abs=1e-6)
 
-    @given(fold=st.integers(2, 12), turns=st.integers(-5, 5), error=st.floats(-0.49, 0.49))
-    def test_pose_error_is_modulo_the_symmetry(self, fold: int, turns: int, error: float) -> None:
+    @given(fold=st.integers(2, 12), revolutions=st.integers(-5, 5), error=st.floats(-0.49, 0.49))
+    def test_pose_error_is_modulo_the_symmetry(self, fold: int, revolutions: int, error: float) -> None:
         period = 360 / fold
-        record = identified(yaw_deg=100.0, truth=Truth("mug-white", 100 + (turns + error) * period, period))
+        record = identified(yaw_deg=100.0, truth=Truth("mug-white", 100 + (revolutions + error) * period, period))
         assert record.pose_error_deg == pytest.approx(abs(error) * period, abs=1e-6)
 
     @pytest.mark.parametrize(

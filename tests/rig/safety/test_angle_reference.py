@@ -28,45 +28,45 @@ def test_servo_and_table_convert_both_ways(direction, zero_deg, shift_deg, table
 
 
 @given(st.sampled_from([1, -1]), st.floats(-720, 720), st.floats(-720, 720), st.integers(-3, 3))
-def test_set_angle_sets_the_table_angle_at_a_position(direction, position_deg, table_deg, turns):
+def test_set_angle_sets_the_table_angle_at_a_position(direction, position_deg, table_deg, revolutions):
     reference = AngleReference(TableConfig(direction=direction))
     before_deg = reference.to_table(position_deg)
-    wound_deg = reference.with_revolutions(position_deg, turns)
+    wound_deg = reference.with_revolutions(position_deg, revolutions)
     assert wrap180(wound_deg - before_deg) == pytest.approx(0, abs=1e-6)
-    assert abs(wound_deg - 360 * turns) <= 180
+    assert abs(wound_deg - 360 * revolutions) <= 180
     reference.set_angle(position_deg, table_deg)
     assert reference.to_table(position_deg) == pytest.approx(table_deg, abs=1e-9)
 
 
 @given(st.floats(-4000, 4000), st.floats(-720, 720), st.sampled_from([360.0, 120.0, 72.0]))
-def test_revolutions_lost_with_the_supply_are_restored_if_the_angle_matches(position_deg, shift_deg, turn_deg):
-    found_deg = position_deg % turn_deg
-    check = check_saved_angle(saved(position_deg, shift_deg), IDENTITY, found_deg, LOST, turn_deg)
+def test_revolutions_lost_with_the_supply_are_restored_if_the_angle_matches(position_deg, shift_deg, revolution_deg):
+    found_deg = position_deg % revolution_deg
+    check = check_saved_angle(saved(position_deg, shift_deg), IDENTITY, found_deg, LOST, revolution_deg)
     assert check.certain
     assert found_deg + check.shift_deg == pytest.approx(position_deg + shift_deg, abs=1e-6)
     restored = check.finding is AngleFinding.REVOLUTIONS_RESTORED
-    assert restored == (abs(position_deg - found_deg) > turn_deg / 2)
+    assert restored == (abs(position_deg - found_deg) > revolution_deg / 2)
     assert restored or check.finding is AngleFinding.UNCHANGED
 
 
 @given(st.floats(-4000, 4000), st.floats(2.1, 357.9))
-def test_rotation_without_supply_makes_the_angle_uncertain(position_deg, turned_deg):
-    check = check_saved_angle(saved(position_deg), IDENTITY, (position_deg + turned_deg) % 360, LOST)
+def test_rotation_without_supply_makes_the_angle_uncertain(position_deg, rotated_deg):
+    check = check_saved_angle(saved(position_deg), IDENTITY, (position_deg + rotated_deg) % 360, LOST)
     assert check.finding is AngleFinding.ROTATED_WITHOUT_POWER
     assert not check.certain
 
 
 @given(st.floats(-4000, 4000), st.floats(-175, 175))
-def test_servo_with_supply_counts_rotation_by_hand(position_deg, turned_deg):
-    check = check_saved_angle(saved(position_deg, 7.0), IDENTITY, position_deg + turned_deg, KEPT)
-    by_hand = abs(turned_deg) > 2
+def test_servo_with_supply_counts_rotation_by_hand(position_deg, rotated_deg):
+    check = check_saved_angle(saved(position_deg, 7.0), IDENTITY, position_deg + rotated_deg, KEPT)
+    by_hand = abs(rotated_deg) > 2
     assert check.finding is (AngleFinding.ROTATED_BY_HAND if by_hand else AngleFinding.UNCHANGED)
     assert check.shift_deg == 7.0
 
 
-@pytest.mark.parametrize("turns", [-2, -1, 1, 3])
-def test_unrecorded_revolutions_make_the_angle_uncertain(turns):
-    check = check_saved_angle(saved(200.0), IDENTITY, 200.0 + 360 * turns, KEPT)
+@pytest.mark.parametrize("revolutions", [-2, -1, 1, 3])
+def test_unrecorded_revolutions_make_the_angle_uncertain(revolutions):
+    check = check_saved_angle(saved(200.0), IDENTITY, 200.0 + 360 * revolutions, KEPT)
     assert check.finding is AngleFinding.POSITION_CHANGED
     assert not check.certain
 

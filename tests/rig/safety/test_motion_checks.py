@@ -103,11 +103,11 @@ def test_frozen_readings_never_become_a_goal():
             kept.append(memory.live())
             memory.set_live(kept[0])
 
-        def look() -> None:
+        def view() -> None:
             speeds.append(wires.world.shaft()[1])
-            wires.world.clock.call_at(wires.world.clock.now_ns() + 10_000_000, look)
+            wires.world.clock.call_at(wires.world.clock.now_ns() + 10_000_000, view)
 
-        look()
+        view()
         with pytest.raises((NoProgress, FollowingError, RotationDisagreement)), Turntable(bench) as table:
             wires.world.clock.call_at(
                 wires.world.clock.now_ns() + 1_500_000_000, lambda: wires.device.distortions.append(stick)
@@ -211,7 +211,7 @@ def readings_until(error, watch: MotionMonitor, state, angle_deg, lag_deg) -> fl
     return float("inf")
 
 
-def turning(k: int) -> float:
+def rotating(k: int) -> float:
     return 90.0 * k * PERIOD_S
 
 
@@ -225,10 +225,10 @@ def test_each_limit_has_its_duration(load):
     assert readings_until(Stalled, monitor(), push | {"velocity_dps": 0.0}, standing, 0.0) == pytest.approx(
         0.28, abs=0.05
     )
-    assert readings_until(Overloaded, monitor(), push, turning, 0.0) == pytest.approx(0.8, abs=0.05)
-    assert readings_until(FollowingError, monitor(), {}, turning, 13.0) == pytest.approx(0.4, abs=0.05)
+    assert readings_until(Overloaded, monitor(), push, rotating, 0.0) == pytest.approx(0.8, abs=0.05)
+    assert readings_until(FollowingError, monitor(), {}, rotating, 13.0) == pytest.approx(0.4, abs=0.05)
     assert readings_until(NoProgress, monitor(), {"velocity_dps": 0.0}, standing, 0.0) == pytest.approx(1.0, abs=0.05)
-    assert readings_until(FollowingError, monitor(60.0), {}, turning, 0.0) == pytest.approx(0.8, abs=0.05)
+    assert readings_until(FollowingError, monitor(60.0), {}, rotating, 0.0) == pytest.approx(0.8, abs=0.05)
 
 
 def test_table_at_its_goal_needs_no_progress():
@@ -239,7 +239,7 @@ def test_short_push_or_voltage_dip_is_not_a_fault():
     watch = monitor()
     for k in range(70):
         dip = {"voltage_v": 6.1} if k % 3 == 0 else {}
-        watch.check(at(k, load_percent=90.0 if k % 18 else 5.0, **dip), turning(k), 0.0)
+        watch.check(at(k, load_percent=90.0 if k % 18 else 5.0, **dip), rotating(k), 0.0)
 
 
 def test_hardware_errors_come_first_and_a_hot_servo_must_cool_down():

@@ -108,10 +108,10 @@ def test_servo_stops_after_sigkill_and_the_next_program_reports_it(start, wires)
     stands_deg = wires.world.shaft()[0]
     sent = len(wires.instructions)
     with start() as bench:
-        told = " ".join(bench.findings)
-        assert "torque was on" in told
-        assert "watchdog stopped it" in told
-        assert "interrupted during a motion" in told
+        reported = " ".join(bench.findings)
+        assert "torque was on" in reported
+        assert "watchdog stopped it" in reported
+        assert "interrupted during a motion" in reported
         assert bench.safety.state is TableState.READY  # it kept its supply: it has counted its turns
         assert all(frame[7] != 3 for frame in wires.instructions[sent:])  # no write, so nothing moved
         with Turntable(bench) as table:
@@ -355,11 +355,11 @@ def test_position_beyond_the_limits_is_never_ready(start, wires):
         table.goto(300.0)
 
 
-@pytest.mark.parametrize("turns", [-3, 2, 3, 99_999_999])
-def test_revolutions_beyond_the_limits_are_rejected_and_not_stored(tmp_path, turns, start, wires):
+@pytest.mark.parametrize("rotations", [-3, 2, 3, 99_999_999])
+def test_revolutions_beyond_the_limits_are_rejected_and_not_stored(tmp_path, rotations, start, wires):
     before = (tmp_path / "state" / "state.json").read_bytes()
     with start() as bench, pytest.raises(UsageError, match="cable budget"):
-        bench.safety.set_revolutions(turns)
+        bench.safety.set_revolutions(rotations)
     assert (tmp_path / "state" / "state.json").read_bytes() == before
 
 
@@ -421,13 +421,13 @@ def test_watchdog_is_explained_by_the_end_of_the_last_session(tmp_path, start, w
         session.write_text(last)
         wires.device.memory["Bus Watchdog"] = register
         with start() as bench:
-            (told,) = bench.findings
-        assert told.startswith(words)
-        assert "the last program" in told
-        assert ("`rig home`, since 2026-01-02" in told) == ("home" in last)
+            (reported,) = bench.findings
+        assert reported.startswith(words)
+        assert "the last program" in reported
+        assert ("`rig home`, since 2026-01-02" in reported) == ("home" in last)
         session.write_text(ended)
         with start() as bench:  # it ended in an orderly way
-            assert not any("the last program" in told for told in bench.findings)
+            assert not any("the last program" in reported for reported in bench.findings)
 
 
 @pytest.mark.parametrize("when", ["in a motion", "between two"])

@@ -39,7 +39,7 @@ class Shaft:
 
     identity = ServoIdentity("xl430_w250", 1060, 1, 46)
     limits = ServoLimits(72.0, (6.0, 14.0))
-    turn_deg = 360.0
+    revolution_deg = 360.0
 
     def __init__(self) -> None:
         self.cable_deg = 0.0
@@ -106,9 +106,9 @@ class Bench(RuleBasedStateMachine):
     def check_ready_angle(self) -> None:
         """What is READY knows its turns."""
         if self.safety.state is TableState.READY:
-            told_deg = self.safety.angle_reference.to_table(self.shaft.read_state().position_deg)
-            assert told_deg == pytest.approx(self.shaft.cable_deg, abs=1e-6)
-            assert abs(told_deg) <= 402.0
+            reported_deg = self.safety.angle_reference.to_table(self.shaft.read_state().position_deg)
+            assert reported_deg == pytest.approx(self.shaft.cable_deg, abs=1e-6)
+            assert abs(reported_deg) <= 402.0
 
     # -- programs -----------------------------------------------------------------------------------------------------
 
@@ -226,12 +226,12 @@ class Bench(RuleBasedStateMachine):
         assert self.safety.state in (TableState.FAULT, TableState.STOPPED, TableState.DISCONNECTED)
 
     @rule(by_deg=st.floats(-720, 720) | st.sampled_from([-360.0, -180.0, 0.0, 180.0, 360.0]))
-    def the_table_is_turned_by_hand(self, by_deg: float) -> None:
+    def the_table_is_rotated_by_hand(self, by_deg: float) -> None:
         """By whole turns to a hair's breadth, with the supply off, is the one thing that no encoder can tell."""
         table = self.store.state.table
         written_deg = table.position_deg + table.shift_deg - 180.0 if table else 0.0
-        turned_deg = self.shaft.cable_deg + by_deg - written_deg
-        if abs(turned_deg) < 180 or abs(wrap180(turned_deg)) > 2.1:
+        rotated_deg = self.shaft.cable_deg + by_deg - written_deg
+        if abs(rotated_deg) < 180 or abs(wrap180(rotated_deg)) > 2.1:
             self.shaft.cable_deg += by_deg
 
     # -- devices ------------------------------------------------------------------------------------------------------

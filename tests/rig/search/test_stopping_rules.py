@@ -34,11 +34,11 @@ def views_of(name: str, count: int, *, seed: int, changing: float = 0.35) -> hbr
     """Return views of an object that change a little from one to the next."""
     rng = np.random.default_rng(seed)
     base = rng.integers(0, 256, KIND.size_bytes)
-    turning = rng.random((8, KIND.size_bytes))
+    rotating = rng.random((8, KIND.size_bytes))
     levels = []
     for i in range(count):
         phase = np.cos(2 * np.pi * (i / count - np.arange(8) / 8))
-        packed = np.where(np.tensordot(np.maximum(phase, 0), turning < changing / 4, 1) > 0.6, 255 - base, base)
+        packed = np.where(np.tensordot(np.maximum(phase, 0), rotating < changing / 4, 1) > 0.6, 255 - base, base)
         levels.append(KIND.unpack(packed.astype(np.uint8).tobytes()))
     return hbr.Views.of_object(name, np.array(levels), np.arange(count) * 360 / count, KIND.name)
 
@@ -238,7 +238,7 @@ def test_rotations_stay_within_the_cable_budget():
     np.testing.assert_array_equal(rotations, np.delete(np.arange(-175.0, 181.0, 5.0), 35))
     assert seconds.min() > 0
     wound, long = reachable_rotations(config, 390.0)  # + turns the camera's way lead beyond 400°: the long way round
-    left, right = (np.flatnonzero(wound == turn)[0] for turn in (-90.0, 90.0))
+    left, right = (np.flatnonzero(wound == rotation)[0] for rotation in (-90.0, 90.0))
     assert len(wound) == 71
     assert long[left] == pytest.approx(long[right] + 2)  # 270° against 90°, at 90° a second
     pan = RigConfig.model_validate({"table": {"mode": "pan", "limits_deg": [-60, 60]}})

@@ -48,8 +48,8 @@ def test_second_operator_needs_the_lease(serve):
     client = serve().client
     first, second = {"X-Rig-Client": "1"}, {"X-Rig-Client": "2"}
     assert client.post(f"{API}/jobs", json={"kind": "doctor"}, headers=first).status_code == 201
-    refused = client.post(f"{API}/jobs", json={"kind": "doctor"}, headers=second)
-    assert (refused.status_code, refused.json()["code"]) == (423, 902)
+    rejected = client.post(f"{API}/jobs", json={"kind": "doctor"}, headers=second)
+    assert (rejected.status_code, rejected.json()["code"]) == (423, 902)
     assert client.post(f"{API}/stop", headers=second).status_code == 200
     assert client.post(f"{API}/lease", json={"force": True}, headers=second).status_code == 200
     assert client.post(f"{API}/jobs", json={"kind": "doctor"}, headers=first).status_code == 423

@@ -114,12 +114,12 @@ def test_host_build_and_the_binary_measure_the_same():
             h.clock.sleep(0.2)
             h.imu.read_samples()
             h.world.drive(to_position(h.clock.now_ns() * 1e-9, 0.0, 0.0, 70.0, 90.0, 300.0))
-            turned = 0.0
+            rotated = 0.0
             for _ in range(16):
                 h.clock.sleep(0.1)
                 samples = h.imu.read_samples()
                 assert samples.lost == 0
-                turned += samples.gyro_dps[:, 2].sum() / h.imu.rate_hz
-            angles[kind] = turned
+                rotated += samples.gyro_dps[:, 2].sum() / h.imu.rate_hz
+            angles[kind] = rotated
     assert angles["memory"] == pytest.approx(70.0, abs=0.02)
     assert angles["avr"] == pytest.approx(angles["memory"], abs=0.01)

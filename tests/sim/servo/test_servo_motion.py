@@ -98,8 +98,8 @@ def test_velocity_mode_ramps_and_keeps_rotating(line: Line) -> None:
     assert line.read("Present Velocity") == line.read("Velocity Trajectory") == -100
     before, start_ns = line.shaft(), line.clock.now_ns()
     line.sleep(10.0)
-    turned = -100 * DPS_PER_UNIT * (line.clock.now_ns() - start_ns) * 1e-9
-    assert line.shaft() - before == pytest.approx(turned)
+    rotated = -100 * DPS_PER_UNIT * (line.clock.now_ns() - start_ns) * 1e-9
+    assert line.shaft() - before == pytest.approx(rotated)
     line.put(Goal_Velocity=0)
     line.sleep(2.0)
     assert line.servos[1].motor.busy is False
@@ -178,17 +178,17 @@ def test_position_mode_loses_the_revolutions_when_torque_is_switched_on(line: Li
     assert line.read("Present Position") == 2048 + 1024
 
 
-@given(turns_deg=st.floats(-2000, 2000), center=st.integers(0, 4095))
+@given(rotations_deg=st.floats(-2000, 2000), center=st.integers(0, 4095))
 @examples(12)
-def test_power_up_reads_within_one_revolution(turns_deg: float, center: int) -> None:
+def test_power_up_reads_within_one_revolution(rotations_deg: float, center: int) -> None:
     line = Line()
     line.add(1, center_counts=center)
     line.put(Operating_Mode=4)
-    line.sleep(line.servos[1].rotate_by_hand(turns_deg))
-    assert line.read("Present Position") == round(center + turns_deg / DEG_PER_COUNT)
+    line.sleep(line.servos[1].rotate_by_hand(rotations_deg))
+    assert line.read("Present Position") == round(center + rotations_deg / DEG_PER_COUNT)
     line.servos[1].power_cycle()
     line.sleep(0.5)
-    assert line.read("Present Position") == round(center + turns_deg / DEG_PER_COUNT) % 4096
+    assert line.read("Present Position") == round(center + rotations_deg / DEG_PER_COUNT) % 4096
 
 
 def test_reverse_mode_inverts_every_sign(line: Line) -> None:

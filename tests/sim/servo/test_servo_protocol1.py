@@ -158,12 +158,12 @@ def test_wheel_mode_needs_both_limits_zero(line: Line1) -> None:
     line.write(24, 1, 1)
     line.write(SPEED, 512)
     line.sleep(5.0)
-    turned = line.world.shaft()[0]
-    assert turned > 360
+    rotated = line.world.shaft()[0]
+    assert rotated > 360
     assert line.read(POSITION) == 1023  # beyond its potentiometer
     line.write(SPEED, 512 | 0x400)
     line.sleep(5.0)
-    assert line.world.shaft()[0] < turned
+    assert line.world.shaft()[0] < rotated
     line.write(SPEED, 0)
     line.sleep(1.0)
     assert line.world.shaft()[1] == 0.0
