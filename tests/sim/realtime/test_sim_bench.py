@@ -39,6 +39,8 @@ from tests.contract.heads import needs
 from tests.fuzzing import fuzz_settings
 
 CLOCK = SystemClock()
+PATIENT = ("table.watchdog_s=2.5", "head.deadman_s=2.0")
+"""Settings with which a busy computer may pause a program."""
 LEFT = {"lock", "rig.toml"}
 """What an ended bench leaves that no program has moved."""
 
@@ -194,7 +196,7 @@ def test_garbage_does_not_end_the_bench(start):
 
 def test_servo_and_rig_head_are_parts_of_one_world(start):
     needs("memory")
-    folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5", "table.velocity_dps=120")
+    folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5", *PATIENT)
     config = load_config(folder / "rig.toml")
     assert not tell(folder, "status")["world"]["light"][0]
     with open_bench("sim-bench", config) as bench:
