@@ -187,6 +187,8 @@ class Enrollment:
             audit.append(
                 connection, self._clock, audit.Action.ENROLLMENT_DISCARDED, self.object_name, enrollment_id=self.id
             )
+        if self.session.empty_table_image is not None:
+            image_file(self._database.root, self.session.empty_table_image).unlink(missing_ok=True)
         for folder in (self.folder, self.folder.parent):
             with suppress(OSError):  # it has images of other enrollments
                 image_file(self._database.root, folder.as_posix()).rmdir()

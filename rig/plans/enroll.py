@@ -6,6 +6,7 @@ Decision: docs/decisions/0002.
 """
 
 from collections.abc import Generator, Mapping
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,16 +98,17 @@ def enroll(
     if missing:
         try:
             bench.operator.place(enrollment.object_name)
-        except RigError:
+            empty_table = None if status.table is None else status.table.image_bgr
+            if empty_table is not None:
+                enrollment.store_empty_table(empty_table)
+            retakes = yield from _take_views(
+                bench, enrollment, to_go, ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
+            )
+        except BaseException:
             if not resume:
-                enrollment.discard()  # so that a mistyped name is not left in the catalog
+                with suppress(RigError):  # it has views to resume
+                    enrollment.discard()  # a mistyped name, or a table that did not start, is not left in the catalog
             raise
-        empty_table = None if status.table is None else status.table.image_bgr
-        if empty_table is not None:
-            enrollment.store_empty_table(empty_table)
-        retakes = yield from _take_views(
-            bench, enrollment, to_go, ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
-        )
     enrollment.finish()
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done

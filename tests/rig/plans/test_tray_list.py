@@ -174,7 +174,6 @@ def test_operator_can_skip_objects_or_stop(simulated, catalog):
 
 def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, catalog):
     s = simulated(*SMALL)
-    s.world.change(light=(0.0, 0.0, 0.0))
 
     class Lights(Scripted):
         def decide_after_error(self, item, error):
@@ -182,7 +181,11 @@ def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, cata
             return super().decide_after_error(item, error)
 
     operator = Lights(problem=[TrayDecision.PROCEED])
-    events = list(enroll_tray(s.bench, catalog, items("dice"), views=4, operator=operator))
+    events = []
+    for event in enroll_tray(s.bench, catalog, items("dice"), views=4, operator=operator):
+        if isinstance(event, Accepted) and not any(isinstance(earlier, Accepted) for earlier in events):
+            s.world.change(light=(0.0, 0.0, 0.0))
+        events.append(event)
     assert operator.troubles == [("dice", ViewRejected)]
     assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
     assert catalog.object("dice").summary.views == 4
