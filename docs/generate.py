@@ -31,7 +31,8 @@ REPOSITORY_PAGES = {
     "firmware/README.md": "how-to/rig-head.md",
     "firmware/PROTOCOL.md": "reference/head-protocol.md",
 }
-"""Pages that stand in the repository outside `docs`, and where the site shows them."""
+"""Pages that stand in the repository outside `docs`, and where the site shows them: as a page of their own, or at the
+beginning of a page in `docs`."""
 
 NOTE = "*This page is generated from the code.*\n\n"
 
@@ -48,7 +49,11 @@ def generated_pages() -> dict[str, str]:
         "reference/exit-codes.md": exit_codes_page(),
         "reference/api/index.md": public_names_page(),
         **dict(api_pages()),
-        **{site: (ROOT / page).read_text(encoding="utf-8") for page, site in REPOSITORY_PAGES.items()},
+        **{
+            site: (ROOT / page).read_text(encoding="utf-8")
+            for page, site in REPOSITORY_PAGES.items()
+            if not (ROOT / "docs" / site).exists()
+        },
     }
 
 
@@ -354,7 +359,12 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_others: Any) -> str:
-    """Rewrite the links of the pages in `docs` that lead out of it."""
+    """Rewrite the links of the pages in `docs` that lead out of it, and put the pages of the repository before them."""
     if page.file.generated_by:
         return markdown
-    return with_site_links(markdown, f"docs/{page.file.src_uri}")[0]
+    shown = with_site_links(markdown, f"docs/{page.file.src_uri}")[0]
+    for source, site in REPOSITORY_PAGES.items():
+        if site == page.file.src_uri:
+            first = with_site_links((ROOT / source).read_text(encoding="utf-8"), source)[0]
+            return first + re.sub(r"^#", "\n##", shown, flags=re.MULTILINE)
+    return shown
