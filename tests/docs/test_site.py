@@ -1,6 +1,7 @@
 """The documentation site: complete generated pages, a navigation that reaches every page, links that exist."""
 
 import re
+import shlex
 from typing import Any
 
 import pytest
@@ -107,3 +108,16 @@ def test_architecture_picture_shows_every_room():
     assert not any(
         importing.startswith("hbr") and imported.startswith("rig") for importing, imported in architecture.imports()
     )
+
+
+def test_commands_of_the_attacks_select_tests():
+    commands = re.findall(r"`(tests/[^`]+)`", (DOCS / "security.md").read_text(encoding="utf-8"))
+    assert len(commands) > 30
+    for command in commands:
+        words = shlex.split(command)
+        places = [ROOT / word for word in words if word.startswith("tests/")]
+        files = [file for place in places for file in ([place] if place.is_file() else place.rglob("test_*.py"))]
+        text = "\n".join(file.name + file.read_text(encoding="utf-8") for file in files)
+        expression = words[words.index("-k") + 1] if "-k" in words else ""
+        for name in set(re.findall(r"\w+", expression)) - {"or"}:
+            assert re.search(rf"(def test|class Test|test_)\w*{name}", text), (command, name)
