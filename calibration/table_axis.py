@@ -254,8 +254,8 @@ class _Axis:
         """Return the estimates, and the root mean square of the corners' residuals in pixels."""
         # Starting without a lean, the fit may end at a lean to the wrong side: try three starts, and use the best.
         starts = [self._start.copy() for _ in range(3)]
-        for start, turn in zip(starts, np.radians([0.0, 120.0, 240.0]), strict=True):
-            start[4:6] = radians(0.05) * np.array([np.cos(turn), np.sin(turn)])
+        for start, angle in zip(starts, np.radians([0.0, 120.0, 240.0]), strict=True):
+            start[4:6] = radians(0.05) * np.array([np.cos(angle), np.sin(angle)])
         tried = [self._solved(start, evaluations=15) for start in starts]
         solved = self._solved(min(tried, key=lambda found: float(found.cost)).x, evaluations=60)
         residuals = self._residuals(solved.x)[: -self._known.size]

@@ -61,7 +61,7 @@ static void test_garbage_stays_within_its_bytes(void) {
 
 /* -- a board without a sensor -------------------------------------------------------------------------------------- */
 
-static int32_t nobody(uint64_t ns, int32_t operation, uint8_t *data, int32_t length) {
+static int32_t no_device(uint64_t ns, int32_t operation, uint8_t *data, int32_t length) {
     (void)ns;
     (void)operation;
     (void)data;
@@ -149,7 +149,7 @@ static uint8_t ask_u8(uint8_t id, uint8_t value) {
 static void power_up(void) {
     now_ns = 0;
     relay = light = trigger = 0;
-    board = board_open((struct board_outside){nobody, never}, NULL, 0, 7);
+    board = board_open((struct board_outside){no_device, never}, NULL, 0, 7);
     run_ms(5);
     CHECK(event[0] == MESSAGE_STATUS_CHANGED && event[FRAME_HEADER + 9] == RESET_POWER_ON);
 }

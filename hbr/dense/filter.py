@@ -142,7 +142,7 @@ class DenseIndex:
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:
         """Two turns of every object's views in rows, where their arcs end, and the penalty there.
 
-        From half a turn before 0 on: a copy of each view is within half a turn of any azimuth.
+        From 180° before 0 on: a copy of each view is within 180° of any azimuth.
         """
         first_deg = np.where(self.azimuth_deg < 180, self.azimuth_deg, self.azimuth_deg - 360)
         first_deg = np.where(self.left_out, np.inf, first_deg)

@@ -26,7 +26,7 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
     for (int64_t j = 0; j < objects; j++, support += BINS) {
         const int64_t n = count[j], two = 2 * n;
         const int64_t *mine = rows + begin[j];
-        int64_t first = 0; /* two turns, from half a turn before 0 on */
+        int64_t first = 0; /* two revolutions, from 180° before 0 on */
         while (first < n && azimuth_deg[mine[first]] < 180) first++;
         for (int64_t i = 0; i < n; i++) {
             const int64_t k = first + i < n ? first + i : first + i - n, row = mine[k];

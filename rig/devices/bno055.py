@@ -161,13 +161,13 @@ class Bno055:
     # -- setting up ---------------------------------------------------------------------------------------------------
 
     def _identify(self) -> ImuIdentity:
-        give_up_ns = self._clock.now_ns() + round(_START_S * 1e9)
+        deadline_ns = self._clock.now_ns() + round(_START_S * 1e9)
         while True:
             try:
                 got = self._registers.read(KIND.register, 1)[0]
                 break
             except DeviceSilent as silent:
-                if self._clock.now_ns() > give_up_ns:
+                if self._clock.now_ns() > deadline_ns:
                     raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent
                 self._clock.sleep(_POLL_S)
         return identified(KIND, got, self._registers.address, self._registers.name, NOISE_DPS_RTHZ)

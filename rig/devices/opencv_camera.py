@@ -260,13 +260,13 @@ class OpenCvCamera:
     def _reconnect(self, reopen: Callable[[], Capture]) -> None:
         """Wait until the camera is connected again, and set it up as before."""
         self._capture.release()
-        give_up_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
+        end_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
         while True:
             try:
                 self._capture = reopen()
                 break
             except DeviceNotFound as missing:
-                if self._clock.now_ns() > give_up_ns:
+                if self._clock.now_ns() > end_ns:
                     raise DeviceSilent(
                         f"{self.identity.name} was disconnected for more than {self._timeout_s:g} s.",
                         next_step=missing.next_step,

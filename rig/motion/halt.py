@@ -59,8 +59,8 @@ def halt(
         bus_s = 2 * min(seconds_between(state.time_ns, clock.now_ns()), STALE_S)  # for the answer and for the goal
         low_deg, high_deg = path.ends_deg
         set_goal(min(max(state.position_deg + ramp_deg + state.velocity_dps * bus_s, low_deg), high_deg))
-        give_up_ns = clock.now_ns() + round((abs(state.velocity_dps) / ramp_dps2 + STOP_ALLOWANCE_S) * 1e9)
-        while state.moving and clock.now_ns() < give_up_ns:
+        deadline_ns = clock.now_ns() + round((abs(state.velocity_dps) / ramp_dps2 + STOP_ALLOWANCE_S) * 1e9)
+        while state.moving and clock.now_ns() < deadline_ns:
             clock.sleep(poll_s)
             state = servo.read_state()
         servo.disarm_watchdog()

@@ -205,12 +205,12 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def _learn_bias(self, duration_s: float) -> None:
         """Measure the gyro's bias; try again after a short disturbance, and fail if the bench keeps shaking."""
-        give_up_ns = self._clock.now_ns() + round(SETTLE_ALLOWANCE_S * 1e9)
+        deadline_ns = self._clock.now_ns() + round(SETTLE_ALLOWANCE_S * 1e9)
         while True:
             try:
                 self._gyro.rest(duration_s)
             except NotReady:
-                if self._clock.now_ns() >= give_up_ns:
+                if self._clock.now_ns() >= deadline_ns:
                     raise
             else:
                 return

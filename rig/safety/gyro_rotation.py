@@ -316,9 +316,9 @@ class GyroRotationMeter:
             return
         newest = gyro_dps[-1]
         others = np.flatnonzero((gyro_dps != newest).any(axis=1))
-        went_on = not others.size and np.array_equal(newest, self._newest_dps)
+        continues = not others.size and np.array_equal(newest, self._newest_dps)
         self._repeated = (
-            len(gyro_dps) - (int(others[-1]) + 1 if others.size else 0) + (self._repeated if went_on else 0)
+            len(gyro_dps) - (int(others[-1]) + 1 if others.size else 0) + (self._repeated if continues else 0)
         )
         self._newest_dps = newest
         if newest.all() and self._repeated >= max(HUNG_S * self._imu.rate_hz, HUNG_SAMPLES):
@@ -338,13 +338,13 @@ class GyroRotationMeter:
     def _wait_for_rest(self, duration_s: float) -> NDArray[np.float64]:
         """Return the rates of at least ``duration_s`` since the rest began or samples were lost."""
         needed = max(round(duration_s * self._imu.rate_hz), 2)
-        give_up_ns = self._clock.now_ns() + round((2 * duration_s + 1.0) * 1e9)
+        deadline_ns = self._clock.now_ns() + round((2 * duration_s + 1.0) * 1e9)
         while True:
             self._drain()
             rate = self._rate_dps[self._time_ns > self._resting_ns]
             if rate.size >= needed:
                 return rate
-            if self._clock.now_ns() > give_up_ns:
+            if self._clock.now_ns() > deadline_ns:
                 raise DeviceSilent(
                     f"The gyro delivered only {rate.size} samples in {2 * duration_s + 1:g} s.",
                     next_step="Check its cable and supply, then open the bench again.",

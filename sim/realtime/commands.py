@@ -72,7 +72,7 @@ class Commands:
             case "objects":
                 return "\n".join([*self._operator.objects, *calibration_targets(self._operator.optics)])
             case "turn":
-                return self._turn(_number(_arguments(command, given, 1, 1)[0], "degrees", MAX_DEG))
+                return self._rotate_by_hand(_number(_arguments(command, given, 1, 1)[0], "degrees", MAX_DEG))
             case "light":
                 factor = _number(_arguments(command, given, 1, 1)[0], "factor", MAX_LIGHT)
                 if factor < 0:
@@ -124,7 +124,7 @@ class Commands:
         operator.place(None)
         return f"{name} is on the table."
 
-    def _turn(self, angle_deg: float) -> str:
+    def _rotate_by_hand(self, angle_deg: float) -> str:
         try:
             seconds = self._devices.servo.rotate_by_hand(angle_deg)
         except ValueError as held:

@@ -108,14 +108,14 @@ class Session:
 
     def _grab(self) -> bool:
         """Wait for the next frame, without holding the world meanwhile."""
-        camera, give_up_ns = self._devices.camera, self._time.now_ns() + round(SELECT_S * 1e9)
+        camera, deadline_ns = self._devices.camera, self._time.now_ns() + round(SELECT_S * 1e9)
         while True:
             self._time.wait()
             with self._time.present():
                 wait_ns = camera.wait_ns()
                 if not wait_ns:
                     return camera.grab()
-            if self._time.now_ns() > give_up_ns:
+            if self._time.now_ns() > deadline_ns:
                 return False
             SystemClock().sleep(min(wait_ns * 1e-9, _POLL_S))
 

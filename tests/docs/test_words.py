@@ -1,13 +1,17 @@
-"""One term for each concept: no file uses a term that docs/glossary.md replaces."""
+"""One term for each concept: no file uses a term that docs/glossary.md replaces, nor translated English."""
 
+import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("hbr", "rig", "sim", "calibration", "examples", "benchmarks", "tests", "docs", "firmware")
-SUFFIXES = {".py", ".md", ".j2", ".toml"}
+SUFFIXES = {".py", ".md", ".j2", ".toml", ".c", ".h"}
 
+REFUSE = r"refus(?:e|es|ed|al|als|ing)"
 # Terms of earlier versions, as regular expressions. They match whole words, also within a name (`_` and case separate).
 RETIRED = (
     r"strangers?",
@@ -33,6 +37,32 @@ RETIRED = (
     r"attendants?",
     r"remed(?:y|ies)",
     r"certainty|sureness",
+    # Phrases, in which an ambiguous word is clear.
+    REFUSE,
+    r"(?:says?|told) so",
+    r"for good",
+    r"(?:has|have|had) it that|as \w+ has it",
+    r"goes on|went on",
+    r"gives? up(?! to\b)|gave up",
+    r"is told|are told|tells? of",
+    r"where there (?:is|are|was) (?:none|no|nothing)|where nothing",
+    r"(?:a|each|every|the) turn of|(?:half|whole|full) (?:a )?turns?|turns? of the (?:table|platter|shaft)",
+    r"(?:servos?|bytes|noise|answers?) on the line|the bus's line",
+)
+RETIRED_NAMES = frozenset(
+    {
+        *("told", "trouble", "turn", "turned", "turning", "look", "looks", "looked", "shot", "shots"),
+        *("refusal", "refused", "rehearse", "stranger", "familiar", "sitting", "verdict", "anew"),
+    }
+)
+"""Words that no function, class, argument, attribute or variable has in its name. In sentences some are correct."""
+ALLOWED_NAMES = frozenset(
+    {
+        "_shot",  # shot noise
+        *("SINGLE_TURN_HOMING_COUNTS", "_CLEAR_MULTI_TURN"),  # names of the servo's manual
+        "turning_share",  # a field of the events
+        "refused",  # a key of earlier versions
+    }
 )
 EXCEPTIONS: dict[str, tuple[str, ...]] = {
     "docs/glossary.md": RETIRED,  # it lists them
@@ -48,6 +78,10 @@ EXCEPTIONS: dict[str, tuple[str, ...]] = {
     "tests/hbr/test_deprecated_names.py": RETIRED,
     "tests/rig/catalog/test_migration.py": RETIRED,
     "tests/rig/search/test_stopping_rules.py": (r"(?:least_|min_)?familiar(?:ity)?|unfamiliar", r"certainty|sureness"),
+    "rig/calibrations/result.py": (REFUSE,),  # a key of earlier files
+    "rig/catalog/exchange/plan.py": (REFUSE,),
+    "rig/views/segmentation_evidence.py": (REFUSE,),
+    "tests/rig/views/test_segmentation_evidence.py": (REFUSE,),
     "hbr/evaluation/unknown_objects.py": (r"strangers?",),  # the name of a random stream: another draws other objects
     "tests/rig/catalog/test_upkeep.py": (r"somebody|nobody|anybody",),  # a user of the operating system
 }
@@ -86,6 +120,43 @@ def retired_terms() -> list[str]:
 def words(line: str) -> str:
     """Return a line with the words of each name apart: ``minFamiliarity`` and ``min_familiarity`` alike."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", line).replace("_", " ")
+
+
+def named(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Yield each name that a module defines, with its line."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.arg(arg=name):
+                yield name, node.lineno
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name, node.lineno
+
+
+def test_no_name_has_a_retired_word():
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for path in files()
+        if path.suffix == ".py"
+        for name, line in named(ast.parse(path.read_text(encoding="utf-8")))
+        if name not in ALLOWED_NAMES
+        and not name.startswith("test_")
+        and RETIRED_NAMES & set(words(name).lower().split())
+    ]
+    assert not found, "\n".join([f"{len(found)} names with retired words:", *found])
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("The program goes on where it was.", "next_look"),
+        ("Nobody is told.", "turn_by_hand"),
+        ("The import was refused.", "Shot"),
+    ],
+)
+def test_retired_phrases_and_names_are_found(text, name):
+    assert any(re.search(rf"\b(?:{term})\b", text, re.IGNORECASE) for term in RETIRED)
+    assert RETIRED_NAMES & set(words(name).lower().split())
+    assert [found for found, _ in named(ast.parse(f"def {name}(): ..."))] == [name]
 
 
 def test_no_retired_term_is_used():

@@ -68,7 +68,7 @@ def test_enrollment_of_a_full_revolution_resumes_to_the_end_after_a_late_fault(t
 def check_enrollment(
     folder: Path, scenario: Scenario, fault: str, *, views: int, resumed_views: int | None = RESUMED_VIEWS
 ) -> Outcome:
-    """Enroll under the fault, check the end, remove the cause and check that the enrollment goes on."""
+    """Enroll under the fault, check the end, remove the cause and check that the enrollment continues."""
     with new_rig(folder) as rig:
         outcome = enrollment(rig, fault, views=views)
         assert outcome.code == scenario.code, outcome.error

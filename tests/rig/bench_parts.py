@@ -97,7 +97,7 @@ def program(wires: Wires, i2c: SimI2cBus, state: StateStore, *settings: str, **s
 
 
 def kill(wires: Wires, motion: Generator[Any, None, None] | None = None) -> None:
-    """Have the program die as SIGKILL does: none of its exits runs, the kernel closes its port, the servo goes on."""
+    """Let the program die as by SIGKILL: no clean-up runs, the kernel closes its port, the servo continues."""
     _dead.append(motion)  # a generator that is forgotten would be closed, and its exits run
     wires.serial.close()
 

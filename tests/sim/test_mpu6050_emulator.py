@@ -67,7 +67,7 @@ class Chip:
     def wait(self, seconds: float) -> None:
         self.world.clock.sleep(seconds)
 
-    def turn(self, dps: float) -> None:
+    def rotate(self, dps: float) -> None:
         now_s = self.world.clock.now_ns() * 1e-9
         self.world.drive(to_velocity(now_s, 0.0, dps, dps, 1.0))
 
@@ -81,7 +81,7 @@ def chip() -> Iterator[Chip]:
 def test_sensor_sleeps_after_power_up_and_reports_its_identity(chip: Chip) -> None:
     assert chip.get(WHO) == [0x68]
     assert chip.get(PWR) == [0x40]
-    chip.turn(50)
+    chip.rotate(50)
     chip.set(USER_CTRL, 0x40)
     chip.set(FIFO_EN, 0xF8)
     chip.wait(1)
@@ -139,7 +139,7 @@ def test_only_the_writable_bits_of_writable_registers_change(register: int, valu
 def test_gyro_and_accelerometer_scale_by_the_range(chip: Chip, setting: int) -> None:
     chip.wake()
     chip.set(GYRO_CONFIG, setting << 3, setting << 3)
-    chip.turn(200.0)
+    chip.rotate(200.0)
     chip.wait(0.2)
     gyro_lsb, acceleration_lsb = (131.0, 65.5, 32.8, 16.4)[setting], 16384 >> setting
     assert chip.words() == [0, 0, acceleration_lsb, chip.words()[3], 0, 0, round(200.0 * gyro_lsb)]
@@ -148,7 +148,7 @@ def test_gyro_and_accelerometer_scale_by_the_range(chip: Chip, setting: int) -> 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_rate_beyond_the_range_saturates(chip: Chip, sign: int) -> None:
     chip.wake()
-    chip.turn(sign * 300.0)
+    chip.rotate(sign * 300.0)
     chip.wait(0.2)
     assert chip.words()[6] == (32767 if sign > 0 else -32768)
 
@@ -179,7 +179,7 @@ def test_fifo_fills_at_the_sample_rate_with_the_chosen_words(divider: int, dlpf:
 
 def test_fifo_frames_follow_the_order_of_the_data_registers(chip: Chip) -> None:
     chip.wake(fifo=0xF8)
-    chip.turn(100.0)
+    chip.rotate(100.0)
     chip.wait(0.1)
     frames = np.frombuffer(chip.drain(), ">i2").reshape(-1, 7)
     assert frames[-1].tolist() == chip.words() == [0, 0, 16384, round((25 - 36.53) * 340), 0, 0, 13100]
@@ -190,7 +190,7 @@ def test_overflowing_fifo_drops_the_oldest_bytes_and_sets_its_flag(chip: Chip) -
     chip.wait(0.12)
     assert chip.get(INT_STATUS) == [0x01]
     assert chip.get(INT_STATUS)[0] & 0x10 == 0
-    chip.turn(50.0)
+    chip.rotate(50.0)
     chip.wait(0.1)
     assert chip.get(INT_STATUS) == [0x11]
     assert chip.get(INT_STATUS)[0] & 0x10 == 0  # reading cleared it
@@ -213,7 +213,7 @@ def test_fifo_reset_works_only_while_the_fifo_is_off(chip: Chip) -> None:
 
 def test_fifo_is_read_in_place_and_an_empty_one_repeats_its_last_byte(chip: Chip) -> None:
     chip.wake(fifo=0x10)
-    chip.turn(100.0)
+    chip.rotate(100.0)
     chip.wait(0.1)
     chip.set(FIFO_EN, 0)
     count = chip.count()
@@ -255,7 +255,7 @@ def test_data_ready_comes_once_a_sample(chip: Chip) -> None:
 def test_old_samples_show_the_rate_of_their_own_time(chip: Chip) -> None:
     chip.wake(dlpf=1, fifo=0x10)
     for dps in (0.0, 40.0, -80.0):
-        chip.turn(dps)
+        chip.rotate(dps)
         chip.wait(0.1)
     rates = np.frombuffer(chip.drain(), ">i2") / 131
     for third, dps in zip(np.array_split(rates, 3), (0.0, 40.0, -80.0), strict=True):
@@ -326,7 +326,7 @@ def test_bias_walks_at_the_models_pace() -> None:
 def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
     with Chip(NoiseModel.none().with_values(imu_tilt_deg=10.0), seed=5) as chip:
         chip.wake()
-        chip.turn(-90.0)
+        chip.rotate(-90.0)
         chip.wait(0.3)
         words = np.array(chip.words())
         up = chip.sensor.inertial.up

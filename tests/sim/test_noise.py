@@ -1,4 +1,4 @@
-"""The noise model: what it rejects, and that the bench behind it says so."""
+"""The noise model: invalid values are rejected, also by the simulated bench."""
 
 import pytest
 

@@ -88,7 +88,7 @@ def serve(
     if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
         settings = settings.merged(None, None, ["bench.sim.speed=1"], None, False)  # people watch it
     arguments = tuple(settings.arguments())
-    run_server(settings.bench_name, settings.load(), settings.seed, arguments, listening, tokens, _told)
+    run_server(settings.bench_name, settings.load(), settings.seed, arguments, listening, tokens, _announced)
 
 
 def is_loopback(host: str) -> bool:
@@ -109,5 +109,5 @@ def _require_tokens(tokens: "Tokens", host: str) -> None:
         )
 
 
-def _told(url: str) -> None:
+def _announced(url: str) -> None:
     print(f"The bench is at {url}. Stop with Ctrl+C.", file=sys.stderr, flush=True)

@@ -18,7 +18,7 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table, protocol_of
 
-GIVE_UP_S: Final = 5.0
+MAX_WAIT_S: Final = 5.0
 """How long the guardian tries: the port may be in use, or the servo without supply."""
 _RETRY_S: Final = 0.05
 _ON, _OFF = b"1", b"0"
@@ -54,7 +54,7 @@ class Guardian:
         if process is not None and process.stdin is not None:
             process.stdin.close()
             with suppress(subprocess.TimeoutExpired):
-                process.wait(GIVE_UP_S)
+                process.wait(MAX_WAIT_S)
 
     def _tell(self, word: bytes) -> None:
         if self._process is not None and self._process.stdin is not None:
@@ -71,7 +71,7 @@ def watch(port: str, baud: int, model: str, bus_id: int) -> bool:
         return True
     clock = SystemClock()
     begun_ns = clock.now_ns()
-    while seconds_between(begun_ns, clock.now_ns()) < GIVE_UP_S:
+    while seconds_between(begun_ns, clock.now_ns()) < MAX_WAIT_S:
         with suppress(RigError):
             connection = open_serial(port, baud)
             try:

@@ -193,13 +193,13 @@ class RegisterServo(ABC):
 
     def reboot(self) -> None:
         self.bus.reboot(self._id)
-        give_up_ns = self._clock.now_ns() + round(BOOT_ALLOWANCE_S * 1e9)
+        deadline_ns = self._clock.now_ns() + round(BOOT_ALLOWANCE_S * 1e9)
         while True:
             self._clock.sleep(0.1)
             try:
                 self.verify()
             except DeviceSilent:
-                if self._clock.now_ns() > give_up_ns:
+                if self._clock.now_ns() > deadline_ns:
                     raise
             else:
                 return

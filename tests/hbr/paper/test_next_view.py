@@ -89,7 +89,7 @@ def test_equal_sides_give_left() -> None:
 
 @pytest.mark.parametrize(("pose_deg", "rotation_deg"), [(45.0, 90.0), (50.0, 85.0), (40.0, 95.0), (355.0, 50.0)])
 def test_rotation_ends_at_the_next_sector_centre(pose_deg: float, rotation_deg: float) -> None:
-    """From a centre to the next one; 5° before a centre the rotation would be too small, so it goes on."""
+    """From a centre to the next one; 5° before a centre the rotation is too small, so the next centre is chosen."""
     decision = next_view(pair(similar_on_left=False, pose_deg=pose_deg, orientations=(200.0, 0.0)))
     assert (decision.side, decision.rotation_deg) == ("left", rotation_deg)
 

@@ -1,4 +1,4 @@
-"""What files of Linux tell of a computer's devices."""
+"""The devices of a computer, found in the files of Linux."""
 
 import os
 

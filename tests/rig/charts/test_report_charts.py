@@ -18,7 +18,7 @@ from rig.events.events import Weighed
 from tests.fuzzing import examples
 
 ANGLE = st.floats(-720, 720)
-TURN = st.floats(-360, 360).filter(lambda a: abs(a) > 1)
+ROTATION = st.floats(-360, 360).filter(lambda a: abs(a) > 1)
 HOSTILE = "<script>alert(1)</script>&\"'"
 
 
@@ -78,7 +78,7 @@ class TestPolarPath:
         assert polar(100, 90)[0] < CENTRE[0]
 
     @examples(14)
-    @given(start=ANGLE, rotations=st.lists(TURN, max_size=8))
+    @given(start=ANGLE, rotations=st.lists(ROTATION, max_size=8))
     def test_views_are_at_their_azimuths_and_arcs_connect_them(self, start: float, rotations: list[float]) -> None:
         svg = polar_path(start, [PathStep(r) for r in rotations], scale="azimuth")
         stops, arcs = having(svg, "stop"), having(svg, "step")
@@ -93,7 +93,7 @@ class TestPolarPath:
                 azimuth += rotations[k]
 
     @examples(14)
-    @given(start=ANGLE, rotation=TURN)
+    @given(start=ANGLE, rotation=ROTATION)
     def test_arc_covers_the_whole_rotation_in_its_direction(self, start: float, rotation: float) -> None:
         way = [azimuth_of(*p) for p in points(having(polar_path(start, [PathStep(rotation)], scale=""), "step")[0])]
         swept = sum((b - a + 180) % 360 - 180 for a, b in pairwise(way))

@@ -224,9 +224,9 @@ def is_torque_off(settings: list[str]) -> bool:
 
 
 def until(condition, seconds: float) -> None:
-    give_up_ns = CLOCK.now_ns() + round(seconds * 1e9)
+    deadline_ns = CLOCK.now_ns() + round(seconds * 1e9)
     while not condition():
-        assert CLOCK.now_ns() < give_up_ns
+        assert CLOCK.now_ns() < deadline_ns
         CLOCK.sleep(0.02)
 
 

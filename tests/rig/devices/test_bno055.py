@@ -35,7 +35,7 @@ class Bench:
     def open(self) -> Bno055:
         return Bno055(self.bus.path, clock=self.clock)
 
-    def turn(self, dps: float) -> None:
+    def rotate(self, dps: float) -> None:
         self.world.drive(to_velocity(self.clock.now_ns() * 1e-9, self.world.table_deg(), dps, dps, 1.0))
 
 
@@ -75,7 +75,7 @@ def test_opening_waits_for_the_gyro_calibration() -> None:
 
 
 def test_opening_on_a_moving_table_ends_in_bounded_time(bench: Bench) -> None:
-    bench.turn(20.0)
+    bench.rotate(20.0)
     with closing(bench.open()) as imu:
         assert imu.calibration().gyro == 0
         assert bench.clock.now_ns() < 6.5e9
@@ -125,7 +125,7 @@ def test_samples_sum_to_the_rotation_for_any_reading_pattern(angles: list[float]
 
 def test_saturation_matches_the_stated_range(bench: Bench, imu: Bno055) -> None:
     imu.read_samples()
-    bench.turn(2100.0)
+    bench.rotate(2100.0)
     bench.clock.sleep(0.1)
     imu.read_samples()
     bench.clock.sleep(0.02)

@@ -1,4 +1,4 @@
-"""Every parser of bytes from a device, fed with whatever a line can make of them: no hang, no wrong value for good.
+"""Parsers of bytes from devices, fed with damaged bytes: no hang, and no wrong value that stays.
 
 A packet is taken only when its sum is right; the oracles below look for such packets in the bytes by themselves.
 """

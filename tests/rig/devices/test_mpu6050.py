@@ -55,7 +55,7 @@ class Bench:
             self.imu.close()
         self.bus.close()
 
-    def turn(self, dps: float) -> None:
+    def rotate(self, dps: float) -> None:
         now_ns = self.clock.now_ns()
         self.world.drive(to_velocity(now_ns * 1e-9, self.world.table_deg(), dps, dps, 1.0))
 
@@ -92,7 +92,7 @@ def test_opening_wakes_and_configures_the_sensor(bench: Bench) -> None:
 
 def test_opening_resets_the_sensor(bench: Bench) -> None:
     bench.open(range_dps=2000, rate_hz=1000).close()
-    bench.turn(90.0)
+    bench.rotate(90.0)
     bench.clock.sleep(2.0)
     imu = bench.open()
     assert len(imu.read_samples().time_ns) <= 1
@@ -270,12 +270,12 @@ def test_sensor_that_loses_settings_is_a_fault(bench: Bench, monkeypatch: pytest
 @pytest.mark.parametrize("range_dps", [250, 500, 1000, 2000])
 def test_rates_are_in_degrees_per_second_up_to_the_end_of_all_ranges(bench: Bench, range_dps: int) -> None:
     imu = bench.open(range_dps=range_dps)
-    bench.turn(-123.4)
+    bench.rotate(-123.4)
     bench.clock.sleep(0.3)
     gyro = imu.read_samples().gyro_dps
     assert gyro[-1] == pytest.approx([0, 0, -123.4], abs=range_dps / 32000)
     for sign in (1, -1):
-        bench.turn(sign * 2 * range_dps)
+        bench.rotate(sign * 2 * range_dps)
         bench.clock.sleep(0.3)
         assert abs(imu.read_samples().gyro_dps[-1, 2]) >= imu.range_dps
 
@@ -377,7 +377,7 @@ def test_missing_sensor_raises_device_silent(bench: Bench, fault: str, imu: Mpu6
 
 
 def test_fifo_overflow_is_reported_and_cleared(bench: Bench, imu: Mpu6050) -> None:
-    bench.turn(30.0)
+    bench.rotate(30.0)
     bench.clock.sleep(1.5)
     overflowed = imu.read_samples()
     assert overflowed.time_ns.size == overflowed.gyro_dps.size == 0
@@ -396,7 +396,7 @@ def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
     """Another sample may arrive between the reading of the count and that of the data."""
     with Bench() as bench:
         imu = bench.open()
-        bench.turn(100.0)
+        bench.rotate(100.0)
         imu.read_samples()
         taken = (bench.clock.now_ns() - bench.sensor._epoch_ns) // 5_000_000
         bench.clock.advance_to(bench.sensor._epoch_ns + (taken + frames) * 5_000_000 - early_us * 1000)
@@ -409,7 +409,7 @@ def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
 
 @pytest.mark.parametrize("after_bytes", [2, 6, 12, 100])
 def test_interrupted_transfer_counts_lost_samples(bench: Bench, after_bytes: int, imu: Mpu6050) -> None:
-    bench.turn(10.0)
+    bench.rotate(10.0)
     bench.clock.sleep(0.2)
     bench.bus.cut_read(after_bytes)  # the two bytes of the count still pass
     samples = imu.read_samples()
@@ -424,7 +424,7 @@ def test_interrupted_transfer_counts_lost_samples(bench: Bench, after_bytes: int
 
 @pytest.mark.parametrize("polled_ms", [5, 20, 100, 500])
 def test_power_cycle_is_detected(bench: Bench, polled_ms: int, imu: Mpu6050) -> None:
-    bench.turn(45.0)
+    bench.rotate(45.0)
     bench.clock.sleep(0.1)
     imu.read_samples()
     bench.sensor.power_cycle()

@@ -147,7 +147,7 @@ def test_unplugged_camera_raises_device_silent(world: World) -> None:
 
 
 class Lagging(SimCapture):
-    """Falls behind when told so: its frames keep coming, each hardly younger than the one before."""
+    """A camera that can fall behind: its frames continue, but each is hardly newer than the previous one."""
 
     stuck_at_ms: float | None = None
 

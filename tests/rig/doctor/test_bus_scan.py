@@ -97,7 +97,7 @@ def test_servo_with_a_corrupt_answer_is_asked_again(bench):
 
 def test_port_without_a_baud_rate_has_one_servo():
     class Relay:
-        """A pseudo-terminal: whatever rate it is told, the bytes arrive."""
+        """A pseudo-terminal: the bytes arrive at any configured rate."""
 
         def __init__(self, wire):
             self.wire, self.baudrate = wire, wire.baudrate

@@ -227,7 +227,7 @@ class Bench(RuleBasedStateMachine):
 
     @rule(by_deg=st.floats(-720, 720) | st.sampled_from([-360.0, -180.0, 0.0, 180.0, 360.0]))
     def the_table_is_rotated_by_hand(self, by_deg: float) -> None:
-        """By whole turns to a hair's breadth, with the supply off, is the one thing that no encoder can tell."""
+        """Rotate by almost whole revolutions, with the supply off: no encoder can detect this."""
         table = self.store.state.table
         written_deg = table.position_deg + table.shift_deg - 180.0 if table else 0.0
         rotated_deg = self.shaft.cable_deg + by_deg - written_deg

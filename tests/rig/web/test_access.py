@@ -72,8 +72,8 @@ class LeaseMachine(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         self.clock = VirtualClock()
-        self.told = []
-        self.lease = Lease(self.clock, self.told.append)
+        self.events = []
+        self.lease = Lease(self.clock, self.events.append)
         self.holder, self.until = None, 0.0
 
     people = st.sampled_from(
@@ -93,8 +93,8 @@ class LeaseMachine(RuleBasedStateMachine):
             return
         self.lease.take(person, force=force)
         if self.holder != person:
-            assert self.told[-1]["client"] == person.client
-            assert self.told[-1]["taken_from"] == (self.holder.key if self.holder else None)
+            assert self.events[-1]["client"] == person.client
+            assert self.events[-1]["taken_from"] == (self.holder.key if self.holder else None)
         self.holder, self.until = person, self.clock.now_ns() * 1e-9 + LEASE_S
 
     @rule(person=people)
