@@ -38,7 +38,7 @@ def walk_through() -> str:
         lines.append(f"$ rig {command}")
         done = CliRunner().invoke(app, command.split(), env={"COLUMNS": "200"})
         assert done.exit_code == 0, done.output
-        for line in done.output.splitlines():
+        for line in done.stdout.splitlines():
             if not LEFT_OUT.match(line):
                 lines.append(line)
             elif lines[-1] != "...":

@@ -19,7 +19,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.database import insert_row
 from rig.catalog.places import file_mode, image_file, make_folder_within
 from rig.catalog.queries import check_complete, find
-from rig.catalog.records import JsonObject, Outcome, Provenance, as_json, check_text
+from rig.catalog.records import JsonObject, Outcome, Provenance, as_json
 from rig.catalog.schema import corrections, results
 from rig.catalog.seal import seal_appended
 from rig.core.errors import CatalogError, UsageError
@@ -167,7 +167,6 @@ def clean_text(text: str, what: str) -> str:
     UsageError
         It is empty, too long, or contains characters that cannot be printed.
     """
-    check_text(text, what)
     cleaned = text.strip()
     if not cleaned or len(cleaned) > MAX_TEXT_LENGTH or not cleaned.isprintable():
         problem = (
