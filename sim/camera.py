@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import ceil, cos, radians, sin
+from threading import get_ident
 from typing import Any
 from zlib import crc32
 
@@ -293,7 +294,7 @@ class SimCapture:
         blur = max(abs(controls.focus - _SHARP_AT) * 0.04, self.blur_px)
         if blur > 0.1:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
-        return _sensor(self._noise, self._world.seed, self._binning).expose(
+        return _sensor(self._noise, self._world.seed, self._binning, get_ident()).expose(
             seen,
             light=scene.light,
             exposure=controls.exposure / NOMINAL_EXPOSURE,
@@ -355,8 +356,8 @@ class SimCapture:
 
 
 @lru_cache(maxsize=4)
-def _sensor(noise: NoiseModel, seed: int, binning: int) -> Sensor:
-    """Return the sensor of a world; it is built for the first frame, and the next bench of the same world shares it."""
+def _sensor(noise: NoiseModel, seed: int, binning: int, _thread: int) -> Sensor:
+    """Return the sensor of a world, built for the first frame and shared by all benches of that world in a thread."""
     return Sensor(noise, np.random.default_rng([seed, crc32(b"camera")]), binning)
 
 
