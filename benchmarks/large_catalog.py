@@ -1,28 +1,27 @@
 """Builds a catalog of 1,000 objects with 72 views, with the records of a real bench and tiny images.
 
 python -m benchmarks.large_catalog FOLDER [OBJECTS]
+
+All objects but the first are copies of its records, with descriptors of their own and without images.
 """
 
+import sqlite3
 import sys
-from collections.abc import Iterator
-from datetime import UTC, datetime
+from contextlib import closing
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
-from hbr import Views, descriptor, pack
-from rig.catalog import Catalog, EnrollmentStatus
-from rig.catalog.exchange import ImportBatch, import_objects, plan_import
-from rig.catalog.exchange.batch import BundledDescriptor, Enrollment, ImageSource, Object, Session, View
+from hbr import Views, descriptor
+from hbr.core.arrays import LevelArray
+from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.catalog.seal import seal_enrollments, seal_objects
 from rig.core.clock import SystemClock
-from rig.views import image_files as images
 from rig.views.description import BENCH_DESCRIPTOR
 
 OBJECTS = 1_000
-_NOW = datetime(2026, 1, 1, tzinfo=UTC)
 #: The evidence that a bench stores with a view.
 _EVIDENCE: dict[str, Any] = {
     "settled_ns": 5916728816,
@@ -47,84 +46,93 @@ _EVIDENCE: dict[str, Any] = {
         "still": True,
     },
 }
-_SESSION = Session(
-    started_utc=_NOW,
-    bench="bench-1",
-    software="hbr-rig",
-    devices={"servo": {"model": "xl430_w250", "firmware": 46}, "camera": {"name": "camera 0", "width": 640}},
-    conditions={"view": {"roi": [80, 0, 480, 480]}},
+_PROVENANCE = Provenance(
+    "bench-1",
+    {"servo": {"model": "xl430_w250", "firmware": 46}, "camera": {"name": "camera 0", "width": 640}},
+    {"view": {"roi": [80, 0, 480, 480]}},
 )
 
 
 def build(folder: Path, objects: int = OBJECTS) -> Views:
     """Make the catalog in a new folder, and return the views in it."""
     views = model(objects)
-    with TemporaryDirectory() as aside, Catalog.open(folder, clock=SystemClock()) as catalog:
-        tiny = Path(aside, "tiny.png")
-        tiny.write_bytes(images.encode(np.zeros((8, 8, 3), np.uint8)))
-        made = tuple(_objects(views))
-        sources = {
-            view.image: ImageSource(str(tiny)) for item in made for one in item.enrollments for view in one.views
-        }
-        for _ in import_objects(catalog, plan_import(catalog, ImportBatch("benchmark", made, sources)), jobs=1):
-            pass
+    with Catalog.open(folder, clock=SystemClock()) as catalog:
+        _enroll(catalog, views)
+    with closing(sqlite3.connect(folder / "catalog.sqlite", isolation_level=None)) as connection:
+        _copy(connection, views)
+    with Catalog.open(folder, clock=SystemClock()) as catalog, catalog.database.write() as writing:
+        seal_objects(writing, None)
+        seal_enrollments(writing, None)
     return views
 
 
-def _objects(views: Views) -> Iterator[Object]:
-    settings = {"region": [80, 0, 480, 480]}
+def _enroll(catalog: Catalog, views: Views) -> None:
+    """Enroll the first object."""
     own = descriptor(BENCH_DESCRIPTOR)
-    for j, name in enumerate(views.object_names):
-        rows = views.of(j)
-        rotating = _rotating(own.size_bytes, len(rows), j)
-        azimuths_deg = views.azimuth_deg[rows].tolist()
-        yield Object(
-            name=name,
-            label=f"shelf {j % 20}",
-            created_utc=_NOW,
-            enrollments=(
-                Enrollment(
-                    status=EnrollmentStatus.COMPLETE,
-                    started_utc=_NOW,
-                    finished_utc=_NOW,
-                    planned_azimuth_deg=tuple(azimuths_deg),
-                    sessions=(_SESSION,),
-                    views=tuple(
-                        View(
-                            index=i,
-                            session=0,
-                            azimuth_deg=azimuths_deg[i],
-                            commanded_deg=-5.0 * i,
-                            encoder_deg=-5.0 * i + 0.03,
-                            imu_deg=-5.0 * i + 0.1,
-                            imu_sigma_deg=0.5,
-                            captured_utc=_NOW,
-                            captured_ns=i,
-                            image=f"{j}/{i}",
-                            evidence=_EVIDENCE,
-                            descriptors=(
-                                BundledDescriptor(
-                                    name="cedd", version=1, settings=settings, packed=pack(views.descriptors[row]).hex()
-                                ),
-                                BundledDescriptor(
-                                    name=own.name, version=own.version, settings=settings, packed=rotating[i]
-                                ),
-                            ),
-                        )
-                        for i, row in enumerate(rows.tolist())
-                    ),
-                ),
-            ),
+    levels = own.unpack_rows(_rotating(own.size_bytes, VIEWS_OF_AN_OBJECT, 0).tobytes())
+    azimuths_deg = views.azimuth_deg[:VIEWS_OF_AN_OBJECT].tolist()
+    enrollment = catalog.begin(
+        views.object_names[0], planned_azimuth_deg=azimuths_deg, provenance=_PROVENANCE, label="shelf 0"
+    )
+    for i, azimuth_deg in enumerate(azimuths_deg):
+        view = ViewRecord(
+            index=i,
+            commanded_deg=-5.0 * i,
+            encoder_deg=-5.0 * i + 0.03,
+            imu_deg=-5.0 * i + 0.1,
+            imu_sigma_deg=0.5,
+            azimuth_deg=azimuth_deg,
+            captured_ns=i,
+            evidence=_EVIDENCE,
+            descriptors={"cedd": views.descriptors[i], own.name: levels[i]},
+            region=(80, 0, 480, 480),
         )
+        enrollment.add(view, np.zeros((480, 560, 3), np.uint8))
+    enrollment.finish()
 
 
-def _rotating(size: int, views: int, seed: int) -> list[str]:
-    """Return packed levels of an object's views, as hexadecimal: a third of them changes slowly with the azimuth."""
+def _copy(connection: sqlite3.Connection, views: Views) -> None:
+    """Insert the other objects as copies of the first one's rows."""
+    kinds = descriptor("cedd"), descriptor(BENCH_DESCRIPTOR)
+    tables = ("objects", "enrollments", "sessions", "views")
+    columns = {table: [row[1] for row in connection.execute(f"PRAGMA table_info({table})")] for table in tables}
+    settings = connection.execute("SELECT settings FROM descriptors LIMIT 1").fetchone()[0]
+
+    def copied(table: str, **changes: object) -> int | None:
+        named = [name for name in columns[table] if name not in ("id", "digest")]
+        values = ", ".join("?" if name in changes else name for name in named)
+        where = "enrollment_id" if table == "views" else "id"
+        statement = f"INSERT INTO {table} ({', '.join(named)}) SELECT {values} FROM {table} WHERE {where} = 1"
+        return connection.execute(statement, [changes[name] for name in named if name in changes]).lastrowid
+
+    connection.execute("BEGIN IMMEDIATE")
+    for j, name in list(enumerate(views.object_names))[1:]:
+        number = copied("objects", name=name, label=f"shelf {j % 20}")
+        enrollment = copied("enrollments", object_id=number)
+        copied("views", enrollment_id=enrollment, session_id=copied("sessions", enrollment_id=enrollment))
+        ids = connection.execute("SELECT id FROM views WHERE enrollment_id = ? ORDER BY view_index", (enrollment,))
+        packed = (
+            kinds[0].pack_rows(views.descriptors[views.of(j)]),
+            _rotating(kinds[1].size_bytes, VIEWS_OF_AN_OBJECT, j),
+        )
+        connection.executemany(
+            "INSERT INTO descriptors (view_id, name, version, settings, packed) VALUES (?, ?, ?, ?, ?)",
+            [
+                (view_id, kind.name, kind.version, settings, row.tobytes())
+                for view_id, *rows in zip((row[0] for row in ids.fetchall()), *packed, strict=True)
+                for kind, row in zip(kinds, rows, strict=True)
+            ],
+        )
+    connection.execute("COMMIT")
+
+
+def _rotating(size: int, views: int, seed: int) -> LevelArray:
+    """Return packed levels of an object's views: a third of them changes slowly with the azimuth."""
     rng = np.random.default_rng(seed)
     base, other = rng.integers(0, 256, (2, size), np.uint8)
     begins = np.where(rng.random(size) < 1 / 3, rng.random(size), 2.0)
     share = np.arange(views)[:, None] / views
-    return [row.tobytes().hex() for row in np.where((share - begins) % 1.0 < 0.5 * (begins <= 1), other, base)]
+    return np.where((share - begins) % 1.0 < 0.5 * (begins <= 1), other, base)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from hbr.descriptors.cedd import cedd
 from hbr.descriptors.cedd_packing import pack, unpack, unpack_rows
 from hbr.descriptors.describe import describe
 from hbr.descriptors.tanimoto import tanimoto
-from hbr.model.views import Views
+from hbr.model.views import PackedViews, Views
 from hbr.paper.hough import Extension, Ranking, retrieve
 from hbr.paper.index import ViewIndex
 from hbr.paper.margin import score_margin
@@ -41,6 +41,7 @@ __all__ = [
     "LeaveOneOut",
     "NextBestView",
     "Outcome",
+    "PackedViews",
     "Ranking",
     "Segmentation",
     "Side",

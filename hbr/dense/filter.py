@@ -12,6 +12,7 @@ The power p gives a query near an enrolled view more weight than one between two
 Decision: docs/decisions/0025.
 """
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import lengths, ranges
-from hbr.descriptors import descriptor
+from hbr.descriptors import Packed, descriptor
 from hbr.kernels import calls
 from hbr.model.views import Views
 
@@ -39,6 +40,8 @@ _POSE_SHARPNESS: Final = 60.0
 #: An azimuth leans to what lies so many degrees aside at most, and where the support falls by so much at least.
 _FARTHEST_LEAN_DEG: Final = 90.0
 _LEAST_FALL: Final = 1e-6
+#: How much the sum of a float32 can be too small.
+_ROUNDING: Final = 1e-6
 #: Degrees that no azimuth reaches.
 _FAR_DEG: Final = 2000.0
 
@@ -69,10 +72,13 @@ class DenseIndex:
         self.omega = omega
         self.power = power
         self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
-        self.compared = descriptor(views.descriptor).prepared(views.descriptors)
+        self.compared = views.prepared()
         order, begin = views.of_each(self.object_index)
         count = lengths(begin, len(order))
-        order = order[np.lexsort((views.azimuth_deg[order], np.repeat(np.arange(len(count)), count)))]
+        rising = np.diff(views.azimuth_deg[order], prepend=0) >= 0
+        rising[begin] = True
+        if not rising.all():
+            order = order[np.lexsort((views.azimuth_deg[order], np.repeat(np.arange(len(count)), count)))]
         self._set_segments(order, begin, count)
 
     def __len__(self) -> int:
@@ -81,41 +87,45 @@ class DenseIndex:
     def without(self, views: IndexArray) -> "DenseIndex":
         """Return an index that leaves out some views; each object must keep at least one."""
         fewer = copy(self)
-        kept = ~np.isin(self._order, views)
-        count = np.add.reduceat(kept, self._begin)
+        kept = ~np.isin(self._segments.order, views)
+        count = np.add.reduceat(kept, self._segments.begin)
         if not count.all():
             raise ValueError("an object would be left without any view; leave out fewer")
-        fewer._set_segments(self._order[kept], np.cumsum(count) - count, count)
+        fewer._set_segments(self._segments.order[kept], np.cumsum(count) - count, count)
         return fewer
 
     def only(self, places: IndexArray) -> "DenseIndex":
         """Return an index of some objects alone, whose later steps do not look at the others."""
         fewer = copy(self)
-        own, begin = ranges(self._begin[places], self._count[places])
-        rows = np.sort(self._order[own])
+        own, begin = ranges(self._segments.begin[places], self._segments.lengths[places])
+        order = self._segments.order[own]
+        rows = order if (np.diff(order) > 0).all() else np.sort(order)
         fewer.views = self.views.select(rows)
         fewer.compared = self.compared.only(rows)
         fewer.object_index = self.object_index[places]
-        fewer._set_segments(np.searchsorted(rows, self._order[own]), begin, self._count[places])
+        order = np.arange(len(rows)) if rows is order else np.searchsorted(rows, order)
+        fewer._set_segments(order, begin, self._segments.lengths[places])
         return fewer
 
     def _set_segments(self, order: IndexArray, begin: IndexArray, count: IndexArray) -> None:
         """Set the views of each object: ``count`` of the rows ``order`` from ``begin`` on, by rising azimuth."""
-        self._order, self._begin, self._count = order, begin, count
+        self._segments = calls.Segments(order, begin, count, bool((np.diff(order, prepend=-1) == 1).all()))
         for name in ("rows", "left_out", "azimuth_deg", "spacing_deg", "_ring"):
             self.__dict__.pop(name, None)  # those of the index that this one was copied from
 
     @cached_property
     def rows(self) -> IndexArray:
         """Rows of each object's views by rising azimuth, padded by the first of them."""
-        columns = np.arange(self._count.max())
-        rows: IndexArray = self._order[self._begin[:, None] + np.where(columns < self._count[:, None], columns, 0)]
+        columns = np.arange(self._segments.lengths.max())
+        rows: IndexArray = self._segments.order[
+            self._segments.begin[:, None] + np.where(columns < self._segments.lengths[:, None], columns, 0)
+        ]
         return rows
 
     @cached_property
     def left_out(self) -> NDArray[np.bool_]:
         """Where `rows` is padding."""
-        padding: NDArray[np.bool_] = np.arange(self._count.max()) >= self._count[:, None]
+        padding: NDArray[np.bool_] = np.arange(self._segments.lengths.max()) >= self._segments.lengths[:, None]
         return padding
 
     @cached_property
@@ -127,16 +137,34 @@ class DenseIndex:
     def spacing_deg(self) -> FloatArray:
         """The usual step between neighbouring views of each object; 360 of a single one."""
         spacing_deg = np.empty(len(self))
-        for count in np.unique(self._count).tolist():  # of objects with as many views
-            ring_deg = self.azimuth_deg[self._count == count, :count]
+        for count in np.unique(self._segments.lengths).tolist():  # of objects with as many views
+            ring_deg = self.azimuth_deg[self._segments.lengths == count, :count]
             steps_deg = np.diff(ring_deg, axis=1, append=ring_deg[:, :1] + 360)
-            spacing_deg[self._count == count] = np.median(steps_deg, axis=1)
+            spacing_deg[self._segments.lengths == count] = np.median(steps_deg, axis=1)
         return spacing_deg
 
-    def best(self, similar: FloatArray) -> FloatArray:
-        """Return the largest similarity of each object's views, (k,), of those of all views, (n,)."""
-        best: FloatArray = np.maximum.reduceat(similar[self._order], self._begin)
+    @cached_property
+    def length(self) -> int:
+        """Number of levels of a view."""
+        return descriptor(self.views.descriptor).length
+
+    def best(self, query: LevelArray) -> FloatArray:
+        """Return the largest similarity of each object's views to a query, (k,)."""
+        similar = self.compared.similarity(query[None])[0]
+        best: FloatArray = np.maximum.reduceat(similar[self._segments.order], self._segments.begin)
         return best
+
+    def bounds(self, query: LevelArray) -> FloatArray:
+        """Return a bound of the support that a query adds to each object at any azimuth, (k,)."""
+        compared = self.compared
+        most = compared.bounds(query, self._segments) if isinstance(compared, Packed) else self.best(query)
+        return self._raised(most).astype(np.float64)
+
+    def nearest(self, query: LevelArray, kept: int) -> IndexArray:
+        """Return the objects with the most similar views, ascending places (kept,); of equal ones, the first."""
+        if isinstance(self.compared, Packed):
+            return self.compared.nearest(query, self._segments, kept)
+        return np.sort(np.argsort(-self.best(query), kind="stable")[:kept])
 
     @cached_property
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:
@@ -151,7 +179,7 @@ class DenseIndex:
         ring_deg = np.take_along_axis(unrolled_deg, places, axis=1)
         with np.errstate(invalid="ignore"):  # padding stands at infinity, behind all views
             middle_deg = (ring_deg[:, 1:] + ring_deg[:, :-1]) / 2
-        own = np.arange(places.shape[1]) < 2 * self._count[:, None]
+        own = np.arange(places.shape[1]) < 2 * self._segments.lengths[:, None]
         # the view at each place of the two turns; behind them one beyond all
         ring = np.where(own, np.take_along_axis(self.rows, places % self.rows.shape[1], axis=1), len(self.views))
         # where the arc of each view ends and the next one's begins; far away behind the last
@@ -178,9 +206,7 @@ class DenseIndex:
         levels = self._raised(similar)
         slope = self.omega / 360
         azimuth_deg = self.views.azimuth_deg
-        compiled = calls.support(
-            self._order, self._begin, self._count, azimuth_deg, levels, slope, part_deg, int(whole)
-        )
+        compiled = calls.support(self._segments, azimuth_deg, levels, slope, part_deg, int(whole))
         if compiled is not None:
             return compiled
         ring, keys, penalty = self._ring
@@ -320,7 +346,7 @@ def update_belief(
     """
     index = so_far.index if isinstance(so_far, Belief) else so_far
     query = np.asarray(query)
-    length = index.views.descriptors.shape[1]
+    length = index.length
     if query.dtype != np.uint8 or query.shape != (length,):
         raise ValueError(
             f"the query is {query.dtype} of shape {query.shape}; {index.views.descriptor} has uint8 of ({length},)"
@@ -329,15 +355,45 @@ def update_belief(
         raise ValueError(f"orientation_deg is {orientation_deg}; a finite angle is needed")
     if kept < 1:
         raise ValueError(f"kept is {kept}; at least 1 object is needed")
-    similar = index.compared.similarity(query[None])[0]
     if isinstance(so_far, Belief):
+        similar = index.compared.similarity(query[None])[0]
         rotated_deg = float(wrap180(orientation_deg - so_far.orientation_deg[0]))
         support = so_far.support + index.support(similar, rotated_deg)
         return Belief(index, support, np.append(so_far.orientation_deg, orientation_deg))
     if len(index) > kept:
-        index = index.only(np.sort(np.argsort(-index.best(similar), kind="stable")[:kept]))
-        similar = index.compared.similarity(query[None])[0]
+        index = index.only(index.nearest(query, kept))
+    similar = index.compared.similarity(query[None])[0]
     return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64))
+
+
+def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) -> Belief:
+    """Return a belief with all objects that can lead it or be second, as if they had been considered from the start.
+
+    The support of an object is at most the sum of the largest similarities of its views. Objects that were left out
+    after the first query, and whose sum reaches the support of the second object considered, are added.
+
+    Parameters
+    ----------
+    belief : Belief
+        Of some objects of the index.
+    index : DenseIndex
+        With all objects.
+    queries : sequence of uint8 arrays (length,)
+        The queries of the belief.
+    """
+    kept = np.searchsorted(index.object_index, belief.index.object_index)
+    best = belief.support.max(axis=1)
+    second = float(np.partition(best, -2)[-2]) if len(best) > 1 else -np.inf
+    bounds = np.sum([index.bounds(query) for query in queries], axis=0)
+    bounds[kept] = np.inf
+    places = np.flatnonzero(bounds >= second - _ROUNDING * len(queries))
+    if len(places) == len(kept):
+        return belief
+    more: DenseIndex | Belief = index.only(places)
+    for query, orientation_deg in zip(queries, belief.orientation_deg.tolist(), strict=True):
+        more = update_belief(query, orientation_deg, more, kept=len(places))
+    assert isinstance(more, Belief)
+    return more
 
 
 def _between(support: FloatArray, bins: FloatArray) -> FloatArray:

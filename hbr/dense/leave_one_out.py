@@ -1,5 +1,6 @@
 """Searches for every enrolled object with its own views: the sample from which a stopping rule is fitted."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -93,7 +94,13 @@ class LeaveOneOut:
 
 
 def leave_one_out(
-    index: DenseIndex, *, beta: float = BETA, views: int = 4, seen: LevelArray | None = None, searches: int = 4
+    index: DenseIndex,
+    *,
+    beta: float = BETA,
+    views: int = 4,
+    seen: LevelArray | None = None,
+    searches: int = 4,
+    progress: Callable[[int, int], object] | None = None,
 ) -> LeaveOneOut:
     """Search for every object with its own enrolled views, 90° apart, as if the camera had stood beside them.
 
@@ -114,6 +121,8 @@ def leave_one_out(
         and blur. The enrolled views themselves by default.
     searches : int
         Searches for each object; their first views are spread around it.
+    progress : callable, optional
+        Called before each object with the number of objects done, and of all.
 
     Raises
     ------
@@ -122,21 +131,26 @@ def leave_one_out(
     """
     if len(index) < 2:
         raise ValueError(f"{len(index)} object; leave-one-out searches need at least two")
-    levels = index.views.descriptors if seen is None else seen
-    if levels.shape != index.views.descriptors.shape:
-        raise ValueError(f"seen has shape {levels.shape}; the catalog's views have {index.views.descriptors.shape}")
+    shape = len(index.views), index.length
+    if seen is not None and seen.shape != shape:
+        raise ValueError(f"seen has shape {seen.shape}; the catalog's views have {shape}")
     searched, known, unknown, confidence, correct = [], [], [], [], []
     aside = 0.0
     for place, object_index in enumerate(index.object_index.tolist()):
+        if progress is not None:
+            progress(place, len(index))
         rows = index.views.of(object_index)
         if len(rows) < max(views, 2):
             continue
         rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
         azimuth_deg = index.views.azimuth_deg[rows]
-        similar = index.compared.similarity(levels[rows])
+        starts = np.unique(np.arange(searches) * len(rows) // searches).tolist()
+        spread = [_spread(azimuth_deg, start, views) for start in starts]
+        used = np.unique(spread)
+        levels = index.views.levels(rows[used]) if seen is None else seen[rows[used]]
+        similar = dict(zip(used.tolist(), index.compared.similarity(levels), strict=True))
         others = np.delete(index.object_index, place)
-        for start in np.unique(np.arange(searches) * len(rows) // searches).tolist():
-            chosen = _spread(azimuth_deg, start, views)
+        for start, chosen in zip(starts, spread, strict=True):
             searched.append(object_index)
             support = np.zeros((len(index), BINS), np.float32)
             for n, i in enumerate(chosen):
@@ -154,14 +168,14 @@ def leave_one_out(
                 correct.append(probability.argmax() == place)
     if not known:
         raise ValueError(f"no object has {max(views, 2)} views; enroll more of each, or search with fewer views")
-    shape = -1, views
+    each = -1, views
     return LeaveOneOut(
         len(index.views.object_names),
         np.array(searched),
-        Leaders.of(known, shape),
-        Leaders.of(unknown, shape),
-        np.reshape(confidence, shape),
-        np.reshape(correct, shape),
+        Leaders.of(known, each),
+        Leaders.of(unknown, each),
+        np.reshape(confidence, each),
+        np.reshape(correct, each),
         beta,
     )
 

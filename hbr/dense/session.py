@@ -5,7 +5,7 @@ from typing import Final
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import LevelArray
-from hbr.dense.filter import KEPT, Belief, DenseIndex, update_belief
+from hbr.dense.filter import KEPT, Belief, DenseIndex, completed, update_belief
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
 
@@ -40,12 +40,17 @@ class DenseSession:
         self.max_views = max_views
         # Taking out a part of the views costs more than it saves if a search ends after one or two views.
         self._kept = KEPT if len(index) > _WORTH_REDUCING * KEPT else len(index)
+        self._index = index
         self._so_far: DenseIndex | Belief = index
+        self._queries: list[LevelArray] = []
 
     def add(self, levels: LevelArray, orientation_deg: float) -> StopDecision:
         """Add the next view, as for `update_belief`, and return the rule's decision."""
         self._so_far = self.belief = update_belief(levels, orientation_deg, self._so_far, kept=self._kept)
+        self._queries.append(levels)
         self.decision = self.rule.decide(self.belief, max_views=self.max_views)
+        if self.decision.outcome is not Outcome.CONTINUE:
+            self._complete()
         return self.decision
 
     def next_best_view(self, rotations_deg: ArrayLike | None = None, seconds: ArrayLike | None = None) -> NextBestView:
@@ -55,5 +60,15 @@ class DenseSession:
     def end(self) -> StopDecision:
         """Return the decision with which the search ends here, even if the rule would continue."""
         if self.decision.outcome is Outcome.CONTINUE:
+            self._complete()
             return self.rule.decide(self.belief, max_views=self.belief.queries)
         return self.decision
+
+    def _complete(self) -> None:
+        """Before an end: decide again if an object that was left out after the first view can be first or second."""
+        if len(self.belief.index) == len(self._index):
+            return
+        found = completed(self.belief, self._index, self._queries)
+        if found is not self.belief:
+            self._so_far = self.belief = found
+            self.decision = self.rule.decide(found, max_views=self.max_views)

@@ -6,6 +6,7 @@
 Decision: docs/decisions/0026.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import ceil, floor, inf, nan
@@ -307,6 +308,7 @@ def calibrate_stopping_rule(
     false_reject: float = 0.02,
     most_searches: int = MOST_SEARCHES,
     sample: int | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> CalibratedRule:
     """Search for the enrolled objects among each other, and return the rule that follows.
 
@@ -320,8 +322,10 @@ def calibrate_stopping_rule(
         Searches in all, from different first views; each object is searched for at least once.
     sample
         Search only for so many objects, among each other.
+    progress
+        As for `leave_one_out`.
     """
-    searches = calibration_searches(index, most_searches=most_searches, sample=sample)
+    searches = calibration_searches(index, most_searches=most_searches, sample=sample, progress=progress)
     if searches is None:
         return CalibratedRule(_rule_without_candidates(index, error_rate, false_reject))
     objects = len(index) if sample is None else min(len(index), max(2, sample))
@@ -345,7 +349,11 @@ def calibrate_stopping_rule(
 
 
 def calibration_searches(
-    index: DenseIndex, *, most_searches: int = MOST_SEARCHES, sample: int | None = None
+    index: DenseIndex,
+    *,
+    most_searches: int = MOST_SEARCHES,
+    sample: int | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> LeaveOneOut | None:
     """Return the leave-one-out searches of a calibration; None if objects cannot be compared with each other."""
     usual_views = int(np.median((~index.left_out).sum(axis=1)))
@@ -358,6 +366,7 @@ def calibration_searches(
         index.only(places),
         views=min(CALIBRATED_VIEWS, usual_views),
         searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
+        progress=progress,
     )
 
 

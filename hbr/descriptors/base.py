@@ -7,7 +7,7 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.kernels import library
-from hbr.kernels.calls import Measure, PackedRows
+from hbr.kernels.calls import Measure, PackedRows, Segments
 from hbr.segmentation import Segmentation
 
 
@@ -233,6 +233,14 @@ class Packed:
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
         return self._rows.similarity(self._kind.pack_rows(queries))
+
+    def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:
+        """Return what the similarity of each object's views to a query cannot exceed, (k,)."""
+        return self._rows.bounds(self._kind.pack_rows(query[None])[0], segments)
+
+    def nearest(self, query: LevelArray, segments: Segments, kept: int) -> IndexArray:
+        """Return the objects with the most similar views, ascending (kept,); of equal ones, the first."""
+        return self._rows.nearest(self._kind.pack_rows(query[None])[0], segments, kept)
 
     def only(self, rows: IndexArray, /) -> "Packed":
         return Packed(self._kind, self._rows.only(rows))

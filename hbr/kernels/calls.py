@@ -96,6 +96,26 @@ class Measure(NamedTuple):
         return _Measure(*self[:4], *(address(array) for array in self[4:]))
 
 
+class _Segments(ctypes.Structure):
+    _fields_ = (
+        ("places", ctypes.c_void_p),
+        ("order", ctypes.c_void_p),
+        ("begin", ctypes.c_void_p),
+        ("count", ctypes.c_void_p),
+        ("objects", ctypes.c_int64),
+    )
+
+
+class Segments(NamedTuple):
+    """The rows of each object, one object after the other: ``lengths`` of ``order`` from ``begin`` on; int64 arrays."""
+
+    order: IndexArray
+    begin: IndexArray
+    lengths: IndexArray
+    is_whole: bool = False
+    """Whether ``order`` is 0, 1, 2, ..."""
+
+
 class PackedRows:
     """Packed rows, prepared for the kernels.
 
@@ -150,6 +170,37 @@ class PackedRows:
         )
         return similar
 
+    def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:
+        """Return what the similarity of each object's rows to a packed query cannot exceed, (k,)."""
+        bounds = np.empty(len(segments.lengths))
+        struct = self._segments(segments)
+        self._library.hbr_bounds(
+            self._by_address,
+            address(query),
+            *self._at,
+            address(self.squares),
+            ctypes.addressof(struct),
+            address(bounds),
+        )
+        return bounds
+
+    def nearest(self, query: LevelArray, segments: Segments, kept: int) -> IndexArray:
+        """Return the objects with the most similar views, ascending (kept,); of equal ones, the first."""
+        bounds = self.bounds(query, segments)
+        by_bound = np.argsort(-bounds).astype(np.int64, copy=False)
+        nearest, similar = np.empty(kept, np.int64), np.empty(kept)
+        struct = self._segments(segments)
+        self._library.hbr_nearest(
+            self._by_address, address(query), *self._at, address(self.squares), ctypes.addressof(struct),
+            address(by_bound), address(bounds), kept, address(nearest), address(similar),
+        )  # fmt: skip
+        return np.sort(nearest)
+
+    def _segments(self, segments: Segments) -> ctypes.Structure:
+        places = 0 if self._places is None else address(self._places)
+        order = 0 if segments.is_whole else address(segments.order)
+        return _Segments(places, order, address(segments.begin), address(segments.lengths), len(segments.lengths))
+
     def only(self, rows: IndexArray) -> "PackedRows":
         """Return some of the rows, in this order; nothing is copied."""
         places = np.ascontiguousarray(rows if self._places is None else self._places[rows], np.int64)
@@ -157,9 +208,7 @@ class PackedRows:
 
 
 def support(
-    rows: IndexArray,
-    begin: IndexArray,
-    count: IndexArray,
+    segments: Segments,
     azimuth_deg: FloatArray,
     levels: NDArray[np.float32],
     slope: float,
@@ -170,11 +219,11 @@ def support(
     found = library()
     if found is None:
         return None
-    room = 2 * int(count.max())
+    room = 2 * int(segments.lengths.max())
     scratch = np.empty(3 * room + 1)
-    added = np.empty((len(count), 72), np.float32)
+    added = np.empty((len(segments.lengths), 72), np.float32)
     found.hbr_support(
-        address(rows), address(begin), address(count), len(count), address(azimuth_deg), address(levels),
+        *map(address, segments[:3]), len(segments.lengths), address(azimuth_deg), address(levels),
         slope, part_deg, whole, address(scratch), room, address(added),
     )  # fmt: skip
     return added

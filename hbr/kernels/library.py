@@ -23,6 +23,8 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
         *[_POINTER] * 2, _INTEGER, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _POINTER,
     ),
     "hbr_among": (_POINTER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),
+    "hbr_bounds": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 3),
+    "hbr_nearest": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 4, _INTEGER, _POINTER, _POINTER),
     "hbr_support": (
         *[_POINTER] * 3, _INTEGER, _POINTER, _POINTER, _REAL, _REAL, _INTEGER, _POINTER, _INTEGER, _POINTER,
     ),

@@ -8,6 +8,7 @@
 #define EDGE_BYTES 128
 #define EDGE_LEVELS (4 * EDGE_BYTES)
 #define COLOUR_BYTES 32
+#define COARSE 59 /* the largest value is 63 of this unit; rounding up adds 0.5 % at most to the values that matter */
 #define CHUNK 128 /* rows whose intermediate results stay in the cache */
 
 /* How packed rows are compared. */
@@ -24,6 +25,7 @@ struct query {
     int16_t edges[EDGE_LEVELS] __attribute__((aligned(32))); /* values, in the order in which a row is read */
     int16_t colours[COLOUR_BYTES] __attribute__((aligned(32)));
     int16_t weights[COLOUR_BYTES] __attribute__((aligned(32)));
+    int8_t coarse[EDGE_LEVELS] __attribute__((aligned(32))); /* values in units of COARSE, rounded up */
     double square;
 };
 
@@ -31,6 +33,7 @@ struct query {
 struct loops {
     void (*expand)(const int32_t v[4], const uint8_t *edges, int16_t *values); /* of a query, in the order of a row */
     void (*edges)(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots);
+    void (*edge_bounds)(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots);
     void (*colours)(const struct query *q, const uint8_t *const *rows, int64_t count, int32_t *distances);
 };
 
@@ -74,7 +77,7 @@ static void colours_plain(const struct query *q, const uint8_t *const *rows, int
     }
 }
 
-static const struct loops PLAIN = {expand_plain, edges_plain, colours_plain};
+static const struct loops PLAIN = {expand_plain, edges_plain, edges_plain, colours_plain};
 
 #if defined(__x86_64__)
 #define AVX2 __attribute__((target("avx2")))
@@ -136,6 +139,41 @@ AVX2 static void edges_avx2(const struct query *q, const uint8_t *const *rows, i
     }
 }
 
+AVX2 static inline __m256i coarse_of_halves(const int32_t v[4], int second) {
+    uint8_t table[32];
+    for (int i = 0; i < 32; i++) table[i] = (uint8_t)((v[second ? i & 3 : i >> 2 & 3] + COARSE - 1) / COARSE);
+    return _mm256_loadu_si256((const __m256i *)table);
+}
+
+/* Store bounds of the products, from above. */
+AVX2 static void edge_bounds_avx2(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots) {
+    const int32_t *v = q->measure->edge_values;
+    const __m256i half = _mm256_set1_epi8(15), ones = _mm256_set1_epi16(1);
+    const __m256i coarse[2] = {coarse_of_halves(v, 0), coarse_of_halves(v, 1)};
+    for (int64_t k = 0; k < count; k++) {
+        const __m256i *row = (const __m256i *)(rows[k] + q->measure->edges_at), *own = (const __m256i *)q->coarse;
+        for (int line = 0; line < 3; line++) /* rows mostly follow each other */
+            _mm_prefetch((const char *)(row) + 2560 + 64 * line, _MM_HINT_T0);
+        __m256i sums = _mm256_setzero_si256();
+#pragma GCC unroll 4
+        for (int vector = 0; vector < EDGE_BYTES / 32; vector++, own += 4) {
+            const __m256i packed = _mm256_loadu_si256(row + vector);
+            const __m256i first = _mm256_and_si256(_mm256_srli_epi16(packed, 4), half);
+            const __m256i last = _mm256_and_si256(packed, half);
+            /* eight products of 63 and 63 are below 2^15 */
+            const __m256i a = _mm256_add_epi16(_mm256_maddubs_epi16(_mm256_shuffle_epi8(coarse[0], first), own[0]),
+                                               _mm256_maddubs_epi16(_mm256_shuffle_epi8(coarse[1], first), own[1]));
+            const __m256i b = _mm256_add_epi16(_mm256_maddubs_epi16(_mm256_shuffle_epi8(coarse[0], last), own[2]),
+                                               _mm256_maddubs_epi16(_mm256_shuffle_epi8(coarse[1], last), own[3]));
+            sums = _mm256_add_epi32(sums, _mm256_madd_epi16(_mm256_add_epi16(a, b), ones));
+        }
+        __m128i four = _mm_add_epi32(_mm256_castsi256_si128(sums), _mm256_extracti128_si256(sums, 1));
+        four = _mm_add_epi32(four, _mm_shuffle_epi32(four, 0x4E));
+        four = _mm_add_epi32(four, _mm_shuffle_epi32(four, 0xB1));
+        dots[k] = (double)((int64_t)_mm_cvtsi128_si32(four) * (COARSE * COARSE));
+    }
+}
+
 AVX2 static void colours_avx2(const struct query *q, const uint8_t *const *rows, int64_t count, int32_t *distances) {
     const __m256i *own = (const __m256i *)q->colours, *weights = (const __m256i *)q->weights;
     for (int64_t k = 0; k < count; k++) {
@@ -151,7 +189,7 @@ AVX2 static void colours_avx2(const struct query *q, const uint8_t *const *rows,
     }
 }
 
-static const struct loops WITH_AVX2 = {expand_avx2, edges_avx2, colours_avx2};
+static const struct loops WITH_AVX2 = {expand_avx2, edges_avx2, edge_bounds_avx2, colours_avx2};
 #endif
 
 static const struct loops *fastest(void) {
@@ -170,7 +208,16 @@ static double square_of(const int16_t *values) {
 
 static void begin_query(struct query *q, const struct measure *m, const uint8_t *packed, const struct loops *loops) {
     q->measure = m;
-    if (m->edges_at >= 0) loops->expand(m->edge_values, packed + m->edges_at, q->edges);
+    if (m->edges_at >= 0) {
+        const uint8_t *edges = packed + m->edges_at;
+        loops->expand(m->edge_values, edges, q->edges);
+        for (int vector = 0; vector < EDGE_BYTES / 32; vector++)
+            for (int field = 0; field < 4; field++)
+                for (int i = 0; i < 32; i++) {
+                    const int32_t value = m->edge_values[edges[32 * vector + i] >> (6 - 2 * field) & 3];
+                    q->coarse[(4 * vector + field) * 32 + i] = (int8_t)((value + COARSE - 1) / COARSE);
+                }
+    }
     if (m->colours_at >= 0)
         for (int i = 0; i < COLOUR_BYTES; i++) {
             q->colours[i] = packed[m->colours_at + i];
@@ -178,15 +225,15 @@ static void begin_query(struct query *q, const struct measure *m, const uint8_t 
         }
 }
 
-/* Store the similarity of a query to at most CHUNK rows. */
+/* Store the similarity of a query to at most CHUNK rows, or bounds of it, from above. */
 FOR_EVERY_PROCESSOR
-static void compare(const struct query *q, const struct loops *loops, const uint8_t *const *rows, const double *squares,
-                    int64_t count, double *similar) {
+static void compare(const struct query *q, const struct loops *loops, int bounds, const uint8_t *const *rows,
+                    const double *squares, int64_t count, double *similar) {
     const struct measure *m = q->measure;
     double dots[CHUNK];
     int32_t distances[CHUNK];
     if (m->edges_at >= 0) {
-        loops->edges(q, rows, count, dots);
+        (bounds ? loops->edge_bounds : loops->edges)(q, rows, count, dots);
         for (int64_t i = 0; i < count; i++) {
             const double cosine = dots[i] / __builtin_sqrt(q->square * squares[i]);
             similar[i] = cosine < 1 ? cosine : 1;
@@ -204,11 +251,19 @@ static void compare(const struct query *q, const struct loops *loops, const uint
 
 /* Store the squared length of the edges of packed rows, which are `stride` bytes apart. */
 EXPORT void hbr_squares(const struct measure *m, const uint8_t *rows, int64_t stride, int64_t count, double *squares) {
-    const struct loops *loops = fastest();
-    struct query q;
+    int64_t of_byte[256]; /* of its four levels */
+    for (int byte = 0; byte < 256; byte++) {
+        of_byte[byte] = 0;
+        for (int shift = 0; shift < 8; shift += 2) {
+            const int64_t value = m->edge_values[byte >> shift & 3];
+            of_byte[byte] += value * value;
+        }
+    }
     for (int64_t i = 0; i < count; i++) {
-        begin_query(&q, m, rows + i * stride, loops);
-        squares[i] = square_of(q.edges);
+        const uint8_t *edges = rows + i * stride + m->edges_at;
+        int64_t total = 0;
+        for (int k = 0; k < EDGE_BYTES; k++) total += of_byte[edges[k]];
+        squares[i] = (double)total;
     }
 }
 
@@ -231,7 +286,7 @@ EXPORT void hbr_similarity(const struct measure *m, const uint8_t *queries, int6
                 chosen[i] = rows + place * stride;
                 lengths[i] = squares[place];
             }
-            compare(&q, loops, chosen, lengths, some, similar + first);
+            compare(&q, loops, 0, chosen, lengths, some, similar + first);
         }
     }
 }
@@ -247,8 +302,108 @@ EXPORT void hbr_among(const struct measure *m, const uint8_t *rows, int64_t stri
             q.square = squares[places[a]];
             for (int64_t b = a; b < size; b++) {
                 const uint8_t *other = rows + places[b] * stride;
-                compare(&q, loops, &other, squares + places[b], 1, similar + a * size + b);
+                compare(&q, loops, 0, &other, squares + places[b], 1, similar + a * size + b);
                 similar[b * size + a] = similar[a * size + b];
             }
         }
+}
+
+/* The views of each object: `count` of the rows at `places[order]` from `begin` on; either may be null, for all. */
+struct segments {
+    const int64_t *places, *order, *begin, *count;
+    int64_t objects;
+};
+
+static inline int64_t place_of(const struct segments *s, int64_t i) {
+    const int64_t at = s->order ? s->order[i] : i;
+    return s->places ? s->places[at] : at;
+}
+
+/* Store the bounds of the similarities of an object's rows from `first` on, at most CHUNK, and return how many. */
+static int64_t bounds_of_rows(const struct query *q, const struct loops *loops, const uint8_t *rows, int64_t stride,
+                              const double *squares, const struct segments *s, int64_t object, int64_t first,
+                              double *bounds) {
+    const uint8_t *chosen[CHUNK];
+    double lengths[CHUNK];
+    const int64_t left = s->count[object] - first, some = left < CHUNK ? left : CHUNK;
+    for (int64_t i = 0; i < some; i++) {
+        const int64_t place = place_of(s, s->begin[object] + first + i);
+        chosen[i] = rows + place * stride;
+        lengths[i] = squares[place];
+    }
+    compare(q, loops, 1, chosen, lengths, some, bounds);
+    return some;
+}
+
+/* Store what the similarity of each object's rows cannot exceed. */
+EXPORT void hbr_bounds(const struct measure *m, const uint8_t *query, const uint8_t *rows, int64_t stride,
+                       const double *squares, const struct segments *s, double *bounds) {
+    const struct loops *loops = fastest();
+    struct query q;
+    double of_rows[CHUNK];
+    begin_query(&q, m, query, loops);
+    q.square = square_of(q.edges);
+    for (int64_t j = 0; j < s->objects; j++) {
+        double most = -1;
+        for (int64_t first = 0; first < s->count[j];) {
+            const int64_t some = bounds_of_rows(&q, loops, rows, stride, squares, s, j, first, of_rows);
+            for (int64_t i = 0; i < some; i++) most = of_rows[i] > most ? of_rows[i] : most;
+            first += some;
+        }
+        bounds[j] = most;
+    }
+}
+
+/* Whether an object is further away than another: less similar, or as similar and later. */
+static inline int further(double a, int64_t object_a, double b, int64_t object_b) {
+    return a < b || (a == b && object_a > object_b);
+}
+
+/* Store the `kept` objects with the most similar views, of equal ones the first, in any order, and their similarities.
+   `by_bound` has the objects by falling bound; `bounds` are those of `hbr_bounds`. */
+EXPORT void hbr_nearest(const struct measure *m, const uint8_t *query, const uint8_t *rows, int64_t stride,
+                        const double *squares, const struct segments *s, const int64_t *by_bound,
+                        const double *bounds, int64_t kept, int64_t *nearest, double *similar) {
+    const struct loops *loops = fastest();
+    struct query q;
+    begin_query(&q, m, query, loops);
+    q.square = square_of(q.edges);
+    int64_t found = 0; /* a heap: the furthest object first */
+    for (int64_t k = 0; k < s->objects; k++) {
+        const int64_t object = by_bound[k];
+        if (found == kept && bounds[object] < similar[0]) break;
+        double best = -1, of_rows[CHUNK];
+        for (int64_t first = 0; first < s->count[object];) {
+            const int64_t some = bounds_of_rows(&q, loops, rows, stride, squares, s, object, first, of_rows);
+            for (int64_t i = 0; i < some; i++) {
+                if (of_rows[i] < best || (found == kept && of_rows[i] < similar[0])) continue;
+                const int64_t place = place_of(s, s->begin[object] + first + i);
+                const uint8_t *row = rows + place * stride;
+                double exact;
+                compare(&q, loops, 0, &row, squares + place, 1, &exact);
+                best = exact > best ? exact : best;
+            }
+            first += some;
+        }
+        if (found == kept && !further(similar[0], nearest[0], best, object)) continue;
+        int64_t hole; /* sift the new object in */
+        if (found < kept) {
+            for (hole = found++; hole && further(best, object, similar[(hole - 1) / 2], nearest[(hole - 1) / 2]);
+                 hole = (hole - 1) / 2) {
+                similar[hole] = similar[(hole - 1) / 2];
+                nearest[hole] = nearest[(hole - 1) / 2];
+            }
+        } else {
+            hole = 0;
+            for (int64_t child; (child = 2 * hole + 1) < kept; hole = child) {
+                if (child + 1 < kept && further(similar[child + 1], nearest[child + 1], similar[child], nearest[child]))
+                    child++;
+                if (!further(similar[child], nearest[child], best, object)) break;
+                similar[hole] = similar[child];
+                nearest[hole] = nearest[child];
+            }
+        }
+        similar[hole] = best;
+        nearest[hole] = object;
+    }
 }

@@ -19,6 +19,7 @@ SLACK: Final = 0.01
 """Similarities that differ by less count as equal: two frames of the same view differ by as much."""
 _MIN_VIEWS: Final = 18  # with fewer views, neighbours are more than 20° apart and too different to compare with
 _ORDERS: Final = range(2, 13)
+_AT_ONCE: Final = 50  # objects whose views are compared at once: the memory does not grow with the catalog
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +128,11 @@ def similar_objects(views: Views, object_index: int, *, similarity: Similarity =
     own = similarity(descriptors, descriptors)
     before, after = np.diagonal(np.roll(own, 1, axis=1)), np.diagonal(np.roll(own, -1, axis=1))
     enough = np.maximum(before, after) - SLACK
-    rows, begin = views.of_each(others)
-    model = views.descriptors[rows]
-    reach = np.stack([np.maximum.reduceat(similarity(view, model)[0], begin) for view in descriptors])
+    parts = []
+    for start in range(0, len(others), _AT_ONCE):
+        rows, begin = views.of_each(others[start : start + _AT_ONCE])
+        parts.append(np.maximum.reduceat(similarity(descriptors, views.levels(rows)), begin, axis=1))
+    reach = np.concatenate(parts, axis=1)
     confused = reach >= enough[:, None]
     found = [
         SimilarObject(
@@ -148,7 +151,7 @@ def _ring(views: Views, object_index: int) -> tuple[LevelArray, FloatArray]:
     """Return descriptors (n, length) and azimuths (n,) of an object's views, by rising azimuth."""
     rows = views.of(object_index)
     rows = rows[np.argsort(views.azimuth_deg[rows], kind="stable")]
-    return views.descriptors[rows], views.azimuth_deg[rows]
+    return views.levels(rows), views.azimuth_deg[rows]
 
 
 def _mean_at(pairwise: FloatArray, azimuth_deg: FloatArray, shift_deg: float) -> float:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hbr.core.angles import wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import ranges
+from hbr.descriptors import Comparison
 from hbr.descriptors import descriptor as descriptor_of
 
 _T = TypeVar("_T", bound=np.generic)
@@ -61,7 +62,19 @@ class Views:
         object.__setattr__(self, "object_names", names)
 
     def __len__(self) -> int:
-        return len(self.descriptors)
+        return len(self.azimuth_deg)
+
+    def levels(self, rows: IndexArray) -> LevelArray:
+        """Return the levels of these views, uint8 (m, length)."""
+        return self.descriptors[rows]
+
+    def packed(self) -> LevelArray:
+        """Return the packed levels of all views, uint8 (n, size_bytes)."""
+        return descriptor_of(self.descriptor).pack_rows(self.descriptors)
+
+    def prepared(self) -> Comparison:
+        """Prepare the views for comparison with many queries."""
+        return descriptor_of(self.descriptor).prepared(self.descriptors)
 
     @classmethod
     def empty(cls, descriptor: str = "cedd") -> "Views":
@@ -126,6 +139,68 @@ class Views:
         order = np.argsort(self.object_index, kind="stable")
         start = np.searchsorted(self.object_index[order], np.arange(len(self.object_names) + 1))
         return order, start
+
+
+class PackedViews(Views):
+    """Views that stay packed, for example in a mapped file: levels are unpacked when somebody asks for them.
+
+    Parameters
+    ----------
+    packed : uint8 array (n, size_bytes)
+        Packed levels of the descriptor; rows may lie apart.
+    azimuth_deg, object_index, object_names, descriptor
+        As for `Views`; the caller has checked them.
+    rows : integer array (m,), optional
+        Only these rows of ``packed``; the other arrays have their length.
+    """
+
+    def __init__(
+        self,
+        packed: LevelArray,
+        azimuth_deg: FloatArray,
+        object_index: IndexArray,
+        object_names: tuple[str, ...],
+        descriptor: str,
+        rows: IndexArray | None = None,
+    ) -> None:
+        self.__dict__.update(
+            _packed=packed,
+            _rows=rows,
+            azimuth_deg=_read_only(azimuth_deg),
+            object_index=_read_only(object_index),
+            object_names=object_names,
+            descriptor=descriptor,
+        )
+
+    @cached_property
+    def descriptors(self) -> LevelArray:
+        """Levels of all views; for a large catalog they take several times the memory of the packed ones."""
+        return _read_only(descriptor_of(self.descriptor).unpack_rows(self.packed().tobytes()))
+
+    def levels(self, rows: IndexArray) -> LevelArray:
+        places = rows if self._rows is None else self._rows[rows]
+        return descriptor_of(self.descriptor).unpack_rows(self._packed[places].tobytes())
+
+    def packed(self) -> LevelArray:
+        return self._packed if self._rows is None else self._packed[self._rows]
+
+    def prepared(self) -> Comparison:
+        return descriptor_of(self.descriptor).opened(self.packed())
+
+    def select(self, rows: IndexArray | NDArray[np.bool_]) -> "PackedViews":
+        chosen = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows.astype(np.intp, copy=False)
+        places = chosen if self._rows is None else self._rows[chosen]
+        return PackedViews(
+            self._packed,
+            self.azimuth_deg[chosen],
+            self.object_index[chosen],
+            self.object_names,
+            self.descriptor,
+            places,
+        )
+
+    _packed: LevelArray
+    _rows: IndexArray | None
 
 
 def _check_views(

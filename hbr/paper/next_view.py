@@ -133,7 +133,7 @@ def _average_view(views: Views, object_index: int, sector: int) -> FloatArray:
     inside = rows[(offset_deg >= -half) & (offset_deg < half)]
     if not len(inside):
         inside = rows[[np.abs(offset_deg).argmin()]]
-    mean: FloatArray = views.descriptors[inside].mean(axis=0)
+    mean: FloatArray = views.levels(inside).mean(axis=0)
     return mean
 
 

@@ -22,9 +22,12 @@ LOST: Final = "lost+found"
 INCOMING: Final = "incoming"
 """Folder of running imports."""
 
+PREPARED: Final = "prepared"
+"""Folder of the prepared views (`rig.catalog.prepared`)."""
+
 _OWN: Final = (
     *(f"{DATABASE_NAME}{suffix}" for suffix in ("", "-wal", "-shm", "-journal")),
-    *(IMAGE_FOLDER, LOST, INCOMING),
+    *(IMAGE_FOLDER, LOST, INCOMING, PREPARED),
 )
 
 

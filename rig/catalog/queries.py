@@ -1,7 +1,7 @@
 """Read a catalog: from rows to records."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from difflib import get_close_matches
 from hashlib import sha256
 from typing import Any
@@ -211,8 +211,10 @@ def retrieved() -> ColumnElement[bool]:
     return and_(enrollments.c.status == EnrollmentStatus.COMPLETE, objects.c.deleted_utc.is_(None))
 
 
-def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDArray[np.int64]]:
-    """Return the views of all complete enrollments, by object and index, and their ids.
+def model_set(
+    connection: Connection, kind: Descriptor, object_ids: Collection[int] | None = None
+) -> tuple[hbr.Views, NDArray[np.int64]]:
+    """Return the views of all complete enrollments, or of those of some objects, by object and index, and their ids.
 
     Raises
     ------
@@ -227,18 +229,18 @@ def model_set(connection: Connection, kind: Descriptor) -> tuple[hbr.Views, NDAr
         .join(enrollments)
         .join(views, views.c.enrollment_id == enrollments.c.id)
         .outerjoin(descriptors, described_by(kind))
-        .where(retrieved())
+        .where(retrieved() if object_ids is None else and_(retrieved(), objects.c.id.in_(object_ids)))
         .order_by(objects.c.id, views.c.view_index)
     ).all()
     if not rows:
         return hbr.Views.empty(kind.name), np.empty(0, np.int64)
-    object_ids, names, view_ids, azimuths_deg, packed, enrollment_ids = zip(*rows, strict=True)
+    found_ids, names, view_ids, azimuths_deg, packed, enrollment_ids = zip(*rows, strict=True)
     if None in packed:
         raise _outdated(connection, kind, names, [levels is None for levels in packed])
-    check_loaded(connection, set(object_ids), set(enrollment_ids))
+    check_loaded(connection, set(found_ids), set(enrollment_ids))
     if set(map(len, packed)) != {kind.size_bytes}:
         raise damaged("the length of a descriptor", sorted(set(map(len, packed))))
-    _, first, object_index = np.unique(np.array(object_ids, np.int64), return_index=True, return_inverse=True)
+    _, first, object_index = np.unique(np.array(found_ids, np.int64), return_index=True, return_inverse=True)
     loaded = hbr.Views(
         descriptors=kind.unpack_rows(b"".join(packed)),
         azimuth_deg=np.array(azimuths_deg, np.float64),

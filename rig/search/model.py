@@ -3,6 +3,7 @@
 Decision: docs/decisions/0030.
 """
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -13,6 +14,8 @@ import hbr
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.descriptions import empty_tables, has_descriptor, read_empty_table
+from rig.catalog.jobs import JobProgress
+from rig.catalog.prepared import prepared_views
 from rig.core.errors import CatalogError, DescriptorOutdated
 from rig.events.events import Note, NoteCode
 from rig.search.stopping_rules import stopping_rule_of
@@ -66,7 +69,9 @@ def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model
     return Model(hbr.ViewIndex(views)) if rule is None else Model(hbr.DenseIndex(views), rule)
 
 
-def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
+def load_model(
+    catalog: Catalog, *, descriptor: str | None = None, progress: Callable[[JobProgress], None] | None = None
+) -> Model:
     """Load the enrolled views: by the bench's own descriptor if every object has it, else by the paper's.
 
     The stopping rule of the dense search is the one that `rig catalog calibrate` stored, if it is of this catalog.
@@ -78,6 +83,8 @@ def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
         An open one.
     descriptor
         Load views by this descriptor and no other.
+    progress
+        Called while views of a large catalog are read that searches have not used before.
 
     Raises
     ------
@@ -88,22 +95,22 @@ def load_model(catalog: Catalog, *, descriptor: str | None = None) -> Model:
     """
     notes: tuple[Note, ...] = ()
     if descriptor == BENCH_DESCRIPTOR:
-        return _dense(catalog)
+        return _dense(catalog, progress)
     if descriptor is None:
         objects = 0
         if has_descriptor(catalog, BENCH_DESCRIPTOR):
             try:
-                return _dense(catalog)
+                return _dense(catalog, progress)
             except DescriptorOutdated as error:
                 objects = int(error.evidence["objects"])
         values = {"used": PAPER_DESCRIPTOR, "missing": BENCH_DESCRIPTOR, "objects": objects}
         notes = (Note(NoteCode.PAPER_SEARCH, values),)
-    views = catalog.views(PAPER_DESCRIPTOR).views
+    views = prepared_views(catalog, PAPER_DESCRIPTOR, progress)
     return Model(hbr.ViewIndex(views), notes=notes if len(views) else ())
 
 
-def _dense(catalog: Catalog) -> Model:
-    views = catalog.views(BENCH_DESCRIPTOR).views
+def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> Model:
+    views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
     if not len(views):
         return Model(hbr.ViewIndex(hbr.Views.empty()))  # the search reports that the catalog is empty
     index = hbr.DenseIndex(views)

@@ -342,7 +342,7 @@ def _model_lines(views: hbr.Views) -> Iterator[str]:
         line = {
             "object": name,
             "azimuth_deg": views.azimuth_deg[rows].tolist(),
-            "descriptors": [pack(levels).hex() for levels in views.descriptors[rows]],
+            "descriptors": [pack(levels).hex() for levels in views.levels(rows)],
         }
         yield json.dumps(line, ensure_ascii=False) + "\n"
 

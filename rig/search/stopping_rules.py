@@ -25,11 +25,13 @@ FILE: Final = "search_rules.json"
 """Beside ``catalog.sqlite``."""
 FORMAT: Final = "hbr-rig search rules"
 MAX_FILE_BYTES: Final = 16_000_000
-VERSION: Final = 2
-"""Version 1 stored limitations as sentences, and used other names."""
+VERSION: Final = 3
+"""Version 1 stored limitations as sentences, and used other names; version 3 has the digest of packed views."""
 ERROR_RATE: Final = 0.01
 FALSE_REJECT: Final = 0.02
 
+_CHUNK: Final = 16_384
+"""Views whose digest is computed at once."""
 _KNOWN_SHARE: Final = 0.5
 _QUICK_S: Final = 0.4
 _LEAST_QUICK_S: Final = 0.08
@@ -78,12 +80,15 @@ class StoredRule:
         Of the model (`digest`).
     made_utc
         When, in the format of ISO 8601.
+    version
+        Of the file.
     """
 
     rule: hbr.StoppingRule
     objects: tuple[str, ...]
     sha256: str
     made_utc: str
+    version: int = VERSION
 
     def adapted(self, views: hbr.Views) -> hbr.StoppingRule:
         """Return the rule for other views; objects that it does not know have typical scores."""
@@ -96,14 +101,20 @@ class StoredRule:
         )
 
 
-def digest(index: hbr.DenseIndex) -> str:
-    """Return a digest of a model: its objects, their views, the descriptor's version, and the program that searches."""
+def digest(index: hbr.DenseIndex, *, packed: bool = True) -> str:
+    """Return a digest of a model: its objects, their views, the descriptor's version, and the program that searches.
+
+    Versions 1 and 2 of the file have the digest of levels that are not ``packed``.
+    """
     views = index.views
     kind = descriptor(views.descriptor)
     searched = [version("hbr-rig"), kind.name, kind.version, index.omega, index.power, BETA]
     found = sha256(json.dumps([searched, views.object_names], ensure_ascii=False).encode())
-    for column in (views.object_index.astype("<i8"), views.azimuth_deg.astype("<f8"), views.descriptors):
+    for column in (views.object_index.astype("<i8"), views.azimuth_deg.astype("<f8")):
         found.update(np.ascontiguousarray(column).data)
+    for start in range(0, len(views), _CHUNK):
+        part = views.select(np.arange(start, min(start + _CHUNK, len(views))))
+        found.update(np.ascontiguousarray(part.packed() if packed else part.descriptors).data)
     return found.hexdigest()
 
 
@@ -120,7 +131,7 @@ def stopping_rule_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.StoppingR
     except CatalogError as error:
         stored = None
         notes.append(Note(NoteCode.STOPPING_RULE_UNREADABLE, {"reason": error.evidence["reason"]}))
-    if stored is not None and stored.sha256 == digest(index):
+    if stored is not None and stored.sha256 == digest(index, packed=stored.version >= 3):
         return stored.rule, _not_guaranteed(stored.rule)
     if stored is None:
         found = quick_stopping_rule(index)
@@ -213,7 +224,9 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
         scores = rule.usual_scores
         if scores.ndim != 2 or scores.shape[1] != len(rule.open_set_thresholds) or not np.isfinite(scores).all():
             raise ValueError("it does not have one usual score for each object and number of views")
-        return StoredRule(rule, tuple(usual), str(values["model"]["sha256"]), str(values["made_utc"]))
+        return StoredRule(
+            rule, tuple(usual), str(values["model"]["sha256"]), str(values["made_utc"]), int(values["version"])
+        )
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:

@@ -13,6 +13,7 @@ from starlette.background import BackgroundTask
 from rig.catalog import ObjectSummary
 from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelete
 from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
+from rig.catalog.prepared import prepared_views
 from rig.events.events import plain
 from rig.plans.similar_objects import similar_objects
 from rig.web.picture import jpeg
@@ -54,7 +55,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
         """Return an object with its enrollments and views."""
         with reading() as catalog:
             found = catalog.object(name)
-            similar = similar_objects(catalog.views().views, found.summary.name) if found.views else None
+            similar = similar_objects(prepared_views(catalog), found.summary.name) if found.views else None
         return {
             **_summary(found.summary),
             "enrollments": [

@@ -10,6 +10,7 @@ from typing import Any, Final, Protocol, assert_never
 from rig.bench import Bench, ObjectAlreadyPlaced, TableClearer
 from rig.calibrations import CalibrationResult
 from rig.catalog import Catalog, ObjectSummary
+from rig.catalog.prepared import prepared_views
 from rig.config import RigConfig
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import RigError, TableNotEmpty, UsageError, ViewRejected
@@ -263,7 +264,7 @@ def _with_similar_objects(catalog: Catalog, events: Generator[Event, None, objec
     with closing(events):
         for event in events:
             if isinstance(event, Enrolled):
-                yield similar_objects(catalog.views().views, event.name)
+                yield similar_objects(prepared_views(catalog), event.name)
             yield event
 
 

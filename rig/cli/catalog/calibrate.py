@@ -31,6 +31,9 @@ def calibrate(
     Example: rig catalog calibrate --bench sim --error-rate 0.005
     """
     from hbr import DenseIndex, calibrate_stopping_rule
+    from rig.catalog.jobs import JobProgress
+    from rig.catalog.prepared import prepared_views
+    from rig.cli.ui.jobs import progress_bar
     from rig.core.clock import SystemClock, seconds_between
     from rig.core.errors import CatalogError
     from rig.events.events import plain
@@ -39,14 +42,20 @@ def calibrate(
 
     clock = SystemClock()
     with settings.open_catalog(read_only=True) as catalog:
-        views = catalog.views(BENCH_DESCRIPTOR).views
+        with progress_bar("Preparing objects for searches") as progress:
+            views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
         if not len(views):
             raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
         path = catalog.path / FILE
     begun_ns = clock.now_ns()
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
     index = DenseIndex(views)
-    found = calibrate_stopping_rule(index, error_rate=error_rate, false_reject=false_reject)
+    with progress_bar("Searching") as progress:
+
+        def show(done: int, total: int) -> None:
+            progress(JobProgress(done, total))
+
+        found = calibrate_stopping_rule(index, error_rate=error_rate, false_reject=false_reject, progress=show)
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
     write_stopping_rule(path, found.rule, index, made_utc=made_utc)
     if settings.json:

@@ -154,6 +154,8 @@ class _Job:
 
     def run(self, events: Any, how_to_continue: list[str], report: Path | None) -> None:
         """Run the plan to its end; after an interruption print how to continue."""
+        from rig.catalog.prepared import prepared_views
+        from rig.cli.ui.jobs import progress_bar
         from rig.events.events import Enrolled, Item
         from rig.plans.similar_objects import similar_objects
 
@@ -163,7 +165,9 @@ class _Job:
                     self.close_view()
                     self._heading = f"{event.number} of {event.of} "
                 if isinstance(event, Enrolled):  # it is in the catalog now; Enrolled stays its last event
-                    self._show(similar_objects(self._catalog.views().views, event.name))
+                    with progress_bar("Preparing objects for searches") as progress:
+                        views = prepared_views(self._catalog, progress=progress)
+                    self._show(similar_objects(views, event.name))
                 self._show(event)
                 if isinstance(event, Enrolled):
                     self._enrolled += 1

@@ -1,7 +1,8 @@
 """Progress of the catalog's long jobs, questions before deletions, and tables."""
 
 import sys
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
@@ -35,6 +36,24 @@ def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted:
         raise
     finally:
         job.close()
+
+
+@contextmanager
+def progress_bar(title: str) -> "Iterator[Callable[[JobProgress], None]]":
+    """Yield a function that shows progress; the bar appears at its first call."""
+    from rig.cli.ui.present import Progress
+
+    with ExitStack() as shown:
+        bar: Progress | None = None
+
+        def show(at: "JobProgress") -> None:
+            nonlocal bar
+            if bar is None:
+                bar = shown.enter_context(Progress(title))
+                bar.start(at.total)
+            bar.at(at.done)
+
+        yield show
 
 
 def is_interactive() -> bool:

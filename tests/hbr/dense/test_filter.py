@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, tanimoto, update_belief
-from hbr.dense.filter import BINS, Belief
+from hbr.dense.filter import BINS, Belief, completed
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import belief_after
 
@@ -61,6 +61,25 @@ def test_support_follows_the_formula_at_every_azimuth_of_every_object(
     mean = np.maximum(wanted.max(axis=1), 0) / len(angles)
     np.testing.assert_allclose(np.sort(ranking.scores) ** power, np.sort(mean), atol=2e-5)
     assert belief.posterior(30.0).sum() == pytest.approx(1)
+
+
+@given(st.integers(0, 10**6), st.integers(2, 5))
+@examples(12)
+def test_no_object_that_can_lead_or_be_second_is_lost(seed: int, queries: int) -> None:
+    """Only one object is considered after the first view; the others come back if they can still win."""
+    views = catalog(seed, objects=12)
+    index = DenseIndex(views)
+    seen, angles = list(catalog(seed + 1, ragged=False).descriptors[:queries]), [50.0 * n for n in range(queries)]
+    every = belief_after(seen, angles, index)
+    few: DenseIndex | Belief = index
+    for query, angle in zip(seen, angles, strict=True):
+        few = update_belief(query, angle, few, kept=1)
+    assert isinstance(few, Belief)
+    assert len(few.index) == 1
+    found, whole = completed(few, index, seen).ranking(), every.ranking()
+    np.testing.assert_array_equal(found.object_index[:2], whole.object_index[:2])
+    np.testing.assert_array_equal(found.scores[:2], whole.scores[:2])
+    np.testing.assert_array_equal(found.pose_deg[:2], whole.pose_deg[:2])
 
 
 @given(st.integers(0, 10**6), st.integers(1, 3))

@@ -19,6 +19,7 @@ from hbr.kernels.library import load
 
 compiled = pytest.mark.skipif(library() is None, reason="the kernels are not compiled: there is no C compiler")
 seeds = st.integers(0, 2**32 - 1)
+KIND = "edges+colours"
 
 
 @st.composite
@@ -118,6 +119,28 @@ def test_support_has_the_bits_of_the_reference(
     with without_library():
         reference = index.support(similar, rotation_deg)
     np.testing.assert_array_equal(index.support(similar, rotation_deg), reference)
+
+
+@compiled
+@settings(max_examples=60)
+@given(st.lists(st.integers(1, 150), min_size=1, max_size=12), st.integers(1, 12), seeds)
+def test_the_nearest_objects_are_those_of_the_reference(counts: list[int], kept: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    objects = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    levels = rows_of("edges+colours", len(objects), rng)
+    levels[rng.integers(0, len(levels), len(levels) // 3)] = levels[0]  # equal similarities
+    views = hbr.Views(levels, rng.uniform(0, 360, len(levels)), objects, tuple(map(str, range(len(counts)))), KIND)
+    query = levels[rng.integers(len(levels))] if seed % 2 else rows_of("edges+colours", 1, rng)[0]
+    index = DenseIndex(views)
+    with without_library():
+        reference = DenseIndex(views)
+        best, nearest = reference.best(query), reference.nearest(query, min(kept, len(counts)))
+    np.testing.assert_array_equal(index.nearest(query, min(kept, len(counts))), nearest)
+    assert (index.bounds(query) >= best**4).all()
+    shuffled = rng.permutation(len(counts))[: (len(counts) + 1) // 2]
+    some = index.only(np.sort(shuffled))
+    np.testing.assert_array_equal(some.best(query), best[np.sort(shuffled)])
+    np.testing.assert_array_equal(some.nearest(query, 1), [best[np.sort(shuffled)].argmax()])
 
 
 @pytest.mark.parametrize(
