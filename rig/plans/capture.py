@@ -8,7 +8,7 @@ from rig.events.events import Event, Moved, Note, NoteCode, Rejected, Unwinding,
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
 from rig.safety.gyro_rotation import finite
-from rig.views.capture import Attempt, Viewer, rejection_text
+from rig.views.capture import Attempt, RejectReason, Viewer, rejection_text
 from rig.views.description import DescribedView
 from rig.views.empty_table import store_table_problem
 
@@ -75,9 +75,14 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
         yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
     evidence = attempt.evidence
     texts = "; ".join(rejection_text(reason, evidence) for reason in attempt.reasons)
+    next_step = "Check the light, the focus and the scene. The limits and view.retakes are in [view]."
+    if RejectReason.LOCKS_CHANGED in attempt.reasons:
+        next_step = (
+            "Lock the camera: set camera.exposure_us and camera.white_balance_k to numbers, then run rig doctor."
+        )
     raise ViewRejected(
         f"View {index + 1} was rejected: {texts}.",
-        next_step="Check the light, the focus and the scene. The limits and view.retakes are in [view].",
+        next_step=next_step,
         evidence={
             "reasons": [reason.value for reason in attempt.reasons],
             "sharpness": round(evidence.sharpness, 1),

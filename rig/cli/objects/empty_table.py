@@ -141,6 +141,6 @@ def _take(settings: Settings, bench: "Bench", *, anyway: bool = False, within_pl
 
     for event in photograph_table(bench, anyway=anyway):
         if within_plan:
-            print(line(event), file=sys.stderr)
+            print(line(event), file=sys.stderr, flush=True)
         else:
             settings.say(line(event), event_dict(event))

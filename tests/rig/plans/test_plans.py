@@ -73,6 +73,16 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
     assert torque(s) == 0
 
 
+def test_camera_without_a_locked_exposure_is_told_to_be_locked(simulated, catalog):
+    s = simulated("camera.exposure_us=none")
+    s.bench.operator.place("dice")
+    with pytest.raises(ViewRejected) as rejected:
+        for _ in enroll(s.bench, catalog, "dice", views=4):
+            s.world.change(light=(0.4, 0.4, 0.4))
+    assert "camera.exposure_us" in rejected.value.next_step
+    assert catalog.objects() == []
+
+
 def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):
     s = simulated()
     stored = 0
