@@ -113,7 +113,7 @@ def searching_densely(
     """The dense search turns by ``rotations_deg``, the best of all, to tell the first two of `NAMES` apart."""
     rng = np.random.default_rng(6)
     yield Started("identify", None, 8, {}, strategy="dense", descriptor="edges+colours", notes=(NOTE,))
-    rotations_deg = tuple(float(rotation) for rotation in range(-175, 185, 5) if rotation)
+    possible_deg = tuple(float(rotation) for rotation in range(-175, 185, 5) if rotation)
     orientation_deg = 0.0
     for k in range(len(rotations_deg) + 1):
         rotation_deg = rotations_deg[k - 1] if k else 0.0
@@ -129,11 +129,11 @@ def searching_densely(
         yield Ranked(k, candidates, 0.1, decision)
         if k < len(rotations_deg):
             step_deg = rotations_deg[k]
-            away = tuple(abs(float(wrap180(rotation - step_deg))) for rotation in rotations_deg)
+            away = tuple(abs(float(wrap180(rotation - step_deg))) for rotation in possible_deg)
             weighed = Weighed(
-                rotations_deg,
+                possible_deg,
                 tuple(-8.0 + a / 30 for a in away),
-                tuple(0.02 + abs(rotation) / 4500 for rotation in rotations_deg),
+                tuple(0.02 + abs(rotation) / 4500 for rotation in possible_deg),
                 tuple(0.5 + a / 400 for a in away) if pair else None,
             )
             reason = RotationReason.SEPARATES_CANDIDATES if pair else RotationReason.NEW_SIDE
