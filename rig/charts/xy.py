@@ -172,7 +172,7 @@ class Chart:
             if self.square:
                 axes.set_aspect("equal")
             if any(series.label for series in self.series) and self.wide:
-                figure.legend(loc="outside right upper")
+                figure.legend(loc="outside right center")  # below a long title
             elif any(series.label for series in self.series):
                 figure.legend(loc="outside lower left", ncols=4)
             # Lay the chart out once. With a layout engine, each file would draw the chart twice.
