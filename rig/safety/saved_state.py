@@ -5,6 +5,7 @@ Decision: docs/decisions/0009.
 
 import errno
 import fcntl
+import hashlib
 import json
 import os
 import signal
@@ -21,8 +22,8 @@ from rig.core.clock import Clock
 from rig.core.errors import BenchBusy, MotionStopped, RigError, StateNotStored, os_errors_as
 from rig.core.files import no_follow
 
-VERSION = 2
-"""Version 1 has neither the settings of the table nor the file of the latched fault."""
+VERSION = 3
+"""Version 1 has neither the settings of the table nor the file of the latched fault; version 2 has no checksum."""
 LATCH_BYTES = 8192
 """Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
 SESSION = "session.json"
@@ -75,12 +76,20 @@ class LatchedFault(_Saved):
 
 
 class BenchState(_Saved):
-    """The whole stored state; ``damage`` (not stored) says why an earlier state could not be read."""
+    """The whole stored state; ``damage`` (not stored) says why an earlier state could not be read.
+
+    ``checksum`` is set in the file only: SHA-256 of the other values.
+    """
 
     version: int = VERSION
     table: SavedTable | None = None
     fault: LatchedFault | None = None
+    checksum: str | None = None
     damage: str = ""
+
+    def with_checksum(self) -> "BenchState":
+        values = self.model_dump_json(exclude={"checksum", "damage"})
+        return self.model_copy(update={"checksum": hashlib.sha256(values.encode()).hexdigest()})
 
 
 class Holder(_Saved):
@@ -255,6 +264,8 @@ class FileStore:
             state = BenchState.model_validate_json(self._file.read_bytes())
             if not 1 <= state.version <= VERSION:
                 damage = f"{self._file} has version {state.version}, but this program reads version {VERSION}"
+            elif state.checksum != (state.with_checksum().checksum if state.version >= 3 else None):
+                damage = f"{self._file} is damaged: its checksum is not that of its values"
         except FileNotFoundError:
             if not self._latch.exists() and not self._used.exists():
                 return state  # a new bench
@@ -277,7 +288,7 @@ class FileStore:
             damage = damage or f"{self._latch} is damaged: {error.errors(include_url=False)[0]['msg']}"
         if damage:
             return BenchState(damage=damage, fault=state.fault or fault or _fault_of_damage(damage))
-        return state.model_copy(update={"fault": state.fault or fault, "version": VERSION})
+        return state.model_copy(update={"fault": state.fault or fault, "version": VERSION, "checksum": None})
 
     def latch(self, fault: LatchedFault | None) -> None:
         with _storing(self._latch):
@@ -308,7 +319,8 @@ class FileStore:
             _make_folder(self.path)
             if not self._latch_is_reserved():
                 self._write_latch(state.fault)
-            files.write(self._file, state.model_dump_json(indent=1, exclude={"damage"}).encode())
+            stored = state.with_checksum().model_dump_json(indent=1, exclude={"damage"})
+            files.write(self._file, stored.encode())
             if not self._used.exists():
                 files.write(
                     self._used, f"This bench has been used. Its state is in the folder {self.path.name}.\n".encode()

@@ -252,7 +252,7 @@ def load_run(folder: Path) -> SavedRun:
         loaded (`hbr.descriptors.load_model`).
     """
     try:
-        about = json_values(_bytes(folder, "run.json"))
+        about = _object(_bytes(folder, "run.json"), "run.json")
         if about.get("format") != FORMAT:
             raise ValueError("run.json does not belong to a saved run")
         if about["version"] not in range(1, VERSION + 1):
@@ -402,10 +402,10 @@ def _lines(content: bytes) -> list[str]:
     return content.decode().removesuffix("\n").split("\n") if content else []
 
 
-def _object(line: str) -> dict[str, Any]:
-    values = json_values(line)
+def _object(text: str | bytes, name: str = "a line") -> dict[str, Any]:
+    values = json_values(text)
     if not isinstance(values, dict):
-        raise TypeError("a line is not a JSON object")
+        raise TypeError(f"{name} is not a JSON object")
     return values
 
 
@@ -425,8 +425,20 @@ def _bytes(folder: Path, name: str) -> bytes:
 
 
 def _reason(error: Exception) -> str:
-    """Return the text of an error; with its type if the text alone is not clear, such as the key of a KeyError."""
-    text = str(error) if type(error) in (ValueError, TypeError) else f"{type(error).__name__}: {error}"
+    """Return an error in words; those of Python are only about its own objects, except a ValueError and a TypeError."""
+    match error:
+        case KeyError():
+            text = f"the value {error.args[0]!r} is missing" if error.args else "a value is missing"
+        case IndexError():
+            text = "a list is too short"
+        case RecursionError():
+            text = "its values are nested too deeply"
+        case ArithmeticError():
+            text = "a number is too large or too small"
+        case AttributeError() | cv2.error():
+            text = "a value has the wrong kind"
+        case _:
+            text = str(error)
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}…"
 
 

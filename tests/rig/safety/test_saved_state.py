@@ -88,6 +88,36 @@ def test_state_of_the_first_version_is_read(tmp_path):
     )
 
 
+def test_state_of_the_second_version_is_read(tmp_path):
+    (tmp_path / "latch").write_bytes(b" " * LATCH_BYTES)
+    (tmp_path / "state.json").write_text(
+        """{"version": 2, "table": {"model_number": 1060, "bus_id": 1, "firmware": 46, "position_deg": -190.25,
+        "shift_deg": 360.0, "path_deg": null, "zero_deg": null, "direction": null, "gear_ratio": null},
+        "fault": null}"""
+    )
+    assert FileStore(tmp_path).load() == BenchState(table=TABLE)
+
+
+@pytest.mark.parametrize("fault", [False, True])
+def test_each_flipped_byte_of_the_state_is_damage(tmp_path, fault):
+    path = {"path_deg": (0.0, 90.5), "zero_deg": 12.5, "direction": -1, "gear_ratio": 1.0}
+    stored = BenchState(table=TABLE.model_copy(update=path), fault=STALLED if fault else None)
+    FileStore(tmp_path).save(stored)
+    content = (tmp_path / "state.json").read_bytes()
+    for place in range(len(content)):
+        for bit in (0, place % 8):
+            flipped = bytearray(content)
+            flipped[place] ^= 1 << bit
+            (tmp_path / "state.json").write_bytes(flipped)
+            state = FileStore(tmp_path).load()
+            if not state.damage:  # another white space between the values
+                assert state == stored
+                assert flipped.split() == content.split()
+            else:
+                assert state.fault is not None
+                assert state.table is None
+
+
 @fuzz_settings(0.1)
 @given(st.binary(max_size=300))
 def test_damaged_state_is_reported_and_not_used(tmp_path_factory, damage):

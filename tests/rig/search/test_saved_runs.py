@@ -300,6 +300,7 @@ def test_invalid_event_is_reported_as_damage(saved, tmp_path, kind, values):
     with pytest.raises(UsageError) as caught:
         check(load_run(changed(saved, tmp_path, place(saved, kind), **values)))
     assert caught.value.evidence["reason"]
+    assert "Error" not in caught.value.evidence["reason"]
 
 
 @pytest.mark.parametrize("name", ["run.json", "model.jsonl", "events.jsonl"])
@@ -312,7 +313,8 @@ def test_json_of_another_kind_is_damage(saved, tmp_path, name, content):
     try:
         assert not check(load_run(folder)).is_complete
     except UsageError as error:
-        assert error.evidence  # noqa: PT017
+        assert error.evidence["reason"]  # noqa: PT017
+        assert "Error" not in error.evidence["reason"]  # noqa: PT017
 
 
 def test_run_opens_no_file_outside_its_folder(saved, tmp_path, monkeypatch):
