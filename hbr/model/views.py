@@ -142,7 +142,7 @@ class Views:
 
 
 class PackedViews(Views):
-    """Views that stay packed, for example in a mapped file: levels are unpacked when somebody asks for them.
+    """Views that stay packed, for example in a mapped file: levels are unpacked on request.
 
     Parameters
     ----------

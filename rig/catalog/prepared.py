@@ -4,7 +4,7 @@ To read a million views from the database, and to check the digests of their row
 database has the same values, as they were after such a check. An entry for each object names the digest that its
 enrollment had then, and has a digest of its part of the file. At each start both are compared, with the database and
 with the file: an object that was added or changed since is read from the database and appended; a damaged file is made
-again. What the file says is never believed without both.
+again. The file is never used without both checks.
 
 Decision: docs/decisions/0042.
 """

@@ -1,4 +1,4 @@
-"""Prepared views: a large catalog is read once, later starts map a file, and a wrong file is never believed."""
+"""Prepared views: a large catalog is read once, later starts map a file, and an invalid file is never used."""
 
 import json
 import os

@@ -73,7 +73,7 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
     assert torque(s) == 0
 
 
-def test_camera_without_a_locked_exposure_is_told_to_be_locked(simulated, catalog):
+def test_unlocked_exposure_of_the_camera_is_a_note(simulated, catalog):
     s = simulated("camera.exposure_us=none")
     s.bench.operator.place("dice")
     with pytest.raises(ViewRejected) as rejected:
