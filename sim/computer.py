@@ -14,6 +14,7 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import control_table, protocol_of
 from rig.devices.opencv_capture import Capture
+from rig.devices.v4l2 import CAPTURE
 from sim.camera import CAMERA_DEVICE
 from sim.devices import SimDevices
 from sim.i2c import SimI2cBus
@@ -47,6 +48,7 @@ class ComputerFiles:
     def process(self, pid: int, command: str, *holds: str) -> None:
         """Add a process with device files open."""
         self.write(f"proc/{pid}/cmdline", command.replace(" ", "\0") + "\0")
+        self.write(f"proc/{pid}/comm", Path(command.split()[0]).name + "\n")
         for number, path in enumerate(holds, start=3):
             self.link(f"proc/{pid}/fd/{number}", (self.root / path.lstrip("/")).resolve())
 
@@ -71,12 +73,23 @@ class ComputerFiles:
         if latency_ms is not None:
             self.write(f"sys/bus/usb-serial/devices/{name}/latency_timer", f"{latency_ms}\n")
         self.write(f"dev/{name}").chmod(mode)
-        by_id = by_id or f"/dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_{serial}-if00-port0"
+        by_id = by_id or f"/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_{serial}-if00-port0"
         self.link(by_id, self.root / "dev" / name)
 
-    def i2c_bus(self, number: int = 1, name: str = "bcm2835 (i2c@7e804000)", *, mode: int = 0o660) -> None:
+    def i2c_bus(
+        self, number: int = 1, name: str = "bcm2835 (i2c@7e804000)", *, mode: int = 0o660, compatible: str = ""
+    ) -> None:
+        """Add an I2C bus; ``compatible`` is its kind in the device tree."""
         self.write(f"sys/class/i2c-dev/i2c-{number}/name", f"{name}\n")
+        if compatible:
+            self.write(f"sys/class/i2c-dev/i2c-{number}/device/of_node/compatible", f"{compatible}\0")
         self.write(f"dev/i2c-{number}").chmod(mode)
+
+    def i2c_driver(self, driver: str, number: int = 1, address: int = 0x68) -> None:
+        """Bind a kernel driver to an address of a bus."""
+        folder = self.root / "sys/bus/i2c/drivers" / driver
+        folder.mkdir(parents=True, exist_ok=True)
+        self.link(f"sys/bus/i2c/devices/{number}-{address:04x}/driver", folder)
 
     def camera(
         self,
@@ -87,11 +100,15 @@ class ComputerFiles:
         mode: int = 0o660,
         serial: str | None = None,
         usb_port: str = "",
+        capabilities: int = CAPTURE,
     ) -> None:
-        """Add a node of a camera, on a USB port such as 1-2; nodes with an index above 0 deliver no images."""
+        """Add a node of a camera, on a USB port such as 1-2; nodes with an index above 0 deliver no images.
+
+        The node's text is what VIDIOC_QUERYCAP returns.
+        """
         self.write(f"sys/class/video4linux/video{number}/name", f"{name}\n")
         self.write(f"sys/class/video4linux/video{number}/index", f"{index}\n")
-        self.write(f"dev/video{number}").chmod(mode)
+        self.write(f"dev/video{number}", f"{capabilities:#x}").chmod(mode)
         self.link(f"dev/v4l/by-id/usb-{name.replace(' ', '_')}-video-index{index}", self.root / f"dev/video{number}")
         if usb_port:
             usb = f"sys/devices/{usb_port}"
@@ -130,6 +147,10 @@ class SimComputer(Computer):
     def i2c_path(self, bus: int | str) -> str:
         wired = isinstance(self.devices.i2c, SimI2cBus) and self.i2c_name(bus) == self._bus
         return self.devices.i2c.path if wired else self.i2c_name(bus)
+
+    def video_capabilities(self, path: str) -> int | None:
+        text = self._text(path)
+        return int(text, 16) if text else None
 
     def camera_device(self, source: int | str) -> str | None:  # noqa: ARG002 - there is one camera
         return CAMERA_DEVICE

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from errno import EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
+from errno import EBUSY, EINVAL, EIO, ENOTTY, ENXIO, EOPNOTSUPP, EPROTO, EREMOTEIO, ETIMEDOUT
 from typing import Any, Protocol
 
 import smbus2.smbus2 as smbus
@@ -74,7 +74,8 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     """A bus with a path that ``smbus2.SMBus(path)`` opens.
 
     Tests use `attach`, `detach` (unplug), `nack`, `nack_conditions` (called with an address; True: no acknowledge),
-    `cut_read`, `stuck`, and `wire`, the last acknowledged messages.
+    `cut_read`, `stuck`, `kernel_drivers` (addresses that a kernel driver uses), `errors` (address to the number of the
+    error at each transfer), and `wire`, the last acknowledged messages.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
@@ -84,6 +85,8 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self._nacks = 0
         self._cut: int | None = None
         self.stuck = False
+        self.kernel_drivers: set[int] = set()
+        self.errors: dict[int, int] = {}
         self.nack_conditions: list[Callable[[int], bool]] = []
         self.wire: deque[Message] = deque(maxlen=1000)
         self._file = RoutedFile(self)
@@ -127,6 +130,8 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
             case smbus.I2C_SLAVE | smbus.I2C_SLAVE_FORCE:
                 if not 0 <= argument <= 0x7F:
                     raise _os_error(EINVAL)
+                if request == smbus.I2C_SLAVE and argument in self.kernel_drivers:
+                    raise _os_error(EBUSY)
                 self._addressed[fd] = argument
             case smbus.I2C_PEC:
                 if argument:
@@ -210,6 +215,8 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
 
     def _start(self, address: int, reading: bool) -> I2cDevice:
         self._pass(1)
+        if address in self.errors:
+            raise _os_error(self.errors[address])
         device = acknowledging(self._devices, address, self._nacks, self.nack_conditions)
         if device is None:
             self._nacks = max(self._nacks - 1, 0)

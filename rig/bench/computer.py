@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from rig.config import RigConfig
 from rig.core.clock import Clock, SystemClock
+from rig.core.errors import BenchBusy
 
 if TYPE_CHECKING:
     from rig.devices.dynamixel.port import SerialConnection
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 
 SERIAL_NAMES = re.compile(r"tty(USB|ACM|AMA|S)\d+")
 _CAMERAS = "sys/class/video4linux"
+_COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
+"""I2C buses of memory, monitors and clock chips, which must not be scanned."""
+_CONVERTERS = re.compile(r"bcm2835-(isp|codec)|pispbe|hevc", re.IGNORECASE)
+"""Video devices of a Raspberry Pi that convert images; some claim to capture."""
 _NETWORK_FILE_SYSTEMS = frozenset({"nfs", "nfs4", "cifs", "smb3", "smbfs", "sshfs", "fuse.sshfs", "9p", "afs"})
 
 
@@ -141,13 +146,44 @@ class Computer:
         node["holders"] = ()  # a pseudo-terminal is always open in the program at its other end
         return SerialPort(**node, latency_ms=None, latency_file="", usb={})
 
-    def i2c_buses(self) -> list[DeviceFile]:
-        return self._nodes("sys/class/i2c-dev", "")
+    def i2c_buses(self, configured: int | str | None = None) -> list[DeviceFile]:
+        """Return the I2C buses for sensors, and the configured one; not those of monitors, memory and clock chips."""
+        nodes = self._nodes("sys/class/i2c-dev", "")
+        monitors = {entry.resolve().name for entry in self._at("sys/class/drm").glob("*/ddc")}
+        bus = None if configured is None else self.i2c_name(configured)
+
+        def computers_own(node: DeviceFile) -> bool:
+            name = Path(node.path).name
+            kind = self._text(f"sys/class/i2c-dev/{name}/device/of_node/compatible")
+            return name in monitors or "hdmi" in kind or _COMPUTERS_OWN.search(node.name) is not None
+
+        return [n for n in nodes if (bus and self.same_file(n.path, bus)) or not computers_own(n)]
+
+    def i2c_driver(self, bus: int | str, address: int) -> str | None:
+        """Return the kernel driver that uses an address of a bus; None if there is none."""
+        from rig.devices.i2c import kernel_driver
+
+        return kernel_driver(self._at(self.i2c_name(bus)).resolve().name, address, self.root)
 
     def cameras(self) -> list[DeviceFile]:
-        """Return the cameras, without the further device files of a camera that deliver no images."""
+        """Return the device files that deliver images: no converters, no metadata, no second file of one camera."""
         nodes = self._nodes(_CAMERAS, "dev/v4l/by-id")
-        return [n for n in nodes if self._text(f"{_CAMERAS}/{Path(n.path).name}/index") in ("", "0")]
+        return [n for n in nodes if self._is_camera(n)]
+
+    def video_capabilities(self, path: str) -> int | None:
+        """Return the capabilities of a video device; None if it does not report them."""
+        from rig.devices.v4l2 import capabilities
+
+        return capabilities(self._at(path))
+
+    def _is_camera(self, node: DeviceFile) -> bool:
+        from rig.devices.v4l2 import captures
+
+        if _CONVERTERS.search(node.name):
+            return False
+        if (caps := self.video_capabilities(node.path)) is not None and not captures(caps):
+            return False
+        return self._text(f"{_CAMERAS}/{Path(node.path).name}/index") in ("", "0")
 
     def camera_device(self, source: int | str) -> str | None:
         """Return what identifies the camera of a source: its USB ids and serial number, or else its place.
@@ -197,7 +233,24 @@ class Computer:
         kind = max(holding, key=lambda m: len(m[1]))[2] if holding else ""
         return Disk(shutil.disk_usage(there).free, kind in _NETWORK_FILE_SYSTEMS, os.access(there, os.W_OK))
 
+    def running(self, command: str) -> Process | None:
+        """Return a running program of that name; None if there is none."""
+        for entry in self._entries("proc"):
+            if entry.name.isdigit() and self._text(f"/proc/{entry.name}/comm") == command:
+                return Process(int(entry.name), command)
+        return None
+
     # -- opening ----------------------------------------------------------------------------------------------------
+
+    def require_unused(self, path: str) -> None:
+        """Raise `BenchBusy` if another program has the serial port open, also if it has not locked the port."""
+        port = self.serial_port(path)
+        if port is not None and port.holders:
+            raise BenchBusy(
+                f"The port {path} is in use by {', '.join(map(str, port.holders))}.",
+                next_step="Close that program. If it hangs: `kill " + f"{port.holders[0].pid}`.",
+                evidence={"port": path, "pids": [process.pid for process in port.holders]},
+            )
 
     def open_serial(self, path: str, baud: int, device: str = "servo") -> "SerialConnection":
         """Open the serial port of ``device``, a section of the configuration."""

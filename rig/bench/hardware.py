@@ -56,6 +56,7 @@ class HardwareBench:
         with ExitStack() as connections:
             connections.callback(BenchLock(state_path, clock).close)
             computer = connections.enter_context(self.computer(config, options, seed))
+            computer.require_unused(config.servo.port)
             connection = computer.open_serial(config.servo.port, config.servo.baud)
             connections.callback(connection.close)
             capture = computer.open_capture(config.camera.source)

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from errno import EAGAIN, EBUSY, EIO, ENXIO, EREMOTEIO, ETIMEDOUT
+from errno import EAGAIN, EBUSY, EIO, ENODEV, ENXIO, EREMOTEIO, ETIMEDOUT
+from pathlib import Path
 from typing import TypeVar
 
 from smbus2 import SMBus, i2c_msg
@@ -12,13 +13,16 @@ from rig.core.errors import DeviceNotFound, DeviceSilent
 
 ATTEMPTS, RETRY_PAUSE_S = 3, 0.002
 
+NO_DEVICE = (ENXIO, EREMOTEIO, ENODEV)
+"""Errors by which the kernel's bus drivers report that no device acknowledges an address."""
+STUCK = (ETIMEDOUT, EAGAIN)
+
 _SMBUS_BLOCK = 32
 _REASONS = {
-    **dict.fromkeys((ENXIO, EREMOTEIO), "it does not acknowledge"),
-    **dict.fromkeys((ETIMEDOUT, EBUSY, EAGAIN), "the bus is stuck: something holds SDA or SCL low"),
+    **dict.fromkeys(NO_DEVICE, "it does not acknowledge"),
+    **dict.fromkeys(STUCK, "the bus is stuck: something holds SDA or SCL low"),
     EIO: "a transfer was interrupted",
 }
-_STUCK = (ETIMEDOUT, EBUSY, EAGAIN)
 
 _T = TypeVar("_T")
 
@@ -78,6 +82,8 @@ class I2cRegisters:
 
         Raises
         ------
+        DeviceNotFound
+            A kernel driver uses the address.
         DeviceSilent
             Every attempt failed.
         """
@@ -90,15 +96,29 @@ class I2cRegisters:
                 return transfer()
             except OSError as error:
                 failure = error
+                if error.errno == EBUSY:
+                    raise self._in_use() from error
         reason = _REASONS.get(failure.errno or 0, failure.strerror)
         raise DeviceSilent(
             f"The sensor at I2C address {self.address:#04x} of {self.name} stopped answering: {reason}.",
             next_step="Switch the supply of all sensors on this bus off and on, and check SDA and SCL for a short. "
             "Then open the bench again."
-            if failure.errno in _STUCK
+            if failure.errno in STUCK
             else "Check its plug and supply, then open the bench again.",
             evidence={"errno": failure.errno, "attempts": ATTEMPTS, "retries_so_far": self.statistics.retries},
         ) from failure
+
+    def _in_use(self) -> DeviceNotFound:
+        """Return the error that a kernel driver uses the address, so that no program can."""
+        bus = Path(self.name).resolve().name
+        driver = kernel_driver(bus, self.address)
+        return DeviceNotFound(
+            f"The kernel driver {driver or '(unknown)'} uses I2C address {self.address:#04x} of {self.name}.",
+            next_step=f"Unbind it: `{unbind_command(bus, self.address, driver)}`."
+            if driver
+            else "`rig doctor` names the driver and the command that unbinds it.",
+            evidence={"errno": EBUSY, "driver": driver},
+        )
 
     def not_found(self, silent: DeviceSilent, pin: str) -> DeviceNotFound:
         """Return the error for a sensor that never answered; ``pin`` names the pin that sets its address."""
@@ -109,6 +129,24 @@ class I2cRegisters:
             "kernel driver uses the address).",
             evidence=silent.evidence,
         )
+
+
+def kernel_driver(bus: str, address: int, root: Path = Path("/")) -> str | None:
+    """Return the kernel driver that uses ``address`` of ``bus`` (``i2c-1``); None if sysfs shows none."""
+    try:
+        return (root / "sys/bus/i2c/devices" / _client(bus, address) / "driver").readlink().name
+    except OSError:
+        return None
+
+
+def unbind_command(bus: str, address: int, driver: str) -> str:
+    """Return the command that makes a kernel driver release an address until the next restart."""
+    return f"echo {_client(bus, address)} | sudo tee /sys/bus/i2c/drivers/{driver}/unbind"
+
+
+def _client(bus: str, address: int) -> str:
+    """Return the kernel's name of a device on an I2C bus, for example 1-0068."""
+    return f"{bus.removeprefix('i2c-')}-{address:04x}"
 
 
 def _open(path: str) -> SMBus:

@@ -1,9 +1,10 @@
 """Scan servo buses and I2C buses for devices; the scan changes nothing."""
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from errno import EBUSY, ENXIO, EREMOTEIO
+from errno import EBUSY
 
 import serial
 from dynamixel_sdk import Protocol2PacketHandler
@@ -16,6 +17,8 @@ from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import model_of
+from rig.devices.i2c import NO_DEVICE, STUCK, unbind_command
+from rig.doctor.finding import Finding, FindingCode, bad
 
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
 """Baud rates of Protocol 2.0: the factory setting first, then in order of frequency."""
@@ -228,8 +231,8 @@ def _answers_corrupt(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
 class FoundImu:
     """A device at an IMU address; ``driver``, the ``imu.model``, is None if there is no driver, or if it is unknown.
 
-    ``note`` has more about it: the note of its row, registers of an unknown chip, or a kernel driver that uses the
-    address.
+    ``note`` has more about it: the note of its row, or registers of an unknown chip. ``kernel_driver`` names the driver
+    that uses the address, "" if its name is not known. ``errno`` is the error of the bus at the address.
     """
 
     bus: str
@@ -237,9 +240,26 @@ class FoundImu:
     name: str
     driver: str | None
     note: str = ""
+    kernel_driver: str | None = None
+    errno: int = 0
 
     def __str__(self) -> str:
         return f"{self.name} at {self.address:#04x} of {self.bus}" + (f": {self.note}" if self.note else "")
+
+
+def unusable_address(found: FoundImu) -> Finding | None:
+    """Return why a program cannot use an address: a kernel driver uses it, or the bus fails; None if it can."""
+    if found.kernel_driver is not None:
+        place = {"driver": found.kernel_driver or "(unknown)", "bus": found.bus, "address": found.address}
+        command = unbind_command(found.bus.removeprefix("/dev/"), found.address, found.kernel_driver)
+        fix = command if found.kernel_driver else "ls -l /sys/bus/i2c/devices/*/driver"
+        return bad("imu", FindingCode.KERNEL_DRIVER, fix, **place)
+    if not found.errno:
+        return None
+    fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
+    code = FindingCode.I2C_STUCK if found.errno in STUCK else FindingCode.I2C_FAILED
+    reason = os.strerror(found.errno)
+    return bad("imu", code, fix, bus=found.bus, address=found.address, reason=reason, errno=found.errno)
 
 
 def use_another_imu() -> str:
@@ -250,10 +270,12 @@ def use_another_imu() -> str:
 def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
     """Return the devices that answer at IMU addresses; no other address is asked, and nothing is written.
 
+    An address at which the bus fails is also returned, with the error's number: the others are asked nevertheless.
+
     Raises
     ------
     OSError
-        The bus cannot be opened, or is stuck.
+        The bus cannot be opened.
     """
     name = computer.i2c_name(bus)
     rows = imu_kinds().values()
@@ -265,10 +287,12 @@ def scan_imus(computer: Computer, bus: int | str) -> list[FoundImu]:
                 for register in sorted({row.register for row in rows if address in row.addresses}):
                     said[register] = wire.read_byte_data(address, register)
             except OSError as error:
-                if error.errno == EBUSY:
-                    found.append(FoundImu(name, address, "unknown device", None, "a kernel driver uses the address"))
-                elif error.errno not in (ENXIO, EREMOTEIO):
-                    raise
+                number = error.errno or 0
+                if number == EBUSY:
+                    driver = computer.i2c_driver(bus, address) or ""
+                    found.append(FoundImu(name, address, "unknown device", None, kernel_driver=driver))
+                elif number not in NO_DEVICE:
+                    found.append(FoundImu(name, address, "unknown device", None, errno=number))
                 continue
             here = [row for row in rows if address in row.addresses and said[row.register] in row.identities]
             if here:

@@ -18,6 +18,12 @@ _PAUSE_S, _PAUSE_ERROR_S = 0.02, 0.25
 _STEP_S = 0.5
 _OLDEST_UTC = datetime(2025, 1, 1, tzinfo=UTC)
 
+PORT_GRABBERS = {
+    "ModemManager": "sudo systemctl disable --now ModemManager",
+    "brltty": "sudo apt remove brltty",
+}
+"""Programs of a desktop that open every new serial port, and how to stop them."""
+
 RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
 
 
@@ -62,7 +68,7 @@ def ports(context: DoctorContext) -> Iterator[Finding]:
 
 def _i2c(context: DoctorContext) -> Iterator[Finding]:
     bus = context.computer.i2c_name(context.config.imu.bus)
-    buses = context.computer.i2c_buses()
+    buses = context.computer.i2c_buses(bus)
     node = next((n for n in buses if context.computer.same_file(n.path, bus)), None)
     if node is not None:
         yield from access(context, "port", node, "i2c")
@@ -141,7 +147,10 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
 
 
 def udev_rules(ports_found: list[SerialPort]) -> str:
-    """Return udev rules: a short latency, a permanent name for the adapter, and access for the logged-in user."""
+    """Return udev rules: a short latency, a permanent name, access for the logged-in user, no ModemManager.
+
+    They cannot keep brltty away, because its own rules are read later.
+    """
     lines = [
         f"# {RULES_FILE}: made by `rig doctor --udev`",
         f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{LATENCY_MS}"',
@@ -154,7 +163,12 @@ def udev_rules(ports_found: list[SerialPort]) -> str:
             lines.append(
                 f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{port.usb["idVendor"]}", '
                 f'ATTRS{{idProduct}}=="{port.usb.get("idProduct", "")}", ATTRS{{serial}}=="{port.usb["serial"]}", '
-                f'GROUP="dialout", MODE="0660", TAG+="uaccess"{link}'
+                f'GROUP="dialout", MODE="0660", TAG+="uaccess", ENV{{ID_MM_PORT_IGNORE}}="1"{link}'
+            )
+            lines.append(
+                f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", ATTR{{idVendor}}=="{port.usb["idVendor"]}", '
+                f'ATTR{{idProduct}}=="{port.usb.get("idProduct", "")}", ATTR{{serial}}=="{port.usb["serial"]}", '
+                'ENV{ID_MM_DEVICE_IGNORE}="1"'
             )
     lines.append('SUBSYSTEM=="i2c-dev", GROUP="i2c", MODE="0660", TAG+="uaccess"')
     lines.append('SUBSYSTEM=="video4linux", GROUP="video", MODE="0660", TAG+="uaccess"')
@@ -176,6 +190,9 @@ def i2c_command(context: DoctorContext) -> str:
 
 def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPort]) -> Finding:
     match [port for port in found if port.usb]:
+        case [] if (program := context.computer.running("brltty")) is not None:
+            fix = PORT_GRABBERS["brltty"]
+            return bad("port", FindingCode.BRLTTY_TAKES_PORT, fix, wanted=wanted, pid=program.pid)
         case []:
             fix = "Plug the adapter in, then: " + context.rig("find")
         case [one]:
@@ -188,8 +205,8 @@ def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPo
 def access(context: DoctorContext, topic: str, node: DeviceFile, usual_group: str) -> Iterator[Finding]:
     """Check that a device file can be opened: no other program uses it, and the user has permission."""
     if node.holders and not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
-        modem = "ModemManager" in node.holders[0].command
-        fix = "sudo systemctl disable --now ModemManager" if modem else f"kill {node.holders[0].pid}"
+        command = node.holders[0].command
+        fix = next((fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {node.holders[0].pid}")
         yield bad(topic, FindingCode.DEVICE_FILE_IN_USE, fix, path=node.path, holders=node.holders)
         return
     if node.usable:

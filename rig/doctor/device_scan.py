@@ -1,6 +1,5 @@
 """Find the devices that are connected to the computer, and their settings for the configuration."""
 
-import re
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from rig.doctor.bus_scan import (
     FoundServo,
     scan_imus,
     scan_servos,
+    unusable_address,
     use_another_imu,
     without_echoes,
 )
@@ -31,9 +31,6 @@ from rig.doctor.context import DoctorContext
 from rig.doctor.examination import Check
 from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
 from rig.doctor.servo import duplicate_id, foreign_bytes
-
-_COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi|\bdp\b", re.IGNORECASE)
-"""I2C buses of memory, monitors and clock chips, which must not be scanned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,12 +150,9 @@ class DeviceScan:
             yield foreign_bytes(context, port.path, scan)
 
     def find_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
-        configured = context.computer.i2c_name(context.config.imu.bus)
         asked = 0
         before = len(self.imus)
-        for node in context.computer.i2c_buses():
-            if _COMPUTERS_OWN.search(node.name) and not context.computer.same_file(node.path, configured):
-                continue
+        for node in context.computer.i2c_buses(context.config.imu.bus):
             asked += 1
             if problems := [finding for finding in access(context, "imu", node, "i2c") if finding.fix]:
                 yield from problems
@@ -167,11 +161,15 @@ class DeviceScan:
             try:
                 there = scan_imus(context.computer, node.path)
             except OSError as error:
-                fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
-                yield bad("imu", FindingCode.I2C_STUCK, fix, bus=node.path, reason=error.strerror)
+                yield bad("imu", FindingCode.I2C_NOT_OPENED, context.rig("find"), bus=node.path, reason=error.strerror)
                 continue
+            failures = {found.errno for found in there if found.errno}
             for found in there:
-                if found.driver:
+                if (problem := unusable_address(found)) is not None:
+                    if not found.errno or found.errno in failures:  # a failing bus is reported once
+                        yield problem
+                    failures.discard(found.errno)
+                elif found.driver:
                     self.imus.append(found)
                     yield fine("imu", FindingCode.IMU_FOUND, found=found, bus=found.bus, address=found.address)
                 else:

@@ -11,7 +11,7 @@ from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, ImuSamples
 from rig.devices.open_imu import open_imu
-from rig.doctor.bus_scan import FoundImu, scan_imus, use_another_imu
+from rig.doctor.bus_scan import FoundImu, scan_imus, unusable_address, use_another_imu
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
 from rig.safety.gyro_rotation import DRAIN_SAMPLES
@@ -129,6 +129,8 @@ def _gravity(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
 
 def _wrong(context: DoctorContext, config: ImuConfig, here: FoundImu | None, there: list[FoundImu]) -> Finding:
     bus = context.computer.i2c_name(config.bus)
+    if here is not None and (problem := unusable_address(here)) is not None:
+        return problem
     if here is not None and here.driver is None:
         return bad("imu", FindingCode.NO_DRIVER, use_another_imu(), found=here, address=here.address)
     if here is not None:
@@ -143,7 +145,4 @@ def _wrong(context: DoctorContext, config: ImuConfig, here: FoundImu | None, the
 
 def _bus_failed(context: DoctorContext, error: OSError) -> Finding:
     bus = context.computer.i2c_name(context.config.imu.bus)
-    if isinstance(error, FileNotFoundError | PermissionError):
-        return bad("imu", FindingCode.I2C_NOT_OPENED, context.rig("find"), bus=bus, reason=error.strerror)
-    fix = "Switch the sensor's supply off and on, and check SDA and SCL for a short circuit"
-    return bad("imu", FindingCode.I2C_STUCK, fix, bus=bus, reason=error.strerror, errno=error.errno)
+    return bad("imu", FindingCode.I2C_NOT_OPENED, context.rig("find"), bus=bus, reason=error.strerror)

@@ -138,6 +138,7 @@ class SingleServo:
 def single_servo(context: DoctorContext, progress: Callable[[str], None] = lambda _: None) -> Iterator[SingleServo]:
     """Yield the only servo on the configured port, opened exclusively; see `SingleServo`."""
     context.require_free()
+    context.computer.require_unused(context.config.servo.port)
     wire = context.computer.open_serial(context.config.servo.port, context.config.servo.baud)
     try:
         yield SingleServo(context, wire, progress)

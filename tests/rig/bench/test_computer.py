@@ -27,7 +27,7 @@ def test_serial_port_has_adapter_stable_name_and_latency(computer):
     assert (first.latency_ms, second.latency_ms) == (None, 16)
     assert second.name == "FTDI USB <-> Serial Converter"
     assert second.usb["serial"] == "FT1"
-    assert second.stable == "/dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_FT1-if00-port0"
+    assert second.stable == "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT1-if00-port0"
     assert host(computer).same_file(second.stable, second.path)
     assert not host(computer).same_file(second.stable, first.path)
 
@@ -53,7 +53,7 @@ def test_port_without_adapter_can_be_named(computer):
     assert (named.path, named.usb, named.usable) == ("/dev/pts/3", {}, True)
     assert host(computer).serial_port("/dev/pts/4") is None
     computer.serial_port()
-    stable = "/dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_SIM00001-if00-port0"
+    stable = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_SIM00001-if00-port0"
     assert host(computer).serial_port(stable).path == "/dev/ttyUSB0"
 
 

@@ -1,6 +1,7 @@
 """Scans of servo buses and I2C buses: devices are found, never disturbed, and duplicate ids are detected."""
 
 from dataclasses import replace
+from errno import EBUSY, EIO, ENODEV, ENXIO, EREMOTEIO, ETIMEDOUT
 from itertools import product
 
 import pytest
@@ -8,8 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.config.imus import imu_kinds
+from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.registers import model_numbers
+from rig.devices.open_imu import open_imu
+from rig.devices.v4l2 import CAPTURE, M2M, M2M_MPLANE, capabilities
 from rig.doctor.bus_scan import BAUD_RATES, BaudScan, scan_imus, scan_servos, without_echoes
+from rig.doctor.device_scan import DeviceScan
+from rig.doctor.examination import run_checks
+from rig.doctor.finding import FindingCode, Severity
 from sim.faults import Faults
 from sim.faults.schedule import read_faults
 from tests.fuzzing import fuzz_settings
@@ -199,7 +206,56 @@ def test_unknown_chip_is_reported_and_other_addresses_are_not_asked(bench):
     assert not memory.written
 
 
-def test_stuck_bus_is_an_os_error(bench):
+def test_stuck_bus_is_reported_once_with_its_error(bench):
     bench.devices.i2c.stuck = True
-    with pytest.raises(TimeoutError):
-        scan_imus(bench.context.computer, 1)
+    assert {found.errno for found in scan_imus(bench.context.computer, 1)} == {ETIMEDOUT}
+    codes = [f.code for f in run_checks(bench.context, DeviceScan().checks) if f.topic == "imu"]
+    assert codes == [FindingCode.I2C_STUCK, FindingCode.NO_IMU_FOUND]
+
+
+@pytest.mark.parametrize("number", [ENXIO, EREMOTEIO, ENODEV, EIO, ETIMEDOUT])
+def test_error_of_one_address_does_not_end_the_scan(number, bench):
+    bench.devices.i2c.errors[0x28] = number
+    found = {one.address: one for one in scan_imus(bench.context.computer, 1)}
+    assert found[0x68].driver == "mpu6050"
+    assert (0x28 in found) == (number in (EIO, ETIMEDOUT))  # the others mean that no device acknowledges
+
+
+def test_kernel_driver_that_uses_the_address_is_named_with_the_command_that_unbinds_it(bench):
+    bench.devices.i2c.kernel_drivers.add(0x68)
+    bench.computer.i2c_driver("inv-mpu6050-i2c")
+    problem = bench.problem("imu")
+    assert (problem.code, problem.parameters["driver"]) == (FindingCode.KERNEL_DRIVER, "inv-mpu6050-i2c")
+    assert problem.fix == "echo 1-0068 | sudo tee /sys/bus/i2c/drivers/inv-mpu6050-i2c/unbind"
+    with pytest.raises(DeviceNotFound, match="kernel driver") as caught:
+        open_imu(bench.context.config.imu, bench.devices.i2c.path, bench.devices.world.clock)
+    assert caught.value.evidence["errno"] == EBUSY
+
+
+def test_buses_of_monitors_are_not_scanned():
+    with unopened(plugged=False) as bench:
+        bench.computer.i2c_bus(20, "fef04500.i2c", compatible="brcm,bcm2711-hdmi-i2c")
+        bench.computer.i2c_bus(6, "107d508200.i2c")
+        bench.computer.link("sys/class/drm/card1-HDMI-A-1/ddc", bench.computer.root / "sys/class/i2c-dev/i2c-6")
+        assert bench.context.computer.i2c_buses() == []
+        assert [bus.path for bus in bench.context.computer.i2c_buses(6)] == ["/dev/i2c-6"]
+        bench.computer.i2c_bus(1)
+        assert [bus.path for bus in bench.context.computer.i2c_buses()] == ["/dev/i2c-1"]
+
+
+def test_converters_and_metadata_are_not_cameras():
+    with unopened(plugged=False) as bench:
+        bench.computer.camera(0, "HD Webcam")
+        bench.computer.camera(1, "HD Webcam metadata", capabilities=0x0080_0000)  # V4L2_CAP_META_CAPTURE
+        bench.computer.camera(10, "bcm2835-codec-decode", capabilities=M2M_MPLANE)
+        bench.computer.camera(14, "bcm2835-isp-capture0", capabilities=CAPTURE)
+        bench.computer.camera(20, "a converter", capabilities=CAPTURE | M2M)
+        assert [node.path for node in bench.context.computer.cameras()] == ["/dev/video0"]
+        scan = DeviceScan()
+        assert [f.level for f in run_checks(bench.context, scan.checks) if f.topic == "camera"] == [Severity.FINE]
+
+
+def test_file_that_is_no_video_device_has_no_capabilities(tmp_path):
+    (tmp_path / "video0").write_text("")
+    assert capabilities(tmp_path / "video0") is None
+    assert capabilities(tmp_path / "video1") is None

@@ -3,20 +3,23 @@
 import os
 import sqlite3
 import threading
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from rig.bench.computer import Disk, User
+from rig.bench.hardware import HardwareBench
 from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore, Estimate
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
-from rig.core.errors import ConfigError, DeviceNotFound, DeviceSilent
+from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, DeviceSilent
 from rig.doctor.checks import CHECKS
 from rig.doctor.computer import udev_rules
 from rig.doctor.examination import Check, run_checks
 from rig.doctor.finding import Finding, FindingCode, Severity, finding_words, fine
+from rig.doctor.single_servo import single_servo
 from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
 from rig.safety.saved_state import BenchState as State
 from sim.clock import VirtualClock
@@ -109,11 +112,45 @@ def test_port_of_root_is_fixed_by_udev_rules():
         assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT3M9M97"' in rules
         assert 'SYMLINK+="rig-servo"' in rules
         assert rules.count("rig-servo") == 1
+        assert 'ENV{ID_MM_PORT_IGNORE}="1"' in rules
+        assert 'ATTR{serial}=="FT3M9M97", ENV{ID_MM_DEVICE_IGNORE}="1"' in rules
+
+
+def test_missing_port_is_explained_by_brltty():
+    with unopened(plugged=False) as bench:
+        bench.computer.i2c_bus()
+        bench.computer.camera()
+        bench.computer.process(77, "/usr/bin/brltty -b hd")
+        problem = bench.problem("port")
+        assert (problem.code, problem.fix) == (FindingCode.BRLTTY_TAKES_PORT, "sudo apt remove brltty")
+
+
+def test_bench_is_not_opened_while_another_program_has_the_port_open(bench):
+    """The simulated computer opens the port: the other program has not locked it."""
+
+    class Local(HardwareBench):
+        @contextmanager
+        def computer(self, config, options, seed):
+            yield bench.context.computer
+
+    bench.computer.process(77, "minicom -D /dev/ttyUSB0", "/dev/ttyUSB0")
+    for opening in (
+        lambda: Local().open(bench.context.config, None, None),
+        lambda: single_servo(bench.context).__enter__(),
+    ):
+        with pytest.raises(BenchBusy, match=r"process 77 \(minicom") as caught:
+            opening()
+        assert "kill 77" in caught.value.next_step
+    assert not bench.sent
 
 
 @pytest.mark.parametrize(
     ("command", "fix"),
-    [("dynamixel_wizard", "kill 77"), ("/usr/sbin/ModemManager", "sudo systemctl disable --now ModemManager")],
+    [
+        ("dynamixel_wizard", "kill 77"),
+        ("/usr/sbin/ModemManager", "sudo systemctl disable --now ModemManager"),
+        ("/usr/bin/brltty -b hd", "sudo apt remove brltty"),
+    ],
 )
 def test_port_in_use_names_the_process(command, fix, bench):
     bench.computer.process(77, command, "/dev/ttyUSB0")
@@ -129,7 +166,7 @@ def test_other_port_is_proposed_by_its_permanent_name():
         bench.computer.camera(2, "Cam")
         fixes = list(bench.problems("port").values())
         assert fixes == [
-            "rig config set servo.port /dev/serial/by-id/usb-FTDI_USB_-__Serial_Converter_FT7-if00-port0",
+            "rig config set servo.port /dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT7-if00-port0",
             "rig config set imu.bus 4",
             "rig config set camera.source /dev/v4l/by-id/usb-Cam-video-index0",
         ]
