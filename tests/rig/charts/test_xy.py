@@ -1,6 +1,7 @@
 """Charts over two axes: the drawing shows the data, in SVG and in PNG, in light and in dark mode."""
 
 import re
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import cv2
@@ -32,6 +33,15 @@ def test_points_are_where_the_data_are() -> None:
     assert second[0] - first[0] == pytest.approx(third[0] - second[0], abs=0.02)
     assert (first[1] - third[1]) * 2 == pytest.approx(first[1] - second[1], abs=0.05)
     assert first[1] > second[1], "larger values are higher"
+
+
+def test_legend_beside_a_wide_chart_is_below_its_title() -> None:
+    figure = replace(
+        CHART, title="coil-100, 100 objects, noise gn:0.012 at 128 px; 10 trials an object; 4 views enrolled", wide=True
+    )._figure
+    title, legend = figure.axes[0]._left_title.get_window_extent(), figure.legends[0].get_window_extent()
+    assert title.x1 > legend.x0, "the title is longer than the plot"
+    assert legend.y1 < title.y0
 
 
 def test_falling_axis_grows_downwards() -> None:
