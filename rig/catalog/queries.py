@@ -273,7 +273,7 @@ def _outdated(
     return DescriptorOutdated(
         f"{described} of {views} views have the descriptor {kind.name} {kind.version}; it is missing for {shown}."
         f"{also}",
-        next_step=f"Describe the stored images: rig catalog redescribe{option}",
+        next_step=f"describe the stored images again: rig catalog redescribe{option}",
         evidence={
             "views": views,
             "described": described,
