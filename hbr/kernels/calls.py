@@ -2,7 +2,7 @@
 
 import ctypes
 import threading
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,6 +205,54 @@ class PackedRows:
         """Return some of the rows, in this order; nothing is copied."""
         places = np.ascontiguousarray(rows if self._places is None else self._places[rows], np.int64)
         return PackedRows(self._measure, self.rows, self.squares, places)
+
+
+class ByteRows:
+    """Rows of at most 4096 bytes, prepared for comparison by the Tanimoto coefficient.
+
+    Parameters
+    ----------
+    rows : uint8 array (n, length)
+    squares : int32 array (n,), optional
+        Squared lengths of the first rows, if they are known.
+    """
+
+    LONGEST: Final = 4096
+
+    def __init__(self, rows: LevelArray, squares: NDArray[np.int32] | None = None) -> None:
+        found = library()
+        assert found is not None
+        self._library = found
+        self._rows = rows if rows.strides[1:] == (1,) else np.ascontiguousarray(rows)
+        self._at = address(self._rows), self._rows.strides[0]
+        known = 0 if squares is None else len(squares)
+        self.squares = np.empty(len(rows), np.int32)
+        if squares is not None:
+            self.squares[:known] = squares
+        if len(rows) > known:
+            rest = self._at[0] + known * self._at[1]
+            missing = address(self.squares) + known * self.squares.itemsize
+            found.hbr_byte_squares(rest, self._at[1], rows.shape[1], len(rows) - known, missing)
+
+    def similarity(self, queries: LevelArray) -> FloatArray:
+        """Return the coefficient of queries, (n, length), with all rows, (n, m)."""
+        queries = np.ascontiguousarray(queries)
+        similar = np.empty((len(queries), len(self._rows)))
+        self._library.hbr_tanimoto(
+            address(queries), queries.strides[0], len(queries), *self._at,
+            address(self.squares), len(self._rows), queries.shape[1], address(similar),
+        )  # fmt: skip
+        return similar
+
+    def top(self, query: LevelArray, kept: int) -> tuple[IndexArray, FloatArray]:
+        """Return the rows with the largest coefficients, best first, of equal ones the first; and the coefficients."""
+        query = np.ascontiguousarray(query)
+        best, similar = np.empty(kept, np.int64), np.empty(kept)
+        self._library.hbr_tanimoto_top(
+            address(query), *self._at, len(query), address(self.squares), len(self._rows), kept,
+            address(best), address(similar),
+        )  # fmt: skip
+        return best, similar
 
 
 def support(

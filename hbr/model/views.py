@@ -1,7 +1,8 @@
 """The model set: the views of the enrolled objects, as arrays."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
@@ -117,12 +118,11 @@ class Views:
 
     def select(self, rows: IndexArray | NDArray[np.bool_]) -> "Views":
         """Return the views of these indices, or of a mask. Every object keeps its index and name."""
-        return replace(
-            self,
-            descriptors=self.descriptors[rows],
-            azimuth_deg=self.azimuth_deg[rows],
-            object_index=self.object_index[rows],
-        )
+        chosen = copy(self)  # which has been checked
+        chosen.__dict__.pop("_by_object", None)
+        for name in ("descriptors", "azimuth_deg", "object_index"):
+            object.__setattr__(chosen, name, _read_only(getattr(self, name)[rows]))
+        return chosen
 
     def of(self, object_index: int) -> IndexArray:
         """Return the indices of the views of an object, ascending."""

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.descriptors.cedd import BINS
 from hbr.descriptors.tanimoto import squares, tanimoto, tanimoto_of_dots
+from hbr.kernels import library
+from hbr.kernels.calls import ByteRows
 from hbr.model.views import Views
 
 Method = Literal["auto", "flat", "bound", "kdtree"]
@@ -139,9 +141,23 @@ class _Searcher(Protocol):
 def _searcher(descriptors: LevelArray, method: Method, known: _Searcher | None = None) -> _Searcher:
     if method == "auto":
         method = "flat" if len(descriptors) < _SMALL else "bound"
-    kinds: dict[str, type[_Flat] | type[_Bound] | type[_Tree]] = {"flat": _Flat, "bound": _Bound, "kdtree": _Tree}
+    flat = _Flat if library() is None else _Compiled
+    kinds: dict[str, type[_Compiled | _Flat | _Bound | _Tree]] = {"flat": flat, "bound": _Bound, "kdtree": _Tree}
     kind = kinds[method]
     return (known.extended(descriptors) if isinstance(known, kind) else None) or kind(descriptors)
+
+
+class _Compiled:
+    """The compiled kernel compares with every view where it lies; only the squared lengths are stored."""
+
+    def __init__(self, descriptors: LevelArray, known: NDArray[np.int32] | None = None) -> None:
+        self._rows = ByteRows(descriptors, known)
+
+    def extended(self, descriptors: LevelArray, /) -> "_Compiled":
+        return _Compiled(descriptors, self._rows.squares)
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        return self._rows.top(query, k)
 
 
 class _Flat:
