@@ -12,6 +12,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from benchmarks.record import record
 from hbr import cedd, describe
 from hbr.core.arrays import ImageArray
 
@@ -38,7 +39,6 @@ def microseconds(function: Callable[[], object]) -> tuple[float, float]:
 
 def main() -> None:
     cv2.setNumThreads(1)
-    print(f"{'frame':>10} {'call':<34} {'min µs':>8} {'median µs':>10} {'ratio':>6}")
     for width, height in ((640, 480), (160, 160), (128, 128)):
         image = frame(width, height)
         grey = image[:, :, 1:2].repeat(3, axis=2)
@@ -53,8 +53,8 @@ def main() -> None:
             "hbr.describe": lambda image=image: describe(image),  # type: ignore[misc]
         }
         rows = {"cv2.resize to 80 x 80, INTER_AREA": peer} | {name: microseconds(call) for name, call in calls.items()}
-        for name, (least, median) in rows.items():
-            print(f"{width:>6}x{height} {name:<34} {least:8.1f} {median:10.1f} {least / peer[0]:6.2f}")
+        for name, (least, _) in rows.items():
+            record(f"{width}x{height}: {name}", least / 1e3, "cv2.resize to 80 x 80", peer[0] / 1e3)
 
 
 if __name__ == "__main__":

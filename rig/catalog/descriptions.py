@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Text, cast, select
+from sqlalchemy import Text, cast, func, select
 
 from hbr.descriptors import descriptor
 from rig.calibrations.store import CALIBRATIONS
@@ -72,15 +72,17 @@ def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.ui
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
     """Return the regions that the views of a bench are described within; None is the whole image.
 
-    Each region comes with the ids of the calibration results in force when its views were taken.
+    Each region comes with the ids of the calibration results in force when its views were taken. The views of a session
+    have one region: the first view of each is read.
     """
+    first = select(func.min(views.c.id)).where(views.c.session_id == sessions.c.id).correlate(sessions)
     with catalog.database.read() as connection:
         rows = connection.execute(
             select(cast(descriptors.c.settings, Text), cast(sessions.c.conditions, Text))
             .select_from(objects)
             .join(enrollments)
-            .join(views, views.c.enrollment_id == enrollments.c.id)
-            .join(sessions, views.c.session_id == sessions.c.id)
+            .join(sessions, sessions.c.enrollment_id == enrollments.c.id)
+            .join(views, views.c.id == first.scalar_subquery())
             .join(descriptors, described_by(descriptor(PAPER_DESCRIPTOR)))
             .where(retrieved(), sessions.c.bench == bench)
             .distinct()

@@ -94,6 +94,44 @@ def test_similarity_has_the_bits_of_the_reference(kind: str, queries: int, count
 
 @compiled
 @settings(max_examples=60)
+@given(queries=st.integers(0, 9), count=st.integers(1, 200), length=st.sampled_from([1, 31, 144, 4096]), seed=seeds)
+def test_tanimoto_has_the_bits_of_the_reference(queries: int, count: int, length: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    top = 255 if seed % 3 else 1
+    asked, rows = (
+        (rng.integers(0, top + 1, (n, length)) * (rng.random((n, length)) < 0.4)).astype(np.uint8)
+        for n in (queries, count)
+    )
+    rows[rng.integers(0, count, count // 3)] = rows[0]
+    rows[count // 2] = rng.choice([0, 255])
+    apart = np.repeat(rows, 2, axis=0)[::2]
+    with without_library():
+        reference = hbr.tanimoto(asked, rows)
+    np.testing.assert_array_equal(hbr.tanimoto(asked, rows), reference)
+    np.testing.assert_array_equal(hbr.tanimoto(asked, apart), reference)
+
+
+@compiled
+@settings(max_examples=40)
+@given(st.integers(1, 300), st.integers(0, 50), st.integers(1, 320), seeds)
+def test_the_paper_s_search_returns_what_it_returns_without_kernels(count: int, more: int, k: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    levels = (rng.integers(0, 8, (count + more, 144)) * (rng.random((count + more, 144)) < 0.1)).astype(np.uint8)
+    levels[rng.integers(0, len(levels), len(levels) // 3)] = levels[0]  # equal similarities
+    first, rest = (
+        hbr.Views(part, np.zeros(len(part)), np.zeros(len(part), np.intp), ("object",))
+        for part in np.split(levels, [count])
+    )
+    index = hbr.ViewIndex(first).extended(rest)
+    with without_library():
+        reference = hbr.ViewIndex(first).extended(rest)
+        wanted = reference.search(levels[0], k)
+    for found, expected in zip(index.search(levels[0], k), wanted, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@compiled
+@settings(max_examples=60)
 @given(
     counts=st.lists(st.integers(1, 40), min_size=1, max_size=6),
     step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),

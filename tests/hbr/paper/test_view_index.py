@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import ViewIndex, Views, tanimoto
-from hbr.paper.index import Method, _best, _Bound, _Flat, _promising
+from hbr.paper.index import Method, _best, _Bound, _promising
 from tests.fuzzing import examples
 
 METHODS = get_args(Method)
@@ -97,13 +97,13 @@ def test_results_are_cached_and_returned_as_copies(monkeypatch: pytest.MonkeyPat
     rows = np.random.default_rng(0).integers(0, 8, (100, 144), dtype=np.uint8)
     index = ViewIndex(views_of(rows))
     searched = []
-    top = _Flat.top
+    top = index._searcher.top
 
-    def counted(self: _Flat, query: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    def counted(query: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         searched.append(k)
-        return top(self, query, k)
+        return top(query, k)
 
-    monkeypatch.setattr(_Flat, "top", counted)
+    monkeypatch.setattr(index._searcher, "top", counted)
     expected = [part.tolist() for part in index.search(rows[3], 5)]
     for part in index.search(rows[3], 5):
         part[:] = 0
