@@ -5,13 +5,17 @@ from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
+from pydantic import Field
 
 from rig.calibrations import CalibrationStore
+from rig.catalog.exchange.results_table import plain_row
+from rig.catalog.records import Outcome
+from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound
 from rig.events.events import plain
 from rig.search.replay import check
 from rig.search.saved_run import SavedRun, load_run
-from rig.web.server import Limit, Server, Watcher, page_of, time_text
+from rig.web.server import CorrectionBody, Limit, OperatorPerson, Server, Watcher, page_of, time_text
 from rig.web.work import calibrations
 
 RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -64,6 +68,39 @@ def add_records(api: APIRouter, server: Server) -> None:
         with saved.damage():
             found = check(saved)
         return {**plain(found), "differences": [str(difference) for difference in found.differences]}
+
+    @api.get("/results", tags=["results"])
+    def results(
+        request: Request,
+        _person: Watcher,
+        limit: Limit = 100,
+        after: Annotated[str | None, Query(max_length=20)] = None,
+        sample: Annotated[str | None, Query(max_length=100)] = None,
+        object_name: Annotated[str | None, Query(alias="object", max_length=100)] = None,
+        outcome: Outcome | None = None,
+    ) -> Response:
+        """List the recorded answers, the newest first. Filters use the corrected values."""
+        with server.open_catalog(True) as catalog:
+            found = find_results(catalog, ResultFilter(sample, object_name, outcome))
+        rows = [{**plain_row(one), "id": str(one.id)} for one in found]
+        return page_of(request, rows[::-1], "id", limit, after)
+
+    @api.post("/results/{result_id}/correct", tags=["results"])
+    def correct_result(
+        body: CorrectionBody, person: OperatorPerson, result_id: Annotated[int, Field(ge=1, lt=2**62)]
+    ) -> dict[str, Any]:
+        """Correct the object or the sample of an answer, with the reason. The answer itself stays."""
+        with server.open_catalog(False) as catalog:
+            correct(
+                catalog,
+                result_id,
+                reason=body.reason,
+                object_name=body.object,
+                unknown=body.unknown,
+                sample=body.sample,
+                operator=person.name,
+            )
+            return plain_row(find_result(catalog, result_id))
 
     @api.get("/calibrations", tags=["bench"])
     def calibration_list(_person: Watcher) -> dict[str, Any]:

@@ -112,6 +112,15 @@ class NameBody(Body):
     name: Annotated[str, Field(max_length=1000)]
 
 
+class CorrectionBody(Body):
+    """A correction of an answer; what is missing stays."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=1000)]
+    object: Annotated[str | None, Field(max_length=100)] = None
+    unknown: bool = Field(False, description="the object is in fact unknown")
+    sample: Annotated[str | None, Field(max_length=100)] = None
+
+
 class Problem(BaseModel):
     """An error (RFC 9457)."""
 

@@ -33,6 +33,11 @@ if ($("runs")) {
       }) }, "Compute again"));
     $("replay").replaceChildren(...run.events.filter((event) => event.text).map((event) => h("li", {}, event.text)));
   };
+  const answers = async () => {
+    const page = await request("GET", "/results?limit=50");
+    table($("answers"), ["Time (UTC)", "Sample", "Answer", "Confidence", "Views", "Operator"], page.items.map((one) => [one.time_utc.slice(0, 19).replace("T", " "), one.sample, one.outcome === "unknown" ? "unknown object" : `${one.outcome === "ambiguous" ? "ambiguous: " : ""}${one.object}${one.corrections ? " (corrected)" : ""}`, one.confidence === null ? "" : `${(one.confidence * 100).toFixed(1)} %`, one.views, one.operator]));
+  };
+  on("hello", () => act(answers));
   const add = (items) => {
     $("runs").append(...items.map((run) => h("li", {}, h("button", { class: "quiet", onclick: () => act(() => open(run.name)) }, run.name))));
     if (!$("runs").children.length) $("runs").append(h("li", {}, "There are no runs yet. Identify an object."));

@@ -18,13 +18,18 @@ def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     picture = served.client.get(f"/api/v1/jobs/{job['id']}/views/5")
     assert picture.headers["content-type"] == "image/jpeg"
     assert picture.content[:2] == b"\xff\xd8"
-    job = served.run(kind="identify")
+    job = served.run(kind="identify", sample="S-1")
     assert job["result"]["outcome"] == "found"
     assert job["result"]["name"] == "mug-white"
     run = served.client.get(f"/api/v1/runs/{job['run']}").json()
     assert run["events"][-1]["event"] == "identified"
     assert "mug-white" in served.client.get(f"/api/v1/runs/{job['run']}/report").text
     assert served.client.post(f"/api/v1/runs/{job['run']}/check").json()["differences"] == []
+    (answer,) = served.client.get("/api/v1/results?sample=S-1").json()["items"]
+    assert (answer["object"], answer["operator"]) == ("mug-white", "local")
+    fixed = {"object": "lamp", "reason": "read the label"}
+    assert served.client.post(f"/api/v1/results/{answer['id']}/correct", json=fixed).json()["object"] == "lamp"
+    assert served.client.get("/api/v1/results?object=mug-white").json()["total"] == 0
 
 
 def test_name_in_use_is_rejected_before_the_table_moves(serve):
