@@ -1,10 +1,11 @@
 """The simulated computer of a simulated bench: the files that Linux shows, and the simulated devices behind them."""
 
 import re
+import subprocess
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from rig.bench.computer import SERIAL_NAMES, Computer, User
 from rig.config import RigConfig, ServoConfig
@@ -162,11 +163,30 @@ class SimComputer(Computer):
 @contextmanager
 def simulated_computer(config: RigConfig, devices: SimDevices) -> Iterator[SimComputer]:
     """Yield the computer of a simulated bench. The servo is configured as by opening the bench."""
-    with TemporaryDirectory(prefix="sim-host-") as folder:
-        write_files(Path(folder), config)
+    with _temporary_folder() as folder:
+        write_files(folder, config)
         with suppress(RigError):  # no supply or a fault: the doctor reports it
             configure_servo(devices, config.servo)
-        yield SimComputer(Path(folder), devices, config)
+        yield SimComputer(folder, devices, config)
+
+
+@contextmanager
+def _temporary_folder() -> Iterator[Path]:
+    """Yield an empty folder. Another process removes it at the end, also if this program is killed."""
+    script = """trap '' PIPE; folder=$(mktemp -d "$1/sim-host-XXXXXX") && printf '%s\\n' "$folder"
+        read -r _; [ -z "$folder" ] || rm -rf -- "$folder" """
+    with subprocess.Popen(
+        ["sh", "-c", script, "sh", tempfile.gettempdir()],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        folder = process.stdout.readline().rstrip("\n")
+        if not folder:
+            raise OSError(f"no folder can be created in {tempfile.gettempdir()}")
+        yield Path(folder)
 
 
 def write_files(folder: Path, config: RigConfig) -> None:

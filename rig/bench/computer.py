@@ -253,10 +253,10 @@ class Computer:
             )
 
     def open_serial(self, path: str, baud: int, device: str = "servo") -> "SerialConnection":
-        """Open the serial port of ``device``, a section of the configuration."""
+        """Open the serial port of ``device``, a section of the configuration; wait for a guardian that uses it."""
         from rig.devices.dynamixel.port import open_serial
 
-        return open_serial(path, baud, device)
+        return open_serial(path, baud, device, self.clock)
 
     def i2c_name(self, bus: int | str) -> str:
         """Return the name of a bus: its device file."""

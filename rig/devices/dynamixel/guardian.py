@@ -15,11 +15,9 @@ from typing import Final
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import RigError
 from rig.devices.dynamixel.bus import DynamixelBus
-from rig.devices.dynamixel.port import ClockedPort, open_serial
+from rig.devices.dynamixel.port import GUARDIAN, GUARDIAN_S, ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table, protocol_of
 
-MAX_WAIT_S: Final = 5.0
-"""How long the guardian tries: the port may be in use, or the servo without supply."""
 _RETRY_S: Final = 0.05
 _ON, _OFF = b"1", b"0"
 
@@ -35,7 +33,7 @@ class Guardian:
         """Let the guardian switch the torque off if this program dies; call it before switching the torque on."""
         if self._process is None or self._process.poll() is not None:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", __name__, *self._arguments],
+                [sys.executable, "-P", "-m", GUARDIAN, *self._arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -54,7 +52,7 @@ class Guardian:
         if process is not None and process.stdin is not None:
             process.stdin.close()
             with suppress(subprocess.TimeoutExpired):
-                process.wait(MAX_WAIT_S)
+                process.wait(GUARDIAN_S)
 
     def _tell(self, word: bytes) -> None:
         if self._process is not None and self._process.stdin is not None:
@@ -71,7 +69,7 @@ def watch(port: str, baud: int, model: str, bus_id: int) -> bool:
         return True
     clock = SystemClock()
     begun_ns = clock.now_ns()
-    while seconds_between(begun_ns, clock.now_ns()) < MAX_WAIT_S:
+    while seconds_between(begun_ns, clock.now_ns()) < GUARDIAN_S:
         with suppress(RigError):
             connection = open_serial(port, baud)
             try:

@@ -1,9 +1,11 @@
 """The SDK's port on the bench's clock, for any object that reads and writes bytes as pyserial does."""
 
 import errno
+import os
 import termios
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Protocol
 
 import serial
@@ -36,30 +38,65 @@ class BusBabble(Exception):
     """Bytes keep arriving, but no packet: another master, a wrong baud rate, or an open bus."""
 
 
-def open_serial(path: str, baud: int, device: str = "servo") -> SerialConnection:
+GUARDIAN = "rig.devices.dynamixel.guardian"
+GUARDIAN_S = 5.0
+"""How long the guardian of a killed program tries to switch the torque off."""
+_BUSY = (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK)
+_BUSY_RETRY_S = 0.05
+
+
+def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None = None) -> SerialConnection:
     """Open the serial port of ``device`` (a section of the configuration), exclusively for this process.
+
+    With a ``clock``, wait while the guardian of a killed program uses the port.
 
     Raises
     ------
     DeviceNotFound
         The next step names the likely reason: no such port, no permission, or another program uses it.
     """
-    try:
-        connection: SerialConnection = serial.Serial(
-            path, baud, timeout=READ_SLICE_S, write_timeout=1.0, exclusive=True
-        )
-    except (serial.SerialException, OSError, ValueError) as error:
-        reason = getattr(error, "errno", None)
-        if reason == errno.EACCES:
-            step = "Join the group dialout (`sudo usermod -aG dialout $USER`), then log in again."
-        elif reason in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-            step = "Close the other program that uses this port (for example Dynamixel Wizard)."
+    begun_ns = clock.now_ns() if clock else 0
+    was_guarded = True  # a guardian may close the port between the attempt to open it and the look at its users
+    while True:
+        try:
+            connection: SerialConnection = serial.Serial(
+                path, baud, timeout=READ_SLICE_S, write_timeout=1.0, exclusive=True
+            )
+        except (serial.SerialException, OSError, ValueError) as error:
+            guarded = getattr(error, "errno", None) in _BUSY and _is_used_by_guardian(path)
+            waits = getattr(error, "errno", None) in _BUSY and (guarded or was_guarded)
+            if clock is None or not waits or clock.now_ns() - begun_ns > 2e9 * GUARDIAN_S:
+                raise _not_opened(path, baud, device, error, guarded=guarded) from error
+            was_guarded = guarded
+            clock.sleep(_BUSY_RETRY_S)
         else:
-            step = f"Check the USB cable and {device}.port; `rig find` lists the ports."
-        raise DeviceNotFound(
-            f"Cannot open the {device}'s port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
-        ) from error
-    return connection
+            return connection
+
+
+def _not_opened(path: str, baud: int, device: str, error: Exception, *, guarded: bool) -> DeviceNotFound:
+    reason = getattr(error, "errno", None)
+    if reason == errno.EACCES:
+        step = "Join the group dialout (`sudo usermod -aG dialout $USER`), then log in again."
+    elif guarded:
+        step = "Wait some seconds: after a program was killed, its guardian switches the torque off. Then try again."
+    elif reason in _BUSY:
+        step = "Close the other program that uses this port (for example Dynamixel Wizard)."
+    else:
+        step = f"Check the USB cable and {device}.port; `rig find` lists the ports."
+    return DeviceNotFound(
+        f"Cannot open the {device}'s port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
+    )
+
+
+def _is_used_by_guardian(path: str) -> bool:
+    """Return whether a guardian has a port open."""
+    port = os.path.realpath(path)
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it ended, or belongs to another user
+            if GUARDIAN.encode() in (process / "cmdline").read_bytes().split(b"\0"):
+                if any(os.path.realpath(one) == port for one in (process / "fd").iterdir()):
+                    return True
+    return False
 
 
 class ClockedPort(PortHandler):  # type: ignore[misc]

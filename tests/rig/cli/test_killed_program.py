@@ -1,25 +1,30 @@
 """A program is killed, stopped and terminated during a motion of a servo that is simulated in real time."""
 
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
+import urllib.request
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from rig.bench.computer import Computer
 from rig.cli.main import app
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.opening import open_servo
-from rig.devices.dynamixel.port import open_serial
+from rig.devices.dynamixel.port import GUARDIAN, open_serial
 from sim.realtime.wire import tell
 from tests.programs import Program
 
 CLOCK = SystemClock()
+JSON = {"Content-Type": "application/json"}
 
 PROGRAM = """
 import os
@@ -183,9 +188,59 @@ def test_guardian_switches_the_torque_off_of_a_killed_program(servo, number):
     until(lambda: is_torque_off(servo), 30.0)
 
 
+SPIN = """
+from rig.config import load_config
+from rig.core.clock import SystemClock
+from rig.devices.dynamixel.guardian import Guardian
+from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.port import open_serial
+import sys
+
+config = load_config(None, sys.argv[1:]).servo
+guardian = Guardian(config.port, config.baud, config.model, config.id)
+servo = open_servo(open_serial(config.port, config.baud), config, SystemClock(), guardian=guardian)
+servo.prepare(write=True)
+for state in servo.spin(60.0, 600.0):
+    if abs(state.velocity_dps) > 30.0:
+        print("moving", flush=True)
+"""
+
+
+@pytest.mark.nightly
+def test_guardian_switches_the_torque_off_of_a_spinning_servo(servo):
+    process = Program(*servo, code=SPIN)
+    assert process.stdout.readline() == "moving\n", process.stderr.read()
+    process.send_signal(signal.SIGKILL)
+    ended(process)
+    until(lambda: is_torque_off(servo), 30.0)
+
+
+def test_next_command_waits_for_the_guardian_of_a_killed_program():
+    ours, theirs = os.openpty()  # no servo answers, so the guardian tries for some seconds
+    port = os.ttyname(theirs)
+    guardian = subprocess.Popen([sys.executable, "-m", GUARDIAN, port, "57600", "xl430", "1"], stdin=subprocess.PIPE)
+    guardian.stdin.write(b"1")
+    guardian.stdin.close()
+
+    def is_named() -> bool:
+        try:
+            open_serial(port, 57_600).close()
+        except DeviceNotFound as error:
+            return "its guardian switches the torque off" in error.next_step
+        return False
+
+    try:
+        until(is_named, 30.0)
+        Computer().open_serial(port, 57_600).close()
+    finally:
+        guardian.wait(30.0)
+        os.close(ours)
+        os.close(theirs)
+
+
 NIGHTLY = [
     *(["home", "--turns", "0"], ["enroll", "cup", "--yes"], ["empty-table"]),
-    *(["calibrate", "servo"], ["calibrate", "imu"]),
+    *(["calibrate", "servo"], ["calibrate", "imu"], ["identify", "--strategy", "sweep"], ["serve", "--port", "0"]),
 ]
 
 
@@ -195,6 +250,11 @@ NIGHTLY = [
 def test_guardian_switches_the_torque_off_of_each_command_that_moves(running_sim_bench, tmp_path, command):
     config = ["--config", str(running_sim_bench / "rig.toml")]
     assert CliRunner().invoke(app, ["home", "--here", *config]).exit_code == 0
+    if command[0] == "identify":
+        enroll = ["enroll", "mug-white", "--views", "4", "--yes", "--bench", "sim"]
+        done = CliRunner().invoke(app, [*enroll, "--set", f"catalog.path={str(tmp_path / 'catalog')!r}"])
+        assert done.exit_code == 0, done.output
+        config += ["--set", f"catalog.path={str(tmp_path / 'catalog')!r}"]
     (tmp_path / "here").mkdir()
     for module in ("signal", "subprocess", "rig"):  # no process imports from the folder in which the program runs
         (tmp_path / "here" / f"{module}.py").write_text("open('imported', 'w')")
@@ -204,7 +264,13 @@ def test_guardian_switches_the_torque_off_of_each_command_that_moves(running_sim
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
+        text=True,
     )
+    if command[0] == "serve":
+        pytest.importorskip("fastapi", reason="the extra hbr-rig[web] is not installed")
+        page = next(found[0] for line in process.stdout if (found := re.search(r"http://\S+/", line)))
+        job = urllib.request.Request(f"{page}api/v1/jobs", b'{"kind": "goto", "angle_deg": 90}', JSON)
+        urllib.request.urlopen(job, timeout=30).close()
 
     def torque() -> bool:
         return tell(running_sim_bench, "status")["world"]["torque"]
