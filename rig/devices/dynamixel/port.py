@@ -93,9 +93,9 @@ def _is_used_by_guardian(path: str) -> bool:
     port = os.path.realpath(path)
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it ended, or belongs to another user
-            if GUARDIAN.encode() in (process / "cmdline").read_bytes().split(b"\0"):
-                if any(os.path.realpath(one) == port for one in (process / "fd").iterdir()):
-                    return True
+            is_guardian = GUARDIAN.encode() in (process / "cmdline").read_bytes().split(b"\0")
+            if is_guardian and any(os.path.realpath(one) == port for one in (process / "fd").iterdir()):
+                return True
     return False
 
 
