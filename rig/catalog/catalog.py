@@ -41,9 +41,9 @@ from rig.catalog.records import (
 )
 from rig.catalog.rows import abandon_unfinished, insert_session, of_status, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, views
-from rig.catalog.seal import changing_enrollments, changing_object, seal_enrollments, seal_objects
+from rig.catalog.seal import changing_enrollments, changing_object, damage_of, seal_enrollments, seal_objects
 from rig.core.clock import Clock
-from rig.core.errors import CatalogError, ObjectExists, UsageError
+from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, UsageError
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
 
@@ -289,6 +289,18 @@ class Catalog(AbstractContextManager["Catalog"]):
                 enrollments=tuple(enrollment_summaries(connection, enrollments.c.object_id == object_id)),
                 views=tuple(stored_views(connection, of_status(object_id, EnrollmentStatus.COMPLETE))),
             )
+
+    def damage(self, name: str | None = None) -> CatalogDamaged | None:
+        """Return the error that rows of an object, or of any object, are not as they were stored; None if they are.
+
+        Compares digests of rows, not of images: 0.2 s for 7,000 views. `rig.catalog.verify` compares everything.
+        """
+        with self.database.read() as connection:
+            if name is None:
+                return damage_of(connection, None, None)
+            object_id, _ = find(connection, name)
+            own = connection.scalars(select(enrollments.c.id).where(enrollments.c.object_id == object_id)).all()
+            return damage_of(connection, [object_id], own)
 
     def views(self, descriptor: str = PAPER_DESCRIPTOR) -> ModelSet:
         """Return the views of every complete enrollment as a descriptor describes them, by object and index.

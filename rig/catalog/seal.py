@@ -84,17 +84,25 @@ def enrollment_digests(connection: Connection, ids: Collection[int] | None = Non
 
 def check_loaded(connection: Connection, object_ids: Collection[int], enrollment_ids: Collection[int]) -> None:
     """Raise `CatalogDamaged` if one of these objects or enrollments is not as it was stored."""
+    if (damage := damage_of(connection, object_ids, enrollment_ids)) is not None:
+        raise damage
+
+
+def damage_of(
+    connection: Connection, object_ids: Collection[int] | None, enrollment_ids: Collection[int] | None
+) -> CatalogDamaged | None:
+    """Return the error that some of these objects or enrollments are not as they were stored; None for all."""
     broken = {one for one, sealed, found in object_digests(connection, object_ids) if sealed != found}
     spoiled = {one for one, sealed, found in enrollment_digests(connection, enrollment_ids) if sealed != found}
     if not broken | spoiled:
-        return
+        return None
     names = connection.exec_driver_sql(
         "SELECT DISTINCT name FROM objects WHERE id IN (SELECT value FROM json_each(?)) "
         "OR id IN (SELECT object_id FROM enrollments WHERE id IN (SELECT value FROM json_each(?))) ORDER BY id",
         (json.dumps(sorted(broken)), json.dumps(sorted(spoiled))),
     )
     shown = [str(name) for name in names.scalars()]
-    raise CatalogDamaged(
+    return CatalogDamaged(
         f"{', '.join(map(repr, shown[:3]))}{' and others' if len(shown) > 3 else ''} in the catalog changed after they "
         "were stored",
         next_step="check the catalog (rig catalog verify); use a backup, or delete these objects and enroll them again",
@@ -102,11 +110,13 @@ def check_loaded(connection: Connection, object_ids: Collection[int], enrollment
     )
 
 
-def appended_digests(connection: Connection, table: Table) -> list[tuple[int, str | None, str]]:
-    """Return id, stored digest and expected digest of every row of an append-only table."""
+def appended_digests(
+    connection: Connection, table: Table, *, after: int = 0, limit: int = -1
+) -> list[tuple[int, str | None, str]]:
+    """Return id, stored digest and expected digest of rows of an append-only table: all, or some ``after`` an id."""
     found = []
-    before = FIRST
-    for row in connection.exec_driver_sql(_appended(table, "TRUE")):
+    before = _digest_before(connection, table, after + 1)
+    for row in connection.exec_driver_sql(f"{_appended(table, 'id > ?')} LIMIT ?", (after, limit)):
         found.append((row[1], row[0], _digest(before, row[1:])))
         before = row[0] or FIRST
     return found
@@ -114,14 +124,16 @@ def appended_digests(connection: Connection, table: Table) -> list[tuple[int, st
 
 def seal_appended(connection: Connection, table: Table) -> None:
     """Store the digests of the rows of an append-only table that have none, those at its end."""
-    before = FIRST
     first = connection.exec_driver_sql(f"SELECT min(id) FROM {table.name} WHERE digest IS NULL").scalar()
-    if first is not None:
-        newest = f"SELECT digest FROM {table.name} WHERE id < ? ORDER BY id DESC LIMIT 1"
-        before = connection.exec_driver_sql(newest, (first,)).scalar() or FIRST
+    before = FIRST if first is None else _digest_before(connection, table, first)
     for row in connection.exec_driver_sql(_appended(table, "id >= ?"), (first,)).all():
         before = _digest(before, row[1:])
         connection.exec_driver_sql(f"UPDATE {table.name} SET digest = ? WHERE id = ?", (before, row[1]))
+
+
+def _digest_before(connection: Connection, table: Table, row_id: int) -> str:
+    newest = f"SELECT digest FROM {table.name} WHERE id < ? ORDER BY id DESC LIMIT 1"
+    return str(connection.exec_driver_sql(newest, (row_id,)).scalar() or FIRST)
 
 
 def _appended(table: Table, where: str) -> str:

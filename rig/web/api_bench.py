@@ -16,7 +16,7 @@ def add_bench(api: APIRouter, server: Server) -> None:
     @api.get("/status", tags=["bench"])
     def status(_person: Watcher) -> dict[str, Any]:
         """Return the state of the bench, as of the last second."""
-        problem_now = server.queue.problem
+        problem_now = server.queue.problem or server.damage
         return {
             **server.worker.status,
             "bench": server.bench,

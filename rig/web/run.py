@@ -3,8 +3,10 @@
 import os
 import secrets
 import socket
+import sys
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,9 +15,10 @@ import uvicorn
 
 from rig.bench import Bench, open_bench
 from rig.catalog import Catalog
+from rig.catalog.background import BackgroundCheck
 from rig.config import RigConfig
 from rig.core.clock import Clock, SystemClock
-from rig.core.errors import UsageError, os_errors_as
+from rig.core.errors import RigError, UsageError, os_errors_as
 from rig.core.files import write
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, BenchLock, ServerAddress
 from rig.web.access import Lease, Sessions, Tokens
@@ -102,7 +105,8 @@ def run_server(
                 )
                 write(folder / SERVER_FILE, address.model_dump_json().encode(), mode=0o600)
                 ready(url)
-                server.worker.run()
+                with _checked_catalog(server):
+                    server.worker.run()
             finally:
                 (folder / SERVER_FILE).unlink(missing_ok=True)
                 server.hub.close()
@@ -111,6 +115,20 @@ def run_server(
                 thread.join(START_S)
     finally:
         lock.close()
+
+
+def _checked_catalog(server: Server) -> AbstractContextManager[object]:
+    """Return a check of the catalog beside the work of a ``with`` block; damage is on stderr and in the status."""
+    path = server.config.catalog_path(server.bench)
+    if not (path / "catalog.sqlite").exists():
+        return nullcontext()
+
+    def report(damage: RigError) -> None:
+        server.damage = damage
+        with suppress(OSError):
+            print(f"Note: {damage.what}. Next step: {damage.next_step}", file=sys.stderr, flush=True)
+
+    return BackgroundCheck(path, server.clock, report)
 
 
 class _Web(uvicorn.Server):

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rig.catalog import Catalog
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
-from rig.core.errors import Forbidden, LoginRequired, UsageError
+from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
 from rig.web.hub import Hub
 from rig.web.jobs import JobQueue
@@ -37,6 +37,8 @@ class Server:
         Whether requests need a token: always, unless the server listens to this computer only.
     open_catalog
         Opens the bench's catalog; ``True`` for reading only.
+    damage
+        Of the catalog; None if none is known.
     """
 
     bench: str
@@ -52,6 +54,7 @@ class Server:
     open_catalog: Callable[[bool], Catalog]
     needs_login: bool
     secure_cookies: bool = False
+    damage: RigError | None = None
 
     def person(self, request: Request) -> Person | None:
         """Return who sends a request; None if it is not known. Raises `LoginRequired`, `TooManyLogins`."""

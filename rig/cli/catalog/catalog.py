@@ -13,9 +13,10 @@ from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from rig.bench import Bench
-    from rig.catalog import Catalog
+    from rig.catalog import Catalog, ObjectDetails, ObjectSummary
 
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
@@ -34,7 +35,7 @@ def list_(
     unfinished: Annotated[bool, typer.Option("--unfinished", help="Only unfinished enrollments.")] = False,
     deleted: Annotated[bool, typer.Option("--deleted", help="List deleted objects instead.")] = False,
 ) -> None:
-    """List the enrolled objects.
+    """List the enrolled objects. Exit code 7 if the catalog is damaged.
 
     Columns: name of the object, its label, its number of views (in brackets those of an unfinished enrollment), and the
     time when its enrollment was complete.
@@ -46,7 +47,7 @@ def list_(
 
     with settings.open_catalog(read_only=True) as catalog:
         found = deleted_objects(catalog) if deleted else catalog.objects()
-        path = catalog.path
+        path, damage = catalog.path, catalog.damage()
     objects = [
         item
         for item in found
@@ -56,11 +57,16 @@ def list_(
     ]
     if settings.json:
         settings.print_json({"catalog": str(path), "objects": plain(objects)})
-        return
-    if not objects:
+    elif objects:
+        _print_objects(objects)
+    else:
         empty = "No deleted objects." if deleted else "No objects yet. Enroll one: rig enroll NAME"
         print(f"None of the {len(found)} objects matches." if found else empty)
-        return
+    if damage is not None:
+        raise damage
+
+
+def _print_objects(objects: "list[ObjectSummary]") -> None:
     rows = []
     for item in objects:
         views = str(item.views)
@@ -80,28 +86,35 @@ def show(
         bool, typer.Option("--full", help="Also show all settings of the devices and conditions of each session.")
     ] = False,
 ) -> None:
-    """Show an object: its enrollments with their sessions, and the angles of its views.
+    """Show an object: its enrollments with their sessions, and the angles of its views. Exit code 7 if it is damaged.
 
     Columns: index of the view, azimuth of the camera, table angle by the servo's encoder and by the IMU, and sharpness.
 
     Example: rig catalog show mug-white --bench sim
     """
-    from rig.events.wording import counted
+    from rig.events.events import plain
     from rig.views.segmentation_evidence import SegmentationSummary
 
     with settings.open_catalog(read_only=True) as catalog:
         details = catalog.object(name)
-        folder = catalog.path
+        folder, damage = catalog.path, catalog.damage(name)
     if settings.json:
-        from rig.events.events import plain
-
         shown = plain(details)
         for view, shown_view in zip(details.views, shown["views"], strict=True):
             levels = {name: found.tolist() for name, found in view.record.descriptors.items()}
             shown_view["record"]["descriptors"] = levels
         shown["segmentation"] = plain(SegmentationSummary.of(view.record.segmentation for view in details.views))
         settings.print_json(shown)
-        return
+    else:
+        _print_object(details, folder, full=full)
+    if damage is not None:
+        raise damage
+
+
+def _print_object(details: "ObjectDetails", folder: "Path", *, full: bool) -> None:
+    from rig.events.wording import counted
+    from rig.views.segmentation_evidence import SegmentationSummary
+
     summary = details.summary
     print("  ".join(text for text in (summary.name, summary.label) if text))
     if summary.note:

@@ -86,7 +86,11 @@ def enroll(
         _dry_run(settings, names, views, resume=resume, replace=replace)
         return
 
-    with settings.open_bench() as bench, settings.open_catalog(clock=bench.clock, create=True) as catalog:
+    with (
+        settings.open_bench() as bench,
+        settings.open_catalog(clock=bench.clock, create=True) as catalog,
+        settings.background_check(),
+    ):
         from rig.bench import ObjectAlreadyPlaced
         from rig.cli.catalog.catalog import report_other_regions
         from rig.cli.objects.empty_table import ensure_empty_table_image

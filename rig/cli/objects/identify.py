@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Generator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,7 +98,8 @@ def identify(
         known = model()  # report a catalog that cannot be searched before the bench is opened
         if scan and not watch:
             sample = ask_sample()
-        with settings.open_bench() as bench, IdentifyView(screen, keys=not scan) as view:
+        check = settings.background_check() if watch else nullcontext()
+        with settings.open_bench() as bench, IdentifyView(screen, keys=not scan) as view, check:
             # Prepare: notes about the catalog, the operator, the empty-table image.
             report_other_regions(settings, catalog, bench)
             seed = settings.seed or 0

@@ -5,6 +5,7 @@ This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must 
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from rig.core.errors import RigError
 if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.catalog import Action, Catalog
+    from rig.catalog.background import BackgroundCheck
     from rig.config import RigConfig
     from rig.core.clock import Clock
 
@@ -81,6 +83,17 @@ class Settings:
         if not create and self.load().catalog.path is None and not path.exists():
             raise self._no_catalog(path)
         return Catalog.open(path, clock=clock or SystemClock(), create=create, read_only=read_only)
+
+    def background_check(self) -> "BackgroundCheck":
+        """Return a check of the bench's catalog beside the work of a ``with`` block; damage is printed on stderr."""
+        from rig.catalog.background import BackgroundCheck
+        from rig.core.clock import SystemClock
+
+        def report(damage: RigError) -> None:
+            with suppress(OSError):  # stderr is closed
+                print(f"Note: {damage.what}. Next step: {damage.next_step}", file=sys.stderr, flush=True)
+
+        return BackgroundCheck(self.load().catalog_path(self.bench_name), SystemClock(), report)
 
     def _no_catalog(self, path: Path) -> RigError:
         """Return the error that the bench has no catalog; it names the benches that have one."""

@@ -1,0 +1,137 @@
+"""Damage of what a command does not load is found beside its work; listings compare what they list."""
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from rig.catalog import Action, Catalog, audit
+from rig.catalog.background import BackgroundCheck
+from rig.catalog.edit import delete
+from rig.core.clock import SystemClock
+from rig.core.errors import CatalogDamaged, RigError
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import PROVENANCE, described, image, plan, true_fill, without_waiting
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A catalog with a complete, a superseded, an unfinished and a deleted enrollment, and 120 entries in its log."""
+    folder = tmp_path_factory.mktemp("sample") / "catalog"
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(folder, clock=VirtualClock()) as catalog:
+        without_waiting(patch)
+        true_fill(catalog, "mug", 2, 0, note="a mug with a chip")
+        true_fill(catalog, "mug", 1, 10, replace=True)
+        true_fill(catalog, "gone", 1, 90, note="a vase with a crack")
+        delete(catalog, "gone")
+        catalog.begin("tin", planned_azimuth_deg=plan(3), provenance=PROVENANCE).add(described(0, 30), image(30))
+        with catalog.database.write() as connection:
+            for number in range(120):
+                audit.append(connection, catalog.clock, Action.MOVED, angle_deg=float(number))
+    return folder
+
+
+@pytest.fixture
+def root(sample: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(sample, tmp_path / "catalog"))
+
+
+def change(root: Path, statement: str) -> None:
+    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
+        (trigger,) = connection.execute("SELECT sql FROM sqlite_master WHERE name = 'audit_no_update'").fetchone()
+        connection.execute("DROP TRIGGER audit_no_update")
+        connection.execute(statement)
+        connection.execute(trigger)
+
+
+def flip(root: Path, text: bytes) -> None:
+    """Flip the lowest bit of the last byte of a text in the database."""
+    with closing(sqlite3.connect(root / "catalog.sqlite")) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    content = bytearray((root / "catalog.sqlite").read_bytes())
+    assert content.count(text) == 1
+    content[content.index(text) + len(text) - 1] ^= 1
+    (root / "catalog.sqlite").write_bytes(content)
+
+
+def found(root: Path) -> list[RigError]:
+    reported: list[RigError] = []
+    with BackgroundCheck(root, SystemClock(), reported.append) as check:
+        check.wait()
+    return reported
+
+
+@pytest.mark.parametrize(
+    ("statement", "named"),
+    [
+        ("UPDATE objects SET label = 'x' WHERE name = 'gone'", "'gone'"),
+        ("UPDATE views SET azimuth_deg = 90 WHERE enrollment_id = 1 AND view_index = 1", "'mug'"),
+        ("UPDATE views SET imu_deg = 3 WHERE enrollment_id = 4", "'tin'"),
+        ("UPDATE audit SET user = 'intruder' WHERE id = 2", "row 2 of audit"),
+        ("UPDATE audit SET user = 'intruder' WHERE id = 115", "row 115 of audit"),
+    ],
+)
+def test_damage_that_no_search_loads_is_found(root: Path, statement: str, named: str) -> None:
+    assert found(root) == []
+    change(root, statement)
+    with Catalog.open(root, clock=VirtualClock(), read_only=True) as catalog:
+        assert len(catalog.views().views) == 1  # a search does not notice it
+    (damage,) = found(root)
+    assert isinstance(damage, CatalogDamaged)
+    assert named in damage.what
+
+
+def test_check_uses_a_small_share_of_time_and_ends_with_the_work(root: Path) -> None:
+    change(root, "UPDATE audit SET user = 'intruder' WHERE id = 115")
+    seconds = count()
+
+    class SlowComputer(SystemClock):
+        """Each portion takes a second."""
+
+        def now_ns(self) -> int:
+            return next(seconds) * 1_000_000_000
+
+    reported: list[RigError] = []
+    with BackgroundCheck(root, SlowComputer(), reported.append) as check:
+        check.wait(0.3)
+    check.wait()
+    assert reported == []  # it waited nearly all of the time
+    assert next(seconds) < 5
+
+
+def test_check_reports_no_change_by_the_program(root: Path) -> None:
+    reported: list[RigError] = []
+    with Catalog.open(root, clock=VirtualClock()) as catalog, pytest.MonkeyPatch.context() as patch:
+        without_waiting(patch)
+        for number in range(3):
+            with BackgroundCheck(root, SystemClock(), reported.append) as check:
+                true_fill(catalog, f"new-{number}", 3, number)
+                check.wait()
+    assert reported == []
+
+
+def test_enrollment_reports_a_flipped_byte_of_another_object(rig, root: Path) -> None:
+    flip(root, b"a vase with a crack")
+    done = rig("enroll", "lamp", "--views", "4", "--yes")
+    assert done.exit_code == 0, done.output
+    assert "'gone' in the catalog changed after they were stored" in done.stderr
+    assert "rig catalog verify" in done.stderr
+    assert "'gone'" not in rig("catalog", "show", "lamp").stderr
+
+
+@pytest.mark.parametrize("words", [("list",), ("list", "tin"), ("show", "mug"), ("list", "--deleted")])
+def test_listing_reports_a_flipped_byte_and_is_printed(rig, root: Path, words: tuple[str, ...]) -> None:
+    intact = rig("catalog", *words)
+    assert intact.exit_code == 0, intact.output
+    flip(root, b"a mug with a chip")
+    done = rig("catalog", *words)
+    assert done.exit_code == 7
+    assert done.stdout.splitlines()[2:] == intact.stdout.splitlines()[2:]
+    assert "Error 707 (catalog damaged): 'mug' in the catalog changed" in done.stderr
+    listed, error = map(json.loads, rig("catalog", *words, "--json").stdout.splitlines())
+    assert listed
+    assert error["code"] == 707
