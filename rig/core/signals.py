@@ -28,6 +28,8 @@ ENDING: Final = tuple(
 )
 """Signals that end a program by default, and that a program can handle."""
 
+_IGNORED_BY_SHELLS: Final = (signal.SIGINT, signal.SIGQUIT)
+
 
 @dataclass(slots=True)
 class _State:
@@ -44,14 +46,14 @@ _clock = SystemClock()
 def handle_signals() -> None:
     """Have each signal in `ENDING` unwind the stack, so that every open device is closed (torque off).
 
-    A shell without job control starts background jobs with SIGINT ignored, and their children inherit that. A stop must
-    reach a moving table anyway. Other ignored signals stay ignored: SIGHUP is what `nohup` ignores.
+    A shell without job control starts background jobs with SIGINT and SIGQUIT ignored, and their children inherit that.
+    A stop must reach a moving table anyway. Other ignored signals stay ignored: SIGHUP is what `nohup` ignores.
     """
     _state.raised_ns = None
     atexit.register(_ignore_signals)  # registered twice, it runs twice, to the same effect
     for number in ENDING:
         found = signal.getsignal(number)
-        if found is signal.SIG_DFL or (number is signal.SIGINT and found in (signal.SIG_IGN, _python_default)):
+        if found is signal.SIG_DFL or (number in _IGNORED_BY_SHELLS and found in (signal.SIG_IGN, _python_default)):
             signal.signal(number, _end)
 
 

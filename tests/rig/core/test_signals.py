@@ -53,6 +53,16 @@ def test_each_signal_that_can_be_handled_unwinds_the_stack_once(number):
         assert caught.value.code == 128 + number
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGQUIT], ids=lambda number: number.name)
+def test_stop_reaches_a_background_job_of_a_script(number):
+    for ignored in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
+        signal.signal(ignored, signal.SIG_IGN)
+    handle_signals()
+    signal.raise_signal(signal.SIGHUP)
+    with pytest.raises(KeyboardInterrupt if number is signal.SIGINT else SystemExit):
+        signal.raise_signal(number)
+
+
 def test_signals_wait_for_the_end_of_a_cleanup():
     handle_signals()
     done = []
