@@ -36,6 +36,12 @@ def revolutions_between(a_deg: float | FloatArray, b_deg: float | FloatArray) ->
     """Return the distance of two directions in revolutions, 0..0.5 (Δ of the Hough score)."""
     difference_deg: float | FloatArray = a_deg - b_deg
     if isinstance(difference_deg, np.ndarray):
-        # same result as wrap180 in a third of the time: the nearest whole revolution is subtracted without rounding
-        return np.abs(difference_deg - 360.0 * np.rint(difference_deg / 360.0)) / 360.0
+        return size_deg(difference_deg) / 360.0
     return abs(wrap180(difference_deg)) / 360.0
+
+
+def size_deg(difference_deg: FloatArray) -> FloatArray:
+    """Return the sizes of differences of directions, 0..180."""
+    # same result as wrap180 in a third of the time: the nearest whole revolution is subtracted without rounding
+    size: FloatArray = np.abs(difference_deg - 360.0 * np.rint(difference_deg / 360.0))
+    return size

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hbr.core.angles import wrap180, wrap360
+from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
 from hbr.dense.filter import BETA, BINS, Belief
 
@@ -99,7 +99,7 @@ def next_best_view(
 
     here_deg = float(belief.orientation_deg[-1])
     landing_deg = here_deg + angles_deg
-    apart_deg = np.abs(wrap180(landing_deg[:, None] - belief.orientation_deg)).min(axis=1)
+    apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
     probability, place, bin_of = _strongest(belief.posterior(beta))
     cost = second_costs * times_s
@@ -178,7 +178,7 @@ def _expected(
     index = belief.index
     seen_deg = bin_of * (360.0 / BINS) + belief.rotated_deg + angles_deg[:, None]
     own_deg = index.azimuth_deg[place]
-    away_deg = np.abs(wrap180(own_deg[None] - seen_deg[:, :, None]))
+    away_deg = size_deg(own_deg[None] - seen_deg[:, :, None])
     away_deg[:, index.left_out[place]] = np.inf
     nearest = away_deg.argmin(axis=2)
     known = np.exp(-0.5 * (np.take_along_axis(away_deg, nearest[:, :, None], axis=2)[:, :, 0] / _NEAR_DEG) ** 2)

@@ -101,13 +101,15 @@ AVX2 static inline int64_t sum_of(__m256i a, __m256i b) {
 
 AVX2 static void expand_avx2(const int32_t v[4], const uint8_t *edges, int16_t *values) {
     const __m256i half = _mm256_set1_epi8(15);
+    const __m256i low[2] = {values_of_halves(v, 0, 0), values_of_halves(v, 1, 0)};
+    const __m256i high[2] = {values_of_halves(v, 0, 8), values_of_halves(v, 1, 8)};
     __m256i *own = (__m256i *)values;
     for (int vector = 0; vector < EDGE_BYTES / 32; vector++) {
         const __m256i packed = _mm256_loadu_si256((const __m256i *)edges + vector);
         for (int field = 0; field < 4; field++, own += 2) {
             const __m256i halves = _mm256_and_si256(field < 2 ? _mm256_srli_epi16(packed, 4) : packed, half);
-            const __m256i l = _mm256_shuffle_epi8(values_of_halves(v, field % 2, 0), halves);
-            const __m256i h = _mm256_shuffle_epi8(values_of_halves(v, field % 2, 8), halves);
+            const __m256i l = _mm256_shuffle_epi8(low[field % 2], halves);
+            const __m256i h = _mm256_shuffle_epi8(high[field % 2], halves);
             own[0] = _mm256_unpacklo_epi8(l, h);
             own[1] = _mm256_unpackhi_epi8(l, h);
         }
@@ -211,18 +213,25 @@ static void begin_query(struct query *q, const struct measure *m, const uint8_t 
     if (m->edges_at >= 0) {
         const uint8_t *edges = packed + m->edges_at;
         loops->expand(m->edge_values, edges, q->edges);
-        for (int vector = 0; vector < EDGE_BYTES / 32; vector++)
-            for (int field = 0; field < 4; field++)
-                for (int i = 0; i < 32; i++) {
-                    const int32_t value = m->edge_values[edges[32 * vector + i] >> (6 - 2 * field) & 3];
-                    q->coarse[(4 * vector + field) * 32 + i] = (int8_t)((value + COARSE - 1) / COARSE);
-                }
     }
     if (m->colours_at >= 0)
         for (int i = 0; i < COLOUR_BYTES; i++) {
             q->colours[i] = packed[m->colours_at + i];
             q->weights[i] = (int16_t)m->colour_weights[i];
         }
+}
+
+/* Prepare a query for bounds, too. */
+static void begin_bounds(struct query *q, const struct measure *m, const uint8_t *packed, const struct loops *loops) {
+    begin_query(q, m, packed, loops);
+    q->square = square_of(q->edges);
+    const uint8_t *edges = packed + m->edges_at;
+    for (int vector = 0; vector < EDGE_BYTES / 32; vector++)
+        for (int field = 0; field < 4; field++)
+            for (int i = 0; i < 32; i++) {
+                const int32_t value = m->edge_values[edges[32 * vector + i] >> (6 - 2 * field) & 3];
+                q->coarse[(4 * vector + field) * 32 + i] = (int8_t)((value + COARSE - 1) / COARSE);
+            }
 }
 
 /* Store the similarity of a query to at most CHUNK rows, or bounds of it, from above. */
@@ -296,14 +305,20 @@ EXPORT void hbr_among(const struct measure *m, const uint8_t *rows, int64_t stri
                       const int64_t *places, int64_t groups, int64_t size, double *similar) {
     const struct loops *loops = fastest();
     struct query q;
+    const uint8_t *chosen[CHUNK];
+    double lengths[CHUNK];
     for (int64_t g = 0; g < groups; g++, places += size, similar += size * size)
         for (int64_t a = 0; a < size; a++) {
             begin_query(&q, m, rows + places[a] * stride, loops);
             q.square = squares[places[a]];
-            for (int64_t b = a; b < size; b++) {
-                const uint8_t *other = rows + places[b] * stride;
-                compare(&q, loops, 0, &other, squares + places[b], 1, similar + a * size + b);
-                similar[b * size + a] = similar[a * size + b];
+            for (int64_t first = a; first < size; first += CHUNK) {
+                const int64_t some = size - first < CHUNK ? size - first : CHUNK;
+                for (int64_t i = 0; i < some; i++) {
+                    chosen[i] = rows + places[first + i] * stride;
+                    lengths[i] = squares[places[first + i]];
+                }
+                compare(&q, loops, 0, chosen, lengths, some, similar + a * size + first);
+                for (int64_t b = first; b < first + some; b++) similar[b * size + a] = similar[a * size + b];
             }
         }
 }
@@ -341,8 +356,7 @@ EXPORT void hbr_bounds(const struct measure *m, const uint8_t *query, const uint
     const struct loops *loops = fastest();
     struct query q;
     double of_rows[CHUNK];
-    begin_query(&q, m, query, loops);
-    q.square = square_of(q.edges);
+    begin_bounds(&q, m, query, loops);
     for (int64_t j = 0; j < s->objects; j++) {
         double most = -1;
         for (int64_t first = 0; first < s->count[j];) {
@@ -366,8 +380,7 @@ EXPORT void hbr_nearest(const struct measure *m, const uint8_t *query, const uin
                         const double *bounds, int64_t kept, int64_t *nearest, double *similar) {
     const struct loops *loops = fastest();
     struct query q;
-    begin_query(&q, m, query, loops);
-    q.square = square_of(q.edges);
+    begin_bounds(&q, m, query, loops);
     int64_t found = 0; /* a heap: the furthest object first */
     for (int64_t k = 0; k < s->objects; k++) {
         const int64_t object = by_bound[k];
