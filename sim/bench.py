@@ -207,6 +207,7 @@ def open_sim_bench(
             i2c_bus=devices.i2c.path,
             capture=devices.camera,
             reopen_camera=devices.reopen_camera,
+            camera_node=devices.camera.node,
             camera_device=CAMERA_DEVICE,
             state=operator.state,
             head_port=devices.head_port,

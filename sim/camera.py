@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.devices import v4l2
 from sim.calibration_board import BoardOnPlatter
 from sim.noise import NoiseModel
 from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
@@ -34,6 +35,10 @@ _GAIN_RANGE_DB = (0, 24)
 _KELVIN_RANGE = (2800, 6500)
 _FOCUS_RANGE = (0, 255)
 _SHARP_AT = 120
+_FOCUS_STEP = 15  # by which the autofocus moves the lens between two measurements
+_SHARPNESS_RANGE = (0, 255)
+_NO_CONTROLS = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_POS_MSEC)
+"""What OpenCV answers without asking the camera."""
 _BUFFERS_RANGE = (1, 10)
 
 _METER_FRAMES = 5  # the automatic settings change every so many frames
@@ -52,9 +57,13 @@ class Controls:
     gain_db: float = 0.0
     auto_white_balance: bool = True
     kelvin: float = 4600.0
-    autofocus: bool = True
+    autofocus: bool = False
     focus: float = _SHARP_AT
     buffers: int = 4
+    sharpness: float = 3
+    backlight_compensation: float = 0
+    power_line_frequency: float = 2
+    dynamic_frame_rate: bool = True
 
     @property
     def gains(self) -> Gains:
@@ -70,7 +79,8 @@ class SimCapture:
     four frames wait in buffers; while the buffers are full, new frames are lost. A frame is drawn when it is retrieved,
     from the world's state at its exposure, so dropped frames take no time and change nothing. The width selects one of
     two modes, 640x480 and 320x240. Properties have the units of OpenCV's V4L2 backend; for an unknown property `set`
-    returns False and `get` 0.
+    returns False and `get` -1. As on V4L2, `isOpened` stays True after an unplug, while `grab` fails. The camera begins
+    with the focus that an earlier program left; plugged in again, it wakes out of focus with its autofocus on.
 
     Attributes
     ----------
@@ -108,6 +118,8 @@ class SimCapture:
         # A well-mounted camera sees the objects as they are drawn; calibration boards are drawn through its lens.
         self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
         self._open = self._plugged = True
+        self._lost = False
+        self._plugs = 1
         self._queue: deque[int] = deque()
         self._next = _frame_after(self._clock.now_ns())
         self._grabbed: int | None = None
@@ -118,19 +130,26 @@ class SimCapture:
 
     def unplug(self) -> None:
         """Unplug the camera: no frame arrives any more."""
-        self._open, self._plugged = False, False
+        self._plugged, self._lost = False, True
 
     def replug(self) -> None:
-        """Plug the camera in; it must be opened again."""
-        self._plugged = True
+        """Plug the camera in; it must be opened again, and has the settings of its power-up."""
+        if not self._plugged:
+            self._plugged = True
+            self._plugs += 1
+            self._change(self._clock.now_ns(), Controls(autofocus=True, focus=0))
+
+    def node(self) -> tuple[int, ...] | None:
+        """Return what identifies its device file until it is unplugged; None while it is unplugged."""
+        return (self._plugs,) if self._plugged else None
 
     def reopen(self) -> bool:
         """Open the stream again with the same settings; return whether the camera is plugged in."""
-        if self._plugged and not self._open:
+        if self._plugged and (self._lost or not self._open):
             self._queue.clear()
             self._next = self._exposed_from(_frame_after(self._clock.now_ns()))
-            self._open = True
-        return self._open
+            self._open, self._lost = True, False
+        return self._plugged
 
     @property
     def exposure(self) -> float:
@@ -154,12 +173,16 @@ class SimCapture:
     def release(self) -> None:
         self._open = False
 
+    @property
+    def _delivers(self) -> bool:
+        return self._open and not self._lost
+
     def read(self) -> tuple[bool, Image | None]:
         return self.retrieve() if self.grab() else (False, None)
 
     def grab(self) -> bool:
         """Take the oldest waiting frame, or wait for the next one."""
-        if not self._open or any(fails() for fails in self.grab_failures):
+        if not self._delivers or any(fails() for fails in self.grab_failures):
             return False
         self._receive()
         if self.hangs and not self._queue:
@@ -174,7 +197,7 @@ class SimCapture:
     def wait_ns(self) -> int:
         """Return how long `grab` would wait for a frame that is on its way."""
         self._receive()
-        if not self._open or self._queue:
+        if not self._delivers or self._queue:
             return 0
         if self.hangs:
             return round(SELECT_S * 1e9)
@@ -182,7 +205,7 @@ class SimCapture:
 
     def retrieve(self) -> tuple[bool, Image | None]:
         """Return the frame that was grabbed last, uint8 (480, 640, 3)."""
-        if self._grabbed is None or not self._open:
+        if self._grabbed is None or not self._delivers:
             return False, None
         self._world.notify(Activity.FRAME_FETCHED)
         image = self._frame(self._grabbed)
@@ -206,8 +229,14 @@ class SimCapture:
             cv2.CAP_PROP_WB_TEMPERATURE: round(now.kelvin),
             cv2.CAP_PROP_AUTOFOCUS: now.autofocus,
             cv2.CAP_PROP_FOCUS: now.focus,
+            cv2.CAP_PROP_SHARPNESS: now.sharpness,
+            cv2.CAP_PROP_BACKLIGHT: now.backlight_compensation,
+            v4l2.POWER_LINE_FREQUENCY: now.power_line_frequency,
+            v4l2.EXPOSURE_DYNAMIC_FRAMERATE: now.dynamic_frame_rate,
         }
-        return float(values.get(prop, 0.0))
+        if self._lost and prop not in _NO_CONTROLS:
+            return -1.0
+        return float(values.get(prop, -1.0))
 
     def set(self, prop: int, value: float) -> bool:
         """Change a setting for later frames; return False for settings that the camera controls automatically."""
@@ -234,9 +263,17 @@ class SimCapture:
             case cv2.CAP_PROP_WB_TEMPERATURE if not now.auto_white_balance:
                 now = replace(now, kelvin=_within(value, _KELVIN_RANGE))
             case cv2.CAP_PROP_AUTOFOCUS:
-                now = replace(now, autofocus=bool(value), focus=_SHARP_AT if value else now.focus)
+                now = replace(now, autofocus=bool(value))
             case cv2.CAP_PROP_FOCUS if not now.autofocus:
                 now = replace(now, focus=_within(value, _FOCUS_RANGE))
+            case cv2.CAP_PROP_SHARPNESS:
+                now = replace(now, sharpness=_within(value, _SHARPNESS_RANGE))
+            case cv2.CAP_PROP_BACKLIGHT:
+                now = replace(now, backlight_compensation=_within(value, (0, 1)))
+            case v4l2.POWER_LINE_FREQUENCY if 0 <= value <= 2:
+                now = replace(now, power_line_frequency=int(value))
+            case v4l2.EXPOSURE_DYNAMIC_FRAMERATE:
+                now = replace(now, dynamic_frame_rate=bool(value))
             case _:
                 return False
         self._change(self._clock.now_ns(), now)
@@ -341,17 +378,21 @@ class SimCapture:
             self._metered += _METER_FRAMES
             time_ns = start_ns(self._metered)
             controls = self._controls[-1][1]
+            if controls.autofocus and controls.focus != _SHARP_AT:
+                step = min(max(_SHARP_AT - controls.focus, -_FOCUS_STEP), _FOCUS_STEP)
+                controls = replace(controls, focus=controls.focus + step)
+                self._change(time_ns, controls)
             if not (controls.auto_exposure or controls.auto_white_balance):
                 continue
             scene = self._world.scene_at(time_ns)
             mean = np.array(cv2.mean(self._picture(scene, self._world.table_deg(time_ns)))[:3])
             mean *= np.array(scene.light) * controls.gains * controls.exposure / NOMINAL_EXPOSURE
             if controls.auto_exposure:
-                step = np.clip(_METER_TARGET / max(mean.mean(), 1e-3), 0.25, 4.0) ** 0.5
-                controls = replace(controls, exposure=float(np.clip(controls.exposure * step, *_EXPOSURE_RANGE)))
+                factor = np.clip(_METER_TARGET / max(mean.mean(), 1e-3), 0.25, 4.0) ** 0.5
+                controls = replace(controls, exposure=float(np.clip(controls.exposure * factor, *_EXPOSURE_RANGE)))
             if controls.auto_white_balance and mean.min() > 0:
-                step = (mean[0] / mean[2]) ** 0.3
-                controls = replace(controls, kelvin=float(np.clip(controls.kelvin * step, *_KELVIN_RANGE)))
+                factor = (mean[0] / mean[2]) ** 0.3
+                controls = replace(controls, kelvin=float(np.clip(controls.kelvin * factor, *_KELVIN_RANGE)))
             self._change(time_ns, controls)
 
 

@@ -156,6 +156,9 @@ class SimComputer(Computer):
     def camera_device(self, source: int | str) -> str | None:  # noqa: ARG002 - there is one camera
         return CAMERA_DEVICE
 
+    def device_node(self, source: int | str) -> tuple[int, ...] | None:  # noqa: ARG002 - there is one camera
+        return self.devices.camera.node()
+
     def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one camera
         return self.devices.reopen_camera()
 

@@ -204,6 +204,15 @@ class Computer:
         place = self._link("dev/v4l/by-path", file)
         return f"{kind} at {Path(place).name}" if place else None
 
+    def device_node(self, source: int | str) -> tuple[int, ...] | None:
+        """Return what identifies the device file of a camera until it is unplugged; None if there is no file."""
+        path = f"/dev/video{source}" if str(source).isdigit() else str(source)
+        try:
+            status = self._at(path).stat()
+        except OSError:
+            return None
+        return status.st_dev, status.st_ino, status.st_rdev
+
     def same_file(self, one: str, other: str) -> bool:
         """Return whether two paths, which may be links, are the same device."""
         return self._at(one).resolve() == self._at(other).resolve()

@@ -3,8 +3,10 @@
 Decision: docs/decisions/0001.
 """
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 from pydantic import BaseModel
@@ -59,9 +61,9 @@ class HardwareBench:
             computer.require_unused(config.servo.port)
             connection = computer.open_serial(config.servo.port, config.servo.baud)
             connections.callback(connection.close)
-            capture = computer.open_capture(config.camera.source)
+            plug = CameraPlug(computer, config.camera.source)
+            capture = plug.open()
             connections.callback(capture.release)
-            camera_device = computer.camera_device(config.camera.source)
             bench = assemble(
                 self.name,
                 config,
@@ -71,8 +73,9 @@ class HardwareBench:
                 guardian=Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id),
                 i2c_bus=computer.i2c_path(config.imu.bus),
                 capture=capture,
-                reopen_camera=lambda: _open_again(computer, config.camera.source, camera_device),
-                camera_device=camera_device,
+                reopen_camera=plug.open,
+                camera_node=plug.node,
+                camera_device=plug.device,
                 state=FileStore(state_path),
                 head_port=lambda: computer.open_serial(config.head.port, BAUD, "head"),
             )
@@ -106,6 +109,7 @@ def assemble(
     i2c_bus: int | str,
     capture: Capture,
     reopen_camera: Callable[[], Capture] | None = None,
+    camera_node: Callable[[], object] = lambda: None,
     camera_device: str | None = None,
     state: StateStore,
     head_port: Callable[[], SerialConnection] | None = None,
@@ -139,11 +143,14 @@ def assemble(
         camera = OpenCvCamera(
             capture,
             clock=clock,
-            settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
+            settings=camera_settings(config, state, camera_device),
             name=f"camera {config.camera.source}",
             device=camera_device,
             reopen=reopen_camera,
+            node=camera_node,
         )
+        if config.camera.focus is None:
+            _store_focus(state, camera_device, camera.read_locks().focus)
         findings += tuple(
             f"camera: {n.setting} was set to {n.asked:g}, but the camera reports {n.reported:g}"
             for n in camera.rejected_settings
@@ -162,18 +169,73 @@ def assemble(
     return bench
 
 
-def _open_again(computer: Computer, source: int | str, device: str | None) -> Capture:
-    """Open a camera that was unplugged. Raises `DeviceMismatch` if the source is another camera now."""
-    capture = computer.open_capture(source)
-    now = computer.camera_device(source)
-    if now != device:
-        capture.release()
-        raise DeviceMismatch(
-            f"The camera {source} is another one after it was unplugged.",
-            next_step="Connect the first camera again, or start again with this one.",
-            evidence={"before": device, "now": now},
-        )
-    return capture
+class CameraPlug:
+    """The camera of a source. It keeps its identity when it is plugged in again, and may get another number.
+
+    Attributes
+    ----------
+    device
+        Identifies the camera (`Computer.camera_device`), once it was opened.
+    """
+
+    def __init__(self, computer: Computer, source: int | str) -> None:
+        self._computer = computer
+        self._source = self._here = source
+        self._opened = False
+        self.device: str | None = None
+
+    def open(self) -> Capture:
+        """Open the camera. Raises DeviceNotFound, and DeviceMismatch if the source is another camera now."""
+        if not self._opened:
+            capture = self._computer.open_capture(self._source)
+            self._opened, self.device = True, self._computer.camera_device(self._source)
+            return capture
+        self._here = self._found()
+        capture = self._computer.open_capture(self._here)
+        now = self._computer.camera_device(self._here)
+        if now != self.device:
+            capture.release()
+            raise DeviceMismatch(
+                f"The camera {self._source} is another one after it was unplugged.",
+                next_step="Connect the first camera again, or start again with this one.",
+                evidence={"before": self.device, "now": now},
+            )
+        return capture
+
+    def node(self) -> object:
+        """Return what identifies the camera's device file now; None if there is none."""
+        return self._computer.device_node(self._here)
+
+    def _found(self) -> int | str:
+        """Return where the camera is now: the kernel gives it a new number while a program holds its old file."""
+        if self.device is None or self._computer.camera_device(self._source) == self.device:
+            return self._source
+        paths = (node.path for node in self._computer.cameras())
+        return next((path for path in paths if self._computer.camera_device(path) == self.device), self._source)
+
+
+_FOCUS_FILE = "camera-focus.json"
+
+
+def camera_settings(config: RigConfig, state: StateStore, device: str | None) -> CameraSettings:
+    """Return the camera's settings: the configured ones, and the focus that an earlier program has settled."""
+    settings = CameraSettings(**config.camera.model_dump(exclude={"source"}))
+    if settings.focus is not None:
+        return settings
+    try:
+        stored = json.loads(state.read_file(_FOCUS_FILE) or b"{}")
+        focus = float(stored["focus"]) if stored["device"] == device else None
+    except (StateNotStored, ValueError, KeyError, TypeError):  # none yet, or damaged: the autofocus settles again
+        return settings
+    return replace(settings, focus=focus)
+
+
+def _store_focus(state: StateStore, device: str | None, focus: float | None) -> None:
+    """Store the focus for the next program, because a camera forgets it without power."""
+    text = json.dumps({"device": device, "focus": focus}).encode()
+    with suppress(StateNotStored):  # writes that matter report a full disk themselves
+        if focus is not None and state.read_file(_FOCUS_FILE) != text:
+            state.store_file(_FOCUS_FILE, text)
 
 
 def _check_reach(config: RigConfig, servo: Servo) -> None:

@@ -1,6 +1,6 @@
 """Questions about how the enrolled views are described: by which descriptors, within which region, with which table."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,23 @@ def empty_tables(catalog: Catalog) -> EmptyTables:
         tuple(name for name, has_image in with_image.items() if not has_image),
         newest,
     )
+
+
+def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
+    """Return the camera's settings (`rig.devices.camera.CameraLocks`) of the objects in use, each combination once."""
+    settings: list[dict[str, Any]] = []
+    with catalog.database.read() as connection:
+        for evidence in connection.scalars(
+            select(views.c.evidence)
+            .select_from(objects)
+            .join(enrollments)
+            .join(views, views.c.enrollment_id == enrollments.c.id)
+            .where(retrieved(), views.c.view_index == 0)
+        ):
+            locks = evidence.get("locks")
+            if isinstance(locks, dict) and locks not in settings:
+                settings.append(locks)
+    return settings
 
 
 def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.uint8]:

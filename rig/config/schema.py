@@ -241,16 +241,35 @@ class CameraConfig(Section):
     height: int = Field(480, ge=80, le=8000, description="pixels")
     fps: float = Field(30.0, ge=0.1, le=500, description="frames per second")
     exposure_us: float | None = Field(
-        8000.0, ge=1, le=1e6, description="locked exposure time; none keeps the camera's own"
+        10_000.0,
+        ge=1,
+        le=1e6,
+        description="locked exposure time; none keeps the camera's own. 10 ms is a period of lamps at 50 Hz mains; use "
+        "8333 at 60 Hz",
     )
     gain: float | None = Field(
-        None, ge=0, le=1e6, description="locked gain in the camera's unit; none keeps the camera's own"
+        0.0, ge=0, le=1e6, description="locked gain in the camera's unit; none keeps the camera's own"
     )
     white_balance_k: float | None = Field(
         5000.0, ge=1000, le=20000, description="locked white balance; none keeps the camera's own"
     )
     focus: float | None = Field(
-        None, ge=0, le=1e6, description="locked focus in the camera's unit; none keeps the camera's own"
+        None,
+        ge=0,
+        le=1e6,
+        description="locked focus in the camera's unit; none: the autofocus finds it once, and the bench stores it",
+    )
+    sharpness: float | None = Field(
+        None, ge=0, le=1e6, description="sharpness in the camera's unit; none keeps the camera's own"
+    )
+    backlight_compensation: float | None = Field(
+        None, ge=0, le=1e6, description="backlight compensation in the camera's unit; none keeps the camera's own"
+    )
+    power_line_frequency: int | None = Field(
+        None,
+        ge=0,
+        le=3,
+        description="flicker filter: 0 off, 1 50 Hz, 2 60 Hz, 3 automatic; none keeps the camera's own",
     )
 
 

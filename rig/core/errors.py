@@ -225,6 +225,10 @@ class RunIncomplete(RigError, code=604, title="run incomplete"):
     """A saved run is cut off, or has no answer."""
 
 
+class CameraSettingsDiffer(RigError, code=605, title="camera settings differ"):
+    """The camera's settings are not those of the enrollments, so views cannot be compared."""
+
+
 class TableNotEmpty(RigError, code=603, title="table not empty"):
     """Something is on the table, which should be empty."""
 

@@ -40,6 +40,10 @@ class CameraLocks:
     auto_white_balance: bool | None
     focus: float | None = None
     autofocus: bool | None = None
+    sharpness: float | None = None
+    backlight_compensation: float | None = None
+    power_line_frequency: float | None = None
+    dynamic_frame_rate: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ known in one of three ways (`TimeBase`), which is determined when the camera is 
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from math import floor
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.devices import v4l2
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
 from rig.devices.opencv_capture import Capture
 
@@ -34,6 +35,9 @@ _FRESH_S = 1.0  # largest age of a frame that the camera just delivered
 _STAMP_ERROR_NS = 2_000_000  # how far a stamp may be ahead of the clock
 _SLICE_S = 0.2  # longest wait for a frame between two calls of ``meanwhile``
 _REPLUG_PAUSE_S = 0.25
+_UNKNOWN_PROPERTY = cv2.CAP_PROP_XI_AEAG  # V4L2 answers -1, other sources 0
+_FOCUS_STILL_S, _FOCUS_LIMIT_S = 1.0, 8.0
+_FOCUS_CHANGE = 0.1  # share of the sharpness that changes while the lens moves
 
 
 class TimeBase(Enum):
@@ -46,9 +50,10 @@ class TimeBase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Requested settings; None leaves a setting to the camera.
+    """Requested settings; None leaves a setting to the camera, but a focus is pinned where the autofocus settles.
 
-    ``gain`` and ``focus`` are in the camera's own units, as `v4l2-ctl --list-ctrls` shows them.
+    ``gain``, ``focus``, ``sharpness`` and ``backlight_compensation`` are in the camera's own units, as `v4l2-ctl
+    --list-ctrls` shows them; ``power_line_frequency`` is the number in its menu.
     """
 
     width: int | None = 640
@@ -58,6 +63,10 @@ class CameraSettings:
     gain: float | None = 0.0
     white_balance_k: float | None = 5000.0
     focus: float | None = None
+    sharpness: float | None = None
+    backlight_compensation: float | None = None
+    power_line_frequency: float | None = None
+    dynamic_frame_rate: bool | None = False
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "fps", "exposure_us", "white_balance_k"):
@@ -95,6 +104,9 @@ class OpenCvCamera:
     reopen
         Opens the source again (raises DeviceNotFound while it is missing). A camera that was unplugged for less than
         ``timeout_s`` gets its settings again and continues.
+    node
+        Returns what identifies the device file now, None if it is missing. Another value than at the opening means that
+        the camera was unplugged: `cv2.VideoCapture.isOpened` stays True on V4L2.
 
     Raises
     ------
@@ -113,10 +125,14 @@ class OpenCvCamera:
         timeout_s: float = 3.0,
         latency_s: float | None = None,
         reopen: Callable[[], Capture] | None = None,
+        node: Callable[[], object] = lambda: None,
     ) -> None:
         self._capture = capture
         self._reopen = reopen
+        self._node = node
+        self._node_opened = node()
         self._settings = settings or CameraSettings()
+        self._missing = capture.get(_UNKNOWN_PROPERTY)
         self.returns = 0
         self._clock = clock
         self._timeout_s = timeout_s
@@ -136,6 +152,9 @@ class OpenCvCamera:
         self._waits_s: deque[float] = deque([self._period_s], maxlen=4)
         self.time_base: TimeBase = TimeBase.STAMPED
         self.time_base = self._find_time_base()
+        if self._settings.focus is None and self.time_base is not TimeBase.RECORDED:
+            self._settle_focus()
+        self._hold()
 
     def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
@@ -172,6 +191,7 @@ class OpenCvCamera:
         auto_exposure = self._known(cv2.CAP_PROP_AUTO_EXPOSURE)
         auto_white_balance = self._known(cv2.CAP_PROP_AUTO_WB)
         autofocus = self._known(cv2.CAP_PROP_AUTOFOCUS)
+        dynamic = self._known(v4l2.EXPOSURE_DYNAMIC_FRAMERATE)
         return CameraLocks(
             exposure_us=None if exposure is None else exposure * _EXPOSURE_UNIT_US,
             gain=self._known(cv2.CAP_PROP_GAIN),
@@ -180,6 +200,10 @@ class OpenCvCamera:
             auto_white_balance=None if auto_white_balance is None else auto_white_balance != 0,
             focus=self._known(cv2.CAP_PROP_FOCUS),
             autofocus=None if autofocus is None else autofocus != 0,
+            sharpness=self._known(cv2.CAP_PROP_SHARPNESS),
+            backlight_compensation=self._known(cv2.CAP_PROP_BACKLIGHT),
+            power_line_frequency=self._known(v4l2.POWER_LINE_FREQUENCY),
+            dynamic_frame_rate=None if dynamic is None else dynamic != 0,
         )
 
     def close(self) -> None:
@@ -192,7 +216,8 @@ class OpenCvCamera:
         asked: list[tuple[str, int, float]] = []
 
         def ask(name: str, prop: int, value: float | None) -> None:
-            if value is not None:
+            absent = value == 0 and self._known(prop) is None  # 0 also describes a camera that lacks the control
+            if value is not None and not absent:
                 asked.append((name, prop, value))
                 if self._capture.set(prop, value):
                     self._supported.add(prop)
@@ -203,13 +228,15 @@ class OpenCvCamera:
         if settings.exposure_us is not None:
             ask("auto_exposure", cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_EXPOSURE_MANUAL)
             ask("exposure_100us", cv2.CAP_PROP_EXPOSURE, round(settings.exposure_us / _EXPOSURE_UNIT_US))
+            ask("dynamic_frame_rate", v4l2.EXPOSURE_DYNAMIC_FRAMERATE, settings.dynamic_frame_rate)
         ask("gain", cv2.CAP_PROP_GAIN, settings.gain)
+        ask("sharpness", cv2.CAP_PROP_SHARPNESS, settings.sharpness)
+        ask("backlight_compensation", cv2.CAP_PROP_BACKLIGHT, settings.backlight_compensation)
+        ask("power_line_frequency", v4l2.POWER_LINE_FREQUENCY, settings.power_line_frequency)
         if settings.white_balance_k is not None:
             ask("auto_white_balance", cv2.CAP_PROP_AUTO_WB, 0)
             ask("white_balance_k", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k)
-        # Without a configured focus the present one stays, because an autofocus would change the images. A fixed lens
-        # has no autofocus to switch off.
-        if settings.focus is not None or self._capture.get(cv2.CAP_PROP_AUTOFOCUS) > 0:
+        if settings.focus is not None:
             ask("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0)
         ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
         read_back = [(name, prop, value, self._capture.get(prop)) for name, prop, value in asked]
@@ -220,9 +247,37 @@ class OpenCvCamera:
         )
 
     def _known(self, prop: int) -> float | None:
-        """Return a property; None if the camera does not report it (0 or -1 in OpenCV)."""
+        """Return a property; None if the camera lacks it: -1 on V4L2, where 0 is a true 0; else 0 if it was not set."""
         value = self._capture.get(prop)
-        return value if value > 0 or (value == 0 and prop in self._supported) else None
+        zero = value == 0 and (self._missing < 0 or prop in self._supported)
+        return value if value > 0 or zero else None
+
+    def _settle_focus(self) -> None:
+        """Let the autofocus find its position, and pin it there: switched off at once, it would stay out of focus."""
+        if self._capture.get(cv2.CAP_PROP_AUTOFOCUS) <= 0:
+            return
+        start_ns = still_ns = self._clock.now_ns()
+        before = (0.0, 0.0)
+        while seconds_between(start_ns, self._clock.now_ns()) < _FOCUS_LIMIT_S:
+            self._grab()
+            grey = cv2.cvtColor(self._retrieve(), cv2.COLOR_BGR2GRAY)
+            now = (self._capture.get(cv2.CAP_PROP_FOCUS), float(cv2.Laplacian(grey, cv2.CV_32F).var()))
+            if now[0] != before[0] or abs(now[1] - before[1]) > _FOCUS_CHANGE * before[1]:
+                before, still_ns = now, self._clock.now_ns()
+            elif seconds_between(still_ns, self._clock.now_ns()) >= _FOCUS_STILL_S:
+                break
+        self._capture.set(cv2.CAP_PROP_AUTOFOCUS, 0)
+        if (reported := self._capture.get(cv2.CAP_PROP_AUTOFOCUS)) != 0:
+            self.rejected_settings += (RejectedSetting("autofocus", 0, reported),)
+
+    def _hold(self) -> None:
+        """Request the camera's own values of the manual controls, too, when it was plugged in again."""
+        locks = self.read_locks()
+        names = ("focus", "sharpness", "backlight_compensation", "power_line_frequency")
+        own: dict[str, Any] = {name: getattr(locks, name) for name in names if getattr(self._settings, name) is None}
+        if locks.autofocus:
+            del own["focus"]
+        self._settings = replace(self._settings, **own)
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
@@ -252,7 +307,8 @@ class OpenCvCamera:
         try:
             return self._grab_now()
         except DeviceSilent:
-            if self._reopen is None or self.time_base is TimeBase.RECORDED or self._capture.isOpened():
+            unplugged = not self._capture.isOpened() or self._node() != self._node_opened
+            if self._reopen is None or self.time_base is TimeBase.RECORDED or not unplugged:
                 raise
             self._reconnect(self._reopen)
             return self._grab_now()
@@ -264,6 +320,7 @@ class OpenCvCamera:
         while True:
             try:
                 self._capture = reopen()
+                self._node_opened = self._node()
                 break
             except DeviceNotFound as missing:
                 if self._clock.now_ns() > end_ns:

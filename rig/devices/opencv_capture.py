@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import cv2
 
 from rig.core.errors import DeviceNotFound
+from rig.devices import v4l2
 
 
 class Capture(Protocol):
@@ -21,7 +22,31 @@ class Capture(Protocol):
     def release(self) -> None: ...
 
 
-def open_capture(source: int | str | Path) -> cv2.VideoCapture:
+class V4l2Capture:
+    """An open `cv2.VideoCapture` of a device file, with the controls that OpenCV lacks, by their V4L2 numbers."""
+
+    def __init__(self, capture: cv2.VideoCapture, path: str) -> None:
+        self._capture = capture
+        self._path = Path(path)
+        self.isOpened = capture.isOpened
+        self.grab = capture.grab
+        self.retrieve = capture.retrieve
+        self.release = capture.release
+
+    def get(self, propId: int, /) -> float:
+        """Return a property or a control; -1 if the camera lacks it."""
+        if propId < v4l2.FIRST_CONTROL:
+            return self._capture.get(propId)
+        value = v4l2.get_control(self._path, propId)
+        return -1.0 if value is None else float(value)
+
+    def set(self, propId: int, value: float, /) -> bool:
+        if propId < v4l2.FIRST_CONTROL:
+            return self._capture.set(propId, value)
+        return v4l2.set_control(self._path, propId, round(value))
+
+
+def open_capture(source: int | str | Path) -> Capture:
     """Open a camera by number or device path, or a video file, an image sequence (``img_%03d.png``) or a stream's URL.
 
     Raises
@@ -47,9 +72,8 @@ def open_capture(source: int | str | Path) -> cv2.VideoCapture:
             next_step="Join the group video (`sudo usermod -aG video $USER`), then log out and in again.",
             evidence={"path": path},
         )
-    return _opened(
-        path, cv2.CAP_V4L2, f"Close the program that uses it (`fuser -v {path}`), or try the camera's next number."
-    )
+    step = f"Close the program that uses it (`fuser -v {path}`), or try the camera's next number."
+    return V4l2Capture(_opened(path, cv2.CAP_V4L2, step), path)
 
 
 def _opened(path: str, backend: int, next_step: str) -> cv2.VideoCapture:

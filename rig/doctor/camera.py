@@ -58,19 +58,45 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     for one in source.rejected_settings:
         found = {"setting": one.setting, "requested": one.asked, "reported": one.reported}
         yield warning("camera", FindingCode.SETTING_REJECTED, fix, **found)
-    automatic = [
+    wanted = context.config.camera
+    not_locked = [
         name
-        for name, value, wanted in (
-            ("exposure", locks.auto_exposure, context.config.camera.exposure_us),
-            ("white balance", locks.auto_white_balance, context.config.camera.white_balance_k),
+        for name, loose in (
+            ("exposure", locks.auto_exposure or (locks.exposure_us is None and wanted.exposure_us is not None)),
+            (
+                "white balance",
+                locks.auto_white_balance or (locks.white_balance_k is None and wanted.white_balance_k is not None),
+            ),
+            ("gain", locks.gain is not None and wanted.gain is None),
+            ("focus", locks.autofocus),
+            ("frame rate", locks.dynamic_frame_rate),
         )
-        if value or (value is None and wanted is not None)
+        if loose
     ]
-    if automatic:
-        yield warning("camera", FindingCode.NOT_LOCKED, fix, settings=automatic)
-    elif not source.rejected_settings:
-        exposure_ms = None if locks.exposure_us is None else locks.exposure_us / 1e3
-        yield fine("camera", FindingCode.LOCKED, exposure_ms=exposure_ms, white_balance_k=locks.white_balance_k)
+    if not_locked:
+        yield warning("camera", FindingCode.NOT_LOCKED, fix, settings=not_locked)
+    rejected = {one.setting for one in source.rejected_settings}
+    read_back = (
+        ("exposure", "exposure_100us", None if locks.exposure_us is None else f"{locks.exposure_us / 1e3:g} ms"),
+        ("white balance", "white_balance_k", None if locks.white_balance_k is None else f"{locks.white_balance_k:g} K"),
+        ("gain", "gain", _text(locks.gain)),
+        ("focus", "focus", _text(locks.focus)),
+        ("sharpness", "sharpness", _text(locks.sharpness)),
+        ("backlight compensation", "backlight_compensation", _text(locks.backlight_compensation)),
+        ("power-line frequency", "power_line_frequency", _text(locks.power_line_frequency)),
+        ("frame rate", "dynamic_frame_rate", None if locks.dynamic_frame_rate is None else "constant"),
+    )
+    locked = [
+        f"{name} {value}"
+        for name, setting, value in read_back
+        if value is not None and name not in not_locked and setting not in rejected
+    ]
+    if locked:
+        yield fine("camera", FindingCode.LOCKED, settings=locked)
+
+
+def _text(value: float | None) -> str | None:
+    return None if value is None else f"{value:g}"
 
 
 def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:

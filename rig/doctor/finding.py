@@ -109,7 +109,7 @@ class FindingCode(Enum):
     TIME_BASE = "frames timed by {time_base} exposure"
     SETTING_REJECTED = "{setting}: requested {requested:g}, the camera reports {reported:g}"
     NOT_LOCKED = "{settings} not locked: views of one object may differ"
-    LOCKED = "locked and read back: exposure {exposure_ms} ms, white balance {white_balance_k} K"
+    LOCKED = "locked and read back: {settings}"
     BLACK = "black: mean level {mean_level:.1f} of 255"
     CAMERA_FROZEN = "frozen: {frames} frames are identical"
     FRAMES = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second"

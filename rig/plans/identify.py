@@ -16,7 +16,7 @@ from rig.core.errors import RigError
 from rig.events.events import Accepted, Decided, Event, Identified, Started
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, moved, unwind, warn_of_table
-from rig.search.model import Model, empty_table_for
+from rig.search.model import Model, check_camera, empty_table_for
 from rig.search.session import SHOWN, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.capture import Viewer
@@ -61,6 +61,8 @@ def identify(
     ------
     CatalogError
         Nothing is enrolled.
+    CameraSettingsDiffer
+        All objects were enrolled with other settings of the camera.
     UsageError
         There is no such strategy, or the model is not for it.
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
@@ -70,6 +72,8 @@ def identify(
     search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
     viewer = Viewer(bench.camera, bench.config.view)
     notes = model.notes if isinstance(model, Model) else ()
+    if isinstance(model, Model):
+        check_camera(bench, model)
     if empty_table is None and isinstance(model, Model):
         empty_table, more = empty_table_for(bench, model)
         notes += more

@@ -16,7 +16,7 @@ from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.opencv_capture import Capture
 from rig.safety.saved_state import holder
 from sim.camera import CAMERA_DEVICE
-from sim.realtime.client import RemoteCapture, RemoteI2c
+from sim.realtime.client import RemoteCapture, RemoteI2c, camera_node
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, not_running
 
 
@@ -58,6 +58,9 @@ class SimBenchComputer(Computer):
 
     def open_capture(self, source: int | str) -> Capture:  # noqa: ARG002 - there is one camera
         return RemoteCapture(self._folder)
+
+    def device_node(self, source: int | str) -> tuple[int, ...] | None:  # noqa: ARG002
+        return camera_node(self._folder)
 
     def camera_device(self, source: int | str) -> str | None:  # noqa: ARG002
         return CAMERA_DEVICE

@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+from contextlib import closing
 from errno import EINVAL, EIO, EOPNOTSUPP
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,16 @@ class RemoteCapture:
             return self._wire.ask(ask="camera", call=call, **values)
         except (OSError, ValueError):  # the simulated bench has ended, or the camera is closed
             return {}, b""
+
+
+def camera_node(folder: Path) -> tuple[int, ...] | None:
+    """Return what identifies the device file of the simulated bench's camera; None if it is unplugged."""
+    try:
+        with closing(Wire(folder)) as wire:
+            node = wire.ask(ask="camera", call="node")[0].get("node")
+    except (DeviceNotFound, OSError, ValueError):
+        return None
+    return None if node is None else (int(node),)
 
 
 class RemoteI2c:

@@ -57,6 +57,10 @@ class Session:
                 return self._i2c(address, rest)
             case {"ask": "camera", "call": "open"}:
                 return self._open_camera(), b""
+            case {"ask": "camera", "call": "node"}:
+                with self._time.present():
+                    node = self._devices.camera.node()
+                return {"node": None if node is None else node[0]}, b""
             case {"ask": "camera", "call": str(call), **rest}:
                 if self._bench.camera_user is not self:
                     return {"ok": False}, b""

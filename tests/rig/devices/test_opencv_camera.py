@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -9,14 +10,18 @@ import cv2
 import numpy as np
 import pytest
 
+from rig.bench.computer import Computer
+from rig.bench.hardware import CameraPlug, camera_settings
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.devices import v4l2
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from rig.events.events import Rejected
 from rig.plans.enroll import enroll
 from sim.camera import FPS, SimCapture
+from sim.computer import ComputerFiles
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -292,7 +297,7 @@ def test_focus_is_locked_and_reported(world: World) -> None:
 def test_fixed_lens_needs_no_focus(world: World) -> None:
     class Fixed(SimCapture):
         def get(self, prop: int) -> float:
-            return 0.0 if prop in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) else super().get(prop)
+            return -1.0 if prop in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) else super().get(prop)
 
         def set(self, prop: int, value: float) -> bool:
             return prop not in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) and super().set(prop, value)
@@ -300,6 +305,87 @@ def test_fixed_lens_needs_no_focus(world: World) -> None:
     camera = OpenCvCamera(Fixed(world), clock=world.clock)
     assert (camera.read_locks().focus, camera.read_locks().autofocus) == (None, None)
     assert camera.rejected_settings == ()
+
+
+def test_drift_of_a_control_from_zero_is_noticed(world: World) -> None:
+    """On V4L2, 0 is a value, and -1 says that the camera lacks the control."""
+    capture = SimCapture(world)
+    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraSettings(gain=None))
+    before = camera.read_locks()
+    assert (before.gain, before.backlight_compensation) == (0, 0)
+    capture.drift(gain_db=6)
+    assert camera.read_locks() == replace(before, gain=6)
+    capture.drift(gain_db=0, sharpness=80, power_line_frequency=1, dynamic_frame_rate=True)
+    assert camera.read_locks() == replace(before, sharpness=80, power_line_frequency=1, dynamic_frame_rate=True)
+
+
+def test_all_controls_that_the_camera_has_are_locked(world: World) -> None:
+    class Plain(SimCapture):
+        missing = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_BACKLIGHT, v4l2.EXPOSURE_DYNAMIC_FRAMERATE)
+
+        def get(self, prop: int) -> float:
+            return -1.0 if prop in self.missing else super().get(prop)
+
+        def set(self, prop: int, value: float) -> bool:
+            return prop not in self.missing and super().set(prop, value)
+
+    settings = CameraSettings(sharpness=10, backlight_compensation=1, power_line_frequency=1)
+    locks = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings).read_locks()
+    assert (locks.gain, locks.sharpness, locks.backlight_compensation) == (0, 10, 1)
+    assert (locks.power_line_frequency, locks.dynamic_frame_rate) == (1, False)
+    camera = OpenCvCamera(Plain(world), clock=world.clock)
+    locks = camera.read_locks()
+    assert (locks.gain, locks.backlight_compensation, locks.dynamic_frame_rate) == (None, None, None)
+    assert camera.rejected_settings == ()
+
+
+def test_autofocus_is_pinned_where_it_settles(world: World) -> None:
+    """A camera wakes with its autofocus on; switched off at once, the lens stays where it happens to be."""
+    capture = SimCapture(world)
+    capture.drift(autofocus=True, focus=0)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    assert (camera.read_locks().focus, camera.read_locks().autofocus) == (120, False)
+
+
+def test_focus_is_stored_for_the_next_program(simulated, world: World) -> None:
+    """A camera without power forgets its focus, and its autofocus may find another one on the next object."""
+    s = simulated("camera.focus=none")
+    state, config, device = s.bench.state, s.bench.config, s.bench.camera.identity.device
+    assert camera_settings(config, state, device).focus == 120
+    assert camera_settings(config, state, "another camera").focus is None
+    state.store_file("camera-focus.json", b"damaged")
+    assert camera_settings(config, state, device).focus is None
+    capture = SimCapture(world)
+    capture.drift(autofocus=True, focus=0)
+    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraSettings(focus=33))
+    assert (camera.read_locks().focus, camera.read_locks().autofocus) == (33, False)
+
+
+def test_camera_with_another_number_after_replugging_is_found(tmp_path: Path, world: World) -> None:
+    """The kernel gives it a new number while a program holds its old device file."""
+
+    class Local(Computer):
+        def open_capture(self, source: int | str) -> SimCapture:
+            if self.device_node(source) is None:
+                raise DeviceNotFound("missing", next_step="connect it")
+            opened.append(source)
+            return SimCapture(world)
+
+    opened: list[int | str] = []
+    files = ComputerFiles(tmp_path)
+    files.camera(0, "Cam", serial="A1", usb_port="1-1")
+    plug = CameraPlug(Local(tmp_path), 0)
+    plug.open()
+    node = plug.node()
+    for gone in ("dev/video0", "sys/class/video4linux/video0/device"):
+        (tmp_path / gone).unlink()
+    assert plug.node() is None
+    with pytest.raises(DeviceNotFound):
+        plug.open()
+    files.camera(1, "Cam again", serial="A1", usb_port="1-2")
+    plug.open()
+    assert opened == [0, "/dev/video1"]
+    assert plug.node() not in (None, node)
 
 
 def returning(world: World, capture: SimCapture, away_s: float) -> OpenCvCamera:
@@ -310,7 +396,7 @@ def returning(world: World, capture: SimCapture, away_s: float) -> OpenCvCamera:
             raise DeviceNotFound("there is no camera", next_step="connect the camera")
         return capture
 
-    camera = OpenCvCamera(capture, clock=world.clock, reopen=reopen)
+    camera = OpenCvCamera(capture, clock=world.clock, reopen=reopen, node=capture.node)
     capture.unplug()
     world.clock.call_at(world.clock.now_ns() + round(away_s * 1e9), capture.replug)
     return camera
@@ -319,12 +405,14 @@ def returning(world: World, capture: SimCapture, away_s: float) -> OpenCvCamera:
 @pytest.mark.parametrize("away_s", [0.0, 0.5, 2.0])
 def test_replugged_camera_continues_with_its_settings(world: World, away_s: float) -> None:
     capture = SimCapture(world)
+    capture.set(cv2.CAP_PROP_SHARPNESS, 77)  # by another program
     camera = returning(world, capture, away_s)
-    locks, after_ns = OpenCvCamera.read_locks(camera), world.clock.now_ns()
-    capture.drift(exposure=33.0)  # as after power-up
+    after_ns = world.clock.now_ns()
     frame = camera.capture(after_ns)
     assert frame.exposed_ns >= after_ns + away_s * 1e9
-    assert camera.read_locks() == locks
+    locks = camera.read_locks()
+    assert (locks.exposure_us, locks.gain, locks.sharpness) == (10_000, 0, 77)
+    assert (locks.focus, locks.autofocus) == (120, False)  # it woke out of focus, with its autofocus on
     assert camera.returns == 1
 
 
@@ -348,7 +436,7 @@ def test_different_camera_after_replugging_is_rejected(world: World) -> None:
         def get(self, prop: int) -> float:
             return 320.0 if prop == cv2.CAP_PROP_FRAME_WIDTH else super().get(prop)
 
-    camera = OpenCvCamera(capture, clock=world.clock, reopen=lambda: Small(world))
+    camera = OpenCvCamera(capture, clock=world.clock, reopen=lambda: Small(world), node=capture.node)
     capture.unplug()
     with pytest.raises(DeviceMismatch, match="another camera") as caught:
         camera.capture(world.clock.now_ns())

@@ -384,6 +384,20 @@ def test_all_checks_end_under_every_fault_and_find_visible_ones(name, bench):
 # -- the IMU ----------------------------------------------------------------------------------------------------------
 
 
+def test_camera_is_reported_as_locked_only_by_settings_that_were_read_back():
+    def camera(*settings):
+        with unopened(*settings) as bench:
+            return {f.code: f for f in bench.findings("camera")}
+
+    locked = camera()[FindingCode.LOCKED].parameters["settings"]
+    assert locked[:4] == ["exposure 10 ms", "white balance 5000 K", "gain 0", "focus 120"]
+    assert "frame rate constant" in locked
+    found = camera("camera.gain=none", "camera.sharpness=999")
+    assert found[FindingCode.NOT_LOCKED].parameters["settings"] == ["gain"]
+    assert found[FindingCode.SETTING_REJECTED].parameters["setting"] == "sharpness"
+    assert not [text for text in found[FindingCode.LOCKED].parameters["settings"] if text.startswith(("gain", "sharp"))]
+
+
 def test_imu_of_another_address_axis_or_kind_is_found():
     with unopened("imu.address=0x69") as bench:
         device = bench.devices.i2c.detach(0x69)
@@ -554,6 +568,7 @@ def test_finding_is_put_into_words_with_its_parameters():
         "servo", Severity.BAD, FindingCode.OTHER_SERVOS, {"id": 1, "baud": 57_600, "port": "COM3", "found": ["a", "b"]}
     )
     assert finding_words(elsewhere) == "no servo answers at id 1, 57600 baud, COM3 (found: a, b)"
-    locked = fine("camera", FindingCode.LOCKED, exposure_ms=None, white_balance_k=4500)
-    assert finding_words(locked) == "locked and read back: exposure ? ms, white balance 4500 K"
+    locked = fine("camera", FindingCode.LOCKED, settings=["gain 0", "focus 120"])
+    assert finding_words(locked) == "locked and read back: gain 0, focus 120"
+    assert finding_words(fine("config", FindingCode.CONFIG_MISTAKE, what=None, mistake=3)) == "?: 3"
     assert locked.as_dict()["code"] == "locked"

@@ -10,6 +10,7 @@ from hbr.core.angles import wrap180
 from rig.catalog import Catalog
 from rig.config import load_config
 from rig.core.errors import (
+    CameraSettingsDiffer,
     CatalogError,
     DeviceFault,
     DeviceSilent,
@@ -22,6 +23,7 @@ from rig.core.errors import (
 from rig.events.events import Accepted, Decided, Enrolled, Identified, Moved, Ranked, Rejected, Started, event_dict
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
+from rig.search.model import load_model
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -81,6 +83,19 @@ def test_unlocked_exposure_of_the_camera_is_a_note(simulated, catalog):
             s.world.change(light=(0.4, 0.4, 0.4))
     assert "camera.exposure_us" in rejected.value.next_step
     assert catalog.objects() == []
+
+
+def test_identify_is_rejected_if_the_camera_has_other_settings_than_at_the_enrollment(simulated, catalog):
+    list(enroll(simulated().bench, catalog, "dice", views=4))
+    s = simulated("camera.gain=6", "camera.sharpness=90")
+    with pytest.raises(CameraSettingsDiffer) as rejected:
+        next(identify(s.bench, load_model(catalog)))
+    assert rejected.value.evidence == {
+        "gain": "6.0 now, 0.0 at the enrollment",
+        "sharpness": "90.0 now, 3.0 at the enrollment",
+    }
+    assert "`rig config set camera.gain 0`, `rig config set camera.sharpness 3`" in rejected.value.next_step
+    next(identify(simulated().bench, load_model(catalog)))
 
 
 def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):

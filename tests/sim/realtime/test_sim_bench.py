@@ -28,7 +28,7 @@ from sim.bench import ShelfOperator
 from sim.devices import SimDevices
 from sim.faults import Faults
 from sim.objects.shelf import shelf
-from sim.realtime.client import RemoteCapture, RemoteI2c
+from sim.realtime.client import RemoteCapture, RemoteI2c, camera_node
 from sim.realtime.commands import HELP, Commands
 from sim.realtime.pace import RealTime
 from sim.realtime.run import run_bench
@@ -241,7 +241,7 @@ def test_camera_shows_the_world_on_the_clock_of_all_programs(start):
         RemoteCapture(folder)
     assert busy.value.next_step == "Close the program that uses it."
     tell(folder, "camera.off")
-    assert (camera.isOpened(), camera.grab()) == (False, False)
+    assert (camera.isOpened(), camera.grab(), camera_node(folder)) == (True, False, None)
     camera.release()
     with pytest.raises(DeviceNotFound):
         until(lambda: RemoteCapture(folder).isOpened())
