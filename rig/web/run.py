@@ -105,7 +105,7 @@ def run_server(
                 )
                 write(folder / SERVER_FILE, address.model_dump_json().encode(), mode=0o600)
                 ready(url)
-                with _checked_catalog(server):
+                with checked_catalog(server):
                     server.worker.run()
             finally:
                 (folder / SERVER_FILE).unlink(missing_ok=True)
@@ -117,7 +117,7 @@ def run_server(
         lock.close()
 
 
-def _checked_catalog(server: Server) -> AbstractContextManager[object]:
+def checked_catalog(server: Server) -> AbstractContextManager[object]:
     """Return a check of the catalog beside the work of a ``with`` block; damage is on stderr and in the status."""
     path = server.config.catalog_path(server.bench)
     if not (path / "catalog.sqlite").exists():

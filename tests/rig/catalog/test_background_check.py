@@ -123,6 +123,13 @@ def test_enrollment_reports_a_flipped_byte_of_another_object(rig, root: Path) ->
     assert "'gone'" not in rig("catalog", "show", "lamp").stderr
 
 
+def test_watch_reports_a_flipped_byte_of_an_object_that_it_does_not_load(rig, root: Path) -> None:
+    flip(root, b"a vase with a crack")
+    words = ["identify", "--watch", "--scan", "--strategy", "sweep", "--max-views", "2"]
+    done = rig(*words, "--set", "bench.sim.object=dice", input="S-1\n\n")  # ends when there is no further sample
+    assert "'gone' in the catalog changed after they were stored" in done.stderr
+
+
 @pytest.mark.parametrize("words", [("list",), ("list", "tin"), ("show", "mug"), ("list", "--deleted")])
 def test_listing_reports_a_flipped_byte_and_is_printed(rig, root: Path, words: tuple[str, ...]) -> None:
     intact = rig("catalog", *words)

@@ -3,6 +3,7 @@
 import pytest
 
 from rig.web.access import Role
+from rig.web.run import checked_catalog
 
 API = "/api/v1"
 
@@ -136,6 +137,17 @@ def test_lists_have_pages_and_etags(serve):
     assert len(rest.json()["items"]) == 1
     assert served.client.get(f"{API}/jobs?limit=2", headers={"If-None-Match": first.headers["etag"]}).status_code == 304
     assert served.client.get(f"{API}/jobs?after=nothing").status_code == 422
+
+
+def test_damage_of_the_catalog_is_in_the_status(serve, capsys):
+    served = serve()
+    with served.server.open_catalog(False) as catalog, catalog.database.write() as connection:
+        connection.exec_driver_sql("INSERT INTO objects (name, label, note, created_utc) VALUES ('a', '', '', '')")
+    assert served.client.get(f"{API}/status").json()["problem"] is None
+    with checked_catalog(served.server) as check:
+        check.wait()
+    assert served.client.get(f"{API}/status").json()["problem"]["code"] == 707
+    assert "rig catalog verify" in capsys.readouterr().err
 
 
 def test_metrics_tell_the_state_of_the_bench(serve):
