@@ -85,6 +85,14 @@ class HomeRequest(_Request):
     kind: Literal["home"] = "home"
 
 
+class ReferenceRequest(_Request):
+    """Set the table's angle after the operator has looked at the cable. Moves nothing."""
+
+    kind: Literal["reference"] = "reference"
+    turns: Annotated[int | None, Field(ge=-100, le=100, description="revolutions that the cable is wound up")] = None
+    here: bool = Field(False, description="the present angle is home, with the cable hanging free")
+
+
 class AcknowledgeRequest(_Request):
     """Acknowledge the latched fault."""
 
@@ -114,6 +122,7 @@ JobRequest = Annotated[
     | EmptyTableRequest
     | GotoRequest
     | HomeRequest
+    | ReferenceRequest
     | AcknowledgeRequest
     | DoctorRequest
     | CalibrateRequest,

@@ -47,6 +47,7 @@ from rig.web.requests import (
     HomeRequest,
     IdentifyRequest,
     Job,
+    ReferenceRequest,
     TrayRequest,
 )
 from rig.web.worker import Context, Work
@@ -124,6 +125,8 @@ class Works:
                 return lambda context: self._rotate(context, request.angle_deg)
             case HomeRequest():
                 return lambda context: self._rotate(context, 0.0)
+            case ReferenceRequest():
+                return lambda context: _refer(context, request)
             case AcknowledgeRequest():
                 return lambda context: _acknowledge(context, reboot=request.reboot)
             case DoctorRequest():
@@ -330,6 +333,17 @@ def _acknowledge(context: Context, *, reboot: bool) -> None:
     state = safety.acknowledge(reboot=reboot)
     context.job.result = {"acknowledged": fault.model_dump() if fault else None, "state": str(state)}
     context.job.result_text = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
+
+
+def _refer(context: Context, request: ReferenceRequest) -> None:
+    if request.here == (request.turns is not None):
+        raise UsageError("Neither or both of turns and here are given.", next_step="Give one of them.")
+    safety = context.bench.safety
+    if request.turns is None:
+        safety.set_angle(0.0)
+    else:
+        safety.set_revolutions(request.turns)
+    context.job.result_text = "The table's angle is set."
 
 
 def _calibrate(context: Context, name: str, thing: str | None) -> None:

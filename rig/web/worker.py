@@ -21,6 +21,7 @@ from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
 from rig.web.hub import Hub
 from rig.web.jobs import JobQueue
+from rig.web.outline import Outliner
 from rig.web.picture import LivePicture, ObservedCamera, jpeg
 from rig.web.requests import Choice, Job, JobState, Progress, Question
 
@@ -105,6 +106,7 @@ class BenchWorker:
         self._stop_asked = threading.Event()
         self._views: dict[str, list[bytes]] = {}
         self._left: TimeLeft | None = None
+        self._outline: Outliner | None = None
         self._status_ns = 0
         self._polled_ns: int | None = None
         self.intervals_s: deque[float] = deque(maxlen=INTERVALS)
@@ -159,7 +161,7 @@ class BenchWorker:
         self._job = job
         self._stop_asked.clear()
         self._views[job.id] = []
-        self._left = None
+        self._left = self._outline = None
         for old in list(self._views)[:-JOBS_WITH_PICTURES]:
             del self._views[old]
         self._polled_ns = None
@@ -204,12 +206,14 @@ class BenchWorker:
         if isinstance(event, Started):
             job.progress = Progress(done=0, total=event.views)
             bench = self._bench()
+            self._outline = Outliner(bench)
             self._left = TimeLeft(MotionModel(bench.config), event.angles_deg) if event.angles_deg else None
         if self._left is not None:
             self._left.add(event)
         if isinstance(event, Accepted):
             self._views[job.id].append(jpeg(event.image_bgr, VIEW_PX))
             values["picture"] = job.views
+            values["outline_px"] = None if self._outline is None else self._outline(event.image_bgr)
             job.views += 1
             if job.progress is not None:
                 left_s = None if self._left is None else self._left.seconds

@@ -56,6 +56,7 @@ def test_day_at_the_bench(page, serve_process, tmp_path, viewport):
     page.fill("#search", "star")
     page.wait_for_selector("#count:has-text('1 object')")
     page.click(".cards button")
+    page.wait_for_selector("#object .ring image:nth-of-type(8)")
     page.fill("#new-name", "mug-red-star")
     page.click("#edit button:has-text('Save')")
     page.wait_for_selector(".cards button:has-text('mug-red-star')")
@@ -70,6 +71,7 @@ def test_day_at_the_bench(page, serve_process, tmp_path, viewport):
     # The bench: rotate, check, stop.
     page.goto(server.url)
     page.wait_for_selector("#state.good")
+    page.wait_for_selector("#lights .lit:has-text('ready')")
     page.fill("#angle", "90")
     page.click("#goto button")
     job_done(page, "Rotate to 90°")
@@ -94,6 +96,20 @@ def test_stop_is_in_reach_above_an_open_dialog_and_stops(page, serve_process):
     job_done(page, "Enroll lamp", "cancelled")
     page.click("#job button:has-text('Continue')")
     page.wait_for_selector("#job:has-text('running')", timeout=WAIT_MS)
+
+
+def test_watch_mode_names_one_object_after_the_other(page, serve_process):
+    server = serve_process("bench.sim.speed=50", 'bench.sim.object=["lamp", "mug-star"]')
+    for name in ("lamp", "mug-star"):
+        enroll(page, server, name, 6)
+        job_done(page, f"Enroll {name}")
+    page.goto(f"{server.url}identify")
+    page.check("#watch")
+    page.click("#start button:has-text('Identify')")
+    for name in ("lamp", "mug-star", "lamp"):
+        page.wait_for_selector(f"#answer.found:has-text('{name}')", timeout=WAIT_MS)
+    page.click("#job button:has-text('Cancel')")
+    job_done(page, "Identify", "cancelled")
 
 
 def test_second_browser_watches_and_takes_over(page, chromium, serve_process):
@@ -132,6 +148,11 @@ def test_server_killed_in_an_enrollment_loses_no_view(page, serve_process):
     page.goto(f"{again.url}catalog")
     text = page.text_content(".cards button:has-text('lamp')")
     assert int(text.split("interrupted, ")[1].split()[0]) >= shown
+    page.goto(again.url)
+    page.wait_for_selector("#lights .lit")
+    if page.locator("#refer").is_visible():  # killed in a motion
+        page.click("#refer button:has-text('Set')")
+        page.wait_for_selector("#lights .lit:has-text('ready')")
     page.goto(f"{again.url}enroll")
     page.click("#job button:has-text('Continue')")
     job_done(page, "Enroll lamp")

@@ -1,8 +1,10 @@
 """The server as a process: slow and silent clients, and other programs beside it."""
 
 import json
+import shutil
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import urllib.error
@@ -79,3 +81,21 @@ def test_commands_of_the_terminal_work_beside_the_server(serve_process):
     stopped = rig("stop")
     assert stopped.returncode == 0, stopped.stderr
     assert call(server, "health")["bench_open"]
+
+
+def test_server_with_a_certificate_speaks_tls_only(serve_process, tmp_path):
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is missing: apt-get install openssl")
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    names = ["-subj", "/CN=bench.local", "-addext", "subjectAltName=IP:127.0.0.1"]
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", *names]
+    subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
+    server = serve_process(options=("--certfile", str(certificate), "--keyfile", str(key)))
+    assert server.url.startswith("https://")
+    context = ssl.create_default_context(cafile=certificate)
+    with urllib.request.urlopen(f"{server.url}api/v1/health", context=context, timeout=20) as answer:
+        assert json.load(answer)["status"] == "ok"
+    with pytest.raises(OSError):  # noqa: PT011 - reset or bad response, as the system likes
+        urllib.request.urlopen(server.url.replace("https", "http"), timeout=20)
+    status = subprocess.run([*RIG, "status", "--bench", "sim", *server.settings], capture_output=True, text=True)
+    assert f"served at {server.url}" in status.stdout, status.stderr

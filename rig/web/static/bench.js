@@ -4,6 +4,7 @@ const polar = (degrees, radius) => {
   const a = ((degrees - 90) * Math.PI) / 180;
   return [Math.cos(a) * radius, Math.sin(a) * radius];
 };
+const STATES = ["disconnected", "connected", "unreferenced", "ready", "moving", "stopped", "fault"];
 let gyro = null;
 
 function dial(status) {
@@ -38,27 +39,36 @@ function dial(status) {
 on("status", (status) => {
   if (!status.open) return;
   if (status.limits_deg) dial(status);
-  const values = [["State", status.state], ["Cable budget", status.limits_deg ? `${status.limits_deg[0]}° to ${status.limits_deg[1]}°` : "–"]];
+  $("lights").replaceChildren(...STATES.map((state) => h("li", { class: state === status.state ? `lit ${state}` : "", "aria-current": state === status.state }, state)));
+  const values = [["Cable budget", status.limits_deg ? `${status.limits_deg[0]}° to ${status.limits_deg[1]}°` : "–"]];
   if (gyro !== null) values.push(["Gyro at the last rest", `${gyro.toFixed(2)}°`]);
   if (status.servo) values.push(["Servo", `${status.servo.model}, ${status.servo.temperature_c} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${status.servo.load_percent.toFixed(0)} %`]);
   if (status.camera) values.push(["Camera", `${status.camera.name}, ${status.camera.width} × ${status.camera.height}`]);
   for (const finding of status.findings || []) values.push(["Note", finding]);
   $("values").replaceChildren(...values.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  $("refer").hidden = !status.doubt;
+  $("doubt").textContent = status.doubt ? `The table's angle is in doubt: ${status.doubt}.` : "";
   $("acknowledge").disabled = !status.fault;
 });
 
 on("plan", (event) => {
   if (event.event === "moved") gyro = event.rotation_imu_deg === null ? null : event.encoder_deg - event.rotation_encoder_deg + event.rotation_imu_deg;
-  if (event.event === "accepted" && event.segmentation && event.segmentation.box_px) outline(event.segmentation.box_px);
+  if (event.event === "accepted" && event.outline_px) outline(event.outline_px);
   if (event.event === "moved") $("outline").replaceChildren();
 });
 
-function outline(box) {
+/** Draw the found object over the picture: its outline, and its box. */
+function outline(found) {
   const image = $("live-image");
   if (!image.naturalWidth) return;
   $("outline").setAttribute("viewBox", `0 0 ${image.naturalWidth} ${image.naturalHeight}`);
-  const [x, y, width, height] = box;
-  $("outline").replaceChildren(h("rect", { x, y, width, height, fill: "none", stroke: "#ffd34d", "stroke-width": 3 }));
+  const [x, y, width, height] = found.box;
+  const path = found.points.map(([px, py], k) => `${k ? "L" : "M"}${px} ${py}`).join(" ");
+  const style = { fill: "none", "stroke-width": 2 };
+  $("outline").replaceChildren(
+    h("rect", { x, y, width, height, stroke: "#8ab8ff", "stroke-dasharray": "6 4", ...style }),
+    h("path", { d: `${path} Z`, stroke: "#ffd34d", ...style }),
+  );
 }
 
 const jobs = new Map();
@@ -96,6 +106,11 @@ $("goto").addEventListener("submit", (event) => {
   event.preventDefault();
   submit({ kind: "goto", angle_deg: Number($("angle").value) });
 });
+$("refer").addEventListener("submit", (event) => {
+  event.preventDefault();
+  submit({ kind: "reference", turns: Number($("turns").value) });
+});
+$("here").addEventListener("click", () => submit({ kind: "reference", here: true }));
 for (const [id, kind] of [["home", "home"], ["empty", "empty-table"], ["acknowledge", "acknowledge"], ["doctor", "doctor"]]) {
   $(id).addEventListener("click", () => submit({ kind }));
 }

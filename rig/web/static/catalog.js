@@ -44,12 +44,20 @@ async function open(name) {
   $("object").scrollTop = 0;
 }
 
-/** The views in a circle, as the camera saw the object. */
+/** The views in a circle at their azimuths, counter-clockwise from the bottom, where the camera is. */
 function ring(views) {
   const step = Math.max(1, Math.ceil(views.length / 24));
-  return h("ol", { class: "thumbs", "aria-label": "Views by azimuth" },
-    ...views.filter((_, k) => k % step === 0).map((view) =>
-      h("li", {}, h("a", { href: `${API}/views/${view.id}/image?full=true`, target: "_blank", "aria-label": `View at ${view.azimuth_deg.toFixed(0)}°, full size` }, h("img", { src: `${API}/views/${view.id}/image`, alt: "", loading: "lazy" })), `${view.azimuth_deg.toFixed(0)}°`)));
+  const some = views.filter((_, k) => k % step === 0);
+  const width = Math.min(220, 2400 / Math.max(some.length, 6));
+  const parts = some.flatMap((view) => {
+    const angle = ((view.azimuth_deg + 90) * Math.PI) / 180;
+    const [x, y] = [Math.cos(angle) * 400, Math.sin(angle) * 400];
+    return [
+      h("image", { href: `${API}/views/${view.id}/image`, x: x - width / 2, y: y - width / 2, width, height: width }),
+      h("text", { x: x * 0.66, y: y * 0.66 + 6 }, `${view.azimuth_deg.toFixed(0)}°`),
+    ];
+  });
+  return h("svg", { class: "ring", viewBox: "-520 -520 1040 1040", role: "img", "aria-label": `${some.length} of ${views.length} views by azimuth` }, ...parts);
 }
 
 async function upload(file) {

@@ -14,7 +14,7 @@ export const $ = (id) => document.getElementById(id);
 
 /** Make an element: attributes as an object (on… are listeners), children as nodes or text. */
 export function h(tag, attributes = {}, ...children) {
-  const svg = ["svg", "path", "circle", "line", "text", "rect", "g"].includes(tag);
+  const svg = ["svg", "path", "circle", "line", "text", "rect", "g", "image"].includes(tag);
   const element = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   for (const [key, value] of Object.entries(attributes)) {
     if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
@@ -175,7 +175,7 @@ $("stop")?.addEventListener("click", async () => {
 
 // -- a job ---------------------------------------------------------------------------------------------------------------
 
-const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", doctor: "Check the bench", calibrate: "Calibrate", "dry-run": "Plan" };
+const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", reference: "Set the angle", doctor: "Check the bench", calibrate: "Calibrate", "dry-run": "Plan" };
 const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "Stop" };
 
 export function jobTitle(job) {

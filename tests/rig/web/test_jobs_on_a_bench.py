@@ -103,6 +103,17 @@ def test_fault_is_latched_shown_and_acknowledged(serve):
         pytest.fail("the table does not move")
 
 
+def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
+    served = serve()
+    served.run(kind="goto", angle_deg=90)
+    assert served.run(kind="reference")["error"]["code"] == 200
+    assert served.run(kind="reference", turns=5)["error"]["code"] == 200  # beyond the cable budget
+    assert served.run(kind="reference", turns=-1)["state"] == "done"
+    assert round(served.client.get("/api/v1/status").json()["table_deg"]) == -270
+    assert served.run(kind="reference", here=True)["state"] == "done"
+    assert round(served.client.get("/api/v1/status").json()["table_deg"]) == 0
+
+
 def test_dry_run_and_doctor_move_nothing(serve):
     served = serve()
     job = served.run(kind="dry-run", objects=[{"name": "lamp"}, {"name": "mug-star", "views": 8}])
