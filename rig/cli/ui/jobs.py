@@ -82,25 +82,29 @@ def confirm(question: str, *, yes: bool, settings: Settings) -> None:
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
     """Print a table as wide as the terminal; in a pipe print every row in full, as one line."""
-    from rich.console import Console
-    from rich.measure import Measurement
+    from rich.cells import cell_len
     from rich.table import Table
 
     from rig.cli.ui.present import console
+    from rig.core.control_characters import neutral
 
-    table: Table = Table(box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(_plain(cell) for cell in row))
-    screen: Console = console()
+    screen = console()
     if screen.is_terminal:
+        table: Table = Table(box=None, pad_edge=False)
+        for column in columns:
+            table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+        for row in rows:
+            table.add_row(*(_plain(cell) for cell in row))
         screen.print(table)
         return
-    screen.width = max(screen.width, Measurement.get(screen, screen.options.update(width=10_000), table).maximum)
-    with screen.capture() as lines:
-        screen.print(table)
-    print("\n".join(line.rstrip() for line in lines.get().splitlines()), flush=True)
+    # Rich takes milliseconds for each row
+    lines = [[neutral(str(cell)) for cell in row] for row in (columns, *rows)]
+    widths = [max(map(cell_len, cells)) for cells in zip(*lines, strict=True)]
+    for line in lines:
+        spaces = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
+        cells = zip(columns, line, spaces, strict=True)
+        print("  ".join(space + cell if name in right else cell + space for name, cell, space in cells).rstrip())
+    sys.stdout.flush()
 
 
 def size_words(size: float) -> str:
