@@ -65,9 +65,10 @@ def test_rotation_beyond_the_cable_budget_is_rejected(rig):
 
 def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
     rig("goto", "90")
-    kept = state()
-    kept["table"]["path_deg"] = [200.0, 600.0]  # killed in a motion, and the supply was off since
-    Path("state/sim/state.json").write_text(json.dumps(kept))
+    store = FileStore(Path("state/sim"))
+    kept = store.load()
+    moving = kept.table.model_copy(update={"path_deg": (200.0, 600.0)})  # killed in a motion, and without supply since
+    store.save(kept.model_copy(update={"table": moving}))
     reported = json.loads(rig("status", "--json").stdout)
     assert reported["state"] == "unreferenced"
     assert reported["table_deg"] is None
