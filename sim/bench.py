@@ -1,15 +1,17 @@
 """The simulated bench: one simulated world, and the real drivers connected to simulated devices."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field, field_validator
 
 from rig.bench import Bench, BenchKind
+from rig.bench.bench import DEVICES
 from rig.bench.computer import Computer
 from rig.bench.hardware import assemble
 from rig.config import RigConfig, Section
@@ -162,6 +164,7 @@ def open_sim_bench(
     faults: Iterable[Fault] = (),
     on_fault: Callable[[Occurrence], None] | None = None,
     devices: SimDevices | None = None,
+    open_now: Collection[str] = DEVICES,
 ) -> Bench:
     """Open a bench whose real drivers are connected to simulated devices, by the code that opens a real bench.
 
@@ -177,6 +180,8 @@ def open_sim_bench(
         Called when a simulated fault begins or ends.
     devices
         Devices of an earlier bench in this world; the caller closes them.
+    open_now
+        Devices to open now, see `rig.bench.open_bench`.
 
     Raises
     ------
@@ -191,6 +196,7 @@ def open_sim_bench(
         owned = devices is None
         if devices is None:
             devices = wires.enter_context(SimDevices.connected(config, world))
+        capture = partial(getattr, devices, "camera")
         operator.devices, operator.faults = devices, Faults(devices)
         if on_fault:
             operator.faults.listeners.append(on_fault)
@@ -205,10 +211,10 @@ def open_sim_bench(
             connection=devices.adapter,
             reopen_serial=devices.reopen_adapter,
             i2c_bus=devices.i2c.path,
-            capture=devices.camera,
+            capture=capture,
             reopen_camera=devices.reopen_camera,
             camera_node=devices.camera.node,
-            camera_device=CAMERA_DEVICE,
+            camera_device=lambda: CAMERA_DEVICE,
             state=operator.state,
             head_port=devices.head_port,
         )
@@ -217,6 +223,11 @@ def open_sim_bench(
                 bench.safety.set_angle(world.table_deg())
             else:
                 bench.safety.set_revolutions(0)
+        try:
+            bench.open_devices(open_now)
+        except BaseException:
+            bench.close()
+            raise
         bench.connections = wires.pop_all()
     bench.operator = operator
     bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
@@ -238,7 +249,7 @@ class SimBenchKind:
             operator = ShelfOperator(world, objects, next_object=single, yaw_deg=options.yaw_deg)
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
-            bench = open_sim_bench(config, operator, faults=read_faults(options.faults))
+            bench = open_sim_bench(config, operator, faults=read_faults(options.faults), open_now=())
             bench.connections.enter_context(held.pop_all())
         return bench
 

@@ -3,7 +3,7 @@
 Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, and those of other packages.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
@@ -23,11 +23,14 @@ from rig.core.signals import uninterrupted
 from rig.devices.camera import Camera
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
+from rig.devices.on_demand import OnDemand
 from rig.devices.servo import Servo
 from rig.safety.saved_state import MemoryStore, SessionEnd, StateStore
 from rig.safety.supervisor import Safety
 
 GROUP = "rig.benches"
+DEVICES = ("imu", "camera")
+"""The devices that can be opened later than the servo."""
 
 
 class Operator(Protocol):
@@ -54,7 +57,7 @@ class ObjectAlreadyPlaced:
 
 @dataclass(slots=True)
 class Bench(AbstractContextManager["Bench"]):
-    """The open devices of one bench, on one clock.
+    """The devices of one bench, on one clock. IMU and camera may be opened at their first use.
 
     Attributes
     ----------
@@ -135,14 +138,36 @@ class Bench(AbstractContextManager["Bench"]):
         """Return whether the rig head's relay cuts the servo's supply: then it has no torque either."""
         return self.head is not None and self.config.head.power and not self.head.status.relay_closed
 
+    def open_devices(self, parts: Collection[str]) -> None:
+        """Open ``imu`` and ``camera`` now, not at their first use.
+
+        Raises
+        ------
+        DeviceNotFound, DeviceMismatch, DeviceSilent
+            A device is missing, is another one, or does not answer.
+        """
+        for part in parts:
+            if isinstance(device := getattr(self, part), OnDemand):
+                setattr(self, part, device.open())
+
     def devices(self) -> dict[str, Any]:
-        """Return the identities of the devices, for records."""
-        identities: dict[str, Any] = {part: getattr(self, part).identity for part in ("servo", "imu", "camera")}
-        return {part: asdict(identity) for part, identity in identities.items()}
+        """Return the identities of the devices, for records; it opens those that are not open yet."""
+        self.open_devices(DEVICES)
+        return self._identities()
+
+    def _identities(self) -> dict[str, Any]:
+        """Return the identities of the open devices."""
+        devices = {part: getattr(self, part) for part in ("servo", "imu", "camera")}
+        return {
+            part: asdict(device.identity)
+            for part, device in devices.items()
+            if not isinstance(device, OnDemand) or device.is_open
+        }
 
     def apparatus(self, *parts: str) -> dict[str, Any]:
-        """Return the part of the bench that a calibration of ``parts`` (default: all devices) depends on."""
-        whole = apparatus(self.name, self.devices(), self.config, self.conditions)
+        """Return the part of the bench that a calibration of ``parts`` (default: all open devices) depends on."""
+        self.open_devices([part for part in parts if part in DEVICES])
+        whole = apparatus(self.name, self._identities(), self.config, self.conditions)
         return {key: value for key, value in whole.items() if not parts or key in ("bench", "conditions", *parts)}
 
 
@@ -174,7 +199,13 @@ def _plugins() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
-def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed: int | None = None) -> Bench:
+def open_bench(
+    name: str | None = None,
+    config: RigConfig | None = None,
+    *,
+    seed: int | None = None,
+    devices: Collection[str] = DEVICES,
+) -> Bench:
     """Open a bench by name; use it in a ``with`` block.
 
     Parameters
@@ -185,6 +216,8 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
         The configuration; None takes the defaults.
     seed
         Seed of a simulated bench; a real one ignores it.
+    devices
+        Devices to open now; the others are opened when they are first used. The servo is always opened.
 
     Raises
     ------
@@ -199,6 +232,7 @@ def open_bench(name: str | None = None, config: RigConfig | None = None, *, seed
     kind, options = _kind(name or config.default_bench, config)
     bench = kind.open(config, options, seed)
     try:
+        bench.open_devices(devices)
         calibrate(bench, CalibrationStore(config.calibration_path(bench.name)))
     except BaseException:
         bench.close()

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 from pydantic import BaseModel
 
@@ -17,6 +17,7 @@ from rig.config import RigConfig, Section
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
+from rig.devices.camera import Camera
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
@@ -24,6 +25,7 @@ from rig.devices.head.head import RigHead
 from rig.devices.head.opening import open_head, powered, switch_on
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu
+from rig.devices.on_demand import OnDemand
 from rig.devices.open_imu import open_imu
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.devices.opencv_capture import Capture
@@ -62,8 +64,6 @@ class HardwareBench:
             connection = computer.open_serial(config.servo.port, config.servo.baud)
             connections.callback(connection.close)
             plug = CameraPlug(computer, config.camera.source)
-            capture = plug.open()
-            connections.callback(capture.release)
             bench = assemble(
                 self.name,
                 config,
@@ -72,10 +72,10 @@ class HardwareBench:
                 reopen_serial=lambda: computer.open_serial(config.servo.port, config.servo.baud),
                 guardian=Guardian(config.servo.port, config.servo.baud, config.servo.model, config.servo.id),
                 i2c_bus=computer.i2c_path(config.imu.bus),
-                capture=capture,
+                capture=plug.open,
                 reopen_camera=plug.open,
                 camera_node=plug.node,
-                camera_device=plug.device,
+                camera_device=lambda: plug.device,
                 state=FileStore(state_path),
                 head_port=lambda: computer.open_serial(config.head.port, BAUD, "head"),
             )
@@ -107,14 +107,14 @@ def assemble(
     reopen_serial: Callable[[], SerialConnection] | None = None,
     guardian: Guardian | None = None,
     i2c_bus: int | str,
-    capture: Capture,
+    capture: Callable[[], Capture],
     reopen_camera: Callable[[], Capture] | None = None,
     camera_node: Callable[[], object] = lambda: None,
-    camera_device: str | None = None,
+    camera_device: Callable[[], str | None] = lambda: None,
     state: StateStore,
     head_port: Callable[[], SerialConnection] | None = None,
 ) -> Bench:
-    """Open the drivers on their connections, for simulated and real benches alike.
+    """Open the drivers on their connections, for simulated and real benches alike; IMU and camera at their first use.
 
     Nothing moves, and the torque stays as it is. `Bench.safety` then knows whether the table may move.
 
@@ -136,25 +136,34 @@ def assemble(
         findings = servo.prepare(write=config.servo.write_settings)
         findings += tuple(f"servo: {one}" for one in servo.remarks)
         _check_reach(config, servo)
-        imu: Imu = head or open_imu(config.imu, i2c_bus, clock)
-        opened.callback(imu.close)
         if head is None and (note := imu_kind(config.imu.model).note):
             findings += (f"imu: {note}",)
-        camera = OpenCvCamera(
-            capture,
-            clock=clock,
-            settings=camera_settings(config, state, camera_device),
-            name=f"camera {config.camera.source}",
-            device=camera_device,
-            reopen=reopen_camera,
-            node=camera_node,
-        )
-        if config.camera.focus is None:
-            _store_focus(state, camera_device, camera.read_locks().focus)
-        findings += tuple(
-            f"camera: {n.setting} was set to {n.asked:g}, but the camera reports {n.reported:g}"
-            for n in camera.rejected_settings
-        )
+
+        def open_camera() -> Camera:
+            with ExitStack() as failed:
+                source = capture()
+                failed.callback(source.release)
+                device = camera_device()
+                camera = OpenCvCamera(
+                    source,
+                    clock=clock,
+                    settings=camera_settings(config, state, device),
+                    name=f"camera {config.camera.source}",
+                    device=device,
+                    reopen=reopen_camera,
+                    node=camera_node,
+                )
+                failed.pop_all()
+            if config.camera.focus is None:
+                _store_focus(state, device, camera.read_locks().focus)
+            bench.findings += tuple(
+                f"camera: {n.setting} was set to {n.asked:g}, but the camera reports {n.reported:g}"
+                for n in camera.rejected_settings
+            )
+            return camera
+
+        imu = cast(Imu, head or OnDemand(lambda: open_imu(config.imu, i2c_bus, clock)))
+        camera = cast(Camera, OnDemand(open_camera))
         bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
         bench.safety.connect()
         if head is not None:
@@ -163,7 +172,7 @@ def assemble(
             bench.safety.restore_actions.append(lambda: switch_on(watched, config.head, clock))
         if fault is not None:
             bench.safety.latch(fault)
-        bench.safety.acknowledge_checks.append(imu.read_samples)
+        bench.safety.acknowledge_checks.append(lambda: imu.read_samples())
         bench.findings += bench.safety.findings
         opened.pop_all()
     return bench

@@ -201,7 +201,7 @@ _TEXTS: Mapping[str, str] = {
     RejectReason.TABLE_MOVED: "the table moved ({0.stillness.peak_rate_dps:.2f} °/s, "
     "shaft {0.stillness.encoder_change_deg:.2f}°, platter {0.stillness.platter_change_deg:+.2f}°)",
     RejectReason.REPEATED_FRAME: "the camera repeated its last frame",
-    RejectReason.LOCKS_CHANGED: "exposure or white balance has changed",
+    RejectReason.LOCKS_CHANGED: "a setting of the camera has changed",
     RejectReason.TOO_DARK: "too dark (mean level {0.mean_level:.1f}, {0.dark_share:.0%} black)",
     RejectReason.OVEREXPOSED: "overexposed ({0.saturated_share:.0%} saturated)",
     RejectReason.BLURRED: "blurred (sharpness {0.sharpness:.1f})",

@@ -107,7 +107,7 @@ def test_servo_of_another_make_rotates_the_table_for_an_enrollment(stepper, tmp_
             world.clock,
             connection=SimpleNamespace(world=world),
             i2c_bus=devices.i2c.path,
-            capture=devices.camera,
+            capture=lambda: devices.camera,
             state=MemoryStore(),
         )
         with bench, Catalog.open(tmp_path / "catalog", clock=bench.clock) as catalog:

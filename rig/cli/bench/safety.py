@@ -42,7 +42,7 @@ def acknowledge(
 
     Example: rig acknowledge --reboot --bench sim
     """
-    with settings.open_bench() as bench:
+    with settings.open_bench(devices=("imu",)) as bench:
         fault = bench.safety.fault
         state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
     text = f"Acknowledged: {fault.what}" if fault else "No fault was latched."

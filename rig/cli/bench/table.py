@@ -1,7 +1,7 @@
 """`rig goto`, `rig home` and `rig status`."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -11,6 +11,7 @@ from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
+    from rig.core.errors import RigError
     from rig.motion.turntable import Turntable
     from rig.safety.saved_state import ServerAddress
     from rig.safety.supervisor import Safety
@@ -31,7 +32,7 @@ def goto(
 
     if not abs(angle_deg) <= MAX_LIMIT_DEG:  # also true for nan
         raise UsageError(f"{angle_deg:g} is not an angle of the table.", next_step="Give the angle in degrees.")
-    with settings.open_bench() as bench, Turntable(bench) as table:
+    with settings.open_bench(devices=("imu",)) as bench, Turntable(bench) as table:
         _rotate(settings, table, angle_deg)
 
 
@@ -61,7 +62,7 @@ def home(
 
     if here and turns is not None:
         raise UsageError("--here and --turns cannot be combined.", next_step="Give one of them.")
-    with settings.open_bench() as bench:
+    with settings.open_bench(devices=("imu",)) as bench:
         if here:
             bench.safety.set_angle(0.0)
             settings.say("The present angle is home now.", {"table_deg": 0.0})
@@ -102,21 +103,26 @@ def _rotate(settings: Settings, table: "Turntable", angle_deg: float) -> None:
 
 @command
 def status(settings: Settings) -> None:
-    """Show the state of the bench and its devices. Moves nothing.
+    """Show the state of the bench and its devices, also if some of them are missing. Moves nothing.
 
     Example: rig status --bench sim --json
     """
+    from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
     from rig.events.events import plain
     from rig.safety.saved_state import server_address
 
     if server := server_address(settings.load().state_path(settings.bench_name)):
         _served_status(settings, server)
         return
-    with settings.open_bench(tell=False) as bench:
+    try:
+        bench = settings.open_bench(tell=False, devices=())
+    except (DeviceNotFound, DeviceMismatch, DeviceSilent) as missing:
+        _status_without_servo(settings, missing)
+    with bench:
         state, safety = bench.servo.read_state(), bench.safety
         config = bench.config.table
         table_deg = None if safety.doubt else safety.angle_reference.to_table(state.position_deg)
-        report = {
+        report: dict[str, Any] = {
             "bench": bench.name,
             "state": str(safety.state),
             "fault": safety.fault.model_dump() if safety.fault else None,
@@ -124,27 +130,91 @@ def status(settings: Settings) -> None:
             "table_deg": table_deg,
             "limits_deg": list(config.limits_deg),
             "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.bus_statistics)},
-            "imu": {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()},
+            "imu": _read(lambda: {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()}),
             **({"head": bench.head.report()} if bench.head else {}),
-            "camera": {**plain(bench.camera.identity), "locks": plain(bench.camera.read_locks())},
-            "findings": list(bench.findings),
+            "camera": _read(
+                lambda: {**plain(bench.camera.identity), "locks": plain(bench.camera.read_locks())},
+            ),
         }
+        report["findings"] = list(bench.findings)  # opening the camera adds some
     if settings.json:
         settings.print_json(report)
-        return
-    print(f"bench    {report['bench']}")
-    print(f"state    {_state_text(safety)}")
-    print(f"table    {_table_text(table_deg, config.limits_deg)}")
+    else:
+        print(f"bench    {report['bench']}")
+        print(f"state    {_state_text(safety)}")
+        print(f"table    {_table_text(table_deg, config.limits_deg)}")
+        _print_devices(report)
+        for finding in bench.findings:
+            print(f"note     {finding}")
+    _exit_if_missing(report)
+
+
+def _read(values: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return the values of a device; if it does not work, its error."""
+    from rig.core.errors import RigError
+
+    try:
+        return values()
+    except RigError as error:
+        return {"error": error.as_dict()}
+
+
+def _status_without_servo(settings: Settings, missing: "RigError") -> NoReturn:
+    """Print what works of a bench that cannot be opened, and exit with the error's code."""
+    from contextlib import closing
+
+    from rig.cli.bench.findings import doctor_context
+    from rig.devices.open_imu import open_imu
+    from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+    from rig.events.events import plain
+
+    with doctor_context(settings) as context:
+        config, computer = context.config, context.computer
+
+        def imu() -> dict[str, Any]:
+            with closing(open_imu(config.imu, computer.i2c_path(config.imu.bus), computer.clock)) as sensor:
+                return {**plain(sensor.identity), "temperature_c": sensor.temperature_c()}
+
+        def camera() -> dict[str, Any]:
+            source = config.camera.source
+            with closing(
+                OpenCvCamera(
+                    computer.open_capture(source),
+                    clock=computer.clock,
+                    settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
+                    name=f"camera {source}",
+                    device=computer.camera_device(source),
+                )
+            ) as opened:
+                return {**plain(opened.identity), "locks": plain(opened.read_locks())}
+
+        report: dict[str, Any] = {"bench": settings.bench_name, "servo": {"error": missing.as_dict()}}
+        report |= {"imu": _read(imu)} if config.imu.connection == "i2c" else {}
+        report["camera"] = _read(camera)
+    if settings.json:
+        settings.print_json(report)
+    else:
+        print(f"bench    {report['bench']}: not open")
+        _print_devices(report)
+    _exit_if_missing(report)
+    raise missing
+
+
+def _print_devices(report: Mapping[str, Any]) -> None:
     for device in ("servo", "imu", "head", "camera"):
-        if device not in report:
-            continue
-        values = report[device]
-        assert isinstance(values, dict)
-        print(
-            f"{device:8s} " + ", ".join(f"{key} {_short(value)}" for key, value in values.items() if key != "time_ns")
-        )
-    for finding in bench.findings:
-        print(f"note     {finding}")
+        values = report.get(device, {})
+        if error := values.get("error"):
+            print(f"{device:8s} error {error['code']}: {error['what']} {error['next_step']}")
+        elif values:
+            shown = (f"{key} {_short(value)}" for key, value in values.items() if key != "time_ns")
+            print(f"{device:8s} {', '.join(shown)}")
+
+
+def _exit_if_missing(report: Mapping[str, Any]) -> None:
+    """Exit with the code of the first device that does not work."""
+    for device in ("servo", "imu", "camera"):
+        if error := report.get(device, {}).get("error"):
+            raise typer.Exit(error["code"] // 100)
 
 
 def _served_status(settings: Settings, server: "ServerAddress") -> None:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 from rig.core.errors import RigError
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from rig.bench import Bench
     from rig.catalog import Action, Catalog
     from rig.catalog.background import BackgroundCheck
@@ -65,11 +67,14 @@ class Settings:
     def bench_name(self) -> str:
         return self.bench or self.load().default_bench
 
-    def open_bench(self, *, tell: bool = True) -> "Bench":
-        """Open the bench and print its notes; with ``tell`` false the command prints those on calibration itself."""
+    def open_bench(self, *, tell: bool = True, devices: "Collection[str]" = ("imu", "camera")) -> "Bench":
+        """Open the bench and print its notes; with ``tell`` false the command prints those on calibration itself.
+
+        The servo and ``devices`` are opened now, the others when they are first used.
+        """
         from rig.bench import open_bench
 
-        bench = open_bench(self.bench_name, self.load(), seed=self.seed)
+        bench = open_bench(self.bench_name, self.load(), seed=self.seed, devices=devices)
         for finding in (*bench.safety.findings, *(bench.calibration_findings if tell else ())):
             print(f"Note: {finding}.", file=sys.stderr)
         return bench

@@ -145,7 +145,25 @@ def test_status_reports_the_devices(rig):
     assert result["table_deg"] == pytest.approx(0, abs=0.3)
     text = rig("status").stdout
     assert "moving no" in text
-    assert "gain –" in text
+    assert "gain 0" in text
+
+
+@pytest.mark.parametrize("device", ["servo", "imu", "camera"])
+def test_status_shows_the_other_devices_if_one_is_missing(rig, device):
+    missing = ("--set", f'bench.sim.faults=["{device}.off"]')
+    done = rig("status", "--json", *missing)
+    result = json.loads(done.stdout)
+    broken = [name for name in ("servo", "imu", "camera") if "error" in result[name]]
+    assert (broken, done.exit_code) == ([device], 4)
+    assert result[device]["error"]["code"] // 100 == 4
+    assert f"{device:8s} error 40" in rig("status", *missing).stdout
+
+
+def test_table_rotates_without_a_camera(rig):
+    missing = ("--set", 'bench.sim.faults=["camera.off"]')
+    assert rig("goto", "20", *missing).exit_code == 0
+    assert rig("home", *missing).exit_code == 0
+    assert rig("identify", *missing).exit_code != 0
 
 
 def test_all_mistakes_in_the_configuration_are_reported_at_once(rig):
