@@ -381,7 +381,8 @@ def _store_session(store: StateStore, session: SavedSession) -> None:
 
 
 def _this_command() -> str:
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return command.encode(errors="replace").decode()  # arguments may have bytes that are not UTF-8
 
 
 class BenchLock:

@@ -120,7 +120,7 @@ class CorrectionBody(Body):
 
     reason: Annotated[str, Field(min_length=1, max_length=1000)]
     object: Annotated[str | None, Field(max_length=100)] = None
-    unknown: bool = Field(False, description="the object is in fact unknown")
+    unknown: bool = Field(False, description="the object is an unknown one")
     sample: Annotated[str | None, Field(max_length=100)] = None
 
 
