@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rig.cli.bench import config, doctor, find, safety, serve, servo, setup, table
+from rig.cli.bench import config, doctor, find, safety, serve, servo, setup, snapshot, table
 from rig.cli.catalog import calibrate as rules
 from rig.cli.catalog import catalog, exchange, results, upkeep
 from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
@@ -131,6 +131,7 @@ app.command("home", rich_help_panel=BENCH)(table.home)
 app.command("status", rich_help_panel=BENCH)(table.status)
 app.command("stop", rich_help_panel=BENCH)(safety.stop)
 app.command("acknowledge", rich_help_panel=BENCH)(safety.acknowledge)
+app.command("snapshot", rich_help_panel=BENCH)(snapshot.snapshot)
 app.command("doctor", rich_help_panel=BENCH)(doctor.doctor)
 app.command("serve", rich_help_panel=BENCH)(serve.serve)
 app.command("find", rich_help_panel=BENCH)(find.find)

@@ -1,18 +1,19 @@
 """Check the camera: its mode, its locks, and the age and quality of its frames."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from rig.bench.hardware import camera_settings
 from rig.core.clock import seconds_between
-from rig.core.errors import DeviceNotFound
 from rig.devices.camera import Camera
-from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+from rig.devices.opencv_camera import OpenCvCamera
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
+from rig.safety.saved_state import FileStore
 from rig.views.capture import ImageQuality, rejection_text
 
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
@@ -27,22 +28,7 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
     if context.holder is not None:
         yield warning("camera", FindingCode.NOT_CHECKED, context.rig("stop"))
         return
-    config = context.config.camera
-    try:
-        capture = context.computer.open_capture(config.source)
-    except DeviceNotFound as error:
-        yield of_error("camera", error)
-        return
-    with ExitStack() as opened:
-        opened.callback(capture.release)
-        settings = CameraSettings(**config.model_dump(exclude={"source"}))
-        source = OpenCvCamera(
-            capture,
-            clock=context.computer.clock,
-            settings=settings,
-            name=f"camera {config.source}",
-            device=context.computer.camera_device(config.source),
-        )
+    with closing(open_camera(context)) as source:
         identity = source.identity
         context.identities["camera"] = {name: getattr(identity, name) for name in identity.__dataclass_fields__}
         mode = {"name": identity.name, "width": identity.width, "height": identity.height, "fps": identity.fps}
@@ -50,6 +36,30 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
         yield fine("camera", FindingCode.TIME_BASE, time_base=source.time_base.value)
         yield from _locks(context, source)
         yield from _frames(context, source)
+
+
+def open_camera(context: DoctorContext) -> OpenCvCamera:
+    """Open the camera with its settings, without the other devices.
+
+    Raises
+    ------
+    DeviceNotFound, DeviceSilent
+        The camera is missing, or delivers no frames.
+    """
+    source = context.config.camera.source
+    capture = context.computer.open_capture(source)
+    device = context.computer.camera_device(source)
+    with ExitStack() as failed:
+        failed.callback(capture.release)
+        camera = OpenCvCamera(
+            capture,
+            clock=context.computer.clock,
+            settings=camera_settings(context.config, FileStore(context.config.state_path(context.bench)), device),
+            name=f"camera {source}",
+            device=device,
+        )
+        failed.pop_all()
+    return camera
 
 
 def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:

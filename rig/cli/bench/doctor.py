@@ -1,13 +1,16 @@
 """`rig doctor`."""
 
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.bench.findings import doctor_context, print_finding, show_progress
+from rig.cli.bench.snapshot import check_new
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
-from rig.core.errors import ConfigError, RigError
+from rig.core.errors import ConfigError, RigError, UsageError
 
 if TYPE_CHECKING:
     from rig.doctor.finding import Finding
@@ -19,10 +22,18 @@ def doctor(
     udev: Annotated[
         bool, typer.Option("--udev", help="Only print udev rules for permissions, latency and a permanent device name.")
     ] = False,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.zip",
+            help="Also write a support bundle: findings, log, configuration and versions. It has no pictures.",
+        ),
+    ] = None,
+    picture: Annotated[bool, typer.Option("--picture", help="Add one image of the camera to the bundle.")] = False,
 ) -> None:
     """Check everything that the bench needs. Print one finding per line, and a fix for each problem.
 
-    Moves nothing and writes nothing. The exit code is 0, or that of the first finding marked ✗.
+    Moves nothing, and writes nothing but the bundle. The exit code is 0, or that of the first finding marked ✗.
 
     Example: rig doctor --bench sim
     """
@@ -32,13 +43,23 @@ def doctor(
         with doctor_context(settings) as context:
             print(udev_rules(context.computer.serial_ports()), end="")
         return
-    code = print_findings(settings)
+    if bundle is not None:
+        check_new(bundle, ".zip")
+    elif picture:
+        raise UsageError("--picture needs a bundle.", next_step="Add --bundle FILE.zip.")
+    findings: list[Finding] = []
+    code = print_findings(settings, findings)
+    if bundle is not None:
+        from rig.cli.bench.bundle import write_bundle
+
+        write_bundle(settings, bundle, findings, picture=picture)
+        print(f"Support bundle: {bundle}. Look through it before you send it.", file=sys.stderr)
     if code:
         raise typer.Exit(code)
 
 
-def print_findings(settings: Settings) -> int:
-    """Check the bench, print the findings, and return the exit code."""
+def print_findings(settings: Settings, findings: "list[Finding] | None" = None) -> int:
+    """Check the bench, print the findings, add them to ``findings``, and return the exit code."""
     from rig.cli.ui.present import console
     from rig.config import RigConfig
     from rig.config.values import default_path
@@ -47,7 +68,7 @@ def print_findings(settings: Settings) -> int:
     from rig.doctor.finding import FindingCode, Severity, bad, fine, of_error
 
     screen = console()
-    findings: list[Finding] = []
+    findings = [] if findings is None else findings
 
     def add(finding: "Finding") -> None:
         findings.append(finding)

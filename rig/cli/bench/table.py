@@ -165,7 +165,7 @@ def _status_without_servo(settings: Settings, missing: "RigError") -> NoReturn:
 
     from rig.cli.bench.findings import doctor_context
     from rig.devices.open_imu import open_imu
-    from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+    from rig.doctor.camera import open_camera
     from rig.events.events import plain
 
     with doctor_context(settings) as context:
@@ -176,16 +176,7 @@ def _status_without_servo(settings: Settings, missing: "RigError") -> NoReturn:
                 return {**plain(sensor.identity), "temperature_c": sensor.temperature_c()}
 
         def camera() -> dict[str, Any]:
-            source = config.camera.source
-            with closing(
-                OpenCvCamera(
-                    computer.open_capture(source),
-                    clock=computer.clock,
-                    settings=CameraSettings(**config.camera.model_dump(exclude={"source"})),
-                    name=f"camera {source}",
-                    device=computer.camera_device(source),
-                )
-            ) as opened:
+            with closing(open_camera(context)) as opened:
                 return {**plain(opened.identity), "locks": plain(opened.read_locks())}
 
         report: dict[str, Any] = {"bench": settings.bench_name, "servo": {"error": missing.as_dict()}}

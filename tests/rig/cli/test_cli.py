@@ -4,7 +4,10 @@ import json
 import shlex
 import signal
 from pathlib import Path
+from zipfile import ZipFile
 
+import cv2
+import numpy as np
 import pytest
 
 from rig.catalog import Catalog
@@ -157,6 +160,36 @@ def test_status_shows_the_other_devices_if_one_is_missing(rig, device):
     assert (broken, done.exit_code) == ([device], 4)
     assert result[device]["error"]["code"] // 100 == 4
     assert f"{device:8s} error 40" in rig("status", *missing).stdout
+
+
+def test_snapshot_is_written_once(rig):
+    done = rig("snapshot", "table.png", "--json")
+    assert json.loads(done.stdout)["locks"]["gain"] == 0
+    image = cv2.imread("table.png")
+    assert image.shape == (240, 320, 3)
+    assert rig("snapshot", "table.png").exit_code == 2
+    assert rig("snapshot", "table.jpg").exit_code == 2
+    assert rig("snapshot", "nowhere/table.png").exit_code == 2
+    assert rig("snapshot", "other.png", "--set", 'bench.sim.faults=["camera.off"]').exit_code == 4
+    assert not Path("other.png").exists()
+
+
+def test_doctor_writes_a_support_bundle_with_a_picture_only_if_asked(rig):
+    rig("goto", "10")
+    assert rig("doctor", "--bundle", "a.zip").exit_code == 0
+    with ZipFile("a.zip") as bundle:
+        assert set(bundle.namelist()) >= {"findings.json", "configuration.json", "versions.json", "state.json"}
+        assert "camera.png" not in bundle.namelist()
+        findings = json.loads(bundle.read("findings.json"))
+        assert {finding["topic"] for finding in findings} >= {"servo", "imu", "camera"}
+        versions = json.loads(bundle.read("versions.json"))
+        assert versions["packages"]["numpy"] == np.__version__
+        assert any(text.startswith("log.json: ") for text in versions["missing"])  # there is no catalog yet
+    assert rig("doctor", "--bundle", "a.zip").exit_code == 2
+    assert rig("doctor", "--picture").exit_code == 2
+    assert rig("doctor", "--bundle", "b.zip", "--picture", "--json").exit_code == 0
+    with ZipFile("b.zip") as bundle:
+        assert bundle.read("camera.png").startswith(b"\x89PNG")
 
 
 def test_table_rotates_without_a_camera(rig):

@@ -1,0 +1,69 @@
+"""`rig snapshot`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.bench.findings import doctor_context
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError, os_errors_as
+
+if TYPE_CHECKING:
+    from rig.devices.camera import CameraIdentity, CameraLocks, Frame
+
+
+@command
+def snapshot(
+    settings: Settings,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="PNG file to write. It must not exist.")],
+) -> None:
+    """Take an image with the camera and its locked settings, and write it to a file. Moves nothing.
+
+    Example: rig snapshot table.png --bench sim
+    """
+    from rig.events.events import plain
+    from rig.views.image_files import encode
+
+    check_new(file, ".png")
+    frame, identity, locks = take(settings)
+    write_new(file, encode(frame.image_bgr))
+    size = f"{identity.width}x{identity.height}"
+    report = {"file": str(file), "camera": plain(identity), "locks": plain(locks)}
+    settings.say(f"{file}: {size} pixels, mean level {frame.image_bgr.mean():.0f}.", report)
+
+
+def take(settings: Settings) -> "tuple[Frame, CameraIdentity, CameraLocks]":
+    """Return a frame of the configured camera, the camera, and its settings.
+
+    Raises
+    ------
+    BenchBusy
+        Another program uses the bench.
+    DeviceNotFound, DeviceSilent
+        The camera is missing, or delivers no frames.
+    """
+    from contextlib import closing
+
+    from rig.doctor.camera import open_camera
+
+    with doctor_context(settings) as context:
+        context.require_free()
+        with closing(open_camera(context)) as camera:
+            return camera.capture(context.computer.clock.now_ns()), camera.identity, camera.read_locks()
+
+
+def check_new(file: Path, suffix: str) -> None:
+    """Raise `UsageError` if a file has another suffix, or exists."""
+    if file.suffix.lower() != suffix:
+        raise UsageError(f"{file} does not end with {suffix}.", next_step=f"Give a name that ends with {suffix}.")
+    if file.exists():
+        raise UsageError(f"{file} exists.", next_step="Give another name.")
+
+
+def write_new(file: Path, content: bytes) -> None:
+    """Write a file that does not exist yet. Raises `UsageError` if that is not possible."""
+    what, step = f"{file} cannot be written.", "Choose another folder."
+    with os_errors_as(UsageError, what, next_step=step), file.open("xb") as output:
+        output.write(content)
