@@ -5,14 +5,13 @@ program on.
 """
 
 import argparse
-import resource
 import timeit
 from collections.abc import Callable
 
 import numpy as np
 
 from benchmarks.record import record
-from hbr import DenseIndex, DenseSession, PackedViews, StoppingRule, next_best_view, update_belief
+from hbr import DenseIndex, PackedViews, StoppingRule, next_best_view, update_belief
 from hbr.core.arrays import LevelArray
 from hbr.dense.filter import BETA, completed
 from hbr.descriptors import descriptor
@@ -57,8 +56,7 @@ def bench(objects: int) -> None:
     words = packed.view(np.uint64)
     peer = "reading the packed views"
     read_ms = milliseconds(words.max)
-    first, second, third = views.levels(np.array([100, 118, 130]))
-    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    first, second = views.levels(np.array([100, 118]))
     index = DenseIndex(views)
     rule = StoppingRule(BETA, 0.9, np.full((objects, 4), 0.9), (0.1,) * 4, 0.01, 0.02, 0.0, 1)
     one = update_belief(first, 0.0, index)
@@ -85,11 +83,6 @@ def bench(objects: int) -> None:
     if kept < objects:
         check_ms = milliseconds(lambda: completed(two, index, [first, second]), 5)
         record(f"{name}: last check of the objects left out, two views", check_ms, peer, read_ms)
-    session = DenseSession(index, rule)
-    for levels, orientation_deg in ((first, 0.0), (second, 90.0), (third, 150.0)):
-        session.add(levels, orientation_deg)
-    used_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb) / 1e3
-    print(f"{name}: {used_mb:.0f} MB of memory beside {packed.nbytes / 1e6:.0f} MB of packed views")
     if objects <= 1_000:
         with without_library():
             plain = DenseIndex(views)

@@ -220,7 +220,7 @@ def test_library_is_used_only_if_it_fits(state: str, tmp_path: Path) -> None:
             path.write_bytes(b"\x7fELF" + bytes(1000))
         case "of other sources":
             (path.parent / "cedd.c").write_text("/* changed */")
-    assert (load(path) is not None) == (state == "intact" and library() is not None)
+    assert (load(path) is not None) == (state == "intact" and load(compiling.LIBRARY) is not None)
 
 
 def test_environment_switches_the_library_off() -> None:
