@@ -9,7 +9,6 @@ simulated: ten-bit addresses, packet error checking, clock stretching, several m
 
 import ctypes
 import os
-import tempfile
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -281,9 +280,9 @@ class RoutedFile:
 
     def __init__(self, adapter: Adapter) -> None:
         global _kernel_ioctl
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - without a name: a program that is killed leaves nothing
-        self.path = f"/dev/fd/{self._file.fileno()}"
-        self._key = _file_key(self._file.fileno())
+        self._fd: int | None = os.memfd_create("sim-i2c")  # without a name: a program that is killed leaves nothing
+        self.path = f"/dev/fd/{self._fd}"
+        self._key = _file_key(self._fd)
         if not _routed:
             _kernel_ioctl, _seam.ioctl = _seam.ioctl, _routed_ioctl
         _routed[self._key] = adapter
@@ -292,7 +291,9 @@ class RoutedFile:
         """Remove the file; a second call does nothing."""
         if _routed.pop(self._key, None) and not _routed:
             _seam.ioctl = _kernel_ioctl
-        self._file.close()
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
 
 
 def _file_key(fd: int) -> _FileKey:
