@@ -270,7 +270,9 @@ class GyroRotationMeter:
             raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")
         count, sum_dps = self._count, self._sum_dps
         if until_ns is not None:
-            later = self._rate_dps[np.searchsorted(self._time_ns, until_ns, side="right") :]
+            # The memory also has samples from before the rest, which are not in the sum.
+            first = max(int(np.searchsorted(self._time_ns, until_ns, side="right")), self._rate_dps.size - self._count)
+            later = self._rate_dps[first:]
             count, sum_dps = count - later.size, sum_dps - float(later.sum())
         duration_s = count / self._imu.rate_hz
         angle_deg = self._to_table * (sum_dps / self._imu.rate_hz - self.bias.rate_dps * duration_s)

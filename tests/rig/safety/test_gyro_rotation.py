@@ -351,3 +351,18 @@ def test_gyro_that_repeats_one_sample_is_detected(bench: Bench, hung: Any, words
         else:
             bench.heading.rest(1.0)
     assert bench.clock.now_ns() - broken_ns < 0.5e9
+
+
+@given(st.floats(0.0, 1.0))
+def test_rotation_until_a_time_before_the_rest_is_zero(before_s):
+    with Bench() as bench:
+        bench.heading.rest()
+        bench.heading.begin()
+        bench.clock.sleep(0.2)
+        bench.heading.end()
+        ended_ns = bench.clock.now_ns()
+        bench.clock.sleep(0.2)
+        bench.heading.begin()
+        rotation = bench.heading.since_rest(ended_ns - round(before_s * 1e9))
+        assert (rotation.angle_deg, rotation.duration_s) == (0.0, 0.0)
+        assert rotation.sigma_deg == 0.0
