@@ -150,7 +150,8 @@ def test_another_stopping_rule_is_noticed(saved, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(saved["dense"][0], folder)
     rule = json.loads((folder / "search_rules.json").read_text())
-    changed = {"open_set_thresholds": [2.0] * len(rule["open_set_thresholds"])}
+    threshold = 0.0 if saved["dense"][1][-1].outcome is hbr.Outcome.UNKNOWN else 2.0
+    changed = {"open_set_thresholds": [threshold] * len(rule["open_set_thresholds"])}
     (folder / "search_rules.json").write_text(json.dumps(rule | changed))
     assert "decision.outcome" in {difference.what for difference in check(load_run(folder)).differences}
 
