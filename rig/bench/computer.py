@@ -252,13 +252,19 @@ class Computer:
     # -- opening ----------------------------------------------------------------------------------------------------
 
     def require_unused(self, path: str) -> None:
-        """Raise `BenchBusy` if another program has the serial port open, also if it has not locked the port."""
+        """Raise `BenchBusy` if another program has the serial port open, also if it has not locked the port.
+
+        The guardian of a killed program does not count: `open_serial` waits for it.
+        """
+        from rig.devices.dynamixel.port import GUARDIAN
+
         port = self.serial_port(path)
-        if port is not None and port.holders:
+        holders = [process for process in port.holders if GUARDIAN not in process.command] if port else []
+        if holders:
             raise BenchBusy(
-                f"The port {path} is in use by {', '.join(map(str, port.holders))}.",
-                next_step="Close that program. If it hangs: `kill " + f"{port.holders[0].pid}`.",
-                evidence={"port": path, "pids": [process.pid for process in port.holders]},
+                f"The port {path} is in use by {', '.join(map(str, holders))}.",
+                next_step=f"Close that program. If it hangs: `kill {holders[0].pid}`.",
+                evidence={"port": path, "pids": [process.pid for process in holders]},
             )
 
     def open_serial(self, path: str, baud: int, device: str = "servo") -> "SerialConnection":

@@ -155,7 +155,7 @@ def assemble(
                 )
                 failed.pop_all()
             if config.camera.focus is None:
-                _store_focus(state, device, camera.read_locks().focus)
+                store_focus(state, device, camera.read_locks().focus)
             bench.findings += tuple(
                 f"camera: {n.setting} was set to {n.asked:g}, but the camera reports {n.reported:g}"
                 for n in camera.rejected_settings
@@ -239,7 +239,7 @@ def camera_settings(config: RigConfig, state: StateStore, device: str | None) ->
     return replace(settings, focus=focus)
 
 
-def _store_focus(state: StateStore, device: str | None, focus: float | None) -> None:
+def store_focus(state: StateStore, device: str | None, focus: float | None) -> None:
     """Store the focus for the next program, because a camera forgets it without power."""
     text = json.dumps({"device": device, "focus": focus}).encode()
     with suppress(StateNotStored):  # writes that matter report a full disk themselves

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Text, cast, func, select
+from sqlalchemy import ColumnElement, Text, and_, cast, func, select
 
 from hbr.descriptors import descriptor
 from rig.calibrations.store import CALIBRATIONS
@@ -12,8 +12,8 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.columns import parse_mapping
 from rig.catalog.describing import EmptyTable, region_of
 from rig.catalog.places import image_file
-from rig.catalog.queries import described_by, retrieved
-from rig.catalog.records import Region
+from rig.catalog.queries import described_by, in_use, retrieved
+from rig.catalog.records import EnrollmentStatus, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
@@ -58,6 +58,16 @@ def empty_tables(catalog: Catalog) -> EmptyTables:
 
 def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
     """Return the camera's settings (`rig.devices.camera.CameraLocks`) of the objects in use, each combination once."""
+    return _camera_settings(catalog, and_(retrieved(), views.c.view_index == 0))
+
+
+def unfinished_camera_settings(catalog: Catalog, name: str) -> list[dict[str, Any]]:
+    """Return the camera's settings of the views of an unfinished enrollment, each combination once."""
+    unfinished = enrollments.c.status == EnrollmentStatus.IN_PROGRESS
+    return _camera_settings(catalog, and_(in_use(name), unfinished))
+
+
+def _camera_settings(catalog: Catalog, condition: ColumnElement[bool]) -> list[dict[str, Any]]:
     settings: list[dict[str, Any]] = []
     with catalog.database.read() as connection:
         for evidence in connection.scalars(
@@ -65,7 +75,7 @@ def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
             .select_from(objects)
             .join(enrollments)
             .join(views, views.c.enrollment_id == enrollments.c.id)
-            .where(retrieved(), views.c.view_index == 0)
+            .where(condition)
         ):
             locks = evidence.get("locks")
             if isinstance(locks, dict) and locks not in settings:

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
-from rig.bench.hardware import camera_settings
+from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
 from rig.devices.camera import Camera
 from rig.devices.opencv_camera import OpenCvCamera
@@ -38,8 +39,10 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
         yield from _frames(context, source)
 
 
-def open_camera(context: DoctorContext) -> OpenCvCamera:
+def open_camera(context: DoctorContext, *, refocus: bool = False) -> OpenCvCamera:
     """Open the camera with its settings, without the other devices.
+
+    With ``refocus`` the autofocus finds a new position, which is stored for later programs.
 
     Raises
     ------
@@ -49,15 +52,22 @@ def open_camera(context: DoctorContext) -> OpenCvCamera:
     source = context.config.camera.source
     capture = context.computer.open_capture(source)
     device = context.computer.camera_device(source)
+    state = FileStore(context.config.state_path(context.bench))
+    settings = camera_settings(context.config, state, device)
     with ExitStack() as failed:
         failed.callback(capture.release)
+        if refocus:
+            settings = replace(settings, focus=None)
+            capture.set(cv2.CAP_PROP_AUTOFOCUS, 1)
         camera = OpenCvCamera(
             capture,
             clock=context.computer.clock,
-            settings=camera_settings(context.config, FileStore(context.config.state_path(context.bench)), device),
+            settings=settings,
             name=f"camera {source}",
             device=device,
         )
+        if refocus:
+            store_focus(state, device, camera.read_locks().focus)
         failed.pop_all()
     return camera
 

@@ -1,9 +1,11 @@
 """The steps that the plans share: rotate the table, capture one accepted view, warn of a changed bench."""
 
-from collections.abc import Generator
+from collections.abc import Collection, Generator, Mapping
+from dataclasses import asdict
+from typing import Any
 
 from rig.bench import Bench
-from rig.core.errors import ViewRejected
+from rig.core.errors import CameraSettingsDiffer, ViewRejected
 from rig.events.events import Event, Moved, Note, NoteCode, Rejected, Unwinding, Warned
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
@@ -51,6 +53,32 @@ def unwind(index: int, table: Turntable) -> Generator[Event, None, None]:
     target_deg = table.unwound_deg()
     if table.unwound_revolutions(target_deg):
         yield from announced(index, table, target_deg)
+
+
+def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
+    """Check that the camera has one of these settings (`rig.devices.camera.CameraLocks`), which earlier views had.
+
+    Raises
+    ------
+    CameraSettingsDiffer
+        All of them are other settings, for example another gain.
+    """
+    now = asdict(bench.camera.read_locks())
+    differing = [
+        {key: value for key, value in before.items() if None not in (value, now.get(key)) and value != now[key]}
+        for before in settings
+    ]
+    if not differing or not all(differing):
+        return
+    nearest = min(differing, key=len)
+    keys = type(bench.config.camera).model_fields
+    commands = [f"`rig config set camera.{key} {value:g}`" for key, value in nearest.items() if key in keys]
+    again = "Otherwise enroll the objects again."
+    raise CameraSettingsDiffer(
+        "The camera has other settings than at the enrollment.",
+        next_step=f"Set it as it was: {', '.join(commands)}. {again}" if commands else f"Lock the camera. {again}",
+        evidence={key: f"{now[key]} now, {value} at the enrollment" for key, value in nearest.items()},
+    )
 
 
 def warn_of_table(bench: Bench, index: int, view: DescribedView) -> Generator[Event, None, None]:

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
+from rig.catalog.descriptions import unfinished_camera_settings
 from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
 from rig.events.events import Accepted, Enrolled, Event, Started, plain
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, capture, moved, warn_of_table
+from rig.plans.capture import announced, capture, check_camera, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import DESCRIPTORS, ViewDescriber
@@ -55,6 +56,8 @@ def enroll(
     ------
     ObjectExists, CatalogError, CatalogBusy
         See `Catalog.begin` and `Catalog.resume`.
+    CameraSettingsDiffer
+        The camera has other settings than at the views to continue.
     RotationDisagreement
         Encoder and gyro differ by more than their uncertainty, or the gyro has no value: no view is stored at an
         uncertain angle.
@@ -76,6 +79,7 @@ def enroll(
         },
     )
     if resume:
+        check_camera(bench, unfinished_camera_settings(catalog, name))
         enrollment = catalog.resume(name, provenance=provenance)
     else:
         enrollment = catalog.begin(

@@ -15,8 +15,8 @@ from rig.core.clock import seconds_between
 from rig.core.errors import RigError
 from rig.events.events import Accepted, Decided, Event, Identified, Started
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, capture, moved, unwind, warn_of_table
-from rig.search.model import Model, check_camera, empty_table_for
+from rig.plans.capture import announced, capture, check_camera, moved, unwind, warn_of_table
+from rig.search.model import Model, empty_table_for
 from rig.search.session import SHOWN, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.capture import Viewer
@@ -73,7 +73,7 @@ def identify(
     viewer = Viewer(bench.camera, bench.config.view)
     notes = model.notes if isinstance(model, Model) else ()
     if isinstance(model, Model):
-        check_camera(bench, model)
+        check_camera(bench, model.camera)
     if empty_table is None and isinstance(model, Model):
         empty_table, more = empty_table_for(bench, model)
         notes += more

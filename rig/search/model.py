@@ -5,7 +5,7 @@ Decision: docs/decisions/0030.
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from rig.catalog import Catalog
 from rig.catalog.descriptions import camera_settings, empty_tables, has_descriptor, read_empty_table
 from rig.catalog.jobs import JobProgress
 from rig.catalog.prepared import prepared_views
-from rig.core.errors import CameraSettingsDiffer, CatalogError, DescriptorOutdated
+from rig.core.errors import CatalogError, DescriptorOutdated
 from rig.events.events import Note, NoteCode
 from rig.search.stopping_rules import stopping_rule_of
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
@@ -129,32 +129,6 @@ def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> 
         with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
             table = read_empty_table(catalog, before.newest)
     return Model(index, rule, notes, with_image, tuple(camera_settings(catalog)), table)
-
-
-def check_camera(bench: Bench, model: Model) -> None:
-    """Check that the camera has the settings with which at least one object was enrolled.
-
-    Raises
-    ------
-    CameraSettingsDiffer
-        All objects were enrolled with other settings, for example another gain.
-    """
-    now = asdict(bench.camera.read_locks())
-    differing = [
-        {key: value for key, value in before.items() if None not in (value, now.get(key)) and value != now[key]}
-        for before in model.camera
-    ]
-    if not differing or not all(differing):
-        return
-    nearest = min(differing, key=len)
-    keys = type(bench.config.camera).model_fields
-    commands = [f"`rig config set camera.{key} {value:g}`" for key, value in nearest.items() if key in keys]
-    again = "Otherwise enroll the objects again."
-    raise CameraSettingsDiffer(
-        "The camera has other settings than at the enrollment.",
-        next_step=f"Set it as it was: {', '.join(commands)}. {again}" if commands else f"Lock the camera. {again}",
-        evidence={key: f"{now[key]} now, {value} at the enrollment" for key, value in nearest.items()},
-    )
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:

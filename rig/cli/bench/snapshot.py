@@ -1,5 +1,6 @@
 """`rig snapshot`."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,13 @@ if TYPE_CHECKING:
 def snapshot(
     settings: Settings,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="PNG file to write. It must not exist.")],
+    refocus: Annotated[
+        bool,
+        typer.Option(
+            "--refocus",
+            help="Let the autofocus find a new position, and store it. Use it after you moved the camera.",
+        ),
+    ] = False,
 ) -> None:
     """Take an image with the camera and its locked settings, and write it to a file. Moves nothing.
 
@@ -27,15 +35,20 @@ def snapshot(
     from rig.views.image_files import encode
 
     check_new(file, ".png")
-    frame, identity, locks = take(settings)
+    if refocus and settings.load().camera.focus is not None:
+        raise UsageError("camera.focus is a number.", next_step="Release it first: rig config set camera.focus none.")
+    frame, identity, locks = take(settings, refocus=refocus)
     write_new(file, encode(frame.image_bgr))
     size = f"{identity.width}x{identity.height}"
     report = {"file": str(file), "camera": plain(identity), "locks": plain(locks)}
     settings.say(f"{file}: {size} pixels, mean level {frame.image_bgr.mean():.0f}.", report)
+    if refocus:
+        focus = "The camera reports no focus" if locks.focus is None else f"The focus is {locks.focus:g} now"
+        print(f"{focus}.", file=sys.stderr)
 
 
-def take(settings: Settings) -> "tuple[Frame, CameraIdentity, CameraLocks]":
-    """Return a frame of the configured camera, the camera, and its settings.
+def take(settings: Settings, *, refocus: bool = False) -> "tuple[Frame, CameraIdentity, CameraLocks]":
+    """Return a frame of the configured camera, the camera, and its settings; with ``refocus`` the focus is new.
 
     Raises
     ------
@@ -50,7 +63,7 @@ def take(settings: Settings) -> "tuple[Frame, CameraIdentity, CameraLocks]":
 
     with doctor_context(settings) as context:
         context.require_free()
-        with closing(open_camera(context)) as camera:
+        with closing(open_camera(context, refocus=refocus)) as camera:
             return camera.capture(context.computer.clock.now_ns()), camera.identity, camera.read_locks()
 
 

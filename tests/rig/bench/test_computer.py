@@ -5,6 +5,7 @@ import os
 import pytest
 
 from rig.bench.computer import Computer, Process, User
+from rig.core.errors import BenchBusy
 from sim.computer import ComputerFiles
 
 GID = os.getgid()
@@ -104,6 +105,17 @@ def test_program_that_uses_a_port_is_found_by_either_name(computer):
     (computer.root / "proc" / "self").mkdir()
     (port,) = host(computer).serial_ports()
     assert port.holders == (Process(312, "dynamixel_wizard --fast"),)
+
+
+def test_port_in_use_is_refused_except_by_a_guardian(computer):
+    """The guardian of a killed program uses the port for a moment; opening the port waits for it."""
+    computer.serial_port()
+    computer.process(314, "python -P -m rig.devices.dynamixel.guardian /dev/ttyUSB0", "/dev/ttyUSB0")
+    host(computer).require_unused("/dev/ttyUSB0")
+    computer.process(312, "minicom", "/dev/ttyUSB0")
+    with pytest.raises(BenchBusy) as busy:
+        host(computer).require_unused("/dev/ttyUSB0")
+    assert busy.value.evidence["pids"] == [312]
 
 
 def test_camera_is_the_device_file_with_images(computer):

@@ -169,6 +169,9 @@ def test_snapshot_is_written_once(rig):
     assert image.shape == (240, 320, 3)
     assert rig("snapshot", "table.png").exit_code == 2
     assert rig("snapshot", "table.jpg").exit_code == 2
+    assert "The focus is 120 now" in rig("snapshot", "sharp.png", "--refocus", "--set", "state_dir=state").output
+    assert json.loads(Path("state/sim/camera-focus.json").read_text())["focus"] == 120
+    assert rig("snapshot", "other.png", "--refocus", "--set", "camera.focus=33").exit_code == 2
     assert rig("snapshot", "nowhere/table.png").exit_code == 2
     assert rig("snapshot", "other.png", "--set", 'bench.sim.faults=["camera.off"]').exit_code == 4
     assert not Path("other.png").exists()

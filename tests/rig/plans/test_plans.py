@@ -98,6 +98,16 @@ def test_identify_is_rejected_if_the_camera_has_other_settings_than_at_the_enrol
     next(identify(simulated().bench, load_model(catalog)))
 
 
+def test_enrollment_is_not_continued_with_other_settings_of_the_camera(simulated, catalog):
+    events = enroll(simulated().bench, catalog, "dice", views=4)
+    while not isinstance(next(events), Accepted):
+        pass
+    events.close()
+    with pytest.raises(CameraSettingsDiffer):
+        next(enroll(simulated("camera.gain=6").bench, catalog, "dice", resume=True))
+    assert isinstance(next(enroll(simulated().bench, catalog, "dice", resume=True)), Started)
+
+
 def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):
     s = simulated()
     stored = 0
