@@ -107,7 +107,7 @@ def test_program_that_uses_a_port_is_found_by_either_name(computer):
     assert port.holders == (Process(312, "dynamixel_wizard --fast"),)
 
 
-def test_port_in_use_is_refused_except_by_a_guardian(computer):
+def test_port_in_use_is_rejected_except_by_a_guardian(computer):
     """The guardian of a killed program uses the port for a moment; opening the port waits for it."""
     computer.serial_port()
     computer.process(314, "python -P -m rig.devices.dynamixel.guardian /dev/ttyUSB0", "/dev/ttyUSB0")
