@@ -107,6 +107,47 @@ def to_velocity(start_s: float, position_deg: float, velocity_dps: float, goal_d
     return path
 
 
+def dragged(path: Trajectory, start_deg: float, half_deg: float, offset_deg: float) -> Trajectory:
+    """Return the motion of a shaft that friction and a steady load hold behind its commanded ``path``.
+
+    A position controller without an integral part pushes in proportion to its error. So the shaft stands until the
+    error overcomes the friction, then follows at a constant distance, and keeps it when the path ends.
+
+    Parameters
+    ----------
+    path
+        The commanded motion; each piece is monotone.
+    start_deg
+        The shaft's angle at the beginning.
+    half_deg
+        Error at which the controller overcomes the friction.
+    offset_deg
+        Error at which it balances the steady load.
+    """
+    rows: list[tuple[float, float, float, float]] = []
+    shaft = start_deg
+    ends_s = [*path.start_s[1:].tolist(), float("inf")]
+    columns = path.start_s, path.position_deg, path.velocity_dps, path.acceleration_dps2
+    for t, x, v, a, end_s in zip(*(column.tolist() for column in columns), ends_s, strict=True):
+        direction = copysign(1.0, v or a) if v or a else 0.0
+        speed, ramp, duration = v * direction, a * direction, end_s - t
+        away = (shaft - offset_deg - x) * direction + half_deg  # how far the path goes before the shaft follows
+        wait = 0.0
+        if direction and away > 0:
+            square = speed * speed + 2 * ramp * away
+            wait = 2 * away / (speed + sqrt(square)) if square > 0 else float("inf")
+        if not direction or wait >= duration:
+            rows.append((t, shaft, 0.0, 0.0))
+            continue
+        if wait > 0:
+            rows.append((t, shaft, 0.0, 0.0))
+        begun = x + v * wait + 0.5 * a * wait * wait
+        rows.append((t + wait, begun + offset_deg - direction * half_deg, v + a * wait, a))
+        if duration < float("inf"):
+            shaft = x + v * duration + 0.5 * a * duration * duration + offset_deg - direction * half_deg
+    return Trajectory(*(np.ascontiguousarray(c) for c in np.array(rows, dtype=np.float64).T))
+
+
 class Platter:
     """The platter on the shaft: backlash and a damped structural vibration.
 

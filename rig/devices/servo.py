@@ -34,7 +34,9 @@ class ServoState:
     """One reading of the servo's status registers, from one transaction.
 
     ``time_ns`` is the middle of the transaction on the bench's clock. ``hardware_errors`` are the names of the bits in
-    Hardware Error Status (a status alert). ``trajectory_deg`` is the present position of the servo's motion profile;
+    Hardware Error Status (a status alert). ``moving`` is False when the motion profile has ended and the shaft is slow.
+    ``in_position`` is the servo's own judgement that it is at its goal: friction may hold it outside of its window.
+    ``trajectory_deg`` is the present position of the servo's motion profile;
     None if the model does not report it.
     """
 

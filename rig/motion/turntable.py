@@ -282,7 +282,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         monitor: MotionMonitor | None = None,
         slip: SlipMonitor | None = None,
     ) -> None:
-        """Poll until the servo is in position and encoder and gyro have been quiet for ``quiet_s``.
+        """Poll until the profile has ended near the goal and encoder and gyro have been quiet for ``quiet_s``.
 
         The polling also feeds the servo's watchdog.
         """
@@ -306,17 +306,22 @@ class Turntable(AbstractContextManager["Turntable"]):
                 self._safety.check_servo(state)
             if slip:
                 self._check_slip(slip, state.time_ns, angle_deg)
-            arrived = state.in_position and not state.moving and abs(angle_deg - goal_deg) <= config.tolerance_deg
+            arrived = not state.moving and abs(angle_deg - goal_deg) <= config.tolerance_deg
             if not arrived:
                 readings.clear()
             readings.append((state.time_ns, angle_deg))
-            if arrived and self._quiet(readings, quiet_s):
+            if arrived and self._quiet(readings, quiet_s) and (state.in_position or self._holds()):
                 self._rest_deg = sum(angle for _, angle in readings) / len(readings)
                 return
             elapsed_s = seconds_between(start_ns, self._clock.now_ns())
             if elapsed_s > allowed_s:
                 peak_dps = self._gyro.peak_dps(config.quiet_s)
                 raise explain_unsettled(goal_deg, angle_deg, allowed_s, state, arrived, peak_dps, config.velocity_dps)
+
+    def _holds(self) -> bool:
+        """Return whether the servo's torque is on: without it, no profile is ongoing either."""
+        condition = self._servo.read_condition()
+        return condition.torque and not condition.power_lost
 
     def _check_slip(self, slip: SlipMonitor, time_ns: int, angle_deg: float) -> None:
         slip.add_reading(time_ns, angle_deg)

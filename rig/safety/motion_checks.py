@@ -24,6 +24,8 @@ from rig.safety.gyro_rotation import Rotation
 
 STANDING_DPS = 3.0
 """A slower shaft counts as standing still: two units of the servo's velocity reading."""
+HELD_DEG = 2.0
+"""A table that rests nearer to its goal is held by friction: its servo's position controller is too weak."""
 VOLTAGE_S = 0.1
 """How long a bad voltage must last: starting motors make it dip."""
 COOLER_C = 5.0
@@ -181,7 +183,15 @@ class MotionMonitor:
                 next_step="Find out what rotated the table, and check its angle with `rig status`.",
                 evidence=evidence,
             )
-        if abs(angle_deg - self._goal_deg) > self._tolerance_deg and self._stands_still(state.time_ns, angle_deg):
+        away_deg = abs(angle_deg - self._goal_deg)
+        if away_deg > self._tolerance_deg and self._stands_still(state.time_ns, angle_deg):
+            if not state.moving and away_deg <= HELD_DEG:
+                raise NoProgress(
+                    f"The table rests at {angle_deg:.1f}°, {away_deg:.1f}° from its goal: friction or a load holds it.",
+                    next_step="Reduce the friction (bearing, cable), or balance the load. Or set table.tolerance_deg "
+                    f"above {away_deg:.1f}: each view stores the measured angle.",
+                    evidence=evidence,
+                )
             raise NoProgress(
                 f"The table stands still at {angle_deg:.1f}° on its way to {self._goal_deg:.1f}°.",
                 next_step="Check the servo's cable and supply, and check that the table rotates freely by hand.",

@@ -247,6 +247,17 @@ def _slip(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End
     return lambda: None
 
 
+@simulated_fault(
+    "friction",
+    "Friction and a steady load hold the table. It rests short of its goal, outside the servo's in-position window.",
+    friction=Parameter(0.025, "friction, as a share of the stall torque", 0, 1),
+    load=Parameter(0.005, "steady load that rotates clockwise, as a share of the stall torque", -1, 1),
+)
+def _friction(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    devices.servo.motor.set_friction(values["friction"], values["load"])
+    return lambda: devices.servo.motor.set_friction(0.0)
+
+
 @simulated_fault("jam", "The shaft is blocked.")
 def _jam(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
     devices.servo.jam()

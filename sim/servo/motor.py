@@ -3,13 +3,15 @@
 from dataclasses import dataclass
 from math import exp
 
-from sim.motion import Trajectory, rest, to_position, to_velocity
+from sim.motion import Trajectory, dragged, rest, to_position, to_velocity
 from sim.servo.models import DEG_PER_COUNT, PWM_FULL, ServoModel
 from sim.servo.shaft import Shaft
 
 FRICTION_LOAD = 0.04  # friction of the gears while the shaft rotates, as a part of the stall torque
 PWM_PER_COUNT = 5.0
 """PWM of the position controller for each count of error: Position P Gain 640 / 128 (e-manual, XL430-W250)."""
+_ERROR_AT_STALL_DEG = PWM_FULL / PWM_PER_COUNT * DEG_PER_COUNT
+"""Error at which the position controller pushes with the stall torque."""
 SUPPLY_DROP_V = 0.4  # voltage lost in the supply's cable at stall
 
 AMBIENT_C = 25.0
@@ -42,9 +44,9 @@ class MotorState:
 class Motor:
     """A position- or speed-controlled shaft in the world's degrees.
 
-    The shaft follows the commanded trajectory exactly, unless it is jammed: then it does not move, and the controller's
-    error and the load grow. `settle` updates heat and overload with the present load; the owner of the motor calls it
-    repeatedly while the motor is `busy`.
+    The shaft follows the commanded trajectory exactly, unless `set_friction` holds it back or it is jammed: then it
+    does not move, and the controller's error and the load grow. `settle` updates heat and overload with the present
+    load; the owner of the motor calls it repeatedly while the motor is `busy`.
     """
 
     def __init__(self, world: Shaft, model: ServoModel) -> None:
@@ -54,6 +56,7 @@ class Motor:
         self._model = model
         self.driven = False
         self._jammed = False
+        self._friction = self._steady_load = 0.0
         self._temperature_c = AMBIENT_C + STANDBY_RISE_C
         self._overloaded_s = 0.0
         self._settled_s = self._now_s()
@@ -90,12 +93,13 @@ class Motor:
         target, target_dps = float(position), float(velocity)
         load = pwm = 0.0
         if self.driven:
+            pushing = (target - angle) / _ERROR_AT_STALL_DEG
             if self._jammed:
-                load = _clamp(PWM_PER_COUNT * (target - angle) / DEG_PER_COUNT / PWM_FULL)
+                load = _clamp(pushing)
             else:
                 friction = FRICTION_LOAD * ((speed > 0) - (speed < 0))
                 inertia = (1 - FRICTION_LOAD) * float(self.commanded.acceleration_at(now_s)) / self.steepest_dps2
-                load = _clamp(friction + inertia)
+                load = _clamp(friction + inertia + (pushing if self._friction else 0.0))
             pwm = _clamp(speed / self.fastest_dps + load)
         return MotorState(angle, speed, target, target_dps, load, pwm)
 
@@ -161,6 +165,20 @@ class Motor:
             goal = float(self.commanded.position_deg[-1])
             self._follow(to_position(self._now_s(), angle, 0.0, goal, self.fastest_dps, self.steepest_dps2))
 
+    def set_friction(self, friction: float, steady_load: float = 0.0) -> None:
+        """Set the friction at rest, and a steady load that pushes clockwise, as shares of the stall torque.
+
+        It acts from the next motion on. A load above the friction would rotate a released shaft, so it counts only up
+        to the friction. Without friction, the shaft moves to its commanded angle.
+        """
+        self.settle()
+        self._friction, self._steady_load = friction, min(max(steady_load, -friction), friction)
+        if not friction and self.driven and not self._jammed and not self.commanded.velocity_dps[-1]:
+            goal = float(self.commanded.position_deg[-1])
+            self._follow(
+                to_position(self._now_s(), *self._world.shaft(), goal, self.fastest_dps, self.steepest_dps2),
+            )
+
     def push(self, angle_deg: float) -> float:
         """Rotate the released shaft by hand by ``angle_deg``; return the time of the motion in seconds.
 
@@ -180,6 +198,9 @@ class Motor:
         self.commanded = path
         if driven is not None:
             self.driven = driven
+        if self._friction and self.driven:
+            error_deg = _ERROR_AT_STALL_DEG * self._friction, -_ERROR_AT_STALL_DEG * self._steady_load
+            path = dragged(path, self._world.shaft()[0], *error_deg)
         if not self._jammed:
             self._world.drive(path)
 

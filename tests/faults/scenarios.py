@@ -192,6 +192,7 @@ SCENARIOS: dict[str, Scenario] = {
             answer=FOUND,
             step=ACK,
         ),
+        survived("friction", "arrival is judged by the end of the profile, standing still and `table.tolerance_deg`"),
         stopped(
             "jam@move3",
             509,

@@ -37,7 +37,7 @@ VOCABULARY = {
         "overheat",
         "watchdog_trip",
     ),
-    *("duplicate_id", "wrong_model", "backlash", "slip", "jam", "object_falls", "i2c_nack", "i2c_stuck"),
+    *("duplicate_id", "wrong_model", "backlash", "slip", "friction", "jam", "object_falls", "i2c_nack", "i2c_stuck"),
     *("imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker", "disk_full"),
     "clock_jump",
 }

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sim.motion import Platter, Trajectory, rest, to_position, to_velocity
+from sim.motion import Platter, Trajectory, dragged, rest, to_position, to_velocity
 from tests.fuzzing import examples
 
 quick = examples(21)
@@ -226,3 +226,23 @@ def test_move_interrupted_by_another_leaves_no_jump(
     assert second.at(when)[0] == pytest.approx(first.at(when)[0], abs=1e-9)
     if structure_hz == 0.0 and play_deg == 0.0:
         assert second.at(when)[1] == pytest.approx(first.at(when)[1], abs=1e-6)
+
+
+# -- friction -------------------------------------------------------------------------------------------------------
+
+
+@quick
+@given(trajectories(), st.floats(0, 3), st.floats(-1, 1), st.floats(-1, 1))
+def test_dragged_shaft_stays_within_the_error_that_overcomes_friction(
+    path: Trajectory, half: float, load: float, start: float
+) -> None:
+    offset = load * half
+    begun = float(path.position_deg[0]) + offset + start * half
+    shaft = dragged(path, begun, half, offset)
+    times = samples(path)
+    (x, v), (y, w) = path.at(times), shaft.at(times)
+    assert shaft.at(path.start_s[0])[0] == pytest.approx(begun, abs=1e-6)
+    assert (np.abs(y - x - offset) <= half + 1e-6).all()
+    moves = np.abs(w) > 1e-9
+    np.testing.assert_allclose(w[moves], v[moves], atol=1e-6)  # it follows, or it stands
+    np.testing.assert_allclose((y - x - offset)[moves], (-np.sign(v) * half)[moves], atol=1e-6)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NotReady, Stalled
+from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NoProgress, NotReady, Stalled
 from rig.devices.servo import MotionProfile
 from rig.motion.move import motion_seconds
 from rig.motion.turntable import Turntable
@@ -52,6 +52,53 @@ def test_backlash_is_visible_without_approach():
         table.goto(100.0)
         table.goto(50.0)
         assert abs(wires.world.table_deg() - from_below) > 1.5
+
+
+def test_table_arrives_although_friction_holds_the_servo_outside_its_window():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        wires.device.motor.set_friction(0.03)
+        for target in (90.0, 60.0, 61.0, 60.5):
+            move = table.goto(target)
+            state = bench.servo.read_state()
+            assert not state.in_position
+            assert state.load_percent == pytest.approx(3, abs=0.1)
+            assert 0.35 < target - move.encoder_deg < 0.6
+            assert move.agrees
+        wires.device.motor.set_friction(0.0)
+        assert table.goto(30.0).encoder_deg == pytest.approx(30.0, abs=0.2)
+
+
+def test_steady_load_adds_to_the_friction():
+    with motion_bench() as (bench, wires), Turntable(bench) as table:
+        wires.device.motor.set_friction(0.02, 0.01)
+        assert 90.0 - table.goto(90.0).encoder_deg == pytest.approx(0.03 * 885 / 5 * 0.0879, abs=0.1)
+        wires.device.motor.set_friction(0.02, -0.01)
+        assert 120.0 - table.goto(120.0).encoder_deg == pytest.approx(0.01 * 885 / 5 * 0.0879, abs=0.1)
+
+
+def test_table_that_friction_holds_beyond_the_tolerance_says_how_far_it_is():
+    with (
+        motion_bench() as (bench, wires),
+        pytest.raises(NoProgress, match=r"[01]\.\d° from its goal: friction") as held,
+        Turntable(bench) as table,
+    ):
+        wires.device.motor.set_friction(0.06)
+        table.goto(90.0)
+    assert "table.tolerance_deg above" in held.value.next_step
+
+
+def test_servo_that_lost_its_torque_near_its_goal_has_not_arrived():
+    """Without torque no profile is ongoing, and the table may stand within the tolerance."""
+
+    def drop() -> None:
+        wires.device.memory["Torque Enable"] = 0
+        wires.device.motor.release()
+
+    with motion_bench() as (bench, wires), pytest.raises(MotionTimeout), Turntable(bench) as table:
+        wires.device.motor.set_friction(0.03)
+        begun_ns = wires.world.clock.now_ns()
+        wires.world.clock.call_at(begun_ns + round(0.97e9), drop)
+        table.goto(45.0)
 
 
 def test_entering_moves_nothing_and_leaving_switches_torque_off():
