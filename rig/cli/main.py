@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rig.cli.bench import config, doctor, find, safety, serve, servo, setup, snapshot, table
+from rig.cli.bench import config, doctor, find, jog, safety, serve, servo, setup, snapshot, table
 from rig.cli.catalog import calibrate as rules
 from rig.cli.catalog import catalog, exchange, results, upkeep
 from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
@@ -128,6 +128,7 @@ app.command("report", rich_help_panel=OBJECTS)(runs.report)
 app.command("empty-table", rich_help_panel=BENCH)(empty_table.empty_table)
 app.command("goto", rich_help_panel=BENCH, context_settings={"ignore_unknown_options": True})(table.goto)
 app.command("home", rich_help_panel=BENCH)(table.home)
+app.command("jog", rich_help_panel=BENCH)(jog.jog)
 app.command("status", rich_help_panel=BENCH)(table.status)
 app.command("stop", rich_help_panel=BENCH)(safety.stop)
 app.command("acknowledge", rich_help_panel=BENCH)(safety.acknowledge)
