@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rig.devices import v4l2
 from sim.calibration_board import BoardOnPlatter
+from sim.frame_times import FrameTimes
 from sim.noise import NoiseModel
 from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
@@ -75,7 +76,8 @@ class Controls:
 class SimCapture:
     """A simulated `cv2.VideoCapture` on the world's clock.
 
-    The exposure of frame k starts at k / 30 s, and the frame arrives `READOUT_NS` after its exposure. As in V4L2, up to
+    Frame k is stamped k / 30 s. Its exposure begins before, by the errors of `sim.frame_times`, and row by row (rolling
+    shutter). The frame arrives `READOUT_NS` and a delay of the USB after an exposure from its stamp. As in V4L2, up to
     four frames wait in buffers; while the buffers are full, new frames are lost. A frame is drawn when it is retrieved,
     from the world's state at its exposure, so dropped frames take no time and change nothing. The width selects one of
     two modes, 640x480 and 320x240. Properties have the units of OpenCV's V4L2 backend; for an unknown property `set`
@@ -96,6 +98,10 @@ class SimCapture:
         Whether the table moves the camera around the object instead of rotating the object.
     blur_px
         Sigma of an additional blur.
+    times
+        The errors of its time.
+    stamp_shift_ns
+        By how much the time stamps have jumped, of a fault.
     backdrop
         Wall, table and platter without an object, uint8 (480, 640, 3).
     filters
@@ -114,6 +120,8 @@ class SimCapture:
         self._clock = world.clock
         self._binning = 1
         self._noise = world.noise
+        self.times = FrameTimes(world)
+        self.stamp_shift_ns = 0
         self.backdrop = empty_platter()
         # A well-mounted camera sees the objects as they are drawn; calibration boards are drawn through its lens.
         self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
@@ -220,7 +228,7 @@ class SimCapture:
             cv2.CAP_PROP_FRAME_WIDTH: WIDTH // self._binning,
             cv2.CAP_PROP_FRAME_HEIGHT: HEIGHT // self._binning,
             cv2.CAP_PROP_FPS: FPS,
-            cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else start_ns(self._grabbed) * 1e-6,
+            cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else self._stamp_ns(self._grabbed) * 1e-6,
             cv2.CAP_PROP_BUFFERSIZE: now.buffers,
             cv2.CAP_PROP_AUTO_EXPOSURE: V4L2_EXPOSURE_APERTURE_PRIORITY if now.auto_exposure else V4L2_EXPOSURE_MANUAL,
             cv2.CAP_PROP_EXPOSURE: round(now.exposure),
@@ -297,12 +305,18 @@ class SimCapture:
                 self._next = self._exposed_from(self._next + 1)
 
     def _exposed_from(self, frame: int) -> int:
-        """Return the number of the next exposed frame, ``frame`` or later."""
-        return -(-frame // self.every) * self.every
+        """Return the number of the next exposed frame that is not lost, ``frame`` or later."""
+        frame = -(-frame // self.every) * self.every
+        while self.times.is_lost(frame):
+            frame += self.every
+        return frame
+
+    def _stamp_ns(self, frame: int) -> int:
+        return start_ns(frame) + self.stamp_shift_ns + self.times.stamp_error_ns(frame)
 
     def _arrival_ns(self, frame: int) -> int:
         start = start_ns(frame)
-        return start + _exposure_ns(self._controls_at(start)) + READOUT_NS + self.latency_ns
+        return start + _exposure_ns(self._controls_at(start)) + READOUT_NS + self.times.late_ns(frame) + self.latency_ns
 
     def _controls_at(self, time_ns: int) -> Controls:
         return next((c for since, c in reversed(self._controls) if since <= time_ns), self._controls[0][1])
@@ -317,17 +331,10 @@ class SimCapture:
 
     def _frame(self, frame: int) -> Image:
         start = start_ns(frame)
-        controls, scene = self._controls_at(start), self._world.scene_at(start)
-        times = self._subframes(start, _exposure_ns(controls))
-        angles = self._world.table_motion(times)[0]
-        seen: NDArray[np.uint8] | NDArray[np.float32]
-        if len(angles) == 1:
-            seen = self._picture(scene, float(angles[0]))
-        else:
-            total = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
-            for angle in angles:
-                cv2.accumulate(self._picture(scene, float(angle)), total)
-            seen = total * np.float32(1 / len(angles))
+        controls = self._controls_at(start)
+        exposed = self.times.exposed_ns(start, frame)
+        scene = self._world.scene_at(exposed)
+        seen = self._exposed(scene, exposed, _exposure_ns(controls))
         blur = max(abs(controls.focus - _SHARP_AT) * 0.04, self.blur_px)
         if blur > 0.1:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
@@ -339,12 +346,30 @@ class SimCapture:
             rng=np.random.default_rng([self._world.seed, crc32(b"camera frame"), frame]),
         )
 
-    def _subframes(self, start: int, exposure: int) -> NDArray[np.int64]:
-        """Return the times whose images are averaged for the exposure: one at rest, else one per pixel of motion."""
-        probes = start + np.linspace(0, exposure, 9).astype(np.int64)
-        path_px = np.abs(np.diff(self._world.table_motion(probes)[0])).sum() * _EDGE_PX_PER_DEG
-        n = 1 if path_px < _STILL_PX else min(1 + ceil(path_px), _MAX_SUBFRAMES)
-        return start + ((np.arange(n) + 0.5) / n * exposure).astype(np.int64)
+    def _exposed(self, scene: Scene, start: int, exposure: int) -> NDArray[np.uint8] | NDArray[np.float32]:
+        """Return what the rows collect: each is exposed for as long, the last one begins `FrameTimes.readout_ns` later.
+
+        At rest this is one image, otherwise the mean of images in steps of a pixel of motion.
+        """
+        readout = self.times.readout_ns
+        angles = self._world.table_motion(start + np.linspace(0, exposure + readout, 9).astype(np.int64))[0]
+        path_px = np.abs(np.diff(angles)).sum() * _EDGE_PX_PER_DEG
+        if path_px < _STILL_PX:
+            return self._picture(scene, float(angles[0]))
+        n = min(1 + ceil(path_px), _MAX_SUBFRAMES * (1 + readout // max(exposure, 1)))
+        steps = (np.arange(n) + 0.5) / n * (exposure + readout)
+        begins = (np.arange(HEIGHT) + 0.5) / HEIGHT * readout
+        half = (exposure + readout) / n / 2  # a step counts as far as it lies within the row's exposure
+        ends = np.minimum(steps[:, None] + half, begins + exposure)
+        weights = np.clip(ends - np.maximum(steps[:, None] - half, begins), 0, None)
+        weights = (weights / weights.sum(axis=0)).astype(np.float32)
+        seen = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
+        for angle, weight in zip(self._world.table_motion(start + steps.astype(np.int64))[0], weights, strict=True):
+            rows = np.flatnonzero(weight)
+            if len(rows):
+                part = slice(rows[0], rows[-1] + 1)
+                seen[part] += self._picture(scene, float(angle))[part] * weight[part, None, None]
+        return seen
 
     def _picture(self, scene: Scene, table_deg: float) -> Image:
         """Return the image of a scene under nominal light."""

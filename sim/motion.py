@@ -148,6 +148,32 @@ def dragged(path: Trajectory, start_deg: float, half_deg: float, offset_deg: flo
     return Trajectory(*(np.ascontiguousarray(c) for c in np.array(rows, dtype=np.float64).T))
 
 
+class Ripple:
+    """A ripple of the shaft's speed by the share ``share``, which repeats every `_PERIOD_DEG` of the shaft.
+
+    The shaft leaves its commanded angle by a fixed wave of the angle. Towards standstill the wave fades away.
+    """
+
+    _PERIOD_DEG = 15.0
+    _FADES_DPS = 10.0
+
+    def __init__(self, share: float) -> None:
+        self._amplitude_deg = share * self._PERIOD_DEG / (2 * np.pi)
+        self._per_deg = 2 * np.pi / self._PERIOD_DEG
+
+    def at(self, shaft: "Trajectory", time_s: ArrayLike) -> tuple[Floats, Floats]:
+        """Return what the ripple adds to the angle and to the rate (°, °/s)."""
+        t = np.asarray(time_s, dtype=np.float64)
+        if not self._amplitude_deg:
+            return np.zeros_like(t), np.zeros_like(t)
+        angle, speed = shaft.at(t)
+        fade = np.minimum(np.abs(speed) / self._FADES_DPS, 1.0)
+        fading = np.where(fade < 1, np.sign(speed) * shaft.acceleration_at(t) / self._FADES_DPS, 0.0)
+        phase = angle * self._per_deg
+        wave, slope = np.sin(phase), np.cos(phase) * self._per_deg * speed
+        return self._amplitude_deg * fade * wave, self._amplitude_deg * (fading * wave + fade * slope)
+
+
 class Platter:
     """The platter on the shaft: backlash and a damped structural vibration.
 

@@ -24,6 +24,9 @@ class NoiseModel:
     """Natural frequency of platter and object on the shaft: they ring after each change of acceleration."""
     structure_damping: float = 0.15
     """Damping ratio of that ringing, below 1."""
+    speed_ripple: float = 0.015
+    """Amplitude of the speed's ripple as a share of the speed. The e-manual states no ripple; the default is one unit
+    of its velocity control, 0.229 rev/min, at 90 °/s. At rest there is no ripple."""
     voltage_noise_v: float = 0.05
     """Standard deviation of the supply voltage."""
 
@@ -60,6 +63,22 @@ class NoiseModel:
     light_flicker: float = 0.004
     """Standard deviation of the relative brightness from frame to frame."""
 
+    camera_readout_ms: float = 11.1
+    """Time from the exposure of the first row to that of the last row (rolling shutter). OV5647: 640x480 at 90
+    frames/s, so that a frame is read in at most 11.1 ms."""
+    stamp_offset_ms: float = 8.0
+    """Standard deviation, from camera to camera, of the time by which a frame is stamped after its exposure began. The
+    V4L2 documentation expects a constant difference of up to a frame period, which is 33 ms at 30 frames/s."""
+    stamp_jitter_ms: float = 0.2
+    """Standard deviation of that time from frame to frame. The V4L2 documentation expects a few scan lines; a line of
+    the OV5647 takes 0.023 ms, and the computer's interrupt adds its own."""
+    lost_frames: float = 0.0
+    """Share of frames that never arrive: USB does not repeat a broken isochronous transfer (USB 2.0, 5.6.4). No vendor
+    publishes a share; the measurements of views in motion use 0.01."""
+    usb_latency_ms: float = 0.0
+    """Mean of the delay of a frame, distributed exponentially, in addition to a constant 15 ms; the measurements of
+    views in motion use 1 ms, a frame of USB (USB 2.0, 5.3.3)."""
+
     camera_mount: float = 0.0
     """Error of the camera's position and direction: 1 means some millimetres and degrees (`sim.optics`)."""
 
@@ -78,6 +97,8 @@ class NoiseModel:
             )
         if self.vignetting > 1:
             raise ValueError(f"vignetting = {self.vignetting!r}: give a share of the light, at most 1")
+        if self.lost_frames >= 1:
+            raise ValueError(f"lost_frames = {self.lost_frames!r}: give a share below 1")
 
     @classmethod
     def none(cls) -> Self:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.clock import VirtualClock
-from sim.motion import Floats, Platter, Trajectory, rest
+from sim.motion import Floats, Platter, Ripple, Trajectory, rest
 from sim.noise import NoiseModel
 
 HISTORY_S = 12.0  # how far back the past is stored: longer than the IMU's FIFO and the camera's buffers
@@ -69,6 +69,7 @@ class World:
         self.seed = seed
         self.listeners: list[Callable[[Activity], None]] = []
         self._scenes: list[tuple[int, Scene]] = [(0, Scene())]
+        self._ripple = Ripple(self.noise.speed_ripple)
         first = self._platter()
         first.follow(rest(0.0, start_deg), None)
         self._motions: list[tuple[int, Platter]] = [(0, first)]
@@ -101,10 +102,16 @@ class World:
         self._slips.append((self.clock.now_ns() * 1e-9, seconds, angle_deg))
 
     def shaft(self, time_ns: int | None = None) -> tuple[float, float]:
-        """Return angle (°) and speed (°/s) of the servo's shaft."""
+        """Return angle (°) and speed (°/s) of the servo's shaft, without ripple."""
         t = self.clock.now_ns() if time_ns is None else time_ns
         x, v = self._motions[self._index(t)][1].shaft.at(t * 1e-9)
         return float(x), float(v)
+
+    def rippled_deg(self) -> float:
+        """Return the angle of the servo's shaft with the ripple of its speed, as the encoder sees it."""
+        t = self.clock.now_ns()
+        shaft = self._motions[self._index(t)][1].shaft
+        return float(shaft.at(t * 1e-9)[0] + self._ripple.at(shaft, t * 1e-9)[0])
 
     def table_deg(self, time_ns: int | None = None) -> float:
         """Return the true angle of the platter, now or at a time not longer ago than `HISTORY_S`."""
@@ -115,19 +122,25 @@ class World:
         t: NDArray[np.int64] = np.atleast_1d(np.asarray(times_ns, dtype=np.int64))
         first, last = self._index(int(t.min())), self._index(int(t.max()))
         if first == last:
-            angle, rate = self._motions[first][1].at(t * 1e-9)
+            angle, rate = self._moved(self._motions[first][1], t * 1e-9)
         else:
             starts = np.array([start for start, _ in self._motions])
             which = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
             angle, rate = np.empty(t.shape), np.empty(t.shape)
             for i in range(first, last + 1):
                 here = which == i
-                angle[here], rate[here] = self._motions[i][1].at(t[here] * 1e-9)
+                angle[here], rate[here] = self._moved(self._motions[i][1], t[here] * 1e-9)
         for start_s, seconds, slip_deg in self._slips:
             share = (t * 1e-9 - start_s) / seconds
             angle += slip_deg * np.clip(share, 0.0, 1.0)
             rate += np.where((share >= 0) & (share < 1), slip_deg / seconds, 0.0)
         return angle, rate
+
+    def _moved(self, platter: Platter, time_s: ArrayLike) -> tuple[Floats, Floats]:
+        """Return the platter's angle and rate within one motion, with the ripple of the shaft's speed."""
+        angle, rate = platter.at(time_s)
+        more_deg, more_dps = self._ripple.at(platter.shaft, time_s)
+        return angle + more_deg, rate + more_dps
 
     # -- the object on it -----------------------------------------------------------------------------------------
 

@@ -115,7 +115,7 @@ class CalibrationStore:
 def apparatus(
     name: str, devices: Mapping[str, Any], config: RigConfig, conditions: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what a result is bound to: the bench, its devices and their mounting, and the conditions.
+    """Return what a result is bound to: the bench, its devices and their mounting, the exposure, and the conditions.
 
     The settings that a calibration itself applies are not part of it.
     """
@@ -126,6 +126,7 @@ def apparatus(
     return {
         "bench": name,
         **{part: {**identity, **mounting.get(part, {})} for part, identity in devices.items()},
+        "exposure": config.camera.model_dump(include={"exposure_us"}),
         "conditions": {key: value for key, value in conditions.items() if key != CALIBRATIONS},
     }
 

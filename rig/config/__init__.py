@@ -3,6 +3,7 @@
 from rig.config.schema import (
     MAX_LIMIT_DEG,
     CameraConfig,
+    CameraTimeConfig,
     CatalogConfig,
     EnrollConfig,
     HeadConfig,
@@ -20,6 +21,7 @@ from rig.config.schema import (
 __all__ = [
     "MAX_LIMIT_DEG",
     "CameraConfig",
+    "CameraTimeConfig",
     "CatalogConfig",
     "EnrollConfig",
     "HeadConfig",

@@ -273,6 +273,21 @@ class CameraConfig(Section):
     )
 
 
+class CameraTimeConfig(Section):
+    """When frames are exposed, from `rig calibrate camera-time`."""
+
+    offset_ms: float | None = Field(
+        None,
+        ge=-1000,
+        le=1000,
+        description="time from a frame's time stamp to the middle of its exposure in the middle row; none: not "
+        "calibrated, and no view is taken in motion",
+    )
+    uncertainty_ms: float = Field(0.2, ge=0, le=100, description="standard uncertainty of this time")
+    jitter_ms: float = Field(0.5, ge=0, le=100, description="standard deviation of this time from frame to frame")
+    readout_ms: float = Field(0.0, ge=0, le=1000, description="time from the first to the last row (rolling shutter)")
+
+
 class ViewConfig(Section):
     """Quality that a view needs."""
 
@@ -286,6 +301,15 @@ class ViewConfig(Section):
     max_saturated: Fraction = Field(0.25, description="largest part of pixels at level 255")
     min_mean: float = Field(4.0, ge=0, le=255, description="smallest mean level")
     retakes: int = Field(3, ge=0, le=20, description="further frames that are taken before a view fails")
+    max_smear_px: float = Field(
+        4.0,
+        ge=0.1,
+        le=100,
+        description="largest motion during an exposure at the edge of the region, of views that are taken in motion",
+    )
+    max_angle_sigma_deg: float = Field(
+        0.2, ge=0.01, le=10, description="largest standard uncertainty of the angle of a view that is taken in motion"
+    )
 
 
 class CatalogConfig(Section):
@@ -300,6 +324,11 @@ class EnrollConfig(Section):
     """How an object is enrolled."""
 
     views: int = Field(72, ge=4, le=720, description="views in a revolution")
+    mode: Literal["auto", "step", "fly"] = Field(
+        "auto",
+        description="fly: the views are taken while the table turns; step: at rest; auto: fly for trays if the camera's "
+        "time is calibrated",
+    )
 
 
 class IdentifyConfig(Section):
@@ -308,6 +337,11 @@ class IdentifyConfig(Section):
     strategy: str | None = Field(
         None,
         description="strategy that chooses the next view; none: dense if the catalog has its descriptors, else ahbr",
+    )
+    mode: Literal["auto", "step", "fly"] = Field(
+        "auto",
+        description="fly: frames count while the table turns; step: only at rest; auto: fly if the camera's time is "
+        "calibrated (dense only)",
     )
     max_views: int = Field(8, ge=1, le=72, description="largest number of views")
     min_views: int = Field(
@@ -373,6 +407,7 @@ class RigConfig(Section):
     imu: ImuConfig = ImuConfig()
     head: HeadConfig = HeadConfig()
     camera: CameraConfig = CameraConfig()
+    camera_time: CameraTimeConfig = CameraTimeConfig()
     view: ViewConfig = Field(ViewConfig(), validate_default=True)
     catalog: CatalogConfig = CatalogConfig()
     enroll: EnrollConfig = EnrollConfig()

@@ -48,10 +48,14 @@ class CameraLocks:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image; ``exposed_ns`` is the start of its exposure on the bench's clock."""
+    """An image; ``exposed_ns`` is the start of its exposure on the bench's clock.
+
+    ``stamped`` says that the camera's own time stamp gave the time, and not the frame's arrival.
+    """
 
     image_bgr: NDArray[np.uint8]
     exposed_ns: int
+    stamped: bool = True
 
 
 class Camera(Protocol):

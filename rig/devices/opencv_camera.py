@@ -177,7 +177,7 @@ class OpenCvCamera:
                 self._await(meanwhile)
             exposed_ns = self._grab()
             if exposed_ns is not None and exposed_ns >= after_ns:
-                return Frame(self._retrieve(), exposed_ns)
+                return Frame(self._retrieve(), exposed_ns, self.time_base is TimeBase.STAMPED)
             dropped += 1
             if self._clock.now_ns() > deadline_ns:
                 raise DeviceSilent(

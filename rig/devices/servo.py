@@ -33,11 +33,12 @@ class MotionProfile:
 class ServoState:
     """One reading of the servo's status registers, from one transaction.
 
-    ``time_ns`` is the middle of the transaction on the bench's clock. ``hardware_errors`` are the names of the bits in
-    Hardware Error Status (a status alert). ``moving`` is False when the motion profile has ended and the shaft is slow.
-    ``in_position`` is the servo's own judgement that it is at its goal: friction may hold it outside of its window.
-    ``trajectory_deg`` is the present position of the servo's motion profile;
-    None if the model does not report it.
+    ``time_ns`` is the middle of the transaction on the bench's clock, ``sampled_ns`` the beginning of the answer, when
+    the servo read its encoder, to a fraction of a millisecond; None if the driver does not know it. ``hardware_errors``
+    are the names of the bits in Hardware Error Status (a status alert). ``moving`` is False when the motion profile has
+    ended and the shaft is slow. ``in_position`` is the servo's own judgement that it is at its goal: friction may hold
+    it outside of its window. ``trajectory_deg`` is the present position of the servo's motion profile; None if the
+    model does not report it.
     """
 
     time_ns: int
@@ -50,6 +51,7 @@ class ServoState:
     in_position: bool
     hardware_errors: tuple[str, ...]
     trajectory_deg: float | None = None
+    sampled_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

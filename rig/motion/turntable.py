@@ -4,8 +4,10 @@ Decision: docs/decisions/0004.
 """
 
 from collections import deque
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from math import isfinite, remainder
+from dataclasses import dataclass
+from math import copysign, isfinite, remainder
 from typing import Self
 
 from rig.bench import Bench
@@ -27,13 +29,41 @@ from rig.devices.servo import MotionProfile, ServoState
 from rig.motion.fault_causes import explain_unsettled, find_cause
 from rig.motion.halt import QUIET_COUNTS, MotionPath, halt, reachable
 from rig.motion.move import Move, equivalent_within, motion_seconds
+from rig.motion.trajectory import TrajectoryRecorder
 from rig.safety.gyro_rotation import GyroRotationMeter, Stillness, compare
 from rig.safety.motion_checks import MotionMonitor, SlipMonitor
+from rig.safety.supervisor import TableState
 
 FIRST_REST_S = 0.6
 """How long the gyro is averaged for its first bias."""
 SETTLE_ALLOWANCE_S = 2.5
 """Time for ringing to die down and for a slow bus, in addition to the motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """How a motion is watched and steered while the table turns.
+
+    Attributes
+    ----------
+    each
+        Called in each round of the control loop, instead of a pause: it waits for the next frame, for example. It
+        returns a new goal, or None to go on to the last one.
+    reach_deg
+        Lowest and highest goal that ``each`` may return.
+    recorder
+        Gets the readings of the encoder and the samples of the gyro.
+    velocity_dps
+        Cruise speed.
+    quiet
+        Whether the motion ends with a rest, as before a view; otherwise it is enough to arrive.
+    """
+
+    each: Callable[[], float | None]
+    reach_deg: tuple[float, float]
+    recorder: TrajectoryRecorder
+    velocity_dps: float
+    quiet: bool = True
 
 
 class Turntable(AbstractContextManager["Turntable"]):
@@ -48,16 +78,19 @@ class Turntable(AbstractContextManager["Turntable"]):
         An open bench.
     trust_gyro
         Whether a motion is stopped if the gyro contradicts the encoder. Calibrations of the gyro set it to False.
+    first_rest_s
+        How long the gyro is averaged for its first bias.
     """
 
-    def __init__(self, bench: Bench, *, trust_gyro: bool = True) -> None:
+    def __init__(self, bench: Bench, *, trust_gyro: bool = True, first_rest_s: float = FIRST_REST_S) -> None:
         self._config = bench.config.table
         self._limits = bench.config.safety
         self._servo = bench.servo
         self._clock = bench.clock
         self._safety = bench.safety
         self._trust_gyro = trust_gyro
-        imu = bench.config.imu
+        self._first_rest_s = first_rest_s
+        imu = self._imu_config = bench.config.imu
         self._gyro = GyroRotationMeter(
             bench.imu, bench.clock, axis=imu.axis, sign=imu.sign, scale=imu.scale, scale_sigma=imu.scale_uncertainty
         )
@@ -76,7 +109,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 MotionProfile(self._config.velocity_dps, self._config.acceleration_dps2)
             )
             self._wait_for_rest(self.angle_deg(), self._config.quiet_s, SETTLE_ALLOWANCE_S)
-            self._learn_bias(FIRST_REST_S)
+            self._learn_bias(self._first_rest_s)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -171,6 +204,55 @@ class Turntable(AbstractContextManager["Turntable"]):
         self.check_target(target_deg)
         return self._move(target_deg, self._waypoints(target_deg))
 
+    def recorder(self) -> TrajectoryRecorder:
+        """Return a recorder for the next motions, with what is known about the gyro now."""
+        bias_dps, sigma_dps = self._gyro.bias_of_table
+        return TrajectoryRecorder(
+            self._servo.resolution_deg,
+            self._config.backlash_deg,
+            self._imu_config.scale_uncertainty,
+            self._gyro.arw,
+            bias_dps,
+            sigma_dps,
+        )
+
+    def fly(self, target_deg: float, flight: Flight) -> Move:
+        """Rotate to ``target_deg`` without a stop, watched and steered by a `Flight`; return when the table is there.
+
+        The table does not approach the target from below. Raises what `goto` raises.
+        """
+        low_deg, high_deg = flight.reach_deg
+        for end_deg in (target_deg, low_deg, high_deg):
+            self.check_target(end_deg)
+        assert self._profile is not None
+        usual = self._profile
+        if abs(flight.velocity_dps - usual.velocity_dps) > 1e-3:
+            self._profile = self._servo.set_profile(MotionProfile(flight.velocity_dps, usual.acceleration_dps2))
+        self._gyro.taps.append(flight.recorder.add_samples)
+        try:
+            return self._move(target_deg, (target_deg,), flight)
+        finally:
+            self._gyro.taps.remove(flight.recorder.add_samples)
+            if self._profile is not None and self._profile != usual:
+                with uninterrupted():
+                    self._profile = usual
+                    self._restore_profile(usual)
+
+    def _restore_profile(self, profile: MotionProfile) -> None:
+        """Set the usual speed again; after a fault the servo may not answer, and the next program sets it."""
+        if self._safety.state is TableState.READY:
+            self._servo.set_profile(profile)
+
+    def stopping_deg(self, state: ServoState) -> float:
+        """Return where the table stops if it brakes now, as a table angle within the limits."""
+        assert self._profile is not None
+        rate_dps = self._config.direction * state.velocity_dps
+        age_s = seconds_between(state.time_ns, self._clock.now_ns()) + self._config.poll_s / 2
+        ramp_deg = copysign(rate_dps**2 / (2 * self._profile.acceleration_dps2), rate_dps) + rate_dps * age_s
+        low_deg, high_deg = self._config.limits_deg
+        here_deg = self._safety.angle_reference.to_table(state.position_deg)
+        return min(max(here_deg + ramp_deg, low_deg), high_deg)
+
     def collect_gyro(self) -> None:
         """Collect the gyro's samples: its buffer is shorter than the time that a slow camera may take."""
         self._gyro.update()
@@ -215,7 +297,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             else:
                 return
 
-    def _move(self, target_deg: float, waypoints: tuple[float, ...]) -> Move:
+    def _move(self, target_deg: float, waypoints: tuple[float, ...], flight: Flight | None = None) -> Move:
         if self._profile is None:
             raise NotReady(
                 "The table has no torque.", next_step="Use it in a with block: `with Turntable(bench) as table:`."
@@ -228,12 +310,15 @@ class Turntable(AbstractContextManager["Turntable"]):
             self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
         else:
             ends_deg = [self._safety.angle_reference.to_servo(angle) for angle in (start_deg, *waypoints)]
+            steered_deg = () if flight is None else flight.reach_deg
+            ends_deg += [self._safety.angle_reference.to_servo(angle) for angle in steered_deg]
             self._path_deg, self._trusted = (min(ends_deg), max(ends_deg)), None
-            with self._safety.motion((start_deg, *waypoints), self._stop) as motion:
+            with self._safety.motion((start_deg, *waypoints, *steered_deg), self._stop) as motion:
                 slip = SlipMonitor(self._limits, start_deg) if self._trust_gyro else None
                 for waypoint in waypoints:
                     # Only the last stop must be a rest; at the others it is enough to arrive.
-                    self._approach(waypoint, self._config.quiet_s if waypoint is waypoints[-1] else 0.0, slip)
+                    last = waypoint is waypoints[-1] and (flight is None or flight.quiet)
+                    target_deg = self._approach(waypoint, self._config.quiet_s if last else 0.0, slip, flight)
                 self._servo.disarm_watchdog()
                 motion.arrived(self._safety.angle_reference.to_servo(self._rest_deg))
         self._backlash_taken_up = self._backlash_taken_up or bool(waypoints)
@@ -255,24 +340,39 @@ class Turntable(AbstractContextManager["Turntable"]):
             target_deg, self._rest_deg, rotation_deg, gyro, agreement, started_ns, self._clock.now_ns(), by_gyro
         )
 
-    def _approach(self, goal_deg: float, quiet_s: float, slip: SlipMonitor | None) -> None:
-        """Rotate to ``goal_deg`` under supervision; return when the table has been quiet there for ``quiet_s``."""
+    def _monitor(self, start_deg: float, goal_deg: float) -> MotionMonitor:
         assert self._profile is not None
-        monitor = MotionMonitor(
+        return MotionMonitor(
             self._limits,
             self._servo.limits,
-            start_deg=self._rest_deg,
+            start_deg=start_deg,
             goal_deg=goal_deg,
             tolerance_deg=self._config.tolerance_deg,
             cruise_dps=self._profile.velocity_dps,
         )
-        allowed_s = 1.5 * motion_seconds(goal_deg - self._rest_deg, self._profile) + SETTLE_ALLOWANCE_S
+
+    def _approach(
+        self, goal_deg: float, quiet_s: float, slip: SlipMonitor | None, flight: Flight | None = None
+    ) -> float:
+        """Rotate to ``goal_deg`` under supervision; return the last goal when the table has been quiet there."""
+        assert self._profile is not None
+        monitor = self._monitor(self._rest_deg, goal_deg)
+        allowed_s = self._allowed_s(goal_deg - self._rest_deg)
         try:
             self._servo.arm_watchdog(self._config.watchdog_s)
             self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
-            self._wait_for_rest(goal_deg, quiet_s, allowed_s, monitor, slip)
+            return self._wait_for_rest(goal_deg, quiet_s, allowed_s, monitor, slip, flight)
         except (RequestRejected, FollowingError, MotionTimeout, NoProgress) as symptom:
             raise find_cause(symptom, self._servo, self._limits) from None
+
+    def _allowed_s(self, distance_deg: float) -> float:
+        assert self._profile is not None
+        return 1.5 * motion_seconds(distance_deg, self._profile) + SETTLE_ALLOWANCE_S
+
+    def _steer(self, state: ServoState, goal_deg: float) -> MotionMonitor:
+        """Give the moving servo another goal; return the monitor of the motion from here on."""
+        self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
+        return self._monitor(self.stopping_deg(state), goal_deg)
 
     def _wait_for_rest(
         self,
@@ -281,8 +381,9 @@ class Turntable(AbstractContextManager["Turntable"]):
         allowed_s: float,
         monitor: MotionMonitor | None = None,
         slip: SlipMonitor | None = None,
-    ) -> None:
-        """Poll until the profile has ended near the goal and encoder and gyro have been quiet for ``quiet_s``.
+        flight: Flight | None = None,
+    ) -> float:
+        """Poll until the profile has ended near the goal and all is quiet for ``quiet_s``; return the goal.
 
         The polling also feeds the servo's watchdog.
         """
@@ -290,15 +391,25 @@ class Turntable(AbstractContextManager["Turntable"]):
         start_ns = self._clock.now_ns()
         readings: deque[tuple[int, float]] = deque()
         while True:
-            self._clock.sleep(config.poll_s)
+            steer_deg = None
+            if flight is None:
+                self._clock.sleep(config.poll_s)
+            else:
+                steer_deg = flight.each()
             self._safety.check_stop_request()
             state = self._servo.read_state()
             for observer in self._safety.observers:
                 observer(state)
             if self._trusted is None or reachable(self._trusted, state, config.velocity_dps):
                 self._trusted = state
-            self._gyro.update()
+            self._gyro.update(now=flight is not None)
             angle_deg = to_table(state.position_deg)
+            if flight is not None:
+                flight.recorder.add_reading(state.sampled_ns or state.time_ns, angle_deg)
+            if flight is not None and steer_deg is not None and abs(steer_deg - goal_deg) > config.tolerance_deg / 2:
+                goal_deg = min(max(steer_deg, flight.reach_deg[0]), flight.reach_deg[1])
+                monitor = self._steer(state, goal_deg)
+                allowed_s = seconds_between(start_ns, self._clock.now_ns()) + self._allowed_s(goal_deg - angle_deg)
             if monitor:
                 lag_deg = None if state.trajectory_deg is None else state.trajectory_deg - state.position_deg
                 monitor.check(state, angle_deg, lag_deg)
@@ -312,7 +423,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             readings.append((state.time_ns, angle_deg))
             if arrived and self._quiet(readings, quiet_s) and (state.in_position or self._holds()):
                 self._rest_deg = sum(angle for _, angle in readings) / len(readings)
-                return
+                return goal_deg
             elapsed_s = seconds_between(start_ns, self._clock.now_ns())
             if elapsed_s > allowed_s:
                 peak_dps = self._gyro.peak_dps(config.quiet_s)

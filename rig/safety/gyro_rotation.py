@@ -8,6 +8,7 @@ time t is
     σ² = ARW²·t + (σ_bias·t)² + (σ_scale·φ)²,    ARW = noise density / √2 for a one-sided density.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from math import hypot, inf, isfinite, sqrt
@@ -178,6 +179,8 @@ class GyroRotationMeter:
         self._issue_limit = 0.0
         self._restart()
         self.bias: Bias | None = None
+        self.taps: list[Callable[[NDArray[np.int64], NDArray[np.float64]], object]] = []
+        """Called with times and rates (°/s, about the table's axis, with the bias) of new samples."""
 
     def rest(self, duration_s: float = 0.5) -> Bias:
         """Measure the bias during the present rest; wait until it has lasted ``duration_s``.
@@ -231,9 +234,21 @@ class GyroRotationMeter:
         self._drain()
         self._moving = True
 
-    def update(self) -> None:
-        """Collect the sensor's new samples, unless it was done very recently."""
-        if self._clock.now_ns() - self._drained_ns >= self._drain_s * 1e9:
+    @property
+    def bias_of_table(self) -> tuple[float, float]:
+        """The bias about the table's axis and its standard uncertainty in °/s, in the unit of `taps`."""
+        if self.bias is None:
+            raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")
+        return self._to_table * self.bias.rate_dps, abs(self._to_table) * self.bias.sigma_dps
+
+    @property
+    def arw(self) -> float:
+        """The angle random walk by the datasheet, in °/√s."""
+        return self._arw
+
+    def update(self, *, now: bool = False) -> None:
+        """Collect the sensor's new samples, unless it was done very recently and ``now`` is false."""
+        if now or self._clock.now_ns() - self._drained_ns >= self._drain_s * 1e9:
             self._drain()
 
     def end(self) -> Rotation:
@@ -297,6 +312,8 @@ class GyroRotationMeter:
         self._drained_ns = self._clock.now_ns()
         self._check_repetition(new.gyro_dps)
         rate = new.gyro_dps[:, self._column]
+        for tap in self.taps:
+            tap(new.time_ns, self._to_table * rate)
         if new.lost:
             self._time_ns, self._rate_dps = self._time_ns[:0], self._rate_dps[:0]
         self._time_ns = np.concatenate([self._time_ns, new.time_ns])

@@ -64,6 +64,56 @@ def _intermittent(devices: SimDevices, values: Values, rng: np.random.Generator)
     return lambda: devices.camera.grab_failures.remove(fails)
 
 
+@simulated_fault("lost_frames", "The USB is overloaded. Some frames never arrive.", rate=share(0.3, "frames"))
+def _lost_frames(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    times = devices.camera.times
+    before, times.lost_share = times.lost_share, min(values["rate"], 0.99)
+    return lambda: setattr(times, "lost_share", before)
+
+
+@simulated_fault(
+    "doubled_frame",
+    "The camera sends some frames a second time instead of the next one, with a new time stamp.",
+    rate=share(0.3, "frames"),
+)
+def _doubled(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
+    images: list[Image] = []
+
+    def again(image: Image) -> Image:
+        if not images or rng.random() >= values["rate"]:
+            images[:] = [image]
+        return images[0]
+
+    return _filter(devices, again)
+
+
+@simulated_fault("stamp_jump", "The time stamps of the frames jump.", ms=Parameter(12.0, "jump, ms", -1000, 1000))
+def _stamp_jump(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    devices.camera.stamp_shift_ns = round(values["ms"] * 1e6)
+    return lambda: setattr(devices.camera, "stamp_shift_ns", 0)
+
+
+@simulated_fault(
+    "stamps_backwards",
+    "The time stamps of the frames go backwards.",
+    ms=Parameter(80.0, "how far, ms", 0, 1000),
+)
+def _stamps_backwards(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    devices.camera.stamp_shift_ns = -round(values["ms"] * 1e6)
+    return lambda: setattr(devices.camera, "stamp_shift_ns", 0)
+
+
+@simulated_fault(
+    "stamp_jitter",
+    "The computer stamps frames late because it is busy.",
+    ms=Parameter(6.0, "1 σ of the error, ms", 0, 100),
+)
+def _stamp_jitter(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    times = devices.camera.times
+    times.stamped_late_ns = values["ms"] * 1e6
+    return lambda: setattr(times, "stamped_late_ns", 0.0)
+
+
 @simulated_fault("frozen_frame", "The camera repeats one image with new time stamps.")
 def _frozen(devices: SimDevices, _values: Values, _rng: np.random.Generator) -> End:
     images: list[Image] = []

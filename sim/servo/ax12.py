@@ -354,7 +354,7 @@ class Ax12Servo(SimulatedServoBase):
         """Return the position reading; outside the 300° of the potentiometer it is the next end."""
         noise_deg = self._shaft.noise.encoder_noise_deg
         error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
-        counts = round((self._shaft.shaft()[0] + error_deg) / DEG_PER_COUNT + self._center)
+        counts = round((self._shaft.rippled_deg() + error_deg) / DEG_PER_COUNT + self._center)
         return min(max(counts, 0), 1023)
 
     def _refresh(self) -> None:

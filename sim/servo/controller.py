@@ -223,7 +223,7 @@ class Controller:
     def _present_position(self) -> int:
         noise_deg = self._world.noise.encoder_noise_deg
         error_deg = noise_deg * self._rng.standard_normal() if noise_deg else 0.0
-        return self._counts(self._world.shaft()[0] + error_deg)
+        return self._counts(self._world.rippled_deg() + error_deg)
 
 
 _STANDSTILL = 1e-9  # smallest speed and acceleration of a profile: a profile of length 0 would have none

@@ -20,6 +20,7 @@ class Shaft(Protocol):
     def rng(self, name: str) -> np.random.Generator: ...
     def drive(self, shaft: Trajectory) -> None: ...
     def shaft(self, time_ns: int | None = None) -> tuple[float, float]: ...
+    def rippled_deg(self) -> float: ...
 
 
 class Geared:
@@ -49,3 +50,7 @@ class Geared:
         """Return angle (°) and speed (°/s) of the servo."""
         angle, speed = self._world.shaft(time_ns)
         return angle * self._ratio, speed * self._ratio
+
+    def rippled_deg(self) -> float:
+        """Return the angle of the servo with the ripple of its speed."""
+        return self._world.rippled_deg() * self._ratio

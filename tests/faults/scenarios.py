@@ -152,6 +152,11 @@ SCENARIOS: dict[str, Scenario] = {
         survived("camera.slow", "not detected: each view waits for its frame"),
         survived("camera.delayed", "not detected: frames are selected by time stamp"),
         survived("camera.intermittent", "a failed frame is fetched again, at most four times"),
+        survived("lost_frames", "not detected at rest: each view waits for its frame"),
+        survived("doubled_frame", "two equal frames; the view is taken again"),
+        survived("stamp_jump", "not detected at rest: a view is exposed long after the table came to rest"),
+        survived("stamps_backwards", "time stamps that go backwards are not used; a frame counts from its arrival"),
+        survived("stamp_jitter", "not detected at rest: a view is exposed long after the table came to rest"),
         # -- the servo's bus, supply, load and gears -------------------------------------------------------------
         survived("crc_flip", "CRC; the transaction is repeated and counted"),
         survived(

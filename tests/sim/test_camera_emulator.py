@@ -393,3 +393,55 @@ def test_invisible_object_is_rejected_with_a_message() -> None:
     world.put(Ghost())
     with pytest.raises(TypeError, match="draw"):
         frame(capture)
+
+
+def rows_of_spot(noise: NoiseModel, seed: int = 0) -> tuple[NDArray[np.float64], float]:
+    """Return in which column each row of a frame in motion shows the spot, and degrees of rotation per millisecond."""
+    world = World(noise=noise, seed=seed)
+    world.put(Spot())
+    capture = camera(world, EXPOSURE=20)
+    world.clock.sleep(1.0)
+    world.drive(to_velocity(world.clock.now_ns() * 1e-9, 0.0, 0.0, 60.0, 1e6))
+    for _ in range(6):  # the buffers are from before
+        assert capture.grab()
+    stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+    image = capture.retrieve()[1]
+    assert image is not None
+    grey = image[100:300, :, 0].astype(float)
+    columns = (grey * np.arange(640)).sum(axis=1) / grey.sum(axis=1)
+    lever = PX_PER_MM * 80
+    seen_deg = np.degrees(np.arcsin((columns - CENTRE_PX[0]) / lever))
+    middle_ns = stamp_ns + 1_000_000 + round(noise.camera_readout_ms * 1e6 / 480) * np.arange(100, 300)
+    return seen_deg - world.table_motion(middle_ns)[0], 0.06
+
+
+def test_rows_are_exposed_one_after_the_other() -> None:
+    error, _ = rows_of_spot(QUIET.with_values(camera_readout_ms=11.1))
+    assert np.abs(error).max() < 0.06
+    global_shutter, _ = rows_of_spot(QUIET)
+    assert np.abs(global_shutter).max() < 0.06
+
+
+def test_exposure_begins_before_the_stamp_by_offset_and_jitter() -> None:
+    offsets = [-rows_of_spot(QUIET.with_values(stamp_offset_ms=5.0), seed)[0].mean() / 0.06 for seed in range(4)]
+    drawn = [SimCapture(World(noise=NoiseModel(stamp_offset_ms=5.0), seed=s)).times.offset_ns * 1e-6 for s in range(4)]
+    assert offsets == pytest.approx(drawn, abs=1.0)
+
+
+def test_lost_frames_do_not_arrive() -> None:
+    world = World(noise=QUIET.with_values(lost_frames=0.5))
+    capture = camera(world)
+    stamps = []
+    for _ in range(40):
+        assert capture.grab()
+        stamps.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * FPS / 1000))
+    assert 1.5 < (stamps[-1] - stamps[0]) / 39 < 2.6
+
+
+def test_views_at_rest_do_not_depend_on_the_errors_of_camera_time() -> None:
+    images = []
+    for noise in (QUIET, QUIET.with_values(camera_readout_ms=20.0, stamp_offset_ms=20.0, stamp_jitter_ms=2.0)):
+        world = World(noise=noise)
+        world.put(shelf()["mug-star"])
+        images.append(frame(camera(world)))
+    assert np.array_equal(*images)

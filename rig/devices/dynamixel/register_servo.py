@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import asdict
+from typing import Final
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
@@ -18,6 +19,9 @@ BOOT_ALLOWANCE_S = 3.0
 TORQUE_OFF_ATTEMPTS = 3
 """How often the torque is switched off and read back before it counts as on."""
 
+_STATUS_BYTES: Final = {1: 6, 2: 11}
+"""Bytes of an answer beside its registers, by protocol."""
+_BITS: Final = 10
 _HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 
 
@@ -70,6 +74,7 @@ class RegisterServo(ABC):
         self._guardian = guardian
         self.resolution_deg = self.deg_per_count / gear_ratio
         self._blocks: dict[tuple[str, str], Block] = {}
+        self._sampled_ns = 0
         try:
             number = bus.ping(bus_id)
         except DeviceSilent as silent:
@@ -235,8 +240,10 @@ class RegisterServo(ABC):
             block = self._blocks[first, last] = Block.of(self._table, first, last)
         begun_ns = self._clock.now_ns()
         image = self.bus.read_block(self._id, block.address, block.layout.size, dated=dated)
-        time_ns = (begun_ns + self._clock.now_ns()) // 2
-        return time_ns, block.values(image)
+        ended_ns = self._clock.now_ns()
+        answer_bytes = block.layout.size + _STATUS_BYTES[self.bus.protocol]
+        self._sampled_ns = ended_ns - answer_bytes * _BITS * 1_000_000_000 // self.bus.port.baudrate
+        return (begun_ns + ended_ns) // 2, block.values(image)
 
 
 def hardware_errors(bits: int) -> tuple[str, ...]:

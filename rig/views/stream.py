@@ -1,0 +1,131 @@
+"""Frames of a running camera: each with the time at the middle of its exposure, and whether that time can be trusted.
+
+A frame's angle is the platter's at the middle of the exposure of the middle row. `rig calibrate camera-time` measures
+how long after the frame's time stamp that is.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import isfinite, nan
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.config import CameraTimeConfig
+from rig.core.clock import Clock
+from rig.devices.camera import Camera
+
+LATEST_S: Final = 1.0
+"""A frame that arrives later after its stamp has no time that can be trusted."""
+GRID_MS: Final = 1.5
+"""How far a stamp may be from the camera's regular rhythm, at least."""
+GRID_SIGMAS: Final = 5.0
+FEWEST_STAMPS: Final = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreamFrame:
+    """A frame of the stream, uint8 (H, W, 3) BGR; times in ns on the bench's clock.
+
+    ``repeated`` says whether the image is that of the frame before. ``stamped`` is False if the camera's time stamps
+    cannot be used.
+    """
+
+    number: int
+    image_bgr: NDArray[np.uint8]
+    stamp_ns: int
+    arrived_ns: int
+    repeated: bool
+    stamped: bool
+
+
+class FrameStream:
+    """Delivers the frames of a camera one after the other.
+
+    Attributes
+    ----------
+    skipped
+        Frames that were not used because the program was too slow.
+    """
+
+    def __init__(self, camera: Camera, clock: Clock) -> None:
+        self._camera = camera
+        self._clock = clock
+        self._last: StreamFrame | None = None
+        self._after_ns = clock.now_ns()
+        self.skipped = 0
+
+    @property
+    def period_s(self) -> float:
+        """Time between two frames by the camera's mode."""
+        fps = self._camera.identity.fps
+        return 1 / fps if 1 <= fps <= 1000 else 1 / 30
+
+    def next(self, meanwhile: Callable[[], object] | None = None, *, newest: bool = False) -> StreamFrame:
+        """Return the next frame, or wait for it; with ``newest``, drop frames that have waited for two periods.
+
+        Raises
+        ------
+        DeviceSilent
+            The camera delivers no frames.
+        """
+        after_ns = self._after_ns
+        if newest and self._last is not None:
+            delay_ns = self._last.arrived_ns - self._last.stamp_ns
+            oldest_ns = self._clock.now_ns() - min(delay_ns, round(LATEST_S * 1e9)) - round(2e9 * self.period_s)
+            if oldest_ns > after_ns:
+                self.skipped += max(int((oldest_ns - after_ns) * 1e-9 / self.period_s), 0)
+                after_ns = oldest_ns
+        frame = self._camera.capture(after_ns, meanwhile)
+        last = self._last
+        found = StreamFrame(
+            0 if last is None else last.number + 1,
+            frame.image_bgr,
+            frame.exposed_ns,
+            self._clock.now_ns(),
+            last is not None and np.array_equal(frame.image_bgr, last.image_bgr),
+            frame.stamped,
+        )
+        self._last, self._after_ns = found, frame.exposed_ns + 1
+        return found
+
+
+def middle_ns(stamp_ns: int, config: CameraTimeConfig) -> int:
+    """Return the middle of the exposure of a frame with this time stamp; the camera's time must be calibrated."""
+    assert config.offset_ms is not None
+    return stamp_ns + round(config.offset_ms * 1e6)
+
+
+def irregular_stamps(stamps_ns: Sequence[int], period_s: float, jitter_ms: float) -> NDArray[np.bool_]:
+    """Return which time stamps do not fit the camera's regular rhythm, bool (n,).
+
+    Lost frames leave whole periods out. The rhythm is that of most frames: stamps that jumped, or that the computer set
+    late, are off. Fewer than `FEWEST_STAMPS` stamps are compared with the period alone.
+    """
+    times = (np.asarray(stamps_ns, np.int64) - stamps_ns[0]) * 1e-9
+    limit_s = max(GRID_MS, GRID_SIGMAS * (jitter_ms if isfinite(jitter_ms) else 0.0)) * 1e-3
+    if len(times) < 2:
+        return np.zeros(len(times), np.bool_)
+    steps = np.diff(times)
+    whole = np.maximum(np.rint(steps / period_s), 1)
+    if len(times) < FEWEST_STAMPS:
+        off = np.abs(steps - whole * period_s) > limit_s
+        return np.concatenate([[off.all()], off])
+    # The camera's own period: it may differ by a thousandth from the nominal one.
+    regular = np.abs(steps - whole * period_s) < 0.05 * period_s
+    period_s = float(np.median(steps[regular] / whole[regular])) if regular.any() else period_s
+    numbers = np.concatenate([[0.0], np.cumsum(whole)])
+    phase = times - numbers * period_s
+    off = np.abs(phase - _densest(phase, limit_s)) > limit_s
+    return np.asarray(off, np.bool_)
+
+
+def _densest(values: NDArray[np.float64], width: float) -> float:
+    """Return the middle of the densest group of values within ``width``; nan if there are none."""
+    if not len(values):
+        return nan
+    ordered = np.sort(values)
+    ends = np.searchsorted(ordered, ordered + 2 * width, side="right")
+    first = int((ends - np.arange(len(ordered))).argmax())
+    return float(np.median(ordered[first : ends[first]]))

@@ -1,0 +1,114 @@
+"""The platter's angle in motion, compared with the simulated world's truth."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.motion.trajectory import TrajectoryRecorder, backlash_states
+from rig.motion.turntable import Flight, Turntable
+from sim.noise import NoiseModel
+from tests.fuzzing import examples
+from tests.rig.bench_parts import motion_bench
+
+
+def flown(goals: list[float], velocity_dps: float, seed: int, noise: NoiseModel | None = None, lost: float = 0.0):  # type: ignore[no-untyped-def]
+    """Return errors, stated uncertainties and errors of the rate at times of a flight, and its trajectory."""
+    rng = np.random.default_rng(seed)
+    with motion_bench(noise=noise, seed=seed) as (bench, wires), Turntable(bench) as table:
+        table.goto(5.0)
+        offset_deg = wires.world.table_deg() - table.rest_deg  # the platter, where the encoder shows its angle
+        recorder = table.recorder()
+        add = recorder.add_reading
+        recorder.add_reading = lambda time_ns, angle: None if rng.random() < lost else add(time_ns, angle)  # type: ignore[method-assign]
+        for goal in goals:
+            table.fly(goal, Flight(lambda: wires.world.clock.sleep(0.033), (-100.0, 390.0), recorder, velocity_dps))
+        trajectory = recorder.fit()
+        assert trajectory is not None
+        first_ns = max(trajectory.start_ns, trajectory.end_ns - 11_000_000_000)
+        times = np.sort(rng.integers(first_ns, trajectory.end_ns, 300))
+        motion = trajectory.at(times)
+        angle, rate = wires.world.table_motion(times)
+        return motion.angle_deg - (angle - offset_deg), motion.sigma_deg, motion.rate_dps - rate, trajectory
+
+
+@examples(4)
+@given(
+    st.integers(0, 1000),
+    st.sampled_from([[120.0], [200.0, 60.0], [90.0, 30.0, 200.0]]),
+    st.floats(20.0, 150.0),
+    st.sampled_from([0.0, 0.4]),
+)
+def test_angle_and_its_uncertainty_are_true_at_any_time(
+    seed: int, goals: list[float], velocity_dps: float, lost: float
+) -> None:
+    error, sigma, _, trajectory = flown(goals, velocity_dps, seed, lost=lost)
+    assert np.abs(error).max() < 0.2
+    assert np.sqrt(np.mean(np.square(error / sigma))) < 2.0
+    assert sigma.max() < 0.2
+    assert trajectory.consistent
+
+
+def test_missing_gyro_samples_widen_the_uncertainty_where_they_are_missing() -> None:
+    recorder = TrajectoryRecorder(0.088, 0.5, 0.01, 0.0035, 0.0, 0.005)
+    times = np.arange(0, 2_000_000_000, 5_000_000)
+    kept = (times < 900_000_000) | (times > 1_100_000_000)
+    for part in (times[kept & (times < 10**9)], times[kept & (times > 10**9)]):
+        recorder.add_samples(part, np.full(len(part), 60.0))
+    for t in range(0, 2_000_000_000, 33_000_000):
+        recorder.add_reading(t, 60e-9 * t)
+    trajectory = recorder.fit()
+    assert trajectory is not None
+    inside, outside = trajectory.at([1_000_000_000, 500_000_000]).sigma_deg
+    assert inside > 10 * outside
+    later = trajectory.at([2_300_000_000]).sigma_deg[0]
+    assert later > 5.0  # nothing was measured then
+
+
+def test_slip_of_the_platter_shows_in_the_residuals() -> None:
+    with motion_bench(seed=3) as (bench, wires), Turntable(bench) as table:
+        recorder = table.recorder()
+        rounds = 0
+
+        def each() -> None:
+            nonlocal rounds
+            rounds += 1
+            if rounds == 40:
+                wires.world.slip(1.5)
+            wires.world.clock.sleep(0.033)
+
+        table.fly(250.0, Flight(each, (-100.0, 390.0), recorder, 90.0))
+        trajectory = recorder.fit()
+    assert trajectory is not None
+    assert not trajectory.consistent
+
+
+def test_goal_may_change_without_a_stop_and_speed_returns_to_the_usual() -> None:
+    with motion_bench(seed=1) as (bench, wires), Turntable(bench) as table:
+        recorder, speeds = table.recorder(), []
+
+        def each() -> float | None:
+            wires.world.clock.sleep(0.033)
+            state = bench.servo.read_state()
+            speeds.append(state.velocity_dps)
+            return table.stopping_deg(state) if wires.world.table_deg() > 60.0 else 300.0
+
+        move = table.fly(100.0, Flight(each, (0.0, 350.0), recorder, 45.0, quiet=False))
+        assert 60.0 < move.commanded_deg < 75.0
+        assert max(speeds) < 50.0
+        assert min(speeds[10:25]) > 40.0  # from the goal 100° to the goal 300° it did not stop
+        assert table.goto(90.0).seconds < 1.5
+
+
+@pytest.mark.parametrize(
+    ("angles", "states", "used"),
+    [
+        ([0.0, 0.4, 0.8, 2.0], [0, 0, 1, 1], [True, False, True, True]),
+        ([0.0, 2.0, 1.7, 1.0, 0.0], [0, 1, 1, -1, -1], [True, True, False, True, True]),
+        ([0.0, 2.0, 1.7, 2.0], [0, 1, 1, 1], [True, True, False, True]),
+    ],
+)
+def test_readings_within_the_backlash_are_not_used(angles: list[float], states: list[int], used: list[bool]) -> None:
+    found, usable = backlash_states(np.array(angles), 0.5)
+    assert found.tolist() == states
+    assert usable.tolist() == used
