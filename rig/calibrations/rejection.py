@@ -154,14 +154,17 @@ class RejectionCode(Enum):
         "The card looks coloured: red is {red:.2f} and blue {blue:.2f} of green. Change camera.white_balance_k until "
         "both are near 1, or use a grey card."
     )
-    EXPOSURE_NOT_LOCKED = "The exposure time is not locked, so that the middle of an exposure changes. Set camera.exposure_us to a number."
+    EXPOSURE_NOT_LOCKED = (
+        "The exposure time is not locked, so that the middle of an exposure changes. Set camera.exposure_us to a "
+        "number."
+    )
     STAMPS_UNUSABLE = (
         "The camera's time stamps cannot be used: they repeat, go backwards, or are not of the computer's clock. Take "
         "views at rest (enroll.mode = step), or use a camera whose driver stamps frames."
     )
     TOO_FEW_FRAMES = (
-        "Only {used} frames in motion can be used, {needed} are needed. Put an object with texture on the table, and light "
-        "it better."
+        "Only {used} frames in motion can be used, {needed} are needed. Put an object with texture on the table, and "
+        "light it better."
     )
     TOO_LITTLE_TEXTURE = (
         "The frames determine the angle only to {uncertainty_deg:.2f}°, {needed_deg:g}° is needed. Put an object with "
@@ -172,8 +175,8 @@ class RejectionCode(Enum):
         "texture on the table, and calibrate again."
     )
     FRAME_JITTER_TOO_LARGE = (
-        "The time of the frames jitters by {jitter_ms:.2f} ms: at {speed_dps:.0f} °/s this is {jitter_deg:.2f}°, more than "
-        "{limit_deg:g}°. Close other programs, connect the camera without a hub, or lower table.velocity_dps."
+        "The time of the frames jitters by {jitter_ms:.2f} ms: at {speed_dps:.0f} °/s this is {jitter_deg:.2f}°, more "
+        "than {limit_deg:g}°. Close other programs, connect the camera without a hub, or lower table.velocity_dps."
     )
     FRAMES_LOST = (
         "{lost:.0%} of the frames were lost, more than {limit:.0%}. Connect the camera to another USB port, without a "

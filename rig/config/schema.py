@@ -326,8 +326,8 @@ class EnrollConfig(Section):
     views: int = Field(72, ge=4, le=720, description="views in a revolution")
     mode: Literal["auto", "step", "fly"] = Field(
         "auto",
-        description="fly: the views are taken while the table turns; step: at rest; auto: fly for trays if the camera's "
-        "time is calibrated",
+        description="fly: the views are taken while the table rotates; step: at rest; auto: fly for trays if the "
+        "camera's time is calibrated",
     )
 
 
@@ -340,7 +340,7 @@ class IdentifyConfig(Section):
     )
     mode: Literal["auto", "step", "fly"] = Field(
         "auto",
-        description="fly: frames count while the table turns; step: only at rest; auto: fly if the camera's time is "
+        description="fly: frames count while the table rotates; step: only at rest; auto: fly if the camera's time is "
         "calibrated (dense only)",
     )
     max_views: int = Field(8, ge=1, le=72, description="largest number of views")
